@@ -1,0 +1,116 @@
+# Everything runs from the repository root; `make help` lists the targets.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+.NOTPARALLEL:
+
+PYTHON ?= python3
+RECORDING ?=
+PYTEST_ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+
+# The ROS wheels start python again with these two and leave them to all its children, where
+# another environment's python would load the wrong libraries.
+ifdef _ROS_WHEELS_BOOTSTRAP_COMPLETE
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
+CLEAN_ENV := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE -u LD_LIBRARY_PATH
+endif
+
+# The interpreter below PYTHON, so that an activated .venv is not taken for the base of itself.
+BASE := $(shell $(CLEAN_ENV) $(PYTHON) -c 'import sys; print(getattr(sys, "_base_executable", sys.executable))' 2>/dev/null)
+VERSION := $(if $(BASE),$(shell $(BASE) -c 'import sys; print("%d.%d" % sys.version_info[:2])'))
+# Where a sourced ROS 2 lies; and where one lies that this interpreter can't import.
+SYSTEM_ROS := $(if $(BASE),$(shell $(BASE) -c 'import rclpy; print(rclpy.__path__[0])' 2>/dev/null))
+FOREIGN_ROS := $(if $(BASE)$(SYSTEM_ROS),$(if $(SYSTEM_ROS),,$(shell $(BASE) -c \
+	'import importlib.util as u; s = u.find_spec("rclpy"); print(s.origin if s else "")')))
+WHEELS_EXIST := $(filter Linux-x86_64,$(shell uname -s)-$(shell uname -m))
+ROS := $(if $(SYSTEM_ROS),system,$(if $(WHEELS_EXIST),wheels,none))
+EXTRAS := $(if $(SYSTEM_ROS),test,dev)
+
+# Written last, so a half-built .venv has none and is built anew; its name says for which Python
+# and which ROS 2 the environment is.
+READY := $(VENV)/.ready-py$(VERSION)-$(ROS)
+DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Makefile
+
+OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
+
+.PHONY: help setup demo test ros-status lint format types pytest benchmark clean distclean
+
+help: ## list the targets
+	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 12
+
+setup: $(READY) ## build .venv: the package (editable) and all that tests and demo need
+
+$(READY): $(DESCRIBED_BY)
+	@if [ -z "$(BASE)" ]; then \
+		echo "make setup: $(PYTHON) does not run here; $(OTHER_PYTHON)." >&2; exit 1; fi
+	@case "$(VERSION)" in 3.10|3.11|3.12|3.13) ;; *) \
+		echo "make setup: $(PYTHON) is Python $(VERSION), but 3.10 to 3.13 is needed;" \
+			"$(OTHER_PYTHON)." >&2; exit 1;; esac
+	@if ! $(BASE) -c 'import ensurepip, venv' 2>/dev/null; then \
+		echo "make setup: $(BASE) has no venv module; install it (Debian, Ubuntu: apt install" \
+			"python$(VERSION)-venv) or $(OTHER_PYTHON)." >&2; exit 1; fi
+	@if [ -n "$(FOREIGN_ROS)" ]; then \
+		echo "make setup: the ROS 2 that is sourced here ($(FOREIGN_ROS)) does not load in Python" \
+			"$(VERSION); take a shell without it, or $(OTHER_PYTHON)." >&2; exit 1; fi
+	@if [ ! -e $@ ]; then \
+		echo "Building $(VENV) with Python $(VERSION)."; \
+		rm -rf $(VENV); \
+		$(BASE) -m venv $(if $(SYSTEM_ROS),--system-site-packages) $(VENV); \
+	fi
+	@rm -f $@
+	@# A ROS 2 built against numpy 1 crashes on numpy 2, which some of the pins need.
+	@if [ "$(ROS)" = system ] && $(BASE) -c \
+			'import numpy, sys; sys.exit(numpy.__version__[:2] != "1.")' 2>/dev/null; then \
+		sed -E 's/^numpy==[^ ;]+/numpy<2/; /^(contourpy|matplotlib|scipy|shapely)==/d' \
+			constraints.txt > $(VENV)/constraints.txt; \
+	else \
+		cp constraints.txt $(VENV)/constraints.txt; \
+	fi
+	@echo "Installing nics_drl_bridge[$(EXTRAS)] into $(VENV); the first time takes a minute or more."
+	@export PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_CONSTRAINT=$(VENV)/constraints.txt; \
+		$(BIN)/python -m pip install -qq setuptools; \
+		$(BIN)/python -m pip install -qq --no-build-isolation --editable '.[$(EXTRAS)]'
+	@touch $@
+
+demo: setup ## run the whole chain on a recording: make demo [RECORDING=folder]
+	$(BIN)/nics demo $(if $(RECORDING),--recording "$(RECORDING)") --out runs/demo
+
+test: ros-status setup lint types pytest ## lint, types and tests: make test [PYTEST_ARGS="-k lidar"]
+
+ros-status:
+ifeq ($(ROS),system)
+	@echo "ROS 2: yes, the system's ($(SYSTEM_ROS))."
+else ifeq ($(ROS),none)
+	@echo "ROS 2: no, none is sourced and there are no wheels for this machine; its tests skip."
+else
+	@if [ -e $(READY) ]; then echo "ROS 2: yes, as wheels in $(VENV)."; \
+	else echo "ROS 2: not yet, set-up will install it as wheels into $(VENV)."; fi
+endif
+
+lint: setup ## ruff: rules and format
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: setup ## let ruff repair what it can
+	$(BIN)/ruff check --fix-only .
+	$(BIN)/ruff format .
+
+types: setup ## mypy
+	$(BIN)/mypy nics_drl_bridge
+
+pytest: setup
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+benchmark: setup ## run every benchmark and print its table
+	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python "$$script"; done
+
+clean: ## remove what building and testing left behind
+	rm -rf build dist install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+
+distclean: clean ## the same, and .venv and runs/
+	rm -rf $(VENV) runs

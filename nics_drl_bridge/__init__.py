@@ -1,0 +1,17 @@
+"""From a recording of a robot to a fast simulator, and from there to the robot over ROS 2.
+
+The package generates a simulator (a fitted, pruned second-order Taylor model of the
+kinematics and baked lidar tables), trains or tests a policy in it, and drives the same task
+and the same policy in process, over ROS 2 and on the vehicle.
+
+Importing this package needs neither ROS 2 nor any heavy library.
+"""
+
+from importlib.metadata import PackageNotFoundError, version
+
+try:
+    __version__ = version("nics_drl_bridge")
+except PackageNotFoundError:  # a source tree that was never installed
+    __version__ = "0+unknown"
+
+__all__ = ["__version__"]

@@ -1,0 +1,219 @@
+"""Calibrates a recording: clocks, latency, mounting, lags and noise, found in the data."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.calibration import stamps
+from nics_drl_bridge.calibration.calibration import Calibration, Response
+from nics_drl_bridge.calibration.clocks import Timing, if_certain, timing_of
+from nics_drl_bridge.calibration.mounting import (
+    Mounting,
+    lateral_lever,
+    mounting_by_commands,
+    mounting_without_lateral_motion,
+)
+from nics_drl_bridge.calibration.noise import Motion, motion, pose_noise
+from nics_drl_bridge.calibration.report import Findings, sentences
+from nics_drl_bridge.calibration.signals import held, interval_means
+from nics_drl_bridge.calibration.timing import followed, inferred_states, moved_commands
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.kinematics.recording import Recording, check
+from nics_drl_bridge.kinematics.spec import RobotSpec
+
+Array = NDArray[np.float64]
+
+MIN_LENGTH = 1e-4  # m, rad
+
+
+def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
+    """Estimates what the streams of a recording need before a fit.
+
+    Args:
+        recording: of a drive in which the robot moved.
+        spec: the robot. Where the recording has no measured state, each of its state
+            variables must follow a command.
+
+    Returns:
+        The calibration; the identity for a recording that needs no correction.
+
+    Raises:
+        RecordingError: the recording can't be used for this robot.
+    """
+    calibration, findings = examine(recording, spec)
+    return replace(calibration, notes=sentences(calibration, findings, spec))
+
+
+def examine(recording: Recording, spec: RobotSpec) -> tuple[Calibration, Findings]:
+    """As `calibrate`, with the findings that its notes are made of."""
+    check(recording, spec)
+    _require_state(recording, spec)
+    bursts = stamps.find_bursts(recording.pose.t)
+    noise = pose_noise(recording.pose.values, bursts)
+    best = stamps.newest(recording.pose.t, bursts)
+    twists = motion(
+        recording.pose.t[best], recording.pose.values[best], bursts, noise or (0.0, 0.0)
+    )
+    if len(twists.start) < stamps.MIN_STAMPS:
+        raise RecordingError(
+            f"{recording.source}: pose: only {len(twists.start)} usable intervals; record a drive "
+            "of 20 s or more without long gaps."
+        )
+    timing = timing_of(recording, spec, twists)
+    mounting = _mounting(recording, spec, twists, timing)
+    calibration = Calibration(
+        clock_offset_s=timing.offset,
+        command_latency_s=timing.latency,
+        burst_period_s=bursts.period_s if bursts else 0.0,
+        position_noise_m=noise[0] if noise else 0.0,
+        heading_noise_rad=noise[1] if noise else 0.0,
+        uncertainty=timing.sigma,
+        wheels_swapped=_wheels_swapped(recording, twists, timing.offset),
+    )
+    calibration = _mounted(calibration, mounting)
+    calibration = replace(
+        calibration, responses=_responses(recording, spec, twists, calibration, timing)
+    )
+    findings = Findings(
+        bursts=bursts,
+        noise_known=noise is not None,
+        separated=timing.separated,
+        clocks_differ=recording.pose.clock != recording.command.clock,
+        lag_sigma=timing.lag_sigma,
+        mounting=mounting,
+        unmoved=_unmoved(recording, spec),
+    )
+    return calibration, findings
+
+
+def _require_state(recording: Recording, spec: RobotSpec) -> None:
+    missing = [v.name for v in spec.state if v.follows is None]
+    if recording.state is None and missing:
+        raise RecordingError(
+            f"{recording.source}: has no measured state, and {missing[0]!r} of robot {spec.name!r} "
+            "follows no command; record the state too, or add `follows:` to the robot's YAML file."
+        )
+
+
+def _unmoved(recording: Recording, spec: RobotSpec) -> tuple[str, ...]:
+    moved = moved_commands(recording.command)
+    return tuple(c.name for c, m in zip(spec.command, moved, strict=True) if not m)
+
+
+def _expected(recording: Recording, spec: RobotSpec, twists: Motion, timing: Timing) -> Array:
+    """Mean state (n, S) over the intervals of the twists, at gain one where inferred."""
+    start, end = twists.start + timing.offset, twists.end + timing.offset
+    if recording.state is not None:
+        return interval_means(recording.state.t, recording.state.values, start, end)
+    grid = np.arange(min(start[0], recording.command.t[0]) - 1.0, end[-1] + 0.01, 0.01)
+    states = inferred_states(recording.command, spec, timing.lags, timing.latency, grid)
+    return interval_means(grid, states, start, end)
+
+
+def _mounting(
+    recording: Recording, spec: RobotSpec, twists: Motion, timing: Timing
+) -> Mounting | None:
+    start, end = twists.start + timing.offset, twists.end + timing.offset
+    command = held(recording.command, spec, start - timing.latency, end - timing.latency)
+    cmd_vel = spec.to_cmd_vel(command)
+    expected = _expected(recording, spec, twists, timing)
+    if any(c.cmd_vel == "linear.y" for c in spec.command):
+        response = expected if recording.state is None else _as_commands(expected, recording, spec, timing.latency)
+        return mounting_by_commands(twists, spec.to_cmd_vel(response))
+    found = mounting_without_lateral_motion(twists, cmd_vel[:, 0])
+    speed = _speed_index(spec)
+    if found is None or speed is None or np.isnan(found.lever_sigma[0]):
+        return found
+    lever_y, sigma = lateral_lever(twists, found.rotation, expected[:, speed])
+    return replace(
+        found,
+        lever=np.array([found.lever[0], lever_y]),
+        lever_sigma=np.array([found.lever_sigma[0], sigma]),
+    )
+
+
+def _as_commands(
+    states: Array, recording: Recording, spec: RobotSpec, latency: float
+) -> Array:
+    """Measured states (n, S) as the commands (n, C) that would hold them."""
+    stream = recording.state
+    if stream is None:
+        return states[:, np.argsort(followed(spec))]
+    span = np.diff(stream.t)
+    keep = span > 0.0
+    rates = np.diff(stream.values, axis=0)[keep] / span[keep, None]
+    before = stream.values[:-1][keep]
+    begin = stream.t - latency
+    u = held(recording.command, spec, begin[:-1][keep], begin[1:][keep])
+    chi = np.concatenate([before, u, np.ones((len(u), 1))], axis=1)
+    beta = np.linalg.lstsq(chi, rates, rcond=1e-9)[0]
+    size = states.shape[1]
+    steady = -np.linalg.pinv(beta[:size].T, rcond=1e-6) @ beta[size:-1].T
+    return np.asarray(states @ np.linalg.pinv(steady).T)
+
+
+def _speed_index(spec: RobotSpec) -> int | None:
+    """The state variable that is the speed along the direction of travel."""
+    speeds = [i for i, v in enumerate(spec.state) if v.unit == "m/s"]
+    return speeds[0] if len(speeds) == 1 else None
+
+
+def _mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
+    """Adds the parts of a mounting that are certain."""
+    if mounting is None:
+        return calibration
+    rotation = if_certain(mounting.rotation, mounting.rotation_sigma, MIN_LENGTH)
+    known = ~np.isnan(mounting.lever_sigma)
+    x, y = (
+        if_certain(float(value), float(sigma), MIN_LENGTH) if k else 0.0
+        for value, sigma, k in zip(mounting.lever, mounting.lever_sigma, known, strict=True)
+    )
+    sigma = {"rotation_rad": mounting.rotation_sigma}
+    sigma |= {
+        f"lever_arm_{axis}_m": float(s)
+        for axis, s, k in zip("xy", mounting.lever_sigma, known, strict=True)
+        if k
+    }
+    return replace(
+        calibration,
+        rotation_rad=rotation,
+        lever_arm_m=(x, y),
+        uncertainty={**calibration.uncertainty, **sigma},
+    )
+
+
+def _responses(
+    recording: Recording, spec: RobotSpec, twists: Motion, calibration: Calibration, timing: Timing
+) -> tuple[Response, ...]:
+    """The inferred states; a speed is scaled so that it is the speed along the travel."""
+    if recording.state is not None:
+        return ()
+    gains = np.ones(len(spec.state))
+    speed = _speed_index(spec)
+    if speed is not None and moved_commands(recording.command)[followed(spec)[speed]]:
+        x = _expected(recording, spec, twists, timing)[:, speed]
+        c, s = np.cos(calibration.rotation_rad), np.sin(calibration.rotation_rad)
+        along = c * twists.twist[:, 0] + s * twists.twist[:, 1]
+        along = along + calibration.lever_arm_m[1] * twists.twist[:, 2]
+        gains[speed] = float(x @ along / (x @ x))
+    return tuple(
+        Response(v.name, str(v.follows), float(lag), float(gain))
+        for v, lag, gain in zip(spec.state, timing.lags, gains, strict=True)
+    )
+
+
+def _wheels_swapped(recording: Recording, twists: Motion, offset: float) -> bool | None:
+    """Whether the left wheel is faster in left turns; None if the wheels don't tell."""
+    if recording.wheels is None:
+        return None
+    start, end = twists.start + offset, twists.end + offset
+    wheels = interval_means(recording.wheels.t, recording.wheels.values, start, end)
+    difference, turn = wheels[:, 1] - wheels[:, 0], twists.twist[:, 2]
+    size = float(np.sqrt((difference**2).mean() * (turn**2).mean()))
+    if size <= 0.0:
+        return None
+    agreement = float((difference * turn).mean()) / size
+    return agreement < 0.0 if abs(agreement) > 0.5 else None

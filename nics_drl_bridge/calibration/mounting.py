@@ -1,0 +1,142 @@
+"""Mounting: where and how the tracked body sits on the robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.calibration.noise import Motion
+from nics_drl_bridge.geometry import rotate, wrap_angle
+
+Array = NDArray[np.float64]
+
+TURN_SCALE_M = 0.2
+"""Weighs yaw rates against speeds: a heading error counts as at this distance."""
+DISTINCT = 4.0
+"""The second direction of motion must stand out of the noise by this factor."""
+MIN_SECOND = 0.05
+"""It must have at least this share of the first one's size."""
+STILL = 1e-3
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Rotation and lever arm, as in `Calibration`, with standard uncertainty.
+
+    Attributes:
+        rotation: heading of `base_link` less that of the tracked body [rad].
+        lever: (2,) of the tracked point seen from `base_link` [m].
+        rotation_sigma: [rad].
+        lever_sigma: (2,) [m]; NaN for a component that could not be learnt.
+        turns: whether the robot turned at all.
+    """
+
+    rotation: float
+    lever: Array
+    rotation_sigma: float
+    lever_sigma: Array
+    turns: bool
+
+
+def mounting_without_lateral_motion(motion: Motion, forward: Array) -> Mounting | None:
+    """Mounting on a robot whose `base_link` never moves sideways.
+
+    The lateral speed of the tracked point is then yaw rate x lever arm:
+    `cos(rotation) uy - sin(rotation) ux - lever_x wz = 0`, the direction in which the twists
+    have no extent. Where the path has one curvature only, rotation and lever arm can't be
+    told apart: the lever arm is taken as zero.
+
+    Args:
+        motion: twists of the tracked body.
+        forward: (n,) what the robot was told or measured to drive; only its sign counts.
+
+    Returns:
+        The mounting; its lever arm along y is not known here. None if nothing moved.
+    """
+    rows = motion.twist * np.array([1.0, 1.0, TURN_SCALE_M])
+    size, axes = np.linalg.svd(rows, full_matrices=False)[1:]
+    size = size / np.sqrt(len(rows))
+    if size[0] < STILL:
+        return None
+    turns = bool(np.abs(rows[:, 2]).mean() > STILL)
+    if size[1] < max(DISTINCT * size[2], MIN_SECOND * size[0]):
+        direction = axes[0, :2]
+        sigma = size[1] / size[0] / np.sqrt(len(rows))
+        travel = float(np.arctan2(direction[1], direction[0]))
+        return _facing(motion, forward, travel, (0.0, np.nan), sigma, turns)
+    normal = axes[2]
+    flat = float(np.hypot(normal[0], normal[1]))
+    sigma = size[2] / size[1] / np.sqrt(len(rows)) / flat
+    travel = float(np.arctan2(-normal[0], normal[1]))
+    lever = -float(normal[2]) * TURN_SCALE_M / flat
+    return _facing(motion, forward, travel, (lever, sigma * TURN_SCALE_M), sigma, turns)
+
+
+def _facing(
+    motion: Motion,
+    forward: Array,
+    travel: float,
+    lever_x: tuple[float, float],
+    sigma: float,
+    turns: bool,
+) -> Mounting:
+    """Chooses between forward and backward; `travel` is the course in the tracked frame."""
+    lever, lever_sigma = lever_x
+    along = motion.twist[:, :2] @ np.array([np.cos(travel), np.sin(travel)])
+    if float(along @ forward) < 0.0:
+        travel, lever = travel + np.pi, -lever
+    return Mounting(
+        float(wrap_angle(travel)),
+        np.array([lever, 0.0]),
+        float(sigma),
+        np.array([lever_sigma, np.nan]),
+        turns,
+    )
+
+
+def lateral_lever(motion: Motion, rotation: float, speed: Array) -> tuple[float, float]:
+    """Lever arm along y and its uncertainty [m], from measured or commanded speed (n,).
+
+    The tracked point runs faster than `base_link` on the outside of a curve:
+    `ux = gain speed - lever_y wz`. NaN uncertainty where all curves were alike.
+    """
+    along = rotate(motion.twist[:, :2], -rotation)[:, 0]
+    chi = np.stack([speed, motion.twist[:, 2]], axis=1)
+    size = np.linalg.svd(chi * np.array([1.0, TURN_SCALE_M]), compute_uv=False)
+    if size[1] < 2.0 * MIN_SECOND * size[0]:
+        return 0.0, float("nan")
+    beta = np.linalg.lstsq(chi, along, rcond=None)[0]
+    rest = along - chi @ beta
+    covariance = np.linalg.inv(chi.T @ chi) * float((rest**2).mean())
+    return -float(beta[1]), float(np.sqrt(covariance[1, 1]))
+
+
+def mounting_by_commands(motion: Motion, response: Array) -> Mounting | None:
+    """Mounting on a robot that moves in every direction.
+
+    Args:
+        motion: twists of the tracked body.
+        response: (n, 3) the body twist, up to one factor, that state or commands make
+            expect of `base_link`.
+
+    Returns:
+        The mounting, or None if it did not move along x and y and turn.
+    """
+    size = np.linalg.svd(response, compute_uv=False)
+    if size[2] < MIN_SECOND * size[0]:
+        return None
+    gain, *_ = np.linalg.lstsq(response, motion.twist, rcond=None)
+    rest = motion.twist - response @ gain
+    spread = np.sqrt(np.diag(np.linalg.inv(response.T @ response)))[:, None] * rest.std(axis=0)
+    rotation = float(np.arctan2(gain[0, 1] - gain[1, 0], gain[0, 0] + gain[1, 1]))
+    across = rotate(gain[2, :2], -rotation) / gain[2, 2]  # (-lever_y, lever_x)
+    scale = float(np.hypot(gain[0, 0], gain[0, 1]))
+    return Mounting(
+        float(wrap_angle(rotation)),
+        np.array([across[1], -across[0]]),
+        float(spread[0, 1] / scale),
+        np.full(2, float(spread[2, 0] / abs(gain[2, 2]))),
+        True,
+    )

@@ -1,0 +1,214 @@
+"""Delays and lags: what shift in time makes a signal a function of the commands.
+
+Every estimate is a separable least squares: for a given delay (and lags) the best linear
+combination of the features of the paper (Eq. 1) is known at once, so only the delay and the
+lags are searched for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from nics_drl_bridge.calibration.signals import held, interval_means, lagged
+from nics_drl_bridge.kinematics import features
+from nics_drl_bridge.kinematics.recording import Stream
+from nics_drl_bridge.kinematics.spec import RobotSpec
+
+Array = NDArray[np.float64]
+
+STEP_S = 0.01
+STEPS_S = (0.05, 0.005, 0.0005)
+SEARCH_S = 3.0
+DEFAULT_LAG_S = 0.1
+LAG_RANGE_S = (0.005, 2.0)
+MAX_ROWS = 3000
+EXACT = 1e-6
+
+
+@dataclass(frozen=True)
+class Delay:
+    """A delay that was searched for.
+
+    Attributes:
+        value: from the command's stamp to its effect, each on its own clock [s].
+        sigma: its standard uncertainty [s].
+        lags: (S,) time constants of the inferred states [s].
+        lag_sigma: (S,) their standard uncertainty; NaN where not estimated.
+        explained: share of the signal's variance that the response explains.
+    """
+
+    value: float
+    sigma: float
+    lags: Array
+    lag_sigma: Array
+    explained: float
+
+
+def followed(spec: RobotSpec) -> NDArray[np.intp]:
+    """(S,) index of the command that each state variable follows."""
+    names = [c.name for c in spec.command]
+    return np.array([names.index(str(v.follows)) for v in spec.state], dtype=np.intp)
+
+
+def moved_commands(command: Stream) -> NDArray[np.bool_]:
+    """(C,) whether each command ever changed."""
+    return np.asarray(np.ptp(command.values, axis=0) > 0.0)
+
+
+def nominal_lags(spec: RobotSpec) -> Array:
+    """(S,) time constants that the spec gives, `NAME_lag`, else a usual one [s]."""
+    return np.array([spec.parameters.get(f"{v.name}_lag", DEFAULT_LAG_S) for v in spec.state])
+
+
+def inferred_states(
+    command: Stream, spec: RobotSpec, lags: Array, latency: float, grid: Array
+) -> Array:
+    """States (T, S) at uniform times (T,), on the commands' clock, at gain one.
+
+    Each state follows its command; one whose command never changes stays at that value.
+    """
+    dt = float(grid[1] - grid[0])
+    target = held(command, spec, grid - latency, grid + dt - latency)[:, followed(spec)]
+    long_ago = np.array([command.t[0] - 2.0])
+    initial = held(command, spec, long_ago, long_ago + 1.0)[0, followed(spec)]
+    return lagged(target, lags, dt, initial)
+
+
+def delay_of_response(
+    command: Stream,
+    spec: RobotSpec,
+    target: tuple[Array, Array, Array],
+    center: float = 0.0,
+    lags: Array | None = None,
+) -> Delay:
+    """The delay and the lags with which a signal follows the commands.
+
+    Args:
+        command: the commands.
+        spec: whose state variables all follow a command.
+        target: start (n,), end (n,) of intervals and the signal's mean (n, K) over each.
+        center: of the search for the delay [s].
+        lags: (S,) known time constants; None to estimate those that the drive shows.
+    """
+    start, end, signal = target
+    moved = moved_commands(command)[followed(spec)] if spec.state else moved_commands(command)
+    powers = features.exponents(len(moved), 2)
+    powers = powers[(powers[:, ~moved] == 0).all(axis=1)]
+    first = min(start.min(), command.t[0] + center - SEARCH_S) - 1.0
+    grid = np.arange(first, end.max() + STEP_S, STEP_S)
+    free = np.flatnonzero(moved[: len(spec.state)]) if lags is None else np.zeros(0, dtype=np.intp)
+    base = nominal_lags(spec) if lags is None else lags
+
+    def signals(tau: Array, delay: float) -> Array:
+        if spec.state:
+            return inferred_states(command, spec, tau, delay, grid)
+        return held(command, spec, grid - delay, grid + STEP_S - delay)
+
+    def residual(theta: Array) -> Array:
+        tau = base.copy()
+        tau[free] = np.exp(theta[1:])
+        chi = features.evaluate(signals(tau, theta[0]), powers)
+        return unexplained(interval_means(grid, chi, start, end), signal)
+
+    theta, sigma, explained = _search(residual, center, np.log(base[free]))
+    found, spread = base.copy(), np.full(len(base), np.nan)
+    found[free] = np.exp(theta[1:])
+    spread[free] = sigma[1:] * found[free]
+    return Delay(float(theta[0]), float(sigma[0]), found, spread, explained)
+
+
+def latency_of_state(command: Stream, state: Stream, spec: RobotSpec) -> Delay | None:
+    """The delay with which a measured state starts to follow the commands.
+
+    None if the drive does not show it; exactly zero if zero explains every digit.
+    """
+    if not moved_commands(command).any():
+        return None
+    keep = np.flatnonzero(np.diff(state.t) > 0.0)
+    keep = keep[:: max(1, len(keep) // MAX_ROWS)]
+    start, end = state.t[keep], state.t[keep + 1]
+    rates = (state.values[keep + 1] - state.values[keep]) / (end - start)[:, None]
+    middle = (state.values[keep + 1] + state.values[keep]) / 2.0
+
+    def residual(theta: Array) -> Array:
+        u = held(command, spec, start - theta[0], end - theta[0])
+        return unexplained(np.concatenate([np.ones((len(u), 1)), middle, u], axis=1), rates)
+
+    return _search_or_zero(residual)
+
+
+def delay_of_pose(state: Stream, target: tuple[Array, Array, Array], center: float) -> Delay:
+    """The delay of the pose's clock behind that of a measured state."""
+    start, end, signal = target
+    chi = features.evaluate(state.values, features.exponents(state.values.shape[1], 2))
+
+    def residual(theta: Array) -> Array:
+        means = interval_means(state.t, chi, start - theta[0], end - theta[0])
+        return unexplained(means, signal)
+
+    return _search_or_zero(residual, center)
+
+
+def unexplained(chi: Array, signal: Array) -> Array:
+    """What no linear combination of features (n, K) explains of a signal (n, D); flattened.
+
+    In shares of each component's spread.
+    """
+    spread = signal.std(axis=0)
+    scaled = (signal - signal.mean(axis=0)) / np.where(spread > 1e-9, spread, 1e9)
+    norm = np.linalg.norm(chi, axis=0)
+    chi = chi / np.where(norm > 0.0, norm, 1.0)
+    beta = np.linalg.lstsq(np.concatenate([np.ones((len(chi), 1)), chi], axis=1), scaled, 1e-10)[0]
+    return np.asarray(scaled - beta[0] - chi @ beta[1:]).ravel()
+
+
+def _search_or_zero(residual: Callable[[Array], Array], center: float = 0.0) -> Delay:
+    nothing = np.zeros(0)
+    if center == 0.0 and np.sqrt((residual(np.zeros(1)) ** 2).mean()) < EXACT:
+        return Delay(0.0, 0.0, nothing, nothing, 1.0)
+    theta, sigma, explained = _search(residual, center, nothing)
+    return Delay(float(theta[0]), float(sigma[0]), nothing, nothing, explained)
+
+
+def _search(
+    residual: Callable[[Array], Array], center: float, log_lags: Array
+) -> tuple[Array, Array, float]:
+    """Delay and log lags of least residual, their uncertainty, and the share explained."""
+    delay = center
+    for reach, step in zip((SEARCH_S, *STEPS_S[:-1]), STEPS_S, strict=True):
+        tries = delay + np.arange(-reach, reach + step / 2.0, step)
+        cost = [float((residual(np.append(d, log_lags)) ** 2).sum()) for d in tries]
+        delay = float(tries[int(np.argmin(cost))])
+    start = np.append(delay, log_lags)
+    low = np.append(start[0] - 0.5, np.full(len(log_lags), np.log(LAG_RANGE_S[0])))
+    high = np.append(start[0] + 0.5, np.full(len(log_lags), np.log(LAG_RANGE_S[1])))
+    found = least_squares(
+        residual,
+        start,
+        bounds=(low, high),
+        diff_step=1e-4,
+        x_scale=np.full(len(start), 0.1),
+        max_nfev=40,
+    )
+    best = np.asarray(found.x) if 2.0 * found.cost < min(cost) else start
+    rest = residual(best)
+    return best, uncertainty(found.jac, rest), 1.0 - float((rest**2).mean())
+
+
+def uncertainty(jacobian: Array, residual: Array) -> Array:
+    """Standard uncertainty (P,) of least squares.
+
+    Widened for residuals that resemble their neighbours.
+    """
+    rest = residual - residual.mean()
+    power = float((rest**2).sum())
+    rho = float((rest[1:] * rest[:-1]).sum()) / power if power > 0.0 else 0.0
+    rho = float(np.clip(rho, 0.0, 0.95))
+    variance = power / max(1, len(residual) - jacobian.shape[1]) * (1.0 + rho) / (1.0 - rho)
+    covariance = np.linalg.pinv(jacobian.T @ jacobian) * variance
+    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))

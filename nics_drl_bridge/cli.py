@@ -1,0 +1,116 @@
+"""The command line: `nics ...`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nics_drl_bridge import __version__
+from nics_drl_bridge.errors import BridgeError
+
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+
+app = typer.Typer(
+    help="From a recording of a robot to a fast simulator, and back to the robot over ROS 2.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+RobotOption = Annotated[str, typer.Option(help="A shipped robot (ackermann) or a YAML file.")]
+WorldOption = Annotated[
+    str, typer.Option("--world", "--scene", help="A shipped world (arena) or a YAML file.")
+]
+
+
+@contextmanager
+def _one_sentence() -> Iterator[None]:
+    """What the user got wrong becomes one sentence and exit code 2, never a traceback."""
+    try:
+        yield
+    except BridgeError as error:
+        typer.echo(f"nics: {error}", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from None
+    except KeyboardInterrupt:
+        typer.echo("nics: interrupted; everything that was started has ended.", err=True)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Options of every command."""
+
+
+@app.command()
+def generate(
+    recording: Annotated[Path, typer.Argument(help="An .npz recording, or a folder of CSV files.")],
+    out: Annotated[Path, typer.Option(help="Folder of the model to write.")],
+    robot: RobotOption = "ackermann",
+    world: WorldOption = "arena",
+    lidar: Annotated[str, typer.Option(help="A shipped lidar (paper) or a YAML file.")] = "paper",
+    order: Annotated[int, typer.Option(min=1, max=4, help="Order of the Taylor model.")] = 2,
+    alpha: Annotated[float, typer.Option(min=0.0, max=1.0, help="Pruning threshold of Eq. 2.")] = 0.99,
+    assume_textbook: Annotated[
+        bool, typer.Option(help="Fill in from the textbook what the drive did not show.")
+    ] = False,
+) -> None:
+    """Generates a simulator from a recording and writes it as a folder."""
+    with _one_sentence():
+        from nics_drl_bridge.generator import generate as generate_model
+        from nics_drl_bridge.generator import save_model
+        from nics_drl_bridge.kinematics.readers import read_recording
+        from nics_drl_bridge.kinematics.spec import load_robot
+        from nics_drl_bridge.lidar.spec import load_lidar
+        from nics_drl_bridge.sim.world import load_world
+
+        spec, radii, sensor = load_robot(robot), load_world(world).obstacles.radii, load_lidar(lidar)
+        model, _ = generate_model(
+            read_recording(recording), spec, sensor, radii, order, alpha, assume=assume_textbook
+        )
+        save_model(model, out)
+        typer.echo(model.report.rstrip())
+        typer.echo(f"model written to {out}")
+
+
+@app.command()
+def demo(
+    recording: Annotated[
+        Path | None, typer.Option(help="A drive; by default one of the textbook robot.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for everything the demo writes.")] = Path("runs/demo"),
+    robot: RobotOption = "ackermann",
+    world: WorldOption = "arena",
+    episodes: Annotated[int, typer.Option(min=1, help="How many episodes.")] = 5,
+) -> None:
+    """Goes the whole road once: generate, drive in process, drive over DDS, report."""
+    with _one_sentence():
+        from nics_drl_bridge.demo import Plan, run
+
+        plan = Plan(out, robot, world, recording, episodes)
+        outcome = run(plan, lambda line: typer.echo(line))
+        typer.echo(outcome.line())
+
+
+def main() -> None:
+    """Entry point of the executable."""
+    app(prog_name="nics")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,227 @@
+"""Strict configuration: YAML read without surprises, checked against a schema.
+
+PyYAML alone reads `1e-3` as a string and keeps the last of two equal keys; here the first
+is a number and the second an error. Every error names file, key and the nearest valid name.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from nics_drl_bridge.errors import ConfigError, nearest
+
+PACKAGE = "nics_drl_bridge"
+MAX_DEPTH = 32
+
+
+class Schema(BaseModel):
+    """Base of all configurations: frozen, no unknown keys, finite numbers only."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+SchemaT = TypeVar("SchemaT", bound=BaseModel)
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.2 numbers, and no duplicate keys."""
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag.rsplit(":", 1)[-1] in ("null", "merge")]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")
+)
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:int", re.compile(r"^[-+]?(?:0|[1-9][0-9]*)$"), list("-+0123456789")
+)
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(
+        r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+        r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+    ),
+    list("-+0123456789."),
+)
+
+
+def _mapping(loader: _Loader, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+    seen: set[Any] = set()
+    for key_node, _ in node.value:
+        key = key_node.value
+        if key in seen:
+            raise yaml.constructor.ConstructorError(
+                None, None, f"the key {key!r} stands twice; keep one", key_node.start_mark
+            )
+        seen.add(key)
+    return yaml.SafeLoader.construct_mapping(loader, node, deep=deep)
+
+
+_Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
+
+
+def _check_depth(text: str) -> None:
+    depth = 0
+    for event in yaml.parse(text, Loader=_Loader):
+        if isinstance(event, (yaml.MappingStartEvent, yaml.SequenceStartEvent)):
+            depth += 1
+            if depth > MAX_DEPTH:
+                raise ValueError(f"it is nested more than {MAX_DEPTH} levels deep; flatten it")
+        elif isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
+            depth -= 1
+
+
+def parse_yaml(text: str, source: str) -> dict[str, Any]:
+    """Reads a YAML mapping.
+
+    Args:
+        text: the YAML.
+        source: the file's name, for errors.
+
+    Returns:
+        The mapping.
+
+    Raises:
+        ConfigError: no YAML, a duplicate key, nothing in it, or no mapping at the top.
+    """
+    try:
+        _check_depth(text)
+        data = yaml.load(text, Loader=_Loader)  # noqa: S506 - _Loader derives from SafeLoader
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        line = f", line {mark.line + 1}" if mark else ""
+        raise ConfigError(f"{source}{line}: {error.problem or 'not YAML'}.") from None
+    except (yaml.YAMLError, ValueError) as error:
+        raise ConfigError(f"{source}: {' '.join(str(error).split())}.") from None
+    if data is None:
+        raise ConfigError(f"{source}: the file is empty; it must hold `key: value` lines.")
+    if not isinstance(data, dict):
+        raise ConfigError(f"{source}: the top level must be `key: value` lines.")
+    return data
+
+
+def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> SchemaT:
+    """Checks a mapping against a schema.
+
+    Args:
+        data: what the file holds.
+        schema: a pydantic model.
+        source: the file's name, for errors.
+
+    Returns:
+        The checked configuration.
+
+    Raises:
+        ConfigError: the first thing that is wrong, with file, key, value and fix.
+    """
+    try:
+        return schema.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {_sentence(error, schema)}") from None
+
+
+def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
+    details = error.errors(include_url=False)
+    first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
+    key = ".".join(str(part) for part in first["loc"]) or "the file"
+    if first["type"] == "extra_forbidden":
+        known = _fields_at(schema, first["loc"][:-1])
+        hint = nearest(str(first["loc"][-1]), known) if known else "remove it"
+        return f"unknown key {key!r}; {hint}"
+    if first["type"] == "missing":
+        return f"the key {key!r} is missing; add it."
+    message = first["msg"].removeprefix("Value error, ").rstrip(".")
+    return f"key {key!r}: {message[0].lower() + message[1:]}, not {first['input']!r:.80}."
+
+
+def _fields_at(schema: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
+    """The field names of the model that lies at `location` inside `schema`."""
+    current: Any = schema
+    for part in location:
+        if isinstance(part, int):
+            continue
+        fields = getattr(current, "model_fields", {})
+        if part in fields:
+            current = _inner_model(fields[part].annotation)
+    return list(getattr(current, "model_fields", {}))
+
+
+def _inner_model(annotation: Any) -> Any:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for argument in getattr(annotation, "__args__", ()):
+        inner = _inner_model(argument)
+        if inner is not None:
+            return inner
+    return None
+
+
+def read_text(path: Path) -> str:
+    """Reads a UTF-8 file, with one sentence when that fails."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; check the path.") from None
+    except IsADirectoryError:
+        raise ConfigError(f"{path}: is a folder, not a file.") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: is not UTF-8 text; save it as UTF-8.") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: can't be read ({error.strerror}).") from None
+
+
+def load_yaml(path: Path, schema: type[SchemaT]) -> SchemaT:
+    """Reads and checks a YAML file. Raises ConfigError with file, key and fix."""
+    return validate(parse_yaml(read_text(path), str(path)), schema, str(path))
+
+
+def dump_yaml(data: Any) -> str:
+    """Writes plain data as YAML that `load_yaml` reads back to the same numbers."""
+    return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+
+
+def share_folder() -> Path:
+    """The folder that holds `config` and `launch`: the checkout, or `share/nics_drl_bridge`."""
+    checkout, *others = Path(__file__).resolve().parents[1:]
+    if (checkout / "config" / "robots").is_dir():
+        return checkout
+    for parent in others:
+        installed = parent / "share" / PACKAGE
+        if (installed / "config").is_dir():
+            return installed
+    raise ConfigError(
+        "the package's config folder was not found; install the package with pip or colcon."
+    )
+
+
+def find_config(name: str, kind: str) -> Path:
+    """Finds a configuration by the name of a shipped one, or by path.
+
+    Args:
+        name: `arena` for `config/KIND/arena.yaml`, or the path of a YAML file.
+        kind: the folder below `config`: `robots`, `worlds` or `nodes`.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        ConfigError: there is none, with the nearest valid name.
+    """
+    if name.endswith((".yaml", ".yml")):
+        return Path(name)
+    folder = share_folder() / "config" / kind
+    path = folder / f"{name}.yaml"
+    if not path.is_file():
+        known = [file.stem for file in folder.glob("*.yaml")]
+        raise ConfigError(
+            f"unknown {kind.removesuffix('s')} {name!r}; {nearest(name, known)} "
+            f"(or give the path of a YAML file)"
+        )
+    return path

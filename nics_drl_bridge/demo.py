@@ -1,0 +1,244 @@
+"""The demo: the whole road once, from a recording to a policy that drives over ROS 2."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from nics_drl_bridge.calibration.identify import Identified
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.registration import NAVIGATION, register_envs
+from nics_drl_bridge.files import write_text
+from nics_drl_bridge.generator import SimulatorModel, generate, save_model
+from nics_drl_bridge.kinematics import textbook
+from nics_drl_bridge.kinematics.readers import read_recording
+from nics_drl_bridge.kinematics.recording import save_recording
+from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
+from nics_drl_bridge.lidar.spec import load_lidar
+from nics_drl_bridge.policy.evaluation import Episode, deviation, drive_all, successes
+from nics_drl_bridge.policy.policies import make_policy
+from nics_drl_bridge.report.page import Block, Code, Picture, Table, page
+from nics_drl_bridge.report.pictures import trajectories
+from nics_drl_bridge.sim.world import load_world, sample_scene
+
+RECORDING_SEED = 1
+POLICY = "go_to_goal"
+LIVE_RATE = 2.0
+LIVE_TIMEOUT_S = 40.0
+IN_PROCESS, OVER_DDS = "in process", "over DDS"
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to demonstrate.
+
+    Attributes:
+        out: folder of everything that the demo writes.
+        robot: name or YAML file of the robot.
+        world: name or YAML file of the world.
+        recording: of a drive; None makes one with the robot's textbook kinematics.
+        episodes: how many.
+    """
+
+    out: Path
+    robot: str = "ackermann"
+    world: str = "arena"
+    recording: Path | None = None
+    episodes: int = 5
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the demo showed: successes in process and over DDS, and where the report is."""
+
+    in_process: int
+    over_dds: int
+    episodes: int
+    report: Path
+
+    def line(self) -> str:
+        """The last line of the demo."""
+        return (
+            f"demo: in process {self.in_process}/{self.episodes}, "
+            f"over DDS {self.over_dds}/{self.episodes}, report {self.report}"
+        )
+
+
+def run(plan: Plan, say: Say) -> Outcome:
+    """Generates a simulator, drives in it, drives the same over DDS, and writes a report.
+
+    Every process that it starts has ended when it returns or raises.
+
+    Args:
+        plan: what to do.
+        say: takes each line of progress.
+
+    Raises:
+        BridgeError: a bad recording or name, or a node that does not come up.
+    """
+    model, identified = _generate(plan, say)
+    seeds = range(plan.episodes)
+    say(f"driving {plan.episodes} episodes in process")
+    here = _drive("sim", plan, model, seeds, say, {})
+    with ExitStack() as stack:
+        domain_id = _start_lockstep(plan, stack, say)
+        say(f"driving the same {plan.episodes} episodes over DDS in lock-step")
+        options = {"truth": True, "domain_id": domain_id}
+        there = _drive("dds", plan, model, seeds, say, options)
+    live = _drive_live(plan, model, say)
+    report = plan.out / "report.html"
+    write_text(report, _report(plan, model, identified, here, there, live))
+    return Outcome(successes(here), successes(there), plan.episodes, report)
+
+
+def _generate(plan: Plan, say: Say) -> tuple[SimulatorModel, Identified]:
+    robot, world = load_robot(plan.robot), load_world(plan.world)
+    source = plan.recording or _record(robot, plan.out / "recording.npz", say)
+    say(f"generating a simulator of the robot {robot.name!r} from {source}")
+    recording = read_recording(source)
+    # A demo has to steer, even if the drive never did; the report names what is assumed.
+    model, identified = generate(
+        recording, robot, load_lidar("paper"), world.obstacles.radii, assume=True
+    )
+    save_model(model, plan.out / "model")
+    say(model.report.rstrip())
+    return model, identified
+
+
+def _record(robot: RobotSpec, path: Path, say: Say) -> Path:
+    say(f"recording a drive of the textbook {robot.name!r} robot")
+    save_recording(textbook.record(robot, np.random.default_rng(RECORDING_SEED)), path)
+    return path
+
+
+def _drive(
+    backend: str,
+    plan: Plan,
+    model: SimulatorModel,
+    seeds: Sequence[int],
+    say: Say,
+    options: dict[str, Any],
+) -> list[Episode]:
+    register_envs()
+    env = gymnasium.make(
+        NAVIGATION, backend=backend, model=model, world=plan.world, backend_options=options
+    )
+    try:
+        policy = make_policy(POLICY, Navigation(model.robot, model.lidar))
+        return drive_all(
+            env,
+            policy,
+            seeds,
+            lambda e: say(f"  seed {e.seed}: {e.result}, {e.steps} steps, {e.length:.2f} m"),
+        )
+    finally:
+        env.close()
+
+
+def _start_lockstep(plan: Plan, stack: ExitStack, say: Say) -> int:
+    """Starts simulator and middleware as processes; returns their domain id."""
+    from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+
+    domain_id, logs = free_domain_id(), plan.out / "logs" / "lockstep"
+    model = str(plan.out / "model")
+    simulator = {"model": model, "world": plan.world, "mode": "lockstep"}
+    for node, parameters in (("simulator_node", simulator), ("middleware_node", {"model": model})):
+        process = stack.enter_context(NodeProcess(node, logs, parameters, domain_id))
+        say(f"started {node} as process {process.pid} in ROS domain {domain_id}")
+    return domain_id
+
+
+@dataclass(frozen=True)
+class Live:
+    """A drive of the deployed nodes in real time, nobody stepping them."""
+
+    arrived: bool
+    path: Episode
+
+
+def _drive_live(plan: Plan, model: SimulatorModel, say: Say) -> Live:
+    """Simulator in real time, middleware, policy and gate, each a process."""
+    from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+    from nics_drl_bridge.nodes.witness import Witness
+
+    world = load_world(plan.world)
+    scene = sample_scene(world, model.robot.footprint_radius, 0)
+    goal = [float(value) for value in scene.goals[0]]
+    folder = str(plan.out / "model")
+    nodes: dict[str, dict[str, Any]] = {
+        "simulator_node": {"model": folder, "world": plan.world, "rate": LIVE_RATE, "episode_seed": 0},
+        "middleware_node": {"model": folder},
+        "command_gate": {"model": folder},
+        "policy_node": {"model": folder, "policy": POLICY, "goal": goal},
+    }
+    domain_id, logs = free_domain_id(), plan.out / "logs" / "realtime"
+    say(f"deploying {', '.join(nodes)} in real time")
+    with ExitStack() as stack:
+        witness = stack.enter_context(Witness(domain_id))
+        processes = [
+            stack.enter_context(NodeProcess(node, logs, parameters, domain_id))
+            for node, parameters in nodes.items()
+        ]
+        task = Navigation(model.robot, model.lidar)
+        # The policy stops where it believes to be there; its odometry drifts.
+        arrived = witness.arrives(goal, task.goal_radius + 0.1, LIVE_TIMEOUT_S)
+        for process in processes:
+            process.check()
+        path = witness.path
+    say(f"  the deployed nodes {'reached' if arrived else 'did not reach'} the goal of seed 0")
+    result = "success" if arrived else "time-out"
+    return Live(arrived, Episode(0, result, path, path, scene.goals[0], scene.circles, 0.0))
+
+
+def _report(
+    plan: Plan,
+    model: SimulatorModel,
+    identified: Identified,
+    here: list[Episode],
+    there: list[Episode],
+    live: Live,
+) -> str:
+    walls = load_world(plan.world).all_walls()
+    footprint = model.robot.footprint_radius
+    rows = [
+        (
+            str(a.seed), a.result, f"{a.steps}", f"{a.length:.2f}", b.result, f"{b.steps}",
+            f"{b.length:.2f}", f"{deviation(a, b):.1e}",
+        )
+        for a, b in zip(here, there, strict=True)
+    ]  # fmt: skip
+    head = ("seed", IN_PROCESS, "steps", "path [m]", OVER_DDS, "steps", "path [m]", "deviation [m]")
+    both = trajectories({IN_PROCESS: here, OVER_DDS: there}, walls, footprint)
+    sections: list[tuple[str, Sequence[Block]]] = [
+        ("The model", ["Generated from " + str(plan.recording or "a textbook drive") + ".", Code(model.report)]),
+        (
+            "The same episodes, in process and over DDS",
+            [
+                f"{successes(here)} of {len(here)} episodes reached the goal in process, "
+                f"{successes(there)} of {len(there)} over DDS in lock-step. Deviation is the greatest "
+                "distance between the two true paths at the same step.",
+                Table(head, rows),
+                Picture(both, "Blue: in process. Red, dashed: over DDS."),
+            ],
+        ),
+        (
+            "Deployed",
+            [
+                "simulator_node in real time, middleware_node, policy_node and command_gate ran as "
+                "processes of their own; nobody stepped them.",
+                Picture(
+                    trajectories({"in process": here[:1], "deployed": [live.path]}, walls, footprint),
+                    "The true path of the deployed robot beside the lock-step one.",
+                ),
+            ],
+        ),
+    ]
+    lead = f"Robot {model.robot.name!r} in the world {plan.world!r}, policy {POLICY!r}."
+    return page("nics_drl_bridge: demo", lead, sections)

@@ -1,0 +1,1 @@
+"""Gymnasium environments: tasks written once, over any backend."""

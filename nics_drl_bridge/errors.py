@@ -1,0 +1,68 @@
+"""Errors that a user can cause and can mend.
+
+Each carries one sentence: what was wrong, where, and what to do. The command line prints
+that sentence and exits with code 2; a library caller catches `BridgeError`.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class BridgeError(Exception):
+    """Base of all errors that come from what the user gave."""
+
+
+class ConfigError(BridgeError):
+    """A YAML file, key, name or option is wrong."""
+
+
+class RecordingError(BridgeError):
+    """A recording can't be read or holds data that can't be used."""
+
+
+class ModelError(BridgeError):
+    """A SimulatorModel can't be read, or does not fit what it is used with."""
+
+
+class FitError(BridgeError):
+    """A recording does not hold enough to fit a model."""
+
+
+class BackendError(BridgeError):
+    """A backend (simulator, ROS 2 graph, vehicle) does not answer as it must."""
+
+
+class StaleDataError(BackendError):
+    """No fresh data came in time.
+
+    Attributes:
+        topic: the topic that is late.
+        age_s: seconds since its last datum, `inf` when there never was one.
+    """
+
+    def __init__(self, topic: str, age_s: float, limit_s: float) -> None:
+        self.topic, self.age_s = topic, age_s
+        last = "nothing has ever arrived" if age_s == float("inf") else f"the last is {age_s:.3f} s old"
+        super().__init__(
+            f"topic {topic!r}: no fresh data within {limit_s:.3f} s, {last}; check that its "
+            "publisher runs in this ROS domain and namespace."
+        )
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A clause that names the closest of the known names, or lists them all.
+
+    Args:
+        name: what was given.
+        known: the valid names.
+
+    Returns:
+        `did you mean 'x'?` or `valid are: 'x', 'y'`.
+    """
+    names = sorted(known)
+    close = difflib.get_close_matches(name, names, n=1)
+    if close:
+        return f"did you mean {close[0]!r}?"
+    return "valid are: " + ", ".join(repr(n) for n in names)

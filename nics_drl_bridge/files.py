@@ -1,0 +1,118 @@
+"""Writing files so that a reader finds the old one or the new one, whole."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.errors import ConfigError
+
+
+def _fsync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Writes a file through a temporary one, fsynced and renamed.
+
+    Args:
+        path: the file; its folder is made when missing.
+        data: the whole content.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    _fsync(path.parent)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a UTF-8 text file through a temporary one, fsynced and renamed."""
+    write_bytes(path, text.encode())
+
+
+@contextmanager
+def whole_folder(path: Path, marker: str) -> Iterator[Path]:
+    """Gives a temporary folder that takes the place of `path` when the block ends well.
+
+    Args:
+        path: the folder to make. An existing one is replaced only if it is empty or holds
+            `marker`, so that a wrong `--out` never removes somebody's work.
+        marker: a file name that a folder of this kind always holds.
+
+    Yields:
+        The temporary folder, beside `path`. After an error nothing is left of it.
+
+    Raises:
+        ConfigError: `path` is a file, or a folder of another kind.
+    """
+    path = path.absolute()
+    if path.exists() and not path.is_dir():
+        raise ConfigError(f"{path}: is a file, not a folder; give the name of a folder.")
+    if path.is_dir() and any(path.iterdir()) and not (path / marker).exists():
+        raise ConfigError(
+            f"{path}: holds other files and no {marker!r}; give a new folder, or empty this one."
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    try:
+        yield temporary
+        for file in temporary.rglob("*"):
+            _fsync(file)
+        temporary.chmod(0o755)
+        _swap(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _swap(new: Path, path: Path) -> None:
+    """Puts `new` at `path`; the old folder is moved away first and removed last."""
+    old = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.old."))
+    try:
+        if path.exists():
+            os.replace(path, old)
+        os.replace(new, path)
+        _fsync(path.parent)
+    finally:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def sha256(data: bytes) -> str:
+    """The SHA-256 of some bytes, in hexadecimal."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """The content of an `.npz` file; equal arrays give equal bytes, unlike `numpy.savez`."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, array in arrays.items():
+            member = zipfile.ZipInfo(f"{name}.npy")  # dated 1980, not today
+            member.compress_type = zipfile.ZIP_DEFLATED
+            content = io.BytesIO()
+            np.lib.format.write_array(content, np.asanyarray(array), allow_pickle=False)
+            archive.writestr(member, content.getvalue())
+    return buffer.getvalue()

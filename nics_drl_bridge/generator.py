@@ -1,0 +1,232 @@
+"""The generator: from a recording to a SimulatorModel, one readable folder on disk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from nics_drl_bridge.calibration.calibration import Calibration
+from nics_drl_bridge.calibration.fit_report import fit_report
+from nics_drl_bridge.calibration.identify import Identified, identify
+from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, validate
+from nics_drl_bridge.errors import ConfigError, ModelError
+from nics_drl_bridge.files import sha256, whole_folder, write_bytes, write_text
+from nics_drl_bridge.kinematics import fit, textbook
+from nics_drl_bridge.kinematics.model import TaylorModel
+from nics_drl_bridge.kinematics.recording import Recording
+from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
+from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
+from nics_drl_bridge.lidar.table import LidarTable, bake
+
+FORMAT = "nics_drl_bridge/simulator_model/1"
+MODEL_FILE, TABLE_FILE, REPORT_FILE = "model.yaml", "lidar_table.npz", "report.txt"
+CONTROL_PERIOD_S = 0.1
+DEFAULT_LIDAR = "paper"
+BUILTIN_SEED = 0
+
+
+class Noise(Schema):
+    """How wrong the wheels' odometry is, as standard deviations of the measured twist.
+
+    Attributes:
+        odom_linear_std: [m/s].
+        odom_angular_std: [rad/s].
+    """
+
+    odom_linear_std: float = Field(default=0.01, ge=0.0)
+    odom_angular_std: float = Field(default=0.01, ge=0.0)
+
+    @property
+    def odometry(self) -> tuple[float, float]:
+        """Linear [m/s] and angular [rad/s]."""
+        return self.odom_linear_std, self.odom_angular_std
+
+
+@dataclass(frozen=True)
+class SimulatorModel:
+    """All that a fast simulator needs to know of a robot.
+
+    Attributes:
+        robot: names, units, order and limits of state and command.
+        kinematics: the fitted, pruned Taylor model.
+        calibration: clock offset, latency, sensor frames, noise of the recording.
+        lidar: the sensor.
+        table: baked ranges of circles.
+        noise: of the odometry.
+        control_period: time between commands [s]; a whole number of `kinematics.dt`.
+        report: how the model came about, as text for people.
+    """
+
+    robot: RobotSpec
+    kinematics: TaylorModel
+    calibration: Calibration
+    lidar: LidarSpec
+    table: LidarTable
+    noise: Noise = Noise()
+    control_period: float = CONTROL_PERIOD_S
+    report: str = ""
+
+    def __post_init__(self) -> None:
+        if self.kinematics.variables != self.robot.variable_names:
+            raise ModelError(
+                f"the kinematics are of {self.kinematics.variables}, the robot {self.robot.name!r} has "
+                f"{self.robot.variable_names}; generate the model anew."
+            )
+        substeps = self.control_period / self.kinematics.dt
+        if round(substeps) < 1 or abs(substeps - round(substeps)) > 1e-6:
+            raise ModelError(
+                f"control_period {self.control_period} s is no multiple of the model's step "
+                f"{self.kinematics.dt} s; change one of them."
+            )
+
+    @property
+    def timing(self) -> tuple[float, int, int]:
+        """Step [s], steps per control period, delay of commands [steps]."""
+        dt = self.kinematics.dt
+        delay = max(0, round(self.calibration.command_latency_s / dt))
+        return dt, round(self.control_period / dt), delay
+
+    @cached_property
+    def text(self) -> str:
+        """The content of `model.yaml`."""
+        table = self.table.dump()
+        return dump_yaml(
+            {
+                "format": FORMAT,
+                "control_period": self.control_period,
+                "robot": self.robot.model_dump(mode="json"),
+                "kinematics": self.kinematics.to_dict(),
+                "calibration": self.calibration.to_dict(),
+                "lidar": self.lidar.model_dump(mode="json"),
+                "noise": self.noise.model_dump(mode="json"),
+                "lidar_table_sha256": sha256(table),
+            }
+        )
+
+    @property
+    def fingerprint(self) -> str:
+        """Tells two models apart: the first 16 digits of a SHA-256 over all of it."""
+        return sha256(self.text.encode())[:16]
+
+
+class _File(Schema):
+    """The keys of `model.yaml`."""
+
+    format: str
+    control_period: float = Field(gt=0.0)
+    robot: RobotSpec
+    kinematics: dict[str, Any]
+    calibration: dict[str, Any]
+    lidar: LidarSpec
+    noise: Noise
+    lidar_table_sha256: str
+
+
+def generate(
+    recording: Recording,
+    robot: RobotSpec,
+    lidar: LidarSpec,
+    radii: tuple[float, ...],
+    order: int = fit.ORDER,
+    alpha: float = fit.ALPHA,
+    assume: bool = False,
+) -> tuple[SimulatorModel, Identified]:
+    """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
+
+    Args:
+        recording: a drive of the robot.
+        robot: what state and command are.
+        lidar: the sensor to simulate.
+        radii: of the obstacles to bake [m]; the robot's own footprint is added.
+        order: of the Taylor model.
+        alpha: pruning threshold of Eq. 2.
+        assume: fill in from the textbook what the drive did not show, marked as assumed.
+
+    Returns:
+        The model, and all that was found out on the way.
+    """
+    identified = identify(recording, robot, order=order, alpha=alpha, assume=assume)
+    table = bake(lidar, (*radii, robot.footprint_radius))
+    model = SimulatorModel(
+        robot, identified.model, identified.calibration, lidar, table,
+        report=fit_report(recording.source, robot, identified),
+    )  # fmt: skip
+    return model, identified
+
+
+@lru_cache(maxsize=8)
+def builtin_model(robot: str) -> SimulatorModel:
+    """The model of a shipped robot, generated from a drive of its textbook kinematics."""
+    spec = load_robot(robot)
+    drive = textbook.record(spec, np.random.default_rng(BUILTIN_SEED))
+    return generate(drive, spec, load_lidar(DEFAULT_LIDAR), ())[0]
+
+
+def open_model(name: str) -> SimulatorModel:
+    """A model by its folder, or by the name of a shipped robot (`ackermann`)."""
+    if Path(name).is_dir():
+        return load_model(Path(name))
+    if "/" in name:
+        raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
+    try:
+        return builtin_model(name)
+    except ConfigError as error:
+        raise ModelError(f"{error} (or the folder of a model).") from None
+
+
+def save_model(model: SimulatorModel, folder: Path) -> None:
+    """Writes a model as a folder, whole or not at all.
+
+    Raises:
+        ConfigError: the folder holds something else.
+    """
+    with whole_folder(folder, MODEL_FILE) as temporary:
+        write_text(temporary / MODEL_FILE, model.text)
+        write_bytes(temporary / TABLE_FILE, model.table.dump())
+        write_text(temporary / REPORT_FILE, model.report)
+
+
+def load_model(folder: Path) -> SimulatorModel:
+    """Reads a model that `save_model` wrote.
+
+    Raises:
+        ConfigError, ModelError: a file is missing, damaged or of another format.
+    """
+    path = folder / MODEL_FILE
+    if not path.is_file():
+        raise ModelError(f"{folder}: holds no {MODEL_FILE}; make a model with `nics generate`.")
+    data = parse_yaml(read_text(path), str(path))
+    if data.get("format") != FORMAT:
+        raise ModelError(
+            f"{path}: key 'format' is {data.get('format')!r}, not {FORMAT!r}; generate the model anew."
+        )
+    file = validate(data, _File, str(path))
+    table = _load_table(folder / TABLE_FILE, file.lidar_table_sha256)
+    try:
+        return SimulatorModel(
+            file.robot,
+            TaylorModel.from_dict(file.kinematics),
+            Calibration.from_dict(file.calibration),
+            file.lidar,
+            table,
+            file.noise,
+            file.control_period,
+            read_text(folder / REPORT_FILE),
+        )
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from None
+
+
+def _load_table(path: Path, checksum: str) -> LidarTable:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ModelError(f"{path}: can't be read ({error.strerror}); generate the model anew.") from None
+    if sha256(data) != checksum:
+        raise ModelError(f"{path}: does not match its checksum in {MODEL_FILE}; generate the model anew.")
+    return LidarTable.parse(data, str(path))

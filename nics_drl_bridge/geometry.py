@@ -1,0 +1,69 @@
+"""Plane geometry: angles and poses. REP-103 axes, radians; heading is in [-pi, pi)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def wrap_angle(angle: ArrayLike) -> Array:
+    """Brings angles (...) [rad] into [-pi, pi)."""
+    wrapped = np.mod(np.asarray(angle, dtype=np.float64) + np.pi, 2.0 * np.pi) - np.pi
+    # A tiny negative sum rounds up to 2 pi in np.mod, which would leave +pi here.
+    return np.where(wrapped >= np.pi, -np.pi, wrapped)
+
+
+def rotate(vector: ArrayLike, angle: ArrayLike) -> Array:
+    """Turns plane vectors (..., 2) by angles (...) [rad], counter-clockwise."""
+    vector, angle = np.asarray(vector, dtype=np.float64), np.asarray(angle, dtype=np.float64)
+    c, s = np.cos(angle), np.sin(angle)
+    x, y = vector[..., 0], vector[..., 1]
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1)
+
+
+def compose(pose: ArrayLike, relative: ArrayLike) -> Array:
+    """The pose that lies at `relative` as seen from `pose`; both (..., 3): x, y, heading."""
+    pose, relative = np.asarray(pose, dtype=np.float64), np.asarray(relative, dtype=np.float64)
+    position = pose[..., :2] + rotate(relative[..., :2], pose[..., 2])
+    heading = wrap_angle(pose[..., 2] + relative[..., 2])
+    return np.concatenate([position, heading[..., None]], axis=-1)
+
+
+def between(pose: ArrayLike, other: ArrayLike) -> Array:
+    """The pose `other` as seen from `pose`; both (..., 3). `compose(pose, result) == other`."""
+    pose, other = np.asarray(pose, dtype=np.float64), np.asarray(other, dtype=np.float64)
+    position = rotate(other[..., :2] - pose[..., :2], -pose[..., 2])
+    heading = wrap_angle(other[..., 2] - pose[..., 2])
+    return np.concatenate([position, heading[..., None]], axis=-1)
+
+
+def exp(twist: ArrayLike) -> Array:
+    """The relative pose (..., 3) that a constant body twist x duration (..., 3) leads to.
+
+    The exponential map of SE(2): motion along the exact arc.
+    """
+    twist = np.asarray(twist, dtype=np.float64)
+    w = twist[..., 2]
+    small = np.abs(w) < 1e-4
+    safe = np.where(small, 1.0, w)
+    a = np.where(small, 1.0 - w * w / 6.0, np.sin(safe) / safe)
+    b = np.where(small, w / 2.0 - w**3 / 24.0, (1.0 - np.cos(safe)) / safe)
+    x, y = twist[..., 0], twist[..., 1]
+    return np.stack([a * x - b * y, b * x + a * y, wrap_angle(w)], axis=-1)
+
+
+def log(relative: ArrayLike) -> Array:
+    """The body twist x duration (..., 3) whose exact arc leads to a relative pose (..., 3).
+
+    The inverse of `exp` for turns of less than half a circle.
+    """
+    relative = np.asarray(relative, dtype=np.float64)
+    w = wrap_angle(relative[..., 2])
+    small = np.abs(w) < 1e-4
+    safe = np.where(small, 1.0, w)
+    half = w / 2.0
+    cot = np.where(small, 1.0 - w * w / 12.0, (safe / 2.0) / np.tan(safe / 2.0))
+    x, y = relative[..., 0], relative[..., 1]
+    return np.stack([cot * x + half * y, -half * x + cot * y, w], axis=-1)

@@ -1,0 +1,144 @@
+"""Reads a folder of CSV files: a car's drive under a motion-capture system."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.kinematics.recording import Recording, Stream
+
+Array = NDArray[np.float64]
+
+COLUMNS = {
+    "cmd.csv": ("linear.x", "angular.z", "time [s]"),
+    "vrpn.csv": ("x", "y", "z", "qx", "qy", "qz", "qw", "time [ns]"),
+    "L_wheel.csv": ("wheel speed", "time [s]"),
+    "R_wheel.csv": ("wheel speed", "time [s]"),
+    "acceleration.csv": ("ax", "ay", "az", "time [s]"),
+}
+"""The files of a folder and their columns; none has a header."""
+
+REQUIRED = ("cmd.csv", "vrpn.csv")
+ROBOT_CLOCK, POSE_CLOCK = "robot", "mocap"
+MAX_DURATION_S = 1e6
+MAX_DURATION_RATIO = 100.0
+
+
+def load_csv_folder(path: Path) -> Recording:
+    """Reads a drive of a car, recorded as five CSV files without a header.
+
+    `cmd.csv` and `vrpn.csv` must be there; the wheels are read when both are. The heading is
+    the yaw of the quaternion. Commands and wheels are stamped by the robot's clock, the pose
+    by the motion capture's: the offset between them is for calibration to find.
+
+    Args:
+        path: the folder.
+
+    Returns:
+        The recording: command (T, 2) as linear.x and angular.z, pose (T, 3), wheels (T, 2).
+
+    Raises:
+        RecordingError: a file is missing, empty, or holds a row that can't be used; one
+            sentence with the file, the row and the fix.
+    """
+    if not path.is_dir():
+        raise RecordingError(f"{path}: no such folder; check the path.")
+    for name in REQUIRED:
+        if not (path / name).is_file():
+            raise RecordingError(
+                f"{path}: the file {name!r} is missing; a folder needs {REQUIRED}."
+            )
+    tables = {name: _read(path / name) for name in COLUMNS if (path / name).exists()}
+    command, vrpn = tables["cmd.csv"], tables["vrpn.csv"]
+    _check_units(path, command, vrpn)
+    return Recording(
+        command=Stream(command[:, 2], command[:, :2], ROBOT_CLOCK),
+        pose=Stream(vrpn[:, 7] * 1e-9, _pose(path / "vrpn.csv", vrpn), POSE_CLOCK),
+        wheels=_wheels(path, tables),
+        source=str(path),
+    )
+
+
+def _read(path: Path) -> Array:
+    """The numbers of a file, checked row by row; time is the last column."""
+    columns = COLUMNS[path.name]
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = [(line, row) for line, row in enumerate(csv.reader(file), 1) if row]
+    except UnicodeDecodeError:
+        raise RecordingError(
+            f"{path}: is not UTF-8 text; it must hold comma-separated numbers."
+        ) from None
+    except (OSError, csv.Error) as error:
+        raise RecordingError(f"{path}: can't be read ({error}).") from None
+    if not rows:
+        raise RecordingError(f"{path}: is empty; record the drive anew.")
+    table = np.array([_numbers(path, line, row, columns) for line, row in rows])
+    for k in np.flatnonzero(np.diff(table[:, -1]) < 0.0)[:1]:
+        raise RecordingError(
+            f"{path}: row {rows[k + 1][0]}: time runs backwards ({table[k, -1]:.6f}, then "
+            f"{table[k + 1, -1]:.6f}); sort the rows, or cut the file there."
+        )
+    return table
+
+
+def _numbers(path: Path, line: int, row: list[str], columns: tuple[str, ...]) -> list[float]:
+    if len(row) != len(columns):
+        raise RecordingError(
+            f"{path}: row {line} has {len(row)} columns where {len(columns)} are needed "
+            f"({', '.join(columns)}); mend the row, or remove it."
+        )
+    values = []
+    for name, text in zip(columns, row, strict=True):
+        try:
+            values.append(float(text))
+        except ValueError:
+            raise RecordingError(
+                f"{path}: row {line}: {name} is {text[:40]!r}, which is no number; "
+                "mend the row, or remove it (these files have no header)."
+            ) from None
+    if not np.isfinite(values).all():
+        raise RecordingError(f"{path}: row {line} holds NaN or inf; remove the row.")
+    return values
+
+
+def _pose(path: Path, vrpn: Array) -> Array:
+    """Pose (T, 3) of positions and quaternions."""
+    qx, qy, qz, qw = vrpn[:, 3:7].T
+    norm = np.linalg.norm(vrpn[:, 3:7], axis=1)
+    for k in np.flatnonzero(np.abs(norm - 1.0) > 0.05)[:1]:
+        raise RecordingError(
+            f"{path}: row {k + 1}: the quaternion has the length {norm[k]:.3f} and not 1; check "
+            "the order of the columns (x, y, z, qx, qy, qz, qw, time)."
+        )
+    heading = np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy**2 + qz**2))
+    return np.stack([vrpn[:, 0], vrpn[:, 1], heading], axis=1)
+
+
+def _check_units(path: Path, command: Array, vrpn: Array) -> None:
+    """Motion capture in ns, commands in s: both must have lasted about as long."""
+    seconds, capture = np.ptp(command[:, -1]), np.ptp(vrpn[:, -1]) * 1e-9
+    if seconds > MAX_DURATION_S:
+        raise RecordingError(
+            f"{path / 'cmd.csv'}: lasts {seconds:.3g} s; its stamps must be in seconds."
+        )
+    if seconds > 0.0 and not 1 / MAX_DURATION_RATIO < capture / seconds < MAX_DURATION_RATIO:
+        raise RecordingError(
+            f"{path / 'vrpn.csv'}: lasts {capture:.3g} s where the commands last {seconds:.3g} s; "
+            "its stamps must be in nanoseconds."
+        )
+
+
+def _wheels(path: Path, tables: dict[str, Array]) -> Stream | None:
+    """Both wheels at the stamps of the left one."""
+    if "L_wheel.csv" not in tables or "R_wheel.csv" not in tables:
+        return None
+    left, right = tables["L_wheel.csv"], tables["R_wheel.csv"]
+    if np.ptp(left[:, 1]) > MAX_DURATION_S:
+        raise RecordingError(f"{path / 'L_wheel.csv'}: its stamps must be in seconds.")
+    at_left = np.interp(left[:, 1], right[:, 1], right[:, 0])
+    return Stream(left[:, 1], np.stack([left[:, 0], at_left], axis=1), ROBOT_CLOCK)

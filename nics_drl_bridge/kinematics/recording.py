@@ -1,0 +1,207 @@
+"""Recording: what was written down while a robot drove; Samples: what a fit takes.
+
+A `Recording` holds streams with stamps of their own, as a robot delivers them. Calibration
+turns it into `Samples`, the paper's data `D_t = (t, Q_t, X_t, dQ_t)` (Sec. IV-A) on one time
+axis.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.files import npz_bytes, write_bytes
+from nics_drl_bridge.kinematics.spec import RobotSpec
+
+Array = NDArray[np.float64]
+FORMAT = "nics_drl_bridge/recording/1"
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Values with stamps.
+
+    Attributes:
+        t: (T,) stamps [s], never decreasing.
+        values: (T, D).
+        clock: the name of the clock that made the stamps. Streams of one clock share an
+            origin; between two clocks there is an unknown offset.
+    """
+
+    t: Array
+    values: Array
+    clock: str = "robot"
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A drive of a robot.
+
+    Attributes:
+        command: (T, C) commands, in the order of the RobotSpec.
+        pose: (T, 3) x [m], y [m], heading [rad] of the tracked body, in a fixed frame.
+        state: (T, S) measured state in the order of the RobotSpec, where there is one.
+        wheels: (T, 2) left and right wheel speed in the encoder's units, where there are any.
+        source: where it came from, for reports and errors.
+    """
+
+    command: Stream
+    pose: Stream
+    state: Stream | None = None
+    wheels: Stream | None = None
+    source: str = "recording"
+
+    @property
+    def streams(self) -> dict[str, Stream]:
+        """The streams that are there, by name."""
+        named = {"command": self.command, "pose": self.pose}
+        if self.state is not None:
+            named["state"] = self.state
+        if self.wheels is not None:
+            named["wheels"] = self.wheels
+        return named
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The paper's data: one row per time step.
+
+    Attributes:
+        t: (T,) start of each step [s].
+        q: (T, 3 + S) pose of `base_link` and state at the start of the step.
+        x: (T, S + C) X = [state, command] during the step.
+        dq: (T, 3 + S) dQ/dt: the constant body twist whose exact arc leads from this pose to
+            the next (`geometry.log`), and the mean rate of the state.
+        dt: length of a step [s].
+    """
+
+    t: Array
+    q: Array
+    x: Array
+    dq: Array
+    dt: float
+    notes: tuple[str, ...] = field(default=())
+
+    def rows(self, keep: NDArray[np.bool_]) -> Samples:
+        """The samples of the steps for which `keep` (T,) is true."""
+        return Samples(
+            self.t[keep], self.q[keep], self.x[keep], self.dq[keep], self.dt, self.notes
+        )
+
+
+def samples_on_one_clock(
+    t: Array, pose: Array, state: Array, command: Array
+) -> Samples:
+    """Builds Samples from series that share uniform stamps.
+
+    Args:
+        t: (T,) uniform stamps [s].
+        pose: (T, 3) pose of `base_link` at each stamp.
+        state: (T, S) state at each stamp.
+        command: (T, C) command held from each stamp to the next.
+
+    Returns:
+        T - 1 steps.
+    """
+    dt = float(np.median(np.diff(t)))
+    twist = geometry.log(geometry.between(pose[:-1], pose[1:])) / dt
+    rates = np.diff(state, axis=0) / dt
+    return Samples(
+        t=t[:-1],
+        q=np.concatenate([pose, state], axis=1)[:-1],
+        x=np.concatenate([state, command], axis=1)[:-1],
+        dq=np.concatenate([twist, rates], axis=1),
+        dt=dt,
+    )
+
+
+def check(recording: Recording, spec: RobotSpec) -> Recording:
+    """Makes sure that a recording can be used for a robot.
+
+    Returns:
+        The recording.
+
+    Raises:
+        RecordingError: a stream is empty, holds NaN, runs backwards, or has the wrong width;
+            one sentence with the place.
+    """
+    width = {"command": len(spec.command), "pose": 3, "state": len(spec.state), "wheels": 2}
+    for name, stream in recording.streams.items():
+        _check_stream(f"{recording.source}: {name}", stream, width[name])
+    angular = np.ptp(np.unwrap(recording.pose.values[:, 2])) if len(recording.pose.t) else 0.0
+    steps = np.abs(geometry.wrap_angle(np.diff(recording.pose.values[:, 2])))
+    if angular > 0.0 and np.percentile(steps, 95) > 1.5:
+        raise RecordingError(
+            f"{recording.source}: pose: the heading jumps by {np.percentile(steps, 95):.1f} rad "
+            "between neighbouring samples; it must be in radians (degrees look like this)."
+        )
+    return recording
+
+
+def _check_stream(place: str, stream: Stream, width: int) -> None:
+    if stream.values.ndim != 2 or stream.values.shape != (len(stream.t), width):
+        raise RecordingError(
+            f"{place}: has the shape {stream.values.shape} where ({len(stream.t)}, {width}) is "
+            "needed; check that the recording is of this robot."
+        )
+    if len(stream.t) < 2:
+        raise RecordingError(f"{place}: has {len(stream.t)} samples; record a drive of 20 s or more.")
+    for row in np.flatnonzero(~np.isfinite(stream.values).all(axis=1) | ~np.isfinite(stream.t))[:1]:
+        raise RecordingError(
+            f"{place}: row {row} holds NaN or inf; remove the row, or find out why it was recorded."
+        )
+    for row in np.flatnonzero(np.diff(stream.t) < 0.0)[:1]:
+        raise RecordingError(
+            f"{place}: time runs backwards at row {row + 1} ({stream.t[row]:.6f} s, then "
+            f"{stream.t[row + 1]:.6f} s); sort the rows, or cut the file there."
+        )
+
+
+def save_recording(recording: Recording, path: Path) -> None:
+    """Writes a recording as `.npz`: `NAME_t`, `NAME` per stream, and `meta`, a JSON text."""
+    arrays: dict[str, NDArray[Any]] = {}
+    clocks = {}
+    for name, stream in recording.streams.items():
+        arrays[f"{name}_t"], arrays[name] = stream.t, stream.values
+        clocks[name] = stream.clock
+    meta = {"format": FORMAT, "source": recording.source, "clocks": clocks}
+    write_bytes(path, npz_bytes({"meta": np.array(json.dumps(meta)), **arrays}))
+
+
+def load_npz(path: Path) -> Recording:
+    """Reads a recording that `save_recording` wrote.
+
+    Raises:
+        RecordingError: no such file, not an `.npz`, damaged, or a stream is missing.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files}
+        meta = json.loads(str(arrays["meta"]))
+        if meta["format"] != FORMAT:
+            raise RecordingError(
+                f"{path}: format {meta['format']!r} is not {FORMAT!r}; record it anew or use the "
+                "version of the package that wrote it."
+            )
+        streams = {
+            name: Stream(arrays[f"{name}_t"].astype(float), arrays[name].astype(float), clock)
+            for name, clock in meta["clocks"].items()
+        }
+        return Recording(**streams, source=str(path))
+    except FileNotFoundError:
+        raise RecordingError(f"{path}: no such file; check the path.") from None
+    except (KeyError, TypeError) as error:
+        raise RecordingError(
+            f"{path}: is not a recording of this package ({error}); write it with "
+            "nics_drl_bridge.kinematics.recording.save_recording."
+        ) from None
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise RecordingError(f"{path}: can't be read as .npz ({error}); it may be damaged.") from None

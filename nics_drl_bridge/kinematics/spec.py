@@ -1,0 +1,153 @@
+"""RobotSpec: the one home of a robot's state, command, their order, units and limits."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+
+from nics_drl_bridge.config import Schema, find_config, load_yaml
+from nics_drl_bridge.errors import ConfigError
+
+CmdVelField = Literal["linear.x", "linear.y", "angular.z"]
+CMD_VEL_FIELDS: tuple[CmdVelField, ...] = ("linear.x", "linear.y", "angular.z")
+POSE_RATES = ("vx", "vy", "wz")
+POSE_UNITS = ("m/s", "m/s", "rad/s")
+
+
+class Variable(Schema):
+    """A component of the state or of the command."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    unit: str
+    min: float
+    max: float
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Variable:
+        if not self.min < self.max:
+            raise ValueError(f"min must be less than max of variable {self.name!r}")
+        return self
+
+
+class StateVariable(Variable):
+    """A component of the state.
+
+    Attributes:
+        follows: the command that it follows with a lag. A recording that does not measure
+            the state can still be used when every state variable names one.
+    """
+
+    follows: str | None = None
+
+
+class CommandVariable(Variable):
+    """A component of the command, and the field of `cmd_vel` that carries it."""
+
+    cmd_vel: CmdVelField
+
+
+class RobotSpec(Schema):
+    """A robot as the package sees it.
+
+    Attributes:
+        name: what users call it.
+        description: one sentence.
+        textbook: the textbook kinematics that make its synthetic recordings, and whose
+            structure may be assumed for what a drive did not show.
+        parameters: of the textbook kinematics [m, s], see `kinematics.textbook`.
+        footprint_radius: radius of the circle around `base_link` that the robot fills [m].
+        state: S components, in the order of every state vector.
+        command: C components, in the order of every command vector.
+    """
+
+    name: str
+    description: str = ""
+    textbook: Literal["ackermann", "differential", "mecanum"] | None = None
+    parameters: dict[str, float] = {}
+    footprint_radius: float = Field(gt=0.0)
+    state: tuple[StateVariable, ...] = ()
+    command: tuple[CommandVariable, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _unique(self) -> RobotSpec:
+        names = self.variable_names
+        if len(set(names)) != len(names):
+            raise ValueError("every state and command variable needs a name of its own")
+        commands = [c.name for c in self.command]
+        for variable in self.state:
+            if variable.follows is not None and variable.follows not in commands:
+                raise ValueError(
+                    f"state {variable.name!r} follows {variable.follows!r}, which is no command"
+                )
+        fields = [c.cmd_vel for c in self.command]
+        if len(set(fields)) != len(fields):
+            raise ValueError("two commands share one field of cmd_vel")
+        return self
+
+    @property
+    def variable_names(self) -> tuple[str, ...]:
+        """Names of X = [S, C]."""
+        return tuple(v.name for v in (*self.state, *self.command))
+
+    @property
+    def variable_units(self) -> tuple[str, ...]:
+        """Units of X = [S, C]."""
+        return tuple(v.unit for v in (*self.state, *self.command))
+
+    @property
+    def dof_names(self) -> tuple[str, ...]:
+        """Names of dQ/dt: the body twist, then the rates of the state."""
+        return (*POSE_RATES, *(f"d_{v.name}" for v in self.state))
+
+    @property
+    def dof_units(self) -> tuple[str, ...]:
+        """Units of dQ/dt."""
+        return (*POSE_UNITS, *(f"{v.unit}/s" for v in self.state))
+
+    @cached_property
+    def command_low(self) -> NDArray[np.float64]:
+        """(C,) least command."""
+        return np.array([c.min for c in self.command])
+
+    @cached_property
+    def command_high(self) -> NDArray[np.float64]:
+        """(C,) greatest command."""
+        return np.array([c.max for c in self.command])
+
+    @cached_property
+    def _cmd_vel_index(self) -> NDArray[np.intp]:
+        return np.array([CMD_VEL_FIELDS.index(c.cmd_vel) for c in self.command], dtype=np.intp)
+
+    def to_cmd_vel(self, command: ArrayLike) -> NDArray[np.float64]:
+        """Command (..., C) as `cmd_vel` (..., 3): linear.x, linear.y, angular.z."""
+        command = np.asarray(command, dtype=np.float64)
+        twist = np.zeros((*command.shape[:-1], 3))
+        twist[..., self._cmd_vel_index] = command
+        return twist
+
+    def from_cmd_vel(self, twist: ArrayLike) -> NDArray[np.float64]:
+        """`cmd_vel` (..., 3) as command (..., C); fields the robot has no use for are dropped."""
+        return np.asarray(twist, dtype=np.float64)[..., self._cmd_vel_index]
+
+
+def load_robot(name: str) -> RobotSpec:
+    """Loads a shipped robot by name (`ackermann`), or any by the path of its YAML file.
+
+    Raises:
+        ConfigError: unknown name or a wrong key, with the nearest valid one.
+    """
+    return load_yaml(find_config(name, "robots"), RobotSpec)
+
+
+def require_textbook(spec: RobotSpec) -> str:
+    """The name of the robot's textbook kinematics, or one sentence when it has none."""
+    if spec.textbook is None:
+        raise ConfigError(
+            f"robot {spec.name!r} names no textbook kinematics; add `textbook:` to its YAML file "
+            "or give a recording."
+        )
+    return spec.textbook

@@ -1,0 +1,1 @@
+"""Lidar: the exact scanner, and baked tables that replace it (Sec. IV-B)."""

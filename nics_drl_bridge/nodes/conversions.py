@@ -1,0 +1,114 @@
+"""Messages to data and back, in pairs: `x_to_ros` and `x_from_ros`."""
+
+from __future__ import annotations
+
+import array
+import math
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Quaternion, Twist
+from nav_msgs.msg import Odometry
+from numpy.typing import ArrayLike, NDArray
+from sensor_msgs.msg import LaserScan
+
+from nics_drl_bridge.lidar.spec import LidarSpec
+
+Array = NDArray[np.float64]
+NANO = 1_000_000_000
+
+
+def stamp_to_ros(time_ns: int) -> Time:
+    """Nanoseconds as a stamp."""
+    return Time(sec=time_ns // NANO, nanosec=time_ns % NANO)
+
+
+def stamp_from_ros(stamp: Time) -> int:
+    """A stamp as nanoseconds."""
+    return int(stamp.sec) * NANO + int(stamp.nanosec)
+
+
+def heading_to_ros(heading: float) -> Quaternion:
+    """A heading [rad] as a quaternion."""
+    return Quaternion(z=math.sin(heading / 2.0), w=math.cos(heading / 2.0))
+
+
+def heading_from_ros(q: Quaternion) -> float:
+    """The heading [rad] of a quaternion."""
+    return math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+
+
+def twist_to_ros(twist: ArrayLike) -> Twist:
+    """linear.x, linear.y, angular.z (3,) as a Twist."""
+    x, y, w = (float(value) for value in np.asarray(twist))
+    message = Twist()
+    message.linear.x, message.linear.y, message.angular.z = x, y, w
+    return message
+
+
+def twist_from_ros(message: Twist) -> Array:
+    """linear.x, linear.y, angular.z (3,) of a Twist."""
+    return np.array([message.linear.x, message.linear.y, message.angular.z])
+
+
+def scan_to_ros(
+    spec: LidarSpec, ranges: NDArray[np.float32], time_ns: int, frame: str
+) -> LaserScan:
+    """Ranges (B,) as a LaserScan; every header field follows from the spec."""
+    message = LaserScan()
+    message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
+    message.angle_min, message.angle_max = float(spec.angles[0]), float(spec.angles[-1])
+    message.angle_increment = spec.angle_increment
+    message.scan_time = 1.0 / spec.rate
+    message.range_min, message.range_max = spec.range_min, spec.range_max
+    message.ranges = array.array("f", np.ascontiguousarray(ranges, np.float32).tobytes())
+    return message
+
+
+def scan_from_ros(message: LaserScan) -> NDArray[np.float32]:
+    """Ranges (B,) of a LaserScan."""
+    return np.array(message.ranges, dtype=np.float32)
+
+
+def odometry_to_ros(
+    pose: ArrayLike,
+    twist: ArrayLike,
+    time_ns: int,
+    frames: tuple[str, str],
+    variance: tuple[float, float, float, float],
+) -> Odometry:
+    """Pose (3,) and body twist (3,) as an Odometry message.
+
+    Args:
+        pose: x [m], y [m], heading [rad] in the first frame.
+        twist: vx, vy [m/s], wz [rad/s] in the second.
+        time_ns: stamp.
+        frames: fixed frame and body frame.
+        variance: of position [m^2], heading [rad^2], linear [m^2/s^2], angular [rad^2/s^2].
+    """
+    x, y, heading = (float(value) for value in np.asarray(pose))
+    message = Odometry()
+    message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frames[0]
+    message.child_frame_id = frames[1]
+    message.pose.pose.position.x, message.pose.pose.position.y = x, y
+    message.pose.pose.orientation = heading_to_ros(heading)
+    message.twist.twist = twist_to_ros(twist)
+    message.pose.covariance = _diagonal(variance[0], variance[1])
+    message.twist.covariance = _diagonal(variance[2], variance[3])
+    return message
+
+
+def odometry_from_ros(message: Odometry) -> tuple[Array, Array]:
+    """Pose (3,) and body twist (3,) of an Odometry message."""
+    pose = message.pose.pose
+    heading = heading_from_ros(pose.orientation)
+    return np.array([pose.position.x, pose.position.y, heading]), twist_from_ros(message.twist.twist)
+
+
+UNUSED_VARIANCE = 1e6
+"""Of z, roll and pitch, which a planar robot does not measure."""
+
+
+def _diagonal(linear: float, angular: float) -> Array:
+    diagonal = [linear, linear, UNUSED_VARIANCE, UNUSED_VARIANCE, UNUSED_VARIANCE, angular]
+    return np.diag(diagonal).ravel()

@@ -1,0 +1,119 @@
+"""Starting the package's nodes as operating-system processes, and ending them for certain."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import random
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from nics_drl_bridge.config import dump_yaml
+from nics_drl_bridge.errors import BackendError
+
+LAST_DOMAIN_ID = 101
+"""Above it, DDS ports may collide with those that Linux hands out."""
+PATIENCE_S = 5.0
+LOG_LINES = 5
+
+
+def free_domain_id() -> int:
+    """The domain id of the environment, or one drawn at random so that runs keep apart."""
+    given = os.environ.get("ROS_DOMAIN_ID")
+    return int(given) if given else random.SystemRandom().randint(1, LAST_DOMAIN_ID)
+
+
+def _die_with_parent() -> None:
+    """Linux: the child gets SIGTERM when its parent dies, however that dies."""
+    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
+
+
+class NodeProcess:
+    """One node in a process of its own; a context manager that ends it.
+
+    Args:
+        node: module below `nics_drl_bridge.nodes`, which is also the executable's name.
+        folder: for its log and its parameter file.
+        parameters: of the node.
+        domain_id: DDS domain.
+        namespace: of the node.
+        remap: names, from -> to.
+    """
+
+    def __init__(
+        self,
+        node: str,
+        folder: Path,
+        parameters: Mapping[str, Any],
+        domain_id: int,
+        namespace: str = "",
+        remap: Mapping[str, str] | None = None,
+    ) -> None:
+        self.node = node
+        folder.mkdir(parents=True, exist_ok=True)
+        self.log = folder / f"{node}.log"
+        file = folder / f"{node}.yaml"
+        file.write_text(dump_yaml({"/**": {"ros__parameters": dict(parameters)}}), encoding="utf-8")
+        command = [sys.executable, "-m", f"nics_drl_bridge.nodes.{node}", "--ros-args"]
+        command += ["--params-file", str(file)]
+        if namespace:
+            command += ["-r", f"__ns:=/{namespace.strip('/')}"]
+        for old, new in (remap or {}).items():
+            command += ["-r", f"{old}:={new}"]
+        environment = os.environ | {
+            "ROS_DOMAIN_ID": str(domain_id),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        }
+        with self.log.open("wb") as log:
+            # A session of its own: Ctrl-C in the terminal reaches the parent alone, which then
+            # ends its children in order.
+            self._process = subprocess.Popen(
+                command,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                preexec_fn=_die_with_parent if sys.platform == "linux" else None,
+            )
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    def check(self) -> None:
+        """Raises BackendError with the end of its log when the node has ended by itself."""
+        code = self._process.poll()
+        if code is not None:
+            lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            raise BackendError(
+                f"{self.node} ended with code {code}: {' | '.join(lines[-LOG_LINES:]) or 'no output'} "
+                f"(its log is {self.log})."
+            )
+
+    def close(self) -> int:
+        """Ends the node: SIGINT, and SIGKILL if it does not listen. Returns its exit code."""
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGINT)
+            try:
+                self._process.wait(PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+        return self._process.wait()
+
+    def __enter__(self) -> NodeProcess:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -1,0 +1,78 @@
+"""How every node of the package starts, spins, and ends."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+
+from nics_drl_bridge.errors import BridgeError
+
+SPIN_S = 0.1
+EXIT_BAD_INPUT = 2
+
+
+def run_node(make: Callable[[Context], Node], args: Sequence[str] | None = None) -> None:
+    """Runs a node until SIGINT or SIGTERM, then destroys it in order.
+
+    A node that offers `stop()` is asked to leave its robot standing still while it can still
+    publish. What the user got wrong is one sentence on standard error and exit code 2.
+
+    Args:
+        make: makes the node in a context of its own.
+        args: the command line, `sys.argv` by default.
+    """
+    # With no range set, discovery stays on this machine: a robot that should be seen by others
+    # sets the variable, and a simulator started in a lab does not move somebody's robot.
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    stopping = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopping.set())
+    context = Context()
+    context.init(list(sys.argv if args is None else args))
+    node: Node | None = None
+    try:
+        node = make(context)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        with contextlib.suppress(ExternalShutdownException):
+            while context.ok() and not stopping.is_set():
+                executor.spin_once(timeout_sec=SPIN_S)
+        executor.shutdown(timeout_sec=1.0)
+    except BridgeError as error:
+        sys.stderr.write(f"{error}\n")
+        raise SystemExit(EXIT_BAD_INPUT) from None
+    finally:
+        if node is not None:
+            if context.ok() and hasattr(node, "stop"):
+                node.stop()
+            node.destroy_node()
+        context.try_shutdown()
+
+
+def declare(node: Node, name: str, default: Any, description: str, **limits: Any) -> Any:
+    """Declares a parameter and returns its value.
+
+    Args:
+        node: whose parameter it is.
+        name: of the parameter.
+        default: gives the type too.
+        description: for `ros2 param describe`.
+        limits: `low` and `high` of a floating-point parameter, `read_only`.
+    """
+    descriptor = ParameterDescriptor(description=description, read_only=limits.get("read_only", False))
+    if "low" in limits:
+        span = FloatingPointRange(from_value=limits["low"], to_value=limits["high"])
+        descriptor.floating_point_range = [span]
+    return node.declare_parameter(name, default, descriptor).value
+
+

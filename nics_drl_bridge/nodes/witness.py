@@ -1,0 +1,82 @@
+"""Witness: watches where a simulated robot really goes, from outside."""
+
+from __future__ import annotations
+
+import threading
+import time
+from types import TracebackType
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from numpy.typing import ArrayLike, NDArray
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+
+from nics_drl_bridge.nodes import conversions, qos
+
+
+class Witness:
+    """Collects `ground_truth` in a thread of its own; a context manager.
+
+    Args:
+        domain_id: DDS domain.
+        topic: of the true poses.
+    """
+
+    def __init__(self, domain_id: int | None = None, topic: str = "ground_truth") -> None:
+        self._poses: list[NDArray[np.float64]] = []
+        self._changed = threading.Condition()
+        self._context = Context()
+        self._context.init(domain_id=domain_id)
+        self._node = Node("witness", context=self._context, start_parameter_services=False)
+        self._node.create_subscription(Odometry, topic, self._take, qos.SENSOR_RELIABLE)
+        self._thread = threading.Thread(target=self._spin, daemon=True, name="witness")
+        self._thread.start()
+
+    def _take(self, message: Odometry) -> None:
+        with self._changed:
+            self._poses.append(conversions.odometry_from_ros(message)[0])
+            self._changed.notify_all()
+
+    def _spin(self) -> None:
+        executor = SingleThreadedExecutor(context=self._context)
+        executor.add_node(self._node)
+        try:
+            while self._context.ok():
+                executor.spin_once(timeout_sec=0.2)
+        except ExternalShutdownException:
+            pass
+        finally:
+            executor.shutdown(timeout_sec=1.0)
+
+    @property
+    def path(self) -> NDArray[np.float64]:
+        """(T, 3) all poses so far."""
+        with self._changed:
+            return np.array(self._poses).reshape(-1, 3)
+
+    def arrives(self, goal: ArrayLike, radius: float, timeout_s: float) -> bool:
+        """Waits until the robot has been within `radius` of a goal (2,); False after the time."""
+        deadline = time.monotonic() + timeout_s
+        goal = np.asarray(goal)
+        with self._changed:
+            while True:
+                if self._poses and np.linalg.norm(self._poses[-1][:2] - goal) < radius:
+                    return True
+                if time.monotonic() > deadline:
+                    return False
+                self._changed.wait(0.2)
+
+    def __enter__(self) -> Witness:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._context.try_shutdown()
+        self._thread.join(timeout=2.0)
+        self._node.destroy_node()

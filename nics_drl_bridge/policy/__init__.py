@@ -1,0 +1,1 @@
+"""Policies: from observation to action, and how good they are."""

@@ -1,0 +1,82 @@
+"""The report: one HTML file that holds everything, pictures included."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 64rem; padding: 0 1rem;
+  color: #222; background: #fff }
+h1 { margin-bottom: 0 } h2 { margin-top: 2.2rem; border-bottom: 1px solid #ddd }
+table { border-collapse: collapse; margin: 1rem 0 } th, td { padding: .3rem .9rem; text-align: right;
+  border-bottom: 1px solid #e5e5e5 } th:first-child, td:first-child { text-align: left }
+pre { background: #f6f7f9; padding: 1rem; overflow-x: auto; font-size: 14px } img { max-width: 100% }
+.lead { color: #555; font-size: 1.1rem }
+"""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text under a heading row."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG with its caption."""
+
+    png: bytes
+    caption: str
+
+
+@dataclass(frozen=True)
+class Code:
+    """Text to show as it stands."""
+
+    text: str
+
+
+Block = Table | Picture | Code | str
+
+
+def page(title: str, lead: str, sections: Sequence[tuple[str, Sequence[Block]]]) -> str:
+    """An HTML page.
+
+    Args:
+        title: of the page.
+        lead: one sentence below it.
+        sections: heading and blocks of each; plain text is a paragraph.
+    """
+    body = "".join(
+        f"<h2>{escape(heading)}</h2>{''.join(_block(block) for block in blocks)}"
+        for heading, blocks in sections
+    )
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f"<style>{STYLE}</style></head><body><h1>{escape(title)}</h1>"
+        f'<p class="lead">{escape(lead)}</p>{body}</body></html>\n'
+    )
+
+
+def _block(block: Block) -> str:
+    if isinstance(block, str):
+        return f"<p>{escape(block)}</p>"
+    if isinstance(block, Code):
+        return f"<pre>{escape(block.text)}</pre>"
+    if isinstance(block, Picture):
+        data = base64.b64encode(block.png).decode()
+        caption = escape(block.caption)
+        return (
+            f'<figure><img src="data:image/png;base64,{data}" alt="{caption}">'
+            f"<figcaption>{caption}</figcaption></figure>"
+        )
+    head = "".join(f"<th>{escape(cell)}</th>" for cell in block.head)
+    rows = "".join(
+        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in block.rows
+    )
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"

@@ -1,0 +1,1 @@
+"""Rules that stand between a policy and a robot, as pure functions."""

@@ -1,0 +1,1 @@
+"""The generated simulator: worlds, motion, collision and lidar, batched."""

@@ -1,0 +1,151 @@
+"""FastSimulator: N worlds x M robots of one SimulatorModel in one set of arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.kinematics.motion import scratch, term_arrays
+from nics_drl_bridge.lidar.scanner import Renderer, make_scanner
+from nics_drl_bridge.sim import kernels
+from nics_drl_bridge.sim.world import Scene, World, sample_scene
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Worlds:
+    """All that changes in a simulation; the order is that of `kernels.step_worlds`.
+
+    Attributes:
+        pose: (N, M, 3) true pose of `base_link` in `map`.
+        state: (N, M, S) true state.
+        history: (N, M, H, C) commands, newest first.
+        bodies: (N, K + M, 4) obstacles, then robots: x, y, radius [m], shape in the table.
+        odom: (N, M, 3) pose by odometry, which drifts; it begins at the start pose.
+        twist: (N, M, 3) measured body twist.
+        ranges: (N, M, B) scan, float32, REP-117.
+        collided: (N, M) 1 once a robot has touched something.
+        steps: (N,) control periods since the reset.
+        seeds: (N,) of the episode.
+    """
+
+    pose: Array
+    state: Array
+    history: Array
+    bodies: Array
+    odom: Array
+    twist: Array
+    ranges: NDArray[np.float32]
+    collided: NDArray[np.uint8]
+    steps: NDArray[np.int64]
+    seeds: NDArray[np.int64]
+
+
+class FastSimulator:
+    """The simulator that a SimulatorModel describes, in a world.
+
+    Args:
+        model: the robot: motion, lidar, noise.
+        world: the field and its obstacles.
+        worlds: N.
+        robots: M in each world. They see and touch each other.
+        renderer: `baked` or `exact`.
+    """
+
+    def __init__(
+        self,
+        model: SimulatorModel,
+        world: World,
+        worlds: int = 1,
+        robots: int = 1,
+        renderer: Renderer = "baked",
+    ) -> None:
+        if worlds < 1 or robots < 1:
+            raise ConfigError(f"a simulator needs at least 1 world and 1 robot, not {worlds} and {robots}.")
+        self.model, self.world = model, world
+        self.goals: Array = np.zeros((worlds, robots, 2))
+        footprint = model.robot.footprint_radius
+        self._scanner = make_scanner(model.lidar, (*world.obstacles.radii, footprint), renderer)
+        self._footprint_shape = self._scanner.table.shape_of(footprint)
+        self._walls = world.all_walls()
+        self._timing = model.timing
+        self._terms = term_arrays(model.kinematics)
+        self._noise = np.array([*model.noise.odometry, model.lidar.noise_std])
+        self._sensor = (*self._scanner.arguments, renderer == "baked", self._scanner.table.lookup)
+        self._scratch = scratch(model.kinematics)
+        self.data = self._allocate(worlds, robots)
+        self._fields: tuple[Any, ...] = tuple(vars(self.data).values())
+
+    def _allocate(self, worlds: int, robots: int) -> Worlds:
+        size, width = len(self.model.robot.state), len(self.model.robot.command)
+        periods = -(-self._timing[2] // self._timing[1]) + 1
+        bodies = self.world.obstacles.count + robots
+        shape = (worlds, robots)
+        return Worlds(
+            pose=np.zeros((*shape, 3)),
+            state=np.zeros((*shape, size)),
+            history=np.zeros((*shape, periods, width)),
+            bodies=np.zeros((worlds, bodies, 4)),
+            odom=np.zeros((*shape, 3)),
+            twist=np.zeros((*shape, 3)),
+            ranges=np.full((*shape, self.model.lidar.beams), np.inf, np.float32),
+            collided=np.zeros(shape, np.uint8),
+            steps=np.zeros(worlds, np.int64),
+            seeds=np.zeros(worlds, np.int64),
+        )
+
+    def reset(
+        self, seeds: Sequence[int], worlds: Sequence[int] | None = None, starts: ArrayLike | None = None
+    ) -> list[Scene]:
+        """Begins episodes.
+
+        Args:
+            seeds: of each episode (n,); a seed fixes scene, start, goal and noise.
+            worlds: which worlds begin anew (n,), all by default.
+            starts: (n, M, 3) poses to begin at instead of the scene's.
+
+        Returns:
+            The scene of each.
+        """
+        chosen = np.arange(len(self.data.steps)) if worlds is None else np.asarray(worlds, np.int64)
+        scenes = []
+        for row, (n, seed) in enumerate(zip(chosen, seeds, strict=True)):
+            scene = sample_scene(
+                self.world, self.model.robot.footprint_radius, int(seed), self.data.pose.shape[1]
+            )
+            start = scene.starts if starts is None else np.asarray(starts, dtype=np.float64)[row]
+            self._place(int(n), int(seed), scene, start)
+            scenes.append(scene)
+        kernels.scan_worlds(self._fields, chosen, self._walls, self._noise, self._sensor)
+        return scenes
+
+    def _place(self, n: int, seed: int, scene: Scene, start: Array) -> None:
+        data, robots = self.data, self.data.pose.shape[1]
+        data.pose[n], data.odom[n] = start, start
+        for zeroed in (data.state, data.history, data.twist, data.collided, data.steps):
+            zeroed[n] = 0
+        data.seeds[n] = seed
+        data.bodies[n, :-robots] = self._scanner.with_shapes(scene.circles)
+        data.bodies[n, -robots:, :2] = start[:, :2]
+        data.bodies[n, -robots:, 2] = self.model.robot.footprint_radius
+        data.bodies[n, -robots:, 3] = self._footprint_shape
+        self.goals[n] = scene.goals
+
+    def step(self, commands: ArrayLike) -> None:
+        """Moves every world by one control period; the results are in `data`.
+
+        Args:
+            commands: (N, M, C) in the units and the order of the RobotSpec.
+        """
+        commands = np.ascontiguousarray(commands, dtype=np.float64)
+        kernels.step_worlds(
+            self._fields, commands, self._walls, self._terms, self._timing,
+            self.model.robot.footprint_radius, self._noise, self._sensor, *self._scratch,
+        )  # fmt: skip

@@ -1,0 +1,105 @@
+"""Packaging for pip and for colcon (build type ament_python)."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+from setuptools import find_packages, setup
+
+PACKAGE = "nics_drl_bridge"
+SHARE = f"share/{PACKAGE}"
+ROOT = Path(__file__).resolve().parent
+
+MANIFEST = ElementTree.parse(ROOT / "package.xml")
+
+REQUIRES = [
+    "filterpy>=2.0",
+    "gymnasium>=1.2,<1.5",
+    "matplotlib>=3.8",
+    "numba>=0.60",
+    "numpy>=1.26",
+    "pydantic>=2.6",
+    "pyyaml>=6.0",
+    "rich>=13",
+    "scipy>=1.11",
+    "typer>=0.12",
+]
+# ROS 2 from wheels, for a machine without a ROS 2 installation. Never install `lark` beside
+# them: it overwrites `lark-parser`, which they need.
+ROS_WHEELS_EXIST = "platform_system == 'Linux' and platform_machine == 'x86_64'"
+EXTRAS = {
+    "ros": [
+        f"{wheel}; {ROS_WHEELS_EXIST}"
+        for wheel in ("ros-rclpy", "ros-common-interfaces", "ros-rmw-fastrtps-cpp")
+    ],
+    "test": [
+        "build",
+        "colcon-bash",
+        "colcon-package-selection",
+        "colcon-ros",
+        "hypothesis",
+        "mypy",
+        "pre-commit",
+        "pytest",
+        "pytest-timeout",
+        "pytest-xdist",
+        "ruff",
+        "setuptools",
+        "shapely",
+        "types-PyYAML",
+    ],
+}
+EXTRAS["dev"] = sorted({requirement for extra in EXTRAS.values() for requirement in extra})
+
+
+def text_of(tag: str) -> str:
+    """The text of a tag of package.xml, on one line."""
+    text = MANIFEST.findtext(tag)
+    if text is None:
+        raise ValueError(f"package.xml: the tag <{tag}> is missing; add it.")
+    return " ".join(text.split())
+
+
+def data_files() -> list[tuple[str, list[str]]]:
+    """What goes to share/: the ament index marker, package.xml, config and launch files."""
+    by_folder = {
+        "share/ament_index/resource_index/packages": [f"resource/{PACKAGE}"],
+        SHARE: ["package.xml"],
+    }
+    for top in ("config", "launch"):
+        for path in sorted((ROOT / top).rglob("*")):
+            file = path.relative_to(ROOT)
+            if path.is_file() and "__pycache__" not in file.parts:
+                by_folder.setdefault(f"{SHARE}/{file.parent.as_posix()}", []).append(str(file))
+    return list(by_folder.items())
+
+
+setup(
+    name=PACKAGE,
+    version=text_of("version"),
+    description=text_of("description"),
+    maintainer=text_of("maintainer"),
+    maintainer_email=MANIFEST.find("maintainer").get("email"),
+    license=text_of("license"),
+    python_requires=">=3.10,<3.14",
+    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
+    package_data={PACKAGE: ["py.typed"]},
+    data_files=data_files(),
+    zip_safe=False,
+    install_requires=REQUIRES,
+    extras_require=EXTRAS,
+    entry_points={
+        "console_scripts": [
+            f"nics = {PACKAGE}.cli:main",
+            f"simulator_node = {PACKAGE}.nodes.simulator_node:main",
+            f"middleware_node = {PACKAGE}.nodes.middleware_node:main",
+            f"policy_node = {PACKAGE}.nodes.policy_node:main",
+            f"command_gate = {PACKAGE}.nodes.command_gate:main",
+        ],
+        # For tools that list environments; gymnasium itself stopped reading this in 1.0.
+        "gymnasium.envs": [f"NicsBridge = {PACKAGE}.env.registration:register_envs"],
+        f"{PACKAGE}.backends": [
+            f"sim = {PACKAGE}.env.sim_backend:SimBackend",
+            f"dds = {PACKAGE}.nodes.dds_backend:DdsBackend",
+        ],
+    },
+)

@@ -1,0 +1,237 @@
+"""The package as a user gets it: installed with pip, and built with colcon."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+from email.message import Message
+from email.parser import HeaderParser
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = "nics_drl_bridge"
+EXECUTABLES = {"nics", "simulator_node", "middleware_node", "policy_node", "command_gate"}
+VERSION = "9.8.7"  # written into the package.xml of the copy, and nowhere else
+
+# Files added to the copy, deeper than any of today's: packaging that lists folders by hand,
+# or takes the top level only, loses them.
+PROBES = {
+    f"{PACKAGE}/probe/__init__.py": "",
+    f"{PACKAGE}/probe/inner/__init__.py": "",
+    f"{PACKAGE}/probe/inner/leaf.py": "",
+    "config/probe/inner/leaf.yaml": "answer: 42\n",
+    "launch/probe/leaf.launch.py": "",
+}
+
+WHERE_AM_I = f"""
+import {PACKAGE}
+from {PACKAGE}.config import share_folder
+print({PACKAGE}.__version__, {PACKAGE}.__file__, share_folder(), sep="\\n")
+"""
+
+LOAD_ENTRY_POINTS = f"""
+from importlib.metadata import distribution
+from importlib.util import find_spec
+for point in distribution("{PACKAGE}").entry_points:
+    if find_spec("rclpy") or ".nodes." not in point.value:
+        assert callable(point.load()), point
+        print(point.name)
+"""
+
+
+def run(*command: str | Path, cwd: Path, **env: str) -> str:
+    """Runs a command; what it printed is returned, or shown when it fails."""
+    done = subprocess.run(
+        [str(word) for word in command],
+        cwd=cwd,
+        env=os.environ | env,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=100,
+    )
+    assert done.returncode == 0, f"{command} ended with {done.returncode}:\n{done.stdout}"
+    return done.stdout
+
+
+def files_below(root: Path, *tops: str) -> set[str]:
+    """The files below some folders, relative to the root."""
+    paths = (path for top in tops for path in (root / top).rglob("*") if path.is_file())
+    return {path.relative_to(root).as_posix() for path in paths if "__pycache__" not in path.parts}
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of this checkout with the probes and another version."""
+    copy = tmp_path_factory.mktemp("workspace") / "src" / PACKAGE
+    left_behind = ("build", "install", "log", "dist", "runs", "*.egg-info", "__pycache__", ".?*")
+    shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(*left_behind))
+    for name, text in PROBES.items():
+        (copy / name).parent.mkdir(parents=True, exist_ok=True)
+        (copy / name).write_text(text, encoding="utf-8")
+    manifest = (copy / "package.xml").read_text(encoding="utf-8")
+    manifest = re.sub("<version>.*</version>", f"<version>{VERSION}</version>", manifest)
+    (copy / "package.xml").write_text(manifest, encoding="utf-8")
+    return copy
+
+
+@pytest.fixture(scope="module")
+def wheel(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, built from the source archive as an index would hold it."""
+    dist = tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", dist, checkout, cwd=dist)
+    return next(dist.glob("*.whl"))
+
+
+@pytest.fixture(scope="module")
+def names_in_wheel(wheel: Path) -> set[str]:
+    """The files of the wheel; what goes to share/ without the folder that pip strips."""
+    data = f"{PACKAGE}-{VERSION}.data/data/"
+    return {name.removeprefix(data) for name in zipfile.ZipFile(wheel).namelist()}
+
+
+@pytest.fixture(scope="module")
+def metadata(wheel: Path) -> Message:
+    """The wheel's core metadata."""
+    text = zipfile.ZipFile(wheel).read(f"{PACKAGE}-{VERSION}.dist-info/METADATA")
+    return HeaderParser().parsestr(text.decode())
+
+
+@pytest.fixture(scope="module")
+def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A fresh virtual environment with the wheel; libraries are those of this one."""
+    venv = tmp_path_factory.mktemp("environment") / "venv"
+    run(sys.executable, "-m", "venv", "--without-pip", venv, cwd=venv.parent)
+    libraries = [path for path in sys.path if path.endswith(("site-packages", "dist-packages"))]
+    site_packages = next(venv.glob("lib/python3.*/site-packages"))
+    (site_packages / "libraries.pth").write_text("\n".join(libraries), encoding="utf-8")
+    pip = (sys.executable, "-m", "pip", "--python", venv / "bin" / "python")
+    run(*pip, "install", "--quiet", "--no-deps", "--no-index", wheel, cwd=venv.parent)
+    return venv
+
+
+@pytest.fixture(scope="module")
+def install_space(checkout: Path) -> Path:
+    """The install folder of `colcon build` in a workspace that holds the copy."""
+    beside_python = Path(sys.executable).with_name("colcon")
+    colcon = beside_python if beside_python.exists() else shutil.which("colcon")
+    if colcon is None:
+        pytest.skip("colcon is not installed; `make setup` installs it")
+    workspace = checkout.parents[1]
+    prefix = os.environ.get("AMENT_PREFIX_PATH", sys.prefix)
+    run(colcon, "build", "--packages-select", PACKAGE, cwd=workspace, AMENT_PREFIX_PATH=prefix)
+    return workspace / "install"
+
+
+def test_the_wheel_holds_every_module(checkout: Path, names_in_wheel: set[str]) -> None:
+    written = files_below(checkout, PACKAGE)
+    assert f"{PACKAGE}/probe/inner/leaf.py" in written
+    assert f"{PACKAGE}/py.typed" in written
+    assert {name for name in names_in_wheel if name.startswith(f"{PACKAGE}/")} == written
+
+
+def test_the_wheel_holds_every_config_and_launch_file(
+    checkout: Path, names_in_wheel: set[str]
+) -> None:
+    written = files_below(checkout, "config", "launch")
+    assert {"config/probe/inner/leaf.yaml", "launch/probe/leaf.launch.py"} <= written
+    share = f"share/{PACKAGE}/"
+    shared = {name.removeprefix(share) for name in names_in_wheel if name.startswith(share)}
+    assert shared == written | {"package.xml"}
+
+
+def test_the_wheel_registers_the_package_with_ament(names_in_wheel: set[str]) -> None:
+    assert f"share/ament_index/resource_index/packages/{PACKAGE}" in names_in_wheel
+
+
+def test_a_pip_install_takes_version_and_config_from_itself(environment: Path) -> None:
+    answer = run(environment / "bin" / "python", "-c", WHERE_AM_I, cwd=environment)
+    version, module, share = answer.splitlines()
+    assert version == VERSION
+    assert environment in Path(module).parents
+    assert Path(share) == environment / "share" / PACKAGE
+
+
+def test_a_pip_install_puts_the_executables_into_bin(environment: Path) -> None:
+    assert {path.name for path in (environment / "bin").iterdir()} >= EXECUTABLES
+    assert "Usage" in run(environment / "bin" / "nics", "--help", cwd=environment)
+
+
+def test_every_entry_point_leads_to_code(environment: Path) -> None:
+    loaded = run(environment / "bin" / "python", "-c", LOAD_ENTRY_POINTS, cwd=environment)
+    assert {"nics", "sim"} <= set(loaded.split())
+
+
+def test_colcon_puts_the_executables_where_ros2_run_looks(install_space: Path) -> None:
+    folder = install_space / PACKAGE / "lib" / PACKAGE
+    assert {path.name for path in folder.iterdir()} == EXECUTABLES
+    assert all(os.access(path, os.X_OK) for path in folder.iterdir())
+
+
+def test_colcon_shares_config_launch_files_and_the_ament_marker(
+    checkout: Path, install_space: Path
+) -> None:
+    share = install_space / PACKAGE / "share"
+    written = files_below(checkout, "config", "launch")
+    assert files_below(share / PACKAGE, "config", "launch") == written
+    assert (share / PACKAGE / "package.xml").is_file()
+    assert (share / "ament_index" / "resource_index" / "packages" / PACKAGE).is_file()
+
+
+def test_a_sourced_colcon_install_takes_version_and_config_from_itself(
+    install_space: Path,
+) -> None:
+    sourced = f"source {install_space}/setup.bash && exec {sys.executable} -c '{WHERE_AM_I}'"
+    answer = run("bash", "-c", sourced, cwd=install_space)
+    version, module, share = answer.splitlines()
+    assert version == VERSION
+    assert install_space in Path(module).parents
+    assert Path(share) == install_space / PACKAGE / "share" / PACKAGE
+
+
+def test_a_sourced_colcon_install_runs_an_executable(install_space: Path) -> None:
+    nics = install_space / PACKAGE / "lib" / PACKAGE / "nics"
+    sourced = f"source {install_space}/setup.bash && exec {nics} --help"
+    assert "Usage" in run("bash", "-c", sourced, cwd=install_space)
+
+
+def requirements(metadata: Message, extra: str = "") -> list[Requirement]:
+    """What the wheel requires on this machine, with an extra or without."""
+    every = [Requirement(text) for text in metadata.get_all("Requires-Dist", [])]
+    return [one for one in every if one.marker is None or one.marker.evaluate({"extra": extra})]
+
+
+def test_package_xml_names_every_python_library(metadata: Message) -> None:
+    words = set(re.findall(r"[\w-]+", (ROOT / "package.xml").read_text(encoding="utf-8")))
+    named = words | {word.removeprefix("python3-") for word in words}
+    libraries = {one.name for one in requirements(metadata)}
+    assert "numpy" in libraries
+    assert libraries - {"pyyaml"} <= named
+    assert "python3-yaml" in named
+
+
+def test_every_requirement_is_pinned_to_a_version_that_it_allows(metadata: Message) -> None:
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    every = [Requirement(line) for line in lines if line and not line.startswith("#")]
+    pins = {
+        canonicalize_name(pin.name): str(pin.specifier).removeprefix("==")
+        for pin in every
+        if pin.marker is None or pin.marker.evaluate()
+    }
+    asked = requirements(metadata, extra="dev")
+    assert {"numpy", "ruff"} <= {one.name for one in asked}
+    for one in asked:
+        assert one.specifier.contains(pins[canonicalize_name(one.name)]), one
+
+
+def test_the_changelog_has_a_section_for_this_version() -> None:
+    manifest = (ROOT / "package.xml").read_text(encoding="utf-8")
+    (version,) = re.findall("<version>(.*)</version>", manifest)
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(rf"^## \[{re.escape(version)}\]", changelog, re.MULTILINE)
