@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -51,7 +50,10 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
 ) -> None:
     """Options of every command."""
@@ -65,7 +67,9 @@ def generate(
     world: WorldOption = "arena",
     lidar: Annotated[str, typer.Option(help="A shipped lidar (paper) or a YAML file.")] = "paper",
     order: Annotated[int, typer.Option(min=1, max=4, help="Order of the Taylor model.")] = 2,
-    alpha: Annotated[float, typer.Option(min=0.0, max=1.0, help="Pruning threshold of Eq. 2.")] = 0.99,
+    alpha: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Pruning threshold of Eq. 2.")
+    ] = 0.99,
     assume_textbook: Annotated[
         bool, typer.Option(help="Fill in from the textbook what the drive did not show.")
     ] = False,
@@ -79,7 +83,11 @@ def generate(
         from nics_drl_bridge.lidar.spec import load_lidar
         from nics_drl_bridge.sim.world import load_world
 
-        spec, radii, sensor = load_robot(robot), load_world(world).obstacles.radii, load_lidar(lidar)
+        spec, radii, sensor = (
+            load_robot(robot),
+            load_world(world).obstacles.radii,
+            load_lidar(lidar),
+        )
         model, _ = generate_model(
             read_recording(recording), spec, sensor, radii, order, alpha, assume=assume_textbook
         )
@@ -93,7 +101,9 @@ def demo(
     recording: Annotated[
         Path | None, typer.Option(help="A drive; by default one of the textbook robot.")
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for everything the demo writes.")] = Path("runs/demo"),
+    out: Annotated[Path, typer.Option(help="Folder for everything the demo writes.")] = Path(
+        "runs/demo"
+    ),
     robot: RobotOption = "ackermann",
     world: WorldOption = "arena",
     episodes: Annotated[int, typer.Option(min=1, help="How many episodes.")] = 5,
@@ -113,4 +123,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -173,7 +173,12 @@ def _drive_live(plan: Plan, model: SimulatorModel, say: Say) -> Live:
     goal = [float(value) for value in scene.goals[0]]
     folder = str(plan.out / "model")
     nodes: dict[str, dict[str, Any]] = {
-        "simulator_node": {"model": folder, "world": plan.world, "rate": LIVE_RATE, "episode_seed": 0},
+        "simulator_node": {
+            "model": folder,
+            "world": plan.world,
+            "rate": LIVE_RATE,
+            "episode_seed": 0,
+        },
         "middleware_node": {"model": folder},
         "command_gate": {"model": folder},
         "policy_node": {"model": folder, "policy": POLICY, "goal": goal},
@@ -182,10 +187,11 @@ def _drive_live(plan: Plan, model: SimulatorModel, say: Say) -> Live:
     say(f"deploying {', '.join(nodes)} in real time")
     with ExitStack() as stack:
         witness = stack.enter_context(Witness(domain_id))
-        processes = [
-            stack.enter_context(NodeProcess(node, logs, parameters, domain_id))
-            for node, parameters in nodes.items()
-        ]
+        processes = []
+        for node, parameters in nodes.items():
+            processes.append(stack.enter_context(NodeProcess(node, logs, parameters, domain_id)))
+            if node == "simulator_node":
+                witness.sees(LIVE_TIMEOUT_S)
         task = Navigation(model.robot, model.lidar)
         # The policy stops where it believes to be there; its odometry drifts.
         arrived = witness.arrives(goal, task.goal_radius + 0.1, LIVE_TIMEOUT_S)
@@ -217,13 +223,19 @@ def _report(
     head = ("seed", IN_PROCESS, "steps", "path [m]", OVER_DDS, "steps", "path [m]", "deviation [m]")
     both = trajectories({IN_PROCESS: here, OVER_DDS: there}, walls, footprint)
     sections: list[tuple[str, Sequence[Block]]] = [
-        ("The model", ["Generated from " + str(plan.recording or "a textbook drive") + ".", Code(model.report)]),
+        (
+            "The model",
+            [
+                "Generated from " + str(plan.recording or "a textbook drive") + ".",
+                Code(model.report),
+            ],
+        ),
         (
             "The same episodes, in process and over DDS",
             [
                 f"{successes(here)} of {len(here)} episodes reached the goal in process, "
-                f"{successes(there)} of {len(there)} over DDS in lock-step. Deviation is the greatest "
-                "distance between the two true paths at the same step.",
+                f"{successes(there)} of {len(there)} over DDS in lock-step. Deviation is the "
+                "greatest distance between the two true paths at the same step.",
                 Table(head, rows),
                 Picture(both, "Blue: in process. Red, dashed: over DDS."),
             ],
@@ -234,7 +246,9 @@ def _report(
                 "simulator_node in real time, middleware_node, policy_node and command_gate ran as "
                 "processes of their own; nobody stepped them.",
                 Picture(
-                    trajectories({"in process": here[:1], "deployed": [live.path]}, walls, footprint),
+                    trajectories(
+                        {"in process": here[:1], "deployed": [live.path]}, walls, footprint
+                    ),
                     "The true path of the deployed robot beside the lock-step one.",
                 ),
             ],

@@ -44,7 +44,11 @@ class StaleDataError(BackendError):
 
     def __init__(self, topic: str, age_s: float, limit_s: float) -> None:
         self.topic, self.age_s = topic, age_s
-        last = "nothing has ever arrived" if age_s == float("inf") else f"the last is {age_s:.3f} s old"
+        last = (
+            "nothing has ever arrived"
+            if age_s == float("inf")
+            else f"the last is {age_s:.3f} s old"
+        )
         super().__init__(
             f"topic {topic!r}: no fresh data within {limit_s:.3f} s, {last}; check that its "
             "publisher runs in this ROS domain and namespace."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -67,15 +67,15 @@ class SimulatorModel:
     calibration: Calibration
     lidar: LidarSpec
     table: LidarTable
-    noise: Noise = Noise()
+    noise: Noise = field(default_factory=Noise)
     control_period: float = CONTROL_PERIOD_S
     report: str = ""
 
     def __post_init__(self) -> None:
         if self.kinematics.variables != self.robot.variable_names:
             raise ModelError(
-                f"the kinematics are of {self.kinematics.variables}, the robot {self.robot.name!r} has "
-                f"{self.robot.variable_names}; generate the model anew."
+                f"the kinematics are of {self.kinematics.variables}, the robot "
+                f"{self.robot.name!r} has {self.robot.variable_names}; generate the model anew."
             )
         substeps = self.control_period / self.kinematics.dt
         if round(substeps) < 1 or abs(substeps - round(substeps)) > 1e-6:
@@ -203,7 +203,8 @@ def load_model(folder: Path) -> SimulatorModel:
     data = parse_yaml(read_text(path), str(path))
     if data.get("format") != FORMAT:
         raise ModelError(
-            f"{path}: key 'format' is {data.get('format')!r}, not {FORMAT!r}; generate the model anew."
+            f"{path}: key 'format' is {data.get('format')!r}, not {FORMAT!r}; generate the model "
+            "anew."
         )
     file = validate(data, _File, str(path))
     table = _load_table(folder / TABLE_FILE, file.lidar_table_sha256)
@@ -226,7 +227,11 @@ def _load_table(path: Path, checksum: str) -> LidarTable:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise ModelError(f"{path}: can't be read ({error.strerror}); generate the model anew.") from None
+        raise ModelError(
+            f"{path}: can't be read ({error.strerror}); generate the model anew."
+        ) from None
     if sha256(data) != checksum:
-        raise ModelError(f"{path}: does not match its checksum in {MODEL_FILE}; generate the model anew.")
+        raise ModelError(
+            f"{path}: does not match its checksum in {MODEL_FILE}; generate the model anew."
+        )
     return LidarTable.parse(data, str(path))

@@ -121,7 +121,11 @@ def _mounting(
     cmd_vel = spec.to_cmd_vel(command)
     expected = _expected(recording, spec, twists, timing)
     if any(c.cmd_vel == "linear.y" for c in spec.command):
-        response = expected if recording.state is None else _as_commands(expected, recording, spec, timing.latency)
+        response = (
+            expected
+            if recording.state is None
+            else _as_commands(expected, recording, spec, timing.latency)
+        )
         return mounting_by_commands(twists, spec.to_cmd_vel(response))
     found = mounting_without_lateral_motion(twists, cmd_vel[:, 0])
     speed = _speed_index(spec)
@@ -135,9 +139,7 @@ def _mounting(
     )
 
 
-def _as_commands(
-    states: Array, recording: Recording, spec: RobotSpec, latency: float
-) -> Array:
+def _as_commands(states: Array, recording: Recording, spec: RobotSpec, latency: float) -> Array:
     """Measured states (n, S) as the commands (n, C) that would hold them."""
     stream = recording.state
     if stream is None:

@@ -214,7 +214,9 @@ def _unpack(
     coefficients = model.coefficients.copy()
     coefficients[problem.free] = theta[:count]
     for i, response in enumerate(calibration.responses):
-        own, command = (_linear_term(model, problem.spec, n) for n in (response.state, response.command))
+        own, command = (
+            _linear_term(model, problem.spec, n) for n in (response.state, response.command)
+        )
         if own is not None and command is not None and not problem.free[3 + i, command]:
             coefficients[3 + i, command] = -response.gain * coefficients[3 + i, own]
     model = replace(model, coefficients=coefficients)

@@ -26,7 +26,7 @@ STEPS_S = (0.05, 0.005, 0.0005)
 SEARCH_S = 3.0
 DEFAULT_LAG_S = 0.1
 LAG_RANGE_S = (0.005, 2.0)
-MAX_ROWS = 3000
+MAX_ROWS = 2000
 EXACT = 1e-6
 
 
@@ -130,7 +130,7 @@ def latency_of_state(command: Stream, state: Stream, spec: RobotSpec) -> Delay |
     if not moved_commands(command).any():
         return None
     keep = np.flatnonzero(np.diff(state.t) > 0.0)
-    keep = keep[:: max(1, len(keep) // MAX_ROWS)]
+    keep = keep[:: -(-len(keep) // MAX_ROWS)]
     start, end = state.t[keep], state.t[keep + 1]
     rates = (state.values[keep + 1] - state.values[keep]) / (end - start)[:, None]
     middle = (state.values[keep + 1] + state.values[keep]) / 2.0

@@ -65,7 +65,7 @@ class Navigation:
     time_reward: float = -0.01
 
     @property
-    def observation_space(self) -> gymnasium.spaces.Box:
+    def observation_space(self) -> gymnasium.Space[NDArray[np.float32]]:
         """Box of one robot's observation."""
         beams = self.lidar.beams
         low = np.full(beams + GOAL_PARTS + TWIST_PARTS, -np.inf, np.float32)
@@ -76,7 +76,7 @@ class Navigation:
         return gymnasium.spaces.Box(low, high, dtype=np.float32)
 
     @property
-    def action_space(self) -> gymnasium.spaces.Box:
+    def action_space(self) -> gymnasium.Space[NDArray[np.float32]]:
         """Box of one robot's action."""
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.robot.command),), np.float32)
 

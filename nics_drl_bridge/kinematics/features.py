@@ -40,9 +40,7 @@ def evaluate(x: ArrayLike, powers: NDArray[np.int64]) -> NDArray[np.float64]:
 
 def term_name(row: NDArray[np.int64], names: tuple[str, ...]) -> str:
     """A term as text: `1`, `speed`, `speed*steering`, `speed^2`."""
-    factors = [
-        names[v] if row[v] == 1 else f"{names[v]}^{row[v]}" for v in np.flatnonzero(row)
-    ]
+    factors = [names[v] if row[v] == 1 else f"{names[v]}^{row[v]}" for v in np.flatnonzero(row)]
     return "*".join(factors) or "1"
 
 

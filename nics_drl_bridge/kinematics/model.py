@@ -77,7 +77,10 @@ class TaylorModel:
         for d, dof in enumerate(self.dofs):
             text = ""
             for k in np.flatnonzero(self.coefficients[d]):
-                value, name = self.coefficients[d, k], features.term_name(self.powers[k], self.variables)
+                value, name = (
+                    self.coefficients[d, k],
+                    features.term_name(self.powers[k], self.variables),
+                )
                 sign = ("-" if value < 0 else "") if not text else (" - " if value < 0 else " + ")
                 mark = " (assumed)" if (dof, name) in self.assumed else ""
                 text += f"{sign}{abs(value):.5g}" + ("" if name == "1" else f"*{name}") + mark
@@ -111,16 +114,22 @@ class TaylorModel:
         try:
             variables, dofs = tuple(data["valid"]), tuple(data["terms"])
             terms = data["terms"]
-            parsed = {name: features.parse_term(name, variables) for dof in dofs for name in terms[dof]}
+            parsed = {
+                name: features.parse_term(name, variables) for dof in dofs for name in terms[dof]
+            }
             names = sorted(parsed, key=lambda name: features.canonical(parsed[name]))
             powers = np.array([parsed[name] for name in names], dtype=np.int64)
             powers = powers.reshape(len(names), len(variables))
-            coefficients = np.array([[float(terms[dof].get(name, 0.0)) for name in names] for dof in dofs])
+            coefficients = np.array(
+                [[float(terms[dof].get(name, 0.0)) for name in names] for dof in dofs]
+            )
             box = np.array([data["valid"][name] for name in variables], dtype=np.float64)
             units, dt = tuple(data["units"][dof] for dof in dofs), float(data["dt"])
             assumed = tuple((str(dof), str(term)) for dof, term in data["assumed"])
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise ModelError(f"kinematics: {error!s} is missing or wrong; generate the model anew.") from None
+            raise ModelError(
+                f"kinematics: {error!s} is missing or wrong; generate the model anew."
+            ) from None
         if not (np.isfinite(coefficients).all() and np.isfinite(box).all() and dt > 0.0):
             raise ModelError("kinematics: holds NaN, inf or dt <= 0; generate the model anew.")
         return cls(

@@ -92,14 +92,10 @@ class Samples:
 
     def rows(self, keep: NDArray[np.bool_]) -> Samples:
         """The samples of the steps for which `keep` (T,) is true."""
-        return Samples(
-            self.t[keep], self.q[keep], self.x[keep], self.dq[keep], self.dt, self.notes
-        )
+        return Samples(self.t[keep], self.q[keep], self.x[keep], self.dq[keep], self.dt, self.notes)
 
 
-def samples_on_one_clock(
-    t: Array, pose: Array, state: Array, command: Array
-) -> Samples:
+def samples_on_one_clock(t: Array, pose: Array, state: Array, command: Array) -> Samples:
     """Builds Samples from series that share uniform stamps.
 
     Args:
@@ -153,7 +149,9 @@ def _check_stream(place: str, stream: Stream, width: int) -> None:
             "needed; check that the recording is of this robot."
         )
     if len(stream.t) < 2:
-        raise RecordingError(f"{place}: has {len(stream.t)} samples; record a drive of 20 s or more.")
+        raise RecordingError(
+            f"{place}: has {len(stream.t)} samples; record a drive of 20 s or more."
+        )
     for row in np.flatnonzero(~np.isfinite(stream.values).all(axis=1) | ~np.isfinite(stream.t))[:1]:
         raise RecordingError(
             f"{place}: row {row} holds NaN or inf; remove the row, or find out why it was recorded."
@@ -204,4 +202,6 @@ def load_npz(path: Path) -> Recording:
             "nics_drl_bridge.kinematics.recording.save_recording."
         ) from None
     except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise RecordingError(f"{path}: can't be read as .npz ({error}); it may be damaged.") from None
+        raise RecordingError(
+            f"{path}: can't be read as .npz ({error}); it may be damaged."
+        ) from None

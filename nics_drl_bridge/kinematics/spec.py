@@ -67,7 +67,7 @@ class RobotSpec(Schema):
     name: str
     description: str = ""
     textbook: Literal["ackermann", "differential", "mecanum"] | None = None
-    parameters: dict[str, float] = {}
+    parameters: dict[str, float] = Field(default_factory=dict)
     footprint_radius: float = Field(gt=0.0)
     state: tuple[StateVariable, ...] = ()
     command: tuple[CommandVariable, ...] = Field(min_length=1)

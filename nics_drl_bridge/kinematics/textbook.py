@@ -60,7 +60,9 @@ def _ackermann(p: dict[str, float]) -> Textbook:
 
     def twist(state: Array) -> Array:
         speed, steering = state[..., 0], state[..., 1]
-        return np.stack([speed, np.zeros_like(speed), speed * np.tan(steering) / wheelbase], axis=-1)
+        return np.stack(
+            [speed, np.zeros_like(speed), speed * np.tan(steering) / wheelbase], axis=-1
+        )
 
     return Textbook(
         twist=twist,
@@ -75,7 +77,9 @@ def _differential(p: dict[str, float]) -> Textbook:
 
     def twist(state: Array) -> Array:
         left, right = state[..., 0], state[..., 1]
-        return np.stack([r * (left + right) / 2, np.zeros_like(left), r * (right - left) / track], -1)
+        return np.stack(
+            [r * (left + right) / 2, np.zeros_like(left), r * (right - left) / track], -1
+        )
 
     def target(command: Array) -> Array:
         v, w = command[..., 0], command[..., 1]
@@ -92,7 +96,9 @@ def _mecanum(p: dict[str, float]) -> Textbook:
     # Columns: vx, vy, wz. Rows: front left, front right, rear left, rear right.
     inverse = np.array([[1, -1, -arm], [1, 1, arm], [1, 1, -arm], [1, -1, arm]]) / r
     forward = np.linalg.pinv(inverse)
-    wheels = tuple(f"{place}_wheel" for place in ("front_left", "front_right", "rear_left", "rear_right"))
+    wheels = tuple(
+        f"{place}_wheel" for place in ("front_left", "front_right", "rear_left", "rear_right")
+    )
     return Textbook(
         twist=lambda state: state @ forward.T,
         target=lambda command: command @ inverse.T,
@@ -108,7 +114,9 @@ _BUILDERS: dict[str, Callable[[dict[str, float]], Textbook]] = {
 }
 
 
-def integrate(book: Textbook, pose: Array, state: Array, command: Array, dt: float) -> tuple[Array, Array]:
+def integrate(
+    book: Textbook, pose: Array, state: Array, command: Array, dt: float
+) -> tuple[Array, Array]:
     """Moves robots for `dt` under a constant command.
 
     The state's lag is exact; the pose follows arcs of at most 1 ms.
@@ -160,7 +168,7 @@ def record(
     held = rng.uniform(spec.command_low, spec.command_high, (holds, len(spec.command)))
     state, middle = _follow(book, held, per_hold * inner, h)
     pose = _chain(geometry.exp(book.twist(middle) * h))
-    t = np.arange(holds * per_hold) * dt
+    t = np.asarray(np.arange(holds * per_hold) * dt, dtype=np.float64)
     return Recording(
         Stream(t, np.repeat(held, per_hold, axis=0)),
         Stream(t, pose[::inner]),

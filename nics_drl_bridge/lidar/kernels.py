@@ -14,6 +14,8 @@ import numpy as np
 from numba import njit
 
 TWO_PI = 2.0 * math.pi
+ROUNDING = 1e-6
+"""A beam this near to an edge, in beams, is tried; the exact test decides."""
 
 
 @njit(cache=True)
@@ -27,11 +29,11 @@ def _lower(out, i, value):  # type: ignore[no-untyped-def]
 def beam_span(low, high, beams, count):  # type: ignore[no-untyped-def]
     """First beam index and number of beams in the angles [low, high].
 
-    For a full circle the index runs over the seam and has to be taken modulo the count. For a
-    partial one the caller turns the angles so that `low` is not below angle_min - 2 pi.
+    In a full circle the beams may run over the seam: the index has to be taken modulo the
+    count.
     """
-    first = math.ceil((low - beams[0]) / beams[1] - 1e-6)
-    last = math.floor((high - beams[0]) / beams[1] + 1e-6)
+    first = math.ceil((low - beams[0]) / beams[1] - ROUNDING)
+    last = math.floor((high - beams[0]) / beams[1] + ROUNDING)
     if beams[2] > 0.0:
         return first % count, min(last - first + 1, count)
     first, last = max(first, 0), min(last, count - 1)
@@ -143,7 +145,7 @@ def baked_circle(out, beams, x, y, radius, shape, table, rows, first, start, fin
         offset = i - (turned - beams[0]) / beams[1]
         if turns == 1:
             offset -= count * math.floor(offset / count + 0.5)
-        j = int(math.floor(offset * fine + 0.5)) - first[shape, lower]
+        j = math.floor(offset * fine + 0.5) - first[shape, lower]
         for _ in range(hits):
             value = rows[begin + min(max(j, 0), last)]
             value += blend * (rows[begin2 + min(max(j + skip, 0), last2)] - value)
@@ -186,20 +188,23 @@ def walls_into(out, directions, beams, sx, sy, c, s, walls):  # type: ignore[no-
     for w in range(walls.shape[0]):
         ax, ay = walls[w, 0] - sx, walls[w, 1] - sy
         bx, by = walls[w, 2] - sx, walls[w, 3] - sy
-        segment(
-            out, directions, beams, c * ax + s * ay, c * ay - s * ax, c * bx + s * by, c * by - s * bx
-        )  # fmt: skip
+        ax, ay = c * ax + s * ay, c * ay - s * ax
+        bx, by = c * bx + s * by, c * by - s * bx
+        segment(out, directions, beams, ax, ay, bx, by)
 
 
 @njit(cache=True)
-def scan(out, pose, mount, directions, beams, limits, circles, walls, baked, lookup):  # type: ignore[no-untyped-def]
-    """One scan (B,) of circles (K, 4: x, y, radius, shape) and walls (W, 4) from a robot's pose (3,).
+def scan(out, pose, circles, walls, sensor):  # type: ignore[no-untyped-def]
+    """One scan (B,) from a robot's pose (3,).
 
     Args:
-        limits: range_min, range_max.
-        baked: whether circles are looked up instead of scanned exactly.
-        lookup: the table's arrays, see `baked_circle`.
+        out: (B,) result.
+        pose: (3,) of `base_link` in the world.
+        circles: (K, 4) x, y, radius [m], index of the radius in the table.
+        walls: (W, 4) x1, y1, x2, y2 [m].
+        sensor: see `scanner.Scanner.arguments`.
     """
+    mount, directions, beams, limits, baked, lookup = sensor
     clear(out)
     sx, sy, c, s = to_sensor(pose, mount)
     table, rows, first, start, fine = lookup

@@ -34,11 +34,16 @@ class Scanner:
 
     @property
     def arguments(self) -> tuple[Any, ...]:
-        """What the kernel `scan` takes between the pose and the scene."""
+        """What the kernels take as `sensor`.
+
+        Mount (3,), directions (B, 2), beams (angle_min, angle_increment, 1 for a full circle),
+        limits (range_min, range_max), whether circles are looked up, the table's arrays.
+        """
         spec = self.spec
         beams = np.array([spec.angle_min, spec.angle_increment, float(spec.full_circle)])
         limits = np.array([spec.range_min, spec.range_max])
-        return np.array(spec.mount), spec.directions, beams, limits
+        baked = self.renderer == "baked"
+        return np.array(spec.mount), spec.directions, beams, limits, baked, self.table.lookup
 
     def scan(self, poses: ArrayLike, circles: ArrayLike, walls: ArrayLike) -> NDArray[np.float32]:
         """Scans of several robots, each in a world of its own.
@@ -55,9 +60,7 @@ class Scanner:
         shaped = self.with_shapes(np.asarray(circles, dtype=np.float64).reshape(len(poses), -1, 3))
         walls = np.asarray(walls, dtype=np.float64).reshape(-1, 4)
         out = np.empty((len(poses), self.spec.beams), np.float32)
-        _scan_batch(
-            out, poses, *self.arguments, shaped, walls, self.renderer == "baked", self.table.lookup
-        )
+        _scan_batch(out, poses, shaped, walls, self.arguments)
         return out
 
     def with_shapes(self, circles: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -70,14 +73,14 @@ class Scanner:
         return np.concatenate([circles, shape[..., None]], axis=-1)
 
 
-def make_scanner(spec: LidarSpec, radii: tuple[float, ...], renderer: Renderer = "baked") -> Scanner:
+def make_scanner(
+    spec: LidarSpec, radii: tuple[float, ...], renderer: Renderer = "baked"
+) -> Scanner:
     """A scanner with a table for circles of the given radii, baked now."""
     return Scanner(spec, bake(spec, radii), renderer)
 
 
 @njit(cache=True)
-def _scan_batch(out, poses, mount, directions, beams, limits, circles, walls, baked, lookup):  # type: ignore[no-untyped-def]
+def _scan_batch(out, poses, circles, walls, sensor):  # type: ignore[no-untyped-def]
     for n in range(poses.shape[0]):
-        kernels.scan(
-            out[n], poses[n], mount, directions, beams, limits, circles[n], walls, baked, lookup
-        )  # fmt: skip
+        kernels.scan(out[n], poses[n], circles[n], walls, sensor)

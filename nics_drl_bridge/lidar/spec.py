@@ -64,7 +64,7 @@ class LidarSpec(Schema):
     @cached_property
     def angles(self) -> NDArray[np.float64]:
         """(B,) direction of each beam in the frame of the lidar [rad]."""
-        return self.angle_min + self.angle_increment * np.arange(self.beams)
+        return np.asarray(self.angle_min + self.angle_increment * np.arange(self.beams))
 
     @cached_property
     def directions(self) -> NDArray[np.float32]:

@@ -56,7 +56,7 @@ class LidarTable:
         return self.grid, self.rows, self.first, self.start, FINE
 
     @property
-    def bytes(self) -> int:
+    def memory(self) -> int:
         """Memory of the table [bytes]."""
         return sum(a.nbytes for a in (self.radii, self.grid, self.rows, self.first, self.start))
 
@@ -71,7 +71,9 @@ class LidarTable:
             with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
                 return cls(**{name: arrays[name] for name in arrays.files})
         except (ValueError, TypeError, OSError, KeyError, zipfile.BadZipFile) as error:
-            raise ModelError(f"{source}: is no lidar table ({error}); generate the model anew.") from None
+            raise ModelError(
+                f"{source}: is no lidar table ({error}); generate the model anew."
+            ) from None
 
 
 def bake(spec: LidarSpec, radii: tuple[float, ...], distances: int = DISTANCES) -> LidarTable:
@@ -101,7 +103,9 @@ def bake(spec: LidarSpec, radii: tuple[float, ...], distances: int = DISTANCES) 
     return LidarTable(ordered, grid, np.concatenate([*rows, np.empty(0, np.float32)]), first, start)
 
 
-def _scan_on_axis(spec: LidarSpec, radius: float, distance: float) -> tuple[int, NDArray[np.float32]]:
+def _scan_on_axis(
+    spec: LidarSpec, radius: float, distance: float
+) -> tuple[int, NDArray[np.float32]]:
     """The points that hit a circle straight ahead: offset of the first, and their ranges."""
     step = spec.angle_increment / FINE
     half = int(np.arcsin(min(radius / distance, 1.0)) / step + 1e-6)

@@ -39,7 +39,9 @@ class TopicCache:
         """Stores a datum unless it is older than the one held, or a copy; says whether."""
         held = self.newest.get(topic)
         if held is not None and stamp_ns <= held.stamp_ns:
-            self.reject(f"{topic}: out of order" if stamp_ns < held.stamp_ns else f"{topic}: duplicate")
+            self.reject(
+                f"{topic}: out of order" if stamp_ns < held.stamp_ns else f"{topic}: duplicate"
+            )
             return False
         sequence = 0 if held is None else held.sequence + 1
         self.newest[topic] = Datum(stamp_ns, arrival_ns, sequence, value)

@@ -8,9 +8,9 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import ArrayLike, NDArray
 
+from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import wrap_angle
 from nics_drl_bridge.kinematics.motion import term_arrays
-from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.middleware import kernels
 
 Array = NDArray[np.float64]

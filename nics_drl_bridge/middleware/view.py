@@ -45,7 +45,7 @@ class Middleware:
         return self.cache.put(SCAN, stamp_ns, arrival_ns, ranges)
 
     def odometry(self, stamp_ns: int, arrival_ns: int, pose: ArrayLike, twist: ArrayLike) -> bool:
-        """Takes an odometry message: pose (3,) in `odom`, body twist (3,); says whether it was used."""
+        """Takes an odometry: pose (3,) in `odom`, body twist (3,); says whether it was used."""
         pose, twist = np.asarray(pose, dtype=np.float64), np.asarray(twist, dtype=np.float64)
         if not (np.isfinite(pose).all() and np.isfinite(twist).all()):
             self.cache.reject(f"{ODOM}: NaN or inf")

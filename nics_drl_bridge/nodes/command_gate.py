@@ -34,7 +34,9 @@ class CommandGate(Node):
     def __init__(self, context: Context) -> None:
         super().__init__("command_gate", context=context)
         declare(self, "model", "ackermann", "Folder of a SimulatorModel, or a shipped robot.")
-        age = declare(self, "scan_age", 0.35, "Oldest scan behind a command [s].", low=0.01, high=10.0)
+        age = declare(
+            self, "scan_age", 0.35, "Oldest scan behind a command [s].", low=0.01, high=10.0
+        )
         robot = open_model(str(self.get_parameter("model").value)).robot
         self._limits = Limits(
             robot.to_cmd_vel(robot.command_low), robot.to_cmd_vel(robot.command_high), float(age)
@@ -48,7 +50,9 @@ class CommandGate(Node):
         self.create_timer(PERIOD_S, self._on_time, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _on_scan(self, message: LaserScan) -> None:
-        self._arrivals.setdefault(conversions.stamp_from_ros(message.header.stamp), time.monotonic())
+        self._arrivals.setdefault(
+            conversions.stamp_from_ros(message.header.stamp), time.monotonic()
+        )
         while len(self._arrivals) > SCANS_KEPT:
             self._arrivals.popitem(last=False)
 

@@ -102,7 +102,9 @@ def odometry_from_ros(message: Odometry) -> tuple[Array, Array]:
     """Pose (3,) and body twist (3,) of an Odometry message."""
     pose = message.pose.pose
     heading = heading_from_ros(pose.orientation)
-    return np.array([pose.position.x, pose.position.y, heading]), twist_from_ros(message.twist.twist)
+    return np.array([pose.position.x, pose.position.y, heading]), twist_from_ros(
+        message.twist.twist
+    )
 
 
 UNUSED_VARIANCE = 1e6

@@ -93,7 +93,7 @@ class DdsBackend:
         world: World,
         namespace: str = "",
         simulator: str = "simulator_node",
-        timeout_s: float = 10.0,
+        timeout_s: float = 30.0,
         truth: bool = False,
         domain_id: int | None = None,
     ) -> None:
@@ -104,26 +104,34 @@ class DdsBackend:
         self._now_ns, self._mail = 0, _Mailbox()
         context = Context()
         context.init(domain_id=domain_id)
-        node = Node("bridge_env", namespace=namespace, context=context, start_parameter_services=False)
+        node = Node(
+            "bridge_env", namespace=namespace, context=context, start_parameter_services=False
+        )
         self._node = node
         types = {SCAN: LaserScan, ODOM: Odometry, TRUTH: Odometry}
         for topic in self._topics:
-            node.create_subscription(types[topic], topic, _putter(self._mail, topic), qos.SENSOR_RELIABLE)
+            node.create_subscription(
+                types[topic], topic, _putter(self._mail, topic), qos.SENSOR_RELIABLE
+            )
         self._commands = node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
         self._reset = node.create_client(Trigger, f"{simulator}/reset")
         self._parameters = node.create_client(
             SetParametersAtomically, f"{simulator}/set_parameters_atomically"
         )
-        thread = threading.Thread(target=_spin, args=(context, node), daemon=True, name="dds_backend")
+        thread = threading.Thread(
+            target=_spin, args=(context, node), daemon=True, name="dds_backend"
+        )
         thread.start()
         self._closing = weakref.finalize(self, _shut_down, context, node, self._commands, thread)
         self._wait_for_peers()
 
     def _wait_for_peers(self) -> None:
-        """Waits until every end of the graph is matched. Raises BackendError with what is missing."""
+        """Waits until every end is matched. Raises BackendError with what is missing."""
         resolve = self._node.resolve_topic_name
         needed: dict[str, Callable[[], bool]] = {
-            f"a subscriber of {resolve('cmd_vel')}": lambda: self._commands.get_subscription_count() > 0,
+            f"a subscriber of {resolve('cmd_vel')}": lambda: (
+                self._commands.get_subscription_count() > 0
+            ),
             **{
                 f"a publisher of {resolve(topic)}": lambda topic=topic: (  # type: ignore[misc]
                     self._node.count_publishers(resolve(topic)) > 0
@@ -137,8 +145,9 @@ class DdsBackend:
         while missing := [name for name, there in needed.items() if not there()]:
             if time.monotonic() > deadline:
                 raise BackendError(
-                    f"after {self._timeout_s:g} s there is still no {' and no '.join(missing)}; start "
-                    "`simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and namespace."
+                    f"after {self._timeout_s:g} s there is still no {' and no '.join(missing)}; "
+                    "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and "
+                    "namespace."
                 )
             time.sleep(POLL_S)
 
@@ -166,8 +175,8 @@ class DdsBackend:
         for key, mine in self._identity.items():
             if answer.get(key) != mine:
                 raise ModelError(
-                    f"the simulator runs the {key} {answer.get(key)!r}, this env {mine!r}; start both "
-                    f"with the same {key}."
+                    f"the simulator runs the {key} {answer.get(key)!r}, this env {mine!r}; start "
+                    f"both with the same {key}."
                 )
 
     def _call(self, client: Any, request: Any) -> Any:
@@ -184,7 +193,7 @@ class DdsBackend:
         return future.result()
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
-        """Publishes a command and waits for the data of the next period; see `interface.Backend`."""
+        """Publishes a command and waits for the data after it; see `interface.Backend`."""
         twist = self._robot.to_cmd_vel(command)
         self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
         self._commands.publish(conversions.twist_to_ros(twist))
@@ -196,10 +205,10 @@ class DdsBackend:
         now = self._now_ns
         messages = self._mail.wait(self._topics, now, self._timeout_s)
         for topic in self._topics:
-            stamp = conversions.stamp_from_ros(messages[topic].header.stamp)
-            if stamp != now:
+            off_ns = conversions.stamp_from_ros(messages[topic].header.stamp) - now
+            if off_ns != 0:
                 raise BackendError(
-                    f"topic {topic!r}: stamped {(stamp - now) / conversions.NANO:+.3f} s off the step; is "
+                    f"topic {topic!r}: stamped {off_ns / conversions.NANO:+.3f} s off the step; is "
                     "somebody else publishing cmd_vel, or the simulator not in lock-step?"
                 )
         arrival = time.monotonic_ns()

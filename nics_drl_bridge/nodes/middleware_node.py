@@ -40,7 +40,10 @@ class MiddlewareNode(Node):
     def _publish(self, stamp_ns: int) -> None:
         view = self._topics.middleware.view(stamp_ns)
         covariance = self._topics.middleware.estimator.covariance
-        frames = (str(self.get_parameter("map_frame").value), str(self.get_parameter("base_frame").value))
+        frames = (
+            str(self.get_parameter("map_frame").value),
+            str(self.get_parameter("base_frame").value),
+        )
         variance = (max(covariance[0, 0], covariance[1, 1]), covariance[2, 2], 1e-4, 1e-4)
         self._filtered.publish(
             conversions.odometry_to_ros(view.pose, view.twist, stamp_ns, frames, variance)

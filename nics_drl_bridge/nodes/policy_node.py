@@ -34,7 +34,9 @@ class PolicyNode(Node):
         declare(self, "model", "ackermann", "Folder of a SimulatorModel, or a shipped robot.")
         declare(self, "policy", "go_to_goal", "Name of a policy.")
         declare(self, "base_frame", "base_link", "Frame id of the robot.")
-        goal = declare(self, "goal", [float("nan")] * 2, "x, y in map [m]; NaN waits for goal_pose.")
+        goal = declare(
+            self, "goal", [float("nan")] * 2, "x, y in map [m]; NaN waits for goal_pose."
+        )
         if len(goal) != 2:
             raise ConfigError(f"parameter 'goal': must be [x, y], not {list(goal)}")
         model = open_model(str(self.get_parameter("model").value))

@@ -93,8 +93,8 @@ class NodeProcess:
         if code is not None:
             lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             raise BackendError(
-                f"{self.node} ended with code {code}: {' | '.join(lines[-LOG_LINES:]) or 'no output'} "
-                f"(its log is {self.log})."
+                f"{self.node} ended with code {code}: "
+                f"{' | '.join(lines[-LOG_LINES:]) or 'no output'} (its log is {self.log})."
             )
 
     def close(self) -> int:

@@ -69,10 +69,10 @@ def declare(node: Node, name: str, default: Any, description: str, **limits: Any
         description: for `ros2 param describe`.
         limits: `low` and `high` of a floating-point parameter, `read_only`.
     """
-    descriptor = ParameterDescriptor(description=description, read_only=limits.get("read_only", False))
+    descriptor = ParameterDescriptor(
+        description=description, read_only=limits.get("read_only", False)
+    )
     if "low" in limits:
         span = FloatingPointRange(from_value=limits["low"], to_value=limits["high"])
         descriptor.floating_point_range = [span]
     return node.declare_parameter(name, default, descriptor).value
-
-

@@ -57,6 +57,7 @@ class SimulatorNode(Node):
         self._now_ns = time.time_ns() // self._period_ns * self._period_ns
         self._command, self._command_ns = np.zeros(len(model.robot.command)), 0
         self._paused = False
+        self._simulator.step(self._command[None, None])  # compiled before anybody waits for it
         self._open_topics()
         self._begin()
 
@@ -65,13 +66,22 @@ class SimulatorNode(Node):
         declare(self, "world", "arena", "World file, or the name of a shipped world.")
         declare(self, "renderer", "baked", "Lidar: baked or exact.")
         declare(self, "mode", "realtime", f"How time runs: {', '.join(MODES)}.")
-        declare(self, "rate", 1.0, "Simulated seconds per second in realtime.", low=0.01, high=1000.0)
+        declare(
+            self, "rate", 1.0, "Simulated seconds per second in realtime.", low=0.01, high=1000.0
+        )
         declare(self, "command_timeout", 0.5, "Stops after this silence [s].", low=0.0, high=3600.0)
-        for frame, default in (("map", "map"), ("odom", "odom"), ("base", "base_link"), ("laser", "laser")):
+        for frame, default in (
+            ("map", "map"),
+            ("odom", "odom"),
+            ("base", "base_link"),
+            ("laser", "laser"),
+        ):
             declare(self, f"{frame}_frame", default, f"Frame id of {default}.")
         declare(self, "episode_seed", 0, "Seed of the episode that ~/reset begins.")
         declare(self, "episode_start", [0.0, 0.0, 0.0], "Start x, y, heading of that episode.")
-        declare(self, "episode_start_given", False, "Whether episode_start holds, or the seed's own.")
+        declare(
+            self, "episode_start_given", False, "Whether episode_start holds, or the seed's own."
+        )
         self.add_on_set_parameters_callback(self._check_parameters)
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
@@ -80,10 +90,13 @@ class SimulatorNode(Node):
                 values = np.array(parameter.value, dtype=np.float64)
                 if values.shape != (3,) or not np.isfinite(values).all():
                     return SetParametersResult(
-                        successful=False, reason="episode_start must be three finite numbers: x, y, heading."
+                        successful=False,
+                        reason="episode_start must be three finite numbers: x, y, heading.",
                     )
             if parameter.name == "episode_seed" and parameter.value < 0:
-                return SetParametersResult(successful=False, reason="episode_seed must be 0 or more.")
+                return SetParametersResult(
+                    successful=False, reason="episode_seed must be 0 or more."
+                )
         return SetParametersResult(successful=True)
 
     def _text(self, name: str) -> str:
@@ -92,7 +105,9 @@ class SimulatorNode(Node):
     def _choice(self, name: str, valid: tuple[str, ...]) -> str:
         value = self._text(name)
         if value not in valid:
-            raise ConfigError(f"parameter {name!r}: unknown value {value!r}; {nearest(value, valid)}")
+            raise ConfigError(
+                f"parameter {name!r}: unknown value {value!r}; {nearest(value, valid)}"
+            )
         return value
 
     def _open_topics(self) -> None:
@@ -166,8 +181,12 @@ class SimulatorNode(Node):
         variance = (linear * drift, angular * drift, linear, angular)
         pose, twist = data.odom[0, 0], data.twist[0, 0]
         self._clock_topic.publish(Clock(clock=conversions.stamp_to_ros(now)))
-        self._odom_topic.publish(conversions.odometry_to_ros(pose, twist, now, (odom_frame, base), variance))
-        self._scan_topic.publish(conversions.scan_to_ros(self._model.lidar, data.ranges[0, 0], now, laser))
+        self._odom_topic.publish(
+            conversions.odometry_to_ros(pose, twist, now, (odom_frame, base), variance)
+        )
+        self._scan_topic.publish(
+            conversions.scan_to_ros(self._model.lidar, data.ranges[0, 0], now, laser)
+        )
         self._truth_topic.publish(
             conversions.odometry_to_ros(data.pose[0, 0], twist, now, (map_frame, base), (0.0,) * 4)
         )

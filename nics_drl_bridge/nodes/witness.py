@@ -56,6 +56,11 @@ class Witness:
         with self._changed:
             return np.array(self._poses).reshape(-1, 3)
 
+    def sees(self, timeout_s: float) -> bool:
+        """Waits for a first pose; False after the time."""
+        with self._changed:
+            return self._changed.wait_for(lambda: bool(self._poses), timeout_s)
+
     def arrives(self, goal: ArrayLike, radius: float, timeout_s: float) -> bool:
         """Waits until the robot has been within `radius` of a goal (2,); False after the time."""
         deadline = time.monotonic() + timeout_s

@@ -83,12 +83,14 @@ class GoToGoal:
         hits = (mount + share[:, None] * self.task.lidar.range_max * directions)[share < 1.0]
         if not len(hits):
             return np.full(len(points), points.shape[1])
-        squared = (points[:, :, None, 0] - hits[:, 0]) ** 2 + (points[:, :, None, 1] - hits[:, 1]) ** 2
+        squared = (points[:, :, None, 0] - hits[:, 0]) ** 2 + (
+            points[:, :, None, 1] - hits[:, 1]
+        ) ** 2
         room = self.task.robot.footprint_radius + self.margin
         # Already nearer than that? Then a path has to lead away; none would start free.
         limit = min(room * room, 0.98 * float((hits**2).sum(axis=-1).min()))
         close = squared.min(axis=-1) < limit
-        return np.where(close.any(axis=1), close.argmax(axis=1), points.shape[1])
+        return np.asarray(np.where(close.any(axis=1), close.argmax(axis=1), points.shape[1]))
 
     def _action(self, curvature: float, free: float) -> NDArray[np.float32]:
         """Speed and turn for an arc, scaled to [-1, 1] in the robot's own commands."""

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from html import escape
 
 STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 64rem; padding: 0 1rem;
-  color: #222; background: #fff }
+body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 64rem;
+  padding: 0 1rem; color: #222; background: #fff }
 h1 { margin-bottom: 0 } h2 { margin-top: 2.2rem; border-bottom: 1px solid #ddd }
-table { border-collapse: collapse; margin: 1rem 0 } th, td { padding: .3rem .9rem; text-align: right;
+table { border-collapse: collapse; margin: 1rem 0 }
+th, td { padding: .3rem .9rem; text-align: right;
   border-bottom: 1px solid #e5e5e5 } th:first-child, td:first-child { text-align: left }
-pre { background: #f6f7f9; padding: 1rem; overflow-x: auto; font-size: 14px } img { max-width: 100% }
+pre { background: #f6f7f9; padding: 1rem; overflow-x: auto; font-size: 14px }
+img { max-width: 100% }
 .lead { color: #555; font-size: 1.1rem }
 """
 

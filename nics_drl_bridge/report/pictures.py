@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
 from nics_drl_bridge.policy.evaluation import Episode
 
-LINES = (
+LINES: tuple[dict[str, Any], ...] = (
     {"color": "#1f6fb2", "linewidth": 3.5, "alpha": 0.55},
     {"color": "#d1495b", "linewidth": 1.4, "linestyle": "--"},
     {"color": "#2f855a", "linewidth": 1.4, "linestyle": ":"},
 )
+LEAST_WIDTH = 5.5
 
 
 def trajectories(
@@ -38,7 +39,9 @@ def trajectories(
     count = max(len(episodes) for episodes in runs.values())
     columns = min(count, 3)
     rows = -(-count // columns)
-    figure = Figure(figsize=(4.2 * columns, 4.2 * rows + 0.5), layout="constrained")
+    figure = Figure(
+        figsize=(max(4.2 * columns, LEAST_WIDTH), 4.2 * rows + 0.5), layout="constrained"
+    )
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, *episodes in zip(grid, *runs.values(), strict=False):
         _panel(axes, dict(zip(names, episodes, strict=True)), walls, footprint)
@@ -58,7 +61,9 @@ def _panel(
     for x, y, radius in first.circles:
         axes.add_patch(Circle((x, y), radius, color="#8d99ae"))
     axes.add_patch(Circle(tuple(first.goal), 0.3, color="#f2c14e", alpha=0.7, label="goal"))
-    axes.add_patch(Circle(tuple(first.path[0, :2]), footprint, fill=False, color="#333333", label="start"))
+    axes.add_patch(
+        Circle(tuple(first.path[0, :2]), footprint, fill=False, color="#333333", label="start")
+    )
     for line, (name, episode) in zip(LINES, episodes.items(), strict=False):
         axes.plot(episode.path[:, 0], episode.path[:, 1], label=name, **line)
     results = ", ".join(dict.fromkeys(episode.result for episode in episodes.values()))
@@ -70,5 +75,5 @@ def _panel(
 
 def _png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)
+    figure.savefig(buffer, format="png")
     return buffer.getvalue()

@@ -71,6 +71,7 @@ def decide(now_s: float, request: Request | None, limits: Limits) -> Decision:
     age = now_s - request.scan_arrival_s
     if not 0.0 <= age <= limits.scan_age_s:
         return Decision(
-            np.zeros(3), f"the scan behind cmd_vel_raw is {age:.3f} s old, the limit is {limits.scan_age_s} s"
+            np.zeros(3),
+            f"the scan behind cmd_vel_raw is {age:.3f} s old, the limit is {limits.scan_age_s} s",
         )
     return Decision(np.clip(request.twist, limits.low, limits.high))

@@ -109,16 +109,15 @@ def scan_robot(ranges, pose, me, bodies, walls, sensor, noise_std, seed, counter
 
     Args:
         me: row of the robot in `bodies`.
-        sensor: mount, directions, beams, limits, baked, lookup; see `lidar.kernels.scan`.
+        sensor: see `lidar.scanner.Scanner.arguments`.
         noise_std: of a range [m].
     """
-    mount, directions, beams, limits, baked, lookup = sensor
     own = bodies[me, 2]
     bodies[me, 2] = 0.0
-    lidar.scan(ranges, pose, mount, directions, beams, limits, bodies, walls, baked, lookup)
+    lidar.scan(ranges, pose, bodies, walls, sensor)
     bodies[me, 2] = own
     if noise_std > 0.0:
-        count = ranges.shape[0]
+        count, limits = ranges.shape[0], sensor[3]
         for i in range(count):
             if np.isfinite(ranges[i]):
                 draw = random.normal(seed, RANGE_STREAM, counter * count + i)
@@ -147,7 +146,8 @@ def step_worlds(arrays, commands, walls, terms, timing, footprint, noise, sensor
                 history[n, m, h] = history[n, m, h - 1]
             history[n, m, 0] = commands[n, m]
         move_world(
-            pose[n], state[n], history[n], bodies[n], walls, collided[n], terms, timing, footprint, x, dq
+            pose[n], state[n], history[n], bodies[n], walls, collided[n],
+            terms, timing, footprint, x, dq,
         )  # fmt: skip
         steps[n] += 1
         for m in range(robots):
@@ -157,7 +157,8 @@ def step_worlds(arrays, commands, walls, terms, timing, footprint, noise, sensor
             period = timing[0] * timing[1]
             measure(odom[n, m], twist[n, m], before, pose[n, m], dq, seeds[n], counter, std, period)
             scan_robot(
-                ranges[n, m], pose[n, m], first + m, bodies[n], walls, sensor, noise[2], seeds[n], counter
+                ranges[n, m], pose[n, m], first + m, bodies[n], walls, sensor,
+                noise[2], seeds[n], counter,
             )  # fmt: skip
 
 

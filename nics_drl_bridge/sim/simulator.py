@@ -68,7 +68,9 @@ class FastSimulator:
         renderer: Renderer = "baked",
     ) -> None:
         if worlds < 1 or robots < 1:
-            raise ConfigError(f"a simulator needs at least 1 world and 1 robot, not {worlds} and {robots}.")
+            raise ConfigError(
+                f"a simulator needs at least 1 world and 1 robot, not {worlds} and {robots}."
+            )
         self.model, self.world = model, world
         self.goals: Array = np.zeros((worlds, robots, 2))
         footprint = model.robot.footprint_radius
@@ -78,7 +80,7 @@ class FastSimulator:
         self._timing = model.timing
         self._terms = term_arrays(model.kinematics)
         self._noise = np.array([*model.noise.odometry, model.lidar.noise_std])
-        self._sensor = (*self._scanner.arguments, renderer == "baked", self._scanner.table.lookup)
+        self._sensor = self._scanner.arguments
         self._scratch = scratch(model.kinematics)
         self.data = self._allocate(worlds, robots)
         self._fields: tuple[Any, ...] = tuple(vars(self.data).values())
@@ -102,7 +104,10 @@ class FastSimulator:
         )
 
     def reset(
-        self, seeds: Sequence[int], worlds: Sequence[int] | None = None, starts: ArrayLike | None = None
+        self,
+        seeds: Sequence[int],
+        worlds: Sequence[int] | None = None,
+        starts: ArrayLike | None = None,
     ) -> list[Scene]:
         """Begins episodes.
 

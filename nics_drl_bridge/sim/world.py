@@ -112,9 +112,9 @@ def sample_scene(world: World, footprint: float, seed: int, robots: int = 1) -> 
     radii = np.array(world.obstacles.radii)
     if not _draw(seed, half, space, radii, world.all_walls(), circles, starts, goals):
         raise ConfigError(
-            f"world {world.name!r}: no free place for {world.obstacles.count} obstacles, a start and "
-            f"a goal of a robot of radius {footprint} m on {world.size[0]} x {world.size[1]} m; "
-            "enlarge `size`, or lower `obstacles.count`, `obstacles.gap` or `clearance`."
+            f"world {world.name!r}: no free place for {world.obstacles.count} obstacles, a start "
+            f"and a goal of a robot of radius {footprint} m on {world.size[0]} x {world.size[1]} "
+            "m; enlarge `size`, or lower `obstacles.count`, `obstacles.gap` or `clearance`."
         )
     return Scene(circles, starts, goals)
 
@@ -152,7 +152,9 @@ def _draw(seed, half, space, radii, walls, circles, starts, goals):  # type: ign
     for _ in range(RESTARTS):
         counter, placed = _place_circles(seed, counter, half, space, radii, walls, circles)
         if placed:
-            counter, placed = _place_robots(seed, counter, half, space, walls, circles, starts, goals)
+            counter, placed = _place_robots(
+                seed, counter, half, space, walls, circles, starts, goals
+            )
         if placed:
             return True
     return False
@@ -198,7 +200,10 @@ def _place_robots(seed, counter, half, space, walls, circles, starts, goals):  #
             distance = np.hypot(gx - x, gy - y)
             if not space[2] <= distance <= space[3]:
                 continue
-            if not (_free(x, y, room, circles, count, walls) and _free(gx, gy, room, circles, count, walls)):
+            if not (
+                _free(x, y, room, circles, count, walls)
+                and _free(gx, gy, room, circles, count, walls)
+            ):
                 continue
             apart = True
             for other in range(m):

@@ -11,6 +11,9 @@ from nics_drl_bridge.kinematics.recording import Recording, Stream
 from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.kinematics.textbook import record
 
+TICKS_PER_METRE = 70.0
+TRACK = 0.16
+
 
 def drive(
     spec: RobotSpec,
@@ -27,24 +30,51 @@ def drive(
     """A random drive.
 
     Args:
+        spec: the robot.
+        seed: of commands and noise.
+        duration: [s].
         latency: from a command's stamp to its effect [s].
         pose_clock_ahead: what the pose's clock shows more than the commands' [s].
         rotation: heading of base_link less that of the tracked body [rad].
         lever: the tracked point seen from base_link [m].
         noise: of position [m] and heading [rad].
         burst: period of the bursts in which poses arrive [s]; 0 for none.
+        measured_state: whether the state is in the recording.
     """
     rng = np.random.default_rng(seed)
     clean = record(spec, rng, duration)
     tracked = geometry.compose(clean.pose.values, np.array([*lever, -rotation]))
-    tracked = tracked + rng.normal(0.0, 1.0, tracked.shape) * np.array([noise[0], noise[0], noise[1]])
+    tracked = tracked + rng.normal(0.0, 1.0, tracked.shape) * np.array([*noise[:1], *noise])
     t = clean.pose.t
-    arrival = np.ceil(t / max(burst, 1e-9) - 1e-6) * burst
-    stamps = t if burst == 0.0 else arrival + (arrival - t) * -1e-3 + 1e-3 * burst
-    different = pose_clock_ahead != 0.0
+    arrival = t if burst == 0.0 else in_bursts(t, burst)
+    clock = "mocap" if pose_clock_ahead != 0.0 else "robot"
     return Recording(
         command=replace(clean.command, t=t - latency),
-        pose=Stream(stamps + pose_clock_ahead, tracked, "mocap" if different else "robot"),
+        pose=Stream(arrival + pose_clock_ahead, tracked, clock),
         state=clean.state if measured_state else None,
         source="disturbed drive",
     )
+
+
+def in_bursts(t: np.ndarray, period: float) -> np.ndarray:
+    """Arrival stamps of samples that are handed over every `period`, 0.1 ms apart or less."""
+    polled = np.ceil(t / period - 1e-6) * period
+    return polled + 1e-3 * (t - (polled - period))
+
+
+def with_wheels(recording: Recording, truth: Recording, swapped: bool) -> Recording:
+    """Adds wheel encoders of a car, counts per tick, on the robot's clock."""
+    state = truth.state
+    assert state is not None
+    speed, turn = state.values[:, 0], state.values[:, 0] * np.tan(state.values[:, 1]) / 0.2
+    left = np.round(TICKS_PER_METRE * (speed - turn * TRACK / 2.0))
+    right = np.round(TICKS_PER_METRE * (speed + turn * TRACK / 2.0))
+    both = np.stack([right, left] if swapped else [left, right], axis=1)
+    return replace(recording, wheels=Stream(state.t[::2], both[::2], "robot"))
+
+
+def without(recording: Recording, start: float, end: float) -> Recording:
+    """Loses the poses between two times."""
+    pose = recording.pose
+    keep = (pose.t < start) | (pose.t > end)
+    return replace(recording, pose=replace(pose, t=pose.t[keep], values=pose.values[keep]))
