@@ -216,7 +216,7 @@ def _report(
     rows = [
         (
             str(a.seed), a.result, f"{a.steps}", f"{a.length:.2f}", b.result, f"{b.steps}",
-            f"{b.length:.2f}", f"{deviation(a, b):.1e}",
+            f"{b.length:.2f}", f"{deviation(a, b):.1g}",
         )
         for a, b in zip(here, there, strict=True)
     ]  # fmt: skip
@@ -244,7 +244,8 @@ def _report(
             "Deployed",
             [
                 "simulator_node in real time, middleware_node, policy_node and command_gate ran as "
-                "processes of their own; nobody stepped them.",
+                "processes of their own; nobody stepped them. The robot "
+                f"{'reached' if live.arrived else 'did not reach'} its goal.",
                 Picture(
                     trajectories(
                         {"in process": here[:1], "deployed": [live.path]}, walls, footprint

@@ -58,7 +58,7 @@ def timing_of(recording: Recording, spec: RobotSpec, twists: Motion) -> Timing:
         offset = float(start) if abs(start) > 60.0 else 0.0
         return Timing(offset, 0.0, {}, nominal_lags(spec), nothing, False)
     target = (twists.start, twists.end, twists.twist)
-    center = _overlap_shift(recording)
+    centers = _likely_shifts(recording)
     if recording.pose.clock == recording.command.clock:
         delay = delay_of_response(recording.command, spec, target)
         latency = if_certain(max(delay.value, 0.0), delay.sigma, MIN_TIME_S)
@@ -66,7 +66,7 @@ def timing_of(recording: Recording, spec: RobotSpec, twists: Motion) -> Timing:
         return Timing(0.0, latency, sigma, delay.lags, delay.lag_sigma, True)
     wheels = _wheel_delay(recording, spec)
     delay = delay_of_response(
-        recording.command, spec, target, center, None if wheels is None else wheels.lags
+        recording.command, spec, target, centers, None if wheels is None else wheels.lags
     )
     if wheels is None:
         sigma = {"clock_offset_s": delay.sigma}
@@ -91,18 +91,16 @@ def _timing_of_measured_state(
     offset = 0.0
     if recording.pose.clock != state.clock:
         target = (twists.start, twists.end, twists.twist)
-        delay = delay_of_pose(state, target, _overlap_shift(recording))
+        delay = delay_of_pose(state, target, _likely_shifts(recording))
         sigma["clock_offset_s"] = delay.sigma
         offset = -if_certain(delay.value, delay.sigma, MIN_TIME_S)
     nothing = np.zeros(0)
     return Timing(offset, latency, sigma, nothing, nothing, found is not None)
 
 
-def _overlap_shift(recording: Recording) -> float:
-    """Where to search for the delay of the pose's clock: zero, unless the clocks don't overlap."""
-    pose, command = recording.pose.t, recording.command.t
-    common = min(pose[-1], command[-1]) - max(pose[0], command[0])
-    return 0.0 if common > 0.5 * np.ptp(pose) else float(pose[0] - command[0])
+def _likely_shifts(recording: Recording) -> tuple[float, ...]:
+    """Where to search for the delay of the pose's clock: no shift, or a common start."""
+    return 0.0, float(recording.pose.t[0] - recording.command.t[0])
 
 
 def _wheel_delay(recording: Recording, spec: RobotSpec) -> Delay | None:

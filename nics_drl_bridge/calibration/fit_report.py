@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from textwrap import fill
+
 from nics_drl_bridge.calibration.identify import Identified
 from nics_drl_bridge.calibration.open_loop import OpenLoop
 from nics_drl_bridge.kinematics.spec import RobotSpec
+
+WIDTH = 96
 
 
 def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
@@ -30,9 +34,13 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
         *_open_loop(identified.held_out),
         "",
         "Found, and not learnt:",
-        *(f"  - {note}" for note in identified.notes or ("Nothing had to be corrected.",)),
+        *(_item(note) for note in identified.notes or ("Nothing had to be corrected.",)),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _item(note: str) -> str:
+    return fill(note, WIDTH, initial_indent="  - ", subsequent_indent="    ")
 
 
 def _errors(identified: Identified) -> list[str]:

@@ -13,10 +13,11 @@ from nics_drl_bridge.calibration.calibration import Calibration
 from nics_drl_bridge.calibration.open_loop import HORIZON_S, OpenLoop, open_loop_error, windows
 from nics_drl_bridge.calibration.refine import refine, simplify
 from nics_drl_bridge.calibration.report import sentences
+from nics_drl_bridge.calibration.timing import SEARCH_S
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.kinematics.fit import ALPHA, ORDER, Fit, fit
 from nics_drl_bridge.kinematics.model import TaylorModel
-from nics_drl_bridge.kinematics.recording import Recording, Samples, Stream
+from nics_drl_bridge.kinematics.recording import Recording, Samples, Stream, check
 from nics_drl_bridge.kinematics.spec import RobotSpec
 
 TRAIN_SHARE = 2.0 / 3.0
@@ -71,7 +72,8 @@ def identify(
         RecordingError: the recording can't be used for this robot.
         FitError: the drive does not hold enough to fit a model.
     """
-    duration = float(recording.pose.t[-1] - recording.pose.t[0]) if len(recording.pose.t) else 0.0
+    check(recording, spec)
+    duration = float(recording.pose.t[-1] - recording.pose.t[0])
     until = TRAIN_SHARE * duration if train_until is None else train_until
     training = cut(recording, until)
     calibration, findings = examine(training, spec)
@@ -88,15 +90,17 @@ def identify(
 
 
 def cut(recording: Recording, until: float) -> Recording:
-    """The part of a recording up to `until` seconds after the first stamp of each clock."""
-    origin: dict[str, float] = {}
-    for stream in recording.streams.values():
-        if len(stream.t):
-            first = float(stream.t[0])
-            origin[stream.clock] = min(first, origin.get(stream.clock, first))
+    """The part of a recording up to `until` seconds after its first pose.
 
-    def part(stream: Stream) -> Stream:
-        keep = ~(stream.t > origin.get(stream.clock, 0.0) + until)
+    The other streams end at about that time: how far the clocks are apart is not known yet.
+    Commands last a little longer, since no pose can be learnt from them.
+    """
+    pose = recording.pose.t
+
+    def part(stream: Stream, margin: float = 0.0) -> Stream:
+        overlap = stream.t[0] < pose[-1] and stream.t[-1] > pose[0]
+        origin = max(stream.t[0], pose[0]) if overlap else stream.t[0]
+        keep = stream.t <= origin + until + margin
         return replace(stream, t=stream.t[keep], values=stream.values[keep])
 
     if not until > 0.0:
@@ -105,7 +109,7 @@ def cut(recording: Recording, until: float) -> Recording:
         )
     return replace(
         recording,
-        command=part(recording.command),
+        command=part(recording.command, SEARCH_S),
         pose=part(recording.pose),
         state=part(recording.state) if recording.state else None,
         wheels=part(recording.wheels) if recording.wheels else None,

@@ -10,12 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.calibration.calibration import Calibration, Response
 from nics_drl_bridge.calibration.open_loop import Windows, predict, windows
-from nics_drl_bridge.calibration.timing import uncertainty
+from nics_drl_bridge.calibration.timing import minimise, uncertainty
 from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec
@@ -30,6 +29,7 @@ HEADING_ARM_M = 0.3
 WORTH = 0.1
 """A term whose loss raises the error by less than this share is left out."""
 DIVERGED = 1e3
+LEAST_SCALE = 0.05
 
 
 @dataclass(frozen=True)
@@ -93,18 +93,14 @@ def refine(
         "rotation_rad" in calibration.uncertainty and not calibration.is_exact,
     )
     theta = _pack(problem, model, calibration)
-    found = least_squares(
-        lambda value: _residual(problem, model, calibration, value),
-        theta,
-        x_scale=np.maximum(np.abs(theta), 0.05),
-        diff_step=1e-5,
-        xtol=1e-7,
-        ftol=1e-7,
-        max_nfev=30,
+    scale = np.maximum(np.abs(theta), LEAST_SCALE)
+    scale[int(problem.free.sum()) :] = LEAST_SCALE  # s, rad
+    theta, jacobian, rest = minimise(
+        lambda value: _residual(problem, model, calibration, value), theta, scale
     )
-    sigma = uncertainty(found.jac, np.asarray(found.fun))
-    model, calibration = _unpack(problem, model, calibration, np.asarray(found.x), sigma)
-    return Refined(model, calibration, float(np.sqrt(np.mean(found.fun**2))))
+    sigma = uncertainty(jacobian, rest)
+    refined = _unpack(problem, model, calibration, theta, sigma)
+    return Refined(*refined, float(np.sqrt(np.mean(rest**2))))
 
 
 def simplify(

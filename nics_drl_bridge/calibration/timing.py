@@ -23,11 +23,14 @@ Array = NDArray[np.float64]
 
 STEP_S = 0.01
 STEPS_S = (0.05, 0.005, 0.0005)
-SEARCH_S = 3.0
+SEARCH_S = 5.0
 DEFAULT_LAG_S = 0.1
 LAG_RANGE_S = (0.005, 2.0)
 MAX_ROWS = 2000
 EXACT = 1e-6
+DIFFERENCE = 1e-4
+TOLERANCE = 1e-7
+MAX_STEPS = 40
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,7 @@ def delay_of_response(
     command: Stream,
     spec: RobotSpec,
     target: tuple[Array, Array, Array],
-    center: float = 0.0,
+    centers: tuple[float, ...] = (0.0,),
     lags: Array | None = None,
 ) -> Delay:
     """The delay and the lags with which a signal follows the commands.
@@ -92,14 +95,14 @@ def delay_of_response(
         command: the commands.
         spec: whose state variables all follow a command.
         target: start (n,), end (n,) of intervals and the signal's mean (n, K) over each.
-        center: of the search for the delay [s].
+        centers: around which to search for the delay [s].
         lags: (S,) known time constants; None to estimate those that the drive shows.
     """
     start, end, signal = target
     moved = moved_commands(command)[followed(spec)] if spec.state else moved_commands(command)
     powers = features.exponents(len(moved), 2)
     powers = powers[(powers[:, ~moved] == 0).all(axis=1)]
-    first = min(start.min(), command.t[0] + center - SEARCH_S) - 1.0
+    first = min(start.min(), command.t[0] + min(centers) - SEARCH_S) - 1.0
     grid = np.arange(first, end.max() + STEP_S, STEP_S)
     free = np.flatnonzero(moved[: len(spec.state)]) if lags is None else np.zeros(0, dtype=np.intp)
     base = nominal_lags(spec) if lags is None else lags
@@ -115,7 +118,7 @@ def delay_of_response(
         chi = features.evaluate(signals(tau, theta[0]), powers)
         return unexplained(interval_means(grid, chi, start, end), signal)
 
-    theta, sigma, explained = _search(residual, center, np.log(base[free]))
+    theta, sigma, explained = _search(residual, centers, np.log(base[free]))
     found, spread = base.copy(), np.full(len(base), np.nan)
     found[free] = np.exp(theta[1:])
     spread[free] = sigma[1:] * found[free]
@@ -130,7 +133,8 @@ def latency_of_state(command: Stream, state: Stream, spec: RobotSpec) -> Delay |
     if not moved_commands(command).any():
         return None
     keep = np.flatnonzero(np.diff(state.t) > 0.0)
-    keep = keep[:: -(-len(keep) // MAX_ROWS)]
+    if len(keep) > MAX_ROWS:  # by the golden section: no stride that commands could share
+        keep = keep[np.unique((np.arange(MAX_ROWS) * 0.6180339887 % 1.0 * len(keep)).astype(int))]
     start, end = state.t[keep], state.t[keep + 1]
     rates = (state.values[keep + 1] - state.values[keep]) / (end - start)[:, None]
     middle = (state.values[keep + 1] + state.values[keep]) / 2.0
@@ -142,7 +146,9 @@ def latency_of_state(command: Stream, state: Stream, spec: RobotSpec) -> Delay |
     return _search_or_zero(residual)
 
 
-def delay_of_pose(state: Stream, target: tuple[Array, Array, Array], center: float) -> Delay:
+def delay_of_pose(
+    state: Stream, target: tuple[Array, Array, Array], centers: tuple[float, ...]
+) -> Delay:
     """The delay of the pose's clock behind that of a measured state."""
     start, end, signal = target
     chi = features.evaluate(state.values, features.exponents(state.values.shape[1], 2))
@@ -151,7 +157,7 @@ def delay_of_pose(state: Stream, target: tuple[Array, Array, Array], center: flo
         means = interval_means(state.t, chi, start - theta[0], end - theta[0])
         return unexplained(means, signal)
 
-    return _search_or_zero(residual, center)
+    return _search_or_zero(residual, centers)
 
 
 def unexplained(chi: Array, signal: Array) -> Array:
@@ -167,37 +173,62 @@ def unexplained(chi: Array, signal: Array) -> Array:
     return np.asarray(scaled - beta[0] - chi @ beta[1:]).ravel()
 
 
-def _search_or_zero(residual: Callable[[Array], Array], center: float = 0.0) -> Delay:
+def _search_or_zero(
+    residual: Callable[[Array], Array], centers: tuple[float, ...] = (0.0,)
+) -> Delay:
     nothing = np.zeros(0)
-    if center == 0.0 and np.sqrt((residual(np.zeros(1)) ** 2).mean()) < EXACT:
+    if np.sqrt((residual(np.zeros(1)) ** 2).mean()) < EXACT:
         return Delay(0.0, 0.0, nothing, nothing, 1.0)
-    theta, sigma, explained = _search(residual, center, nothing)
+    theta, sigma, explained = _search(residual, centers, nothing)
     return Delay(float(theta[0]), float(sigma[0]), nothing, nothing, explained)
 
 
 def _search(
-    residual: Callable[[Array], Array], center: float, log_lags: Array
+    residual: Callable[[Array], Array], centers: tuple[float, ...], log_lags: Array
 ) -> tuple[Array, Array, float]:
     """Delay and log lags of least residual, their uncertainty, and the share explained."""
-    delay = center
+    around = np.array(centers)
     for reach, step in zip((SEARCH_S, *STEPS_S[:-1]), STEPS_S, strict=True):
-        tries = delay + np.arange(-reach, reach + step / 2.0, step)
+        tries = np.add.outer(around, np.arange(-reach, reach + step / 2.0, step)).ravel()
         cost = [float((residual(np.append(d, log_lags)) ** 2).sum()) for d in tries]
-        delay = float(tries[int(np.argmin(cost))])
-    start = np.append(delay, log_lags)
+        around = tries[[int(np.argmin(cost))]]
+    start = np.append(around, log_lags)
     low = np.append(start[0] - 0.5, np.full(len(log_lags), np.log(LAG_RANGE_S[0])))
     high = np.append(start[0] + 0.5, np.full(len(log_lags), np.log(LAG_RANGE_S[1])))
+    found, jacobian, rest = minimise(residual, start, np.full(len(start), 0.1), (low, high))
+    if float((rest**2).sum()) >= min(cost):
+        found, rest = start, residual(start)
+    return found, uncertainty(jacobian, rest), 1.0 - float((rest**2).mean())
+
+
+def minimise(
+    residual: Callable[[Array], Array],
+    start: Array,
+    scale: Array,
+    bounds: tuple[Array, Array] | None = None,
+) -> tuple[Array, Array, Array]:
+    """Least squares in steps of each parameter's own scale, however large its value is.
+
+    Args:
+        residual: of parameters (P,).
+        start: (P,).
+        scale: (P,) by which a parameter may be expected to move.
+        bounds: least and greatest parameters (P,).
+
+    Returns:
+        Parameters (P,), Jacobian (n, P) and residual (n,) there.
+    """
+    low, high = bounds or (np.full(len(start), -np.inf), np.full(len(start), np.inf))
     found = least_squares(
-        residual,
-        start,
-        bounds=(low, high),
-        diff_step=1e-4,
-        x_scale=np.full(len(start), 0.1),
-        max_nfev=40,
+        lambda z: residual(start + (z - 1.0) * scale),
+        np.ones(len(start)),
+        bounds=((low - start) / scale + 1.0, (high - start) / scale + 1.0),
+        diff_step=DIFFERENCE,
+        xtol=TOLERANCE,
+        ftol=TOLERANCE,
+        max_nfev=MAX_STEPS,
     )
-    best = np.asarray(found.x) if 2.0 * found.cost < min(cost) else start
-    rest = residual(best)
-    return best, uncertainty(found.jac, rest), 1.0 - float((rest**2).mean())
+    return start + (found.x - 1.0) * scale, found.jac / scale, np.asarray(found.fun)
 
 
 def uncertainty(jacobian: Array, residual: Array) -> Array:

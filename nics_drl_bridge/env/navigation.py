@@ -7,6 +7,7 @@ thousands in the vector simulator. Nothing here asks where the robot lives.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import gymnasium
 import numpy as np
@@ -106,15 +107,20 @@ class Navigation:
     def judge(self, view: RobotView, goal: ArrayLike) -> Verdict:
         """Whether robots are at their goals, and whether they touch something."""
         distance = np.linalg.norm(self._relative(view, goal), axis=-1)
+        # Comparing with NaN, which is unknown, is False; -inf, too close, is nearer than all.
+        touched = (view.ranges < self._contact_ranges).any(axis=-1)
+        return Verdict(np.asarray(distance < self.goal_radius), np.asarray(touched))
+
+    @cached_property
+    def _contact_ranges(self) -> NDArray[np.float32]:
+        """(B,) range at which each beam leaves the footprint and its margin [m]."""
         x, y, heading = self.lidar.mount
         angles = self.lidar.angles + heading
-        # No return and unknown are far away here; too close is at the lidar itself.
-        near = np.nan_to_num(view.ranges, nan=np.inf, posinf=np.inf, neginf=0.0)
-        near = np.minimum(near, self.lidar.range_max)
-        px, py = x + near * np.cos(angles), y + near * np.sin(angles)
         limit = self.robot.footprint_radius + self.contact_margin
-        touched = (px * px + py * py < limit * limit).any(axis=-1)
-        return Verdict(np.asarray(distance < self.goal_radius), np.asarray(touched))
+        along = x * np.cos(angles) + y * np.sin(angles)
+        rest = limit * limit - x * x - y * y + along * along
+        leaves = np.where(rest >= 0.0, np.sqrt(np.maximum(rest, 0.0)) - along, -np.inf)
+        return leaves.astype(np.float32)
 
     def reward(
         self, before: RobotView, after: RobotView, goal: ArrayLike, verdict: Verdict

