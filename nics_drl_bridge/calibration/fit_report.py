@@ -55,8 +55,8 @@ def _open_loop(held_out: OpenLoop | None) -> list[str]:
     if held_out is None:
         return ["  the drive is too short to hold data out"]
     return [
-        f"  after {held_out.horizon_s:g} s: position error {held_out.mean_position_error_m:.3g} m on "
-        f"average, {held_out.max_position_error_m:.3g} m at most,",
-        f"  heading error {held_out.mean_heading_error_rad:.3g} rad on average, over a mean path of "
-        f"{held_out.mean_path_m:.2f} m ({held_out.windows} windows)",
+        f"  after {held_out.horizon_s:g} s: position error {held_out.mean_position_error_m:.3g} m "
+        f"on average, {held_out.max_position_error_m:.3g} m at most,",
+        f"  heading error {held_out.mean_heading_error_rad:.3g} rad on average, over a mean path "
+        f"of {held_out.mean_path_m:.2f} m ({held_out.windows} windows)",
     ]

@@ -194,10 +194,4 @@ def _held_out(
             f"a prediction over {HORIZON_S:g} s: the model was not tried on unseen data; record "
             "20 s or more.",
         )  # fmt: skip
-    result = open_loop_error(model, calibration, recording, spec, until, duration)
-    return result, (
-        f"On the held-out last {duration - until:.1f} s, {result.windows} predictions over "
-        f"{HORIZON_S:g} s end {result.mean_position_error_m:.2g} m and "
-        f"{result.mean_heading_error_rad:.2g} rad from the truth on average, over a mean path of "
-        f"{result.mean_path_m:.2f} m.",
-    )  # fmt: skip
+    return open_loop_error(model, calibration, recording, spec, until, duration), ()

@@ -14,8 +14,8 @@ from nics_drl_bridge.calibration.calibration import Calibration
 from nics_drl_bridge.calibration.signals import held
 from nics_drl_bridge.calibration.timing import followed
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.kinematics.kernels import rollout
 from nics_drl_bridge.kinematics.model import TaylorModel
+from nics_drl_bridge.kinematics.motion import rollout, term_arrays
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec
 
@@ -150,8 +150,7 @@ def _by_one_rollout(
     command = held(recording.command, spec, begin, begin + model.dt)
     gains = np.array([r.gain for r in calibration.responses])
     state = gains * command[0, followed(spec)]
-    poses, _ = _roll(model, np.zeros((1, 3)), state[None], command[None])
-    path = poses[0, :-1]
+    path = _roll(model, state[None], command[None])[0, :-1]
     at = [np.stack([np.interp(t, grid, column) for column in path.T], axis=1) for t in (start, end)]
     return geometry.between(at[0], at[1])
 
@@ -169,28 +168,21 @@ def _by_windows(
     begin = start[:, None] + model.dt * np.arange(steps) - calibration.command_latency_s
     command = held(recording.command, spec, begin, begin + model.dt)
     state = states_at(recording, calibration, spec, start)
-    poses, _ = _roll(model, np.zeros((len(start), 3)), state, command)
+    poses = _roll(model, state, command)
     exact = (end - start) / model.dt
     step = np.floor(exact + 1e-6).astype(np.intp)
     share, row = np.clip(exact - step, 0.0, 1.0)[:, None], np.arange(len(start))
     return np.asarray((1.0 - share) * poses[row, step] + share * poses[row, step + 1])
 
 
-def _roll(model: TaylorModel, pose: Array, state: Array, command: Array) -> tuple[Array, Array]:
+def _roll(model: TaylorModel, state: Array, command: Array) -> Array:
+    """Poses (W, T + 1, 3) from the origin, under commands (W, T, C); headings are unwrapped."""
     count, steps = command.shape[:2]
-    poses = np.empty((count, steps + 1, 3))
-    states = np.empty((count, steps + 1, state.shape[1]))
-    rollout(
-        pose,
-        np.ascontiguousarray(state),
-        np.ascontiguousarray(command),
-        model.powers,
-        np.ascontiguousarray(model.coefficients),
-        model.dt,
-        poses,
-        states,
-    )
-    return poses, states
+    poses, states = np.zeros((count, steps + 1, 3)), np.empty((count, steps + 1, state.shape[1]))
+    states[:, 0] = state
+    rollout(poses, states, np.ascontiguousarray(command), term_arrays(model), model.dt)
+    poses[..., 2] = np.unwrap(poses[..., 2], axis=1)
+    return poses
 
 
 def open_loop_error(

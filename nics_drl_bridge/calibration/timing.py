@@ -22,6 +22,7 @@ from nics_drl_bridge.kinematics.spec import RobotSpec
 Array = NDArray[np.float64]
 
 STEP_S = 0.01
+LEAD_S = 2.0  # for the states to forget where they started
 STEPS_S = (0.05, 0.005, 0.0005)
 SEARCH_S = 5.0
 DEFAULT_LAG_S = 0.1
@@ -102,8 +103,7 @@ def delay_of_response(
     moved = moved_commands(command)[followed(spec)] if spec.state else moved_commands(command)
     powers = features.exponents(len(moved), 2)
     powers = powers[(powers[:, ~moved] == 0).all(axis=1)]
-    first = min(start.min(), command.t[0] + min(centers) - SEARCH_S) - 1.0
-    grid = np.arange(first, end.max() + STEP_S, STEP_S)
+    grid = np.arange(start.min() - LEAD_S, end.max() + STEP_S, STEP_S)
     free = np.flatnonzero(moved[: len(spec.state)]) if lags is None else np.zeros(0, dtype=np.intp)
     base = nominal_lags(spec) if lags is None else lags
 

@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 ALPHA = 0.99
 ORDER = 2
 MIN_SAMPLES_PER_TERM = 5
+NEGLIGIBLE = 1e-3
+"""A direction in which the robot moves by less than this share of the other is left at zero."""
 STILL = 1e-3
 """A variable whose spread is below this share of its range did not move."""
 CERTAIN = 3.0
@@ -103,7 +105,7 @@ def fit(
     chi, kept_powers = chi[:, independent], moved[independent]
     coefficients = np.zeros((samples.dq.shape[1], len(kept_powers)))
     by_state = _through_state(kept_powers, spec, unmoved)
-    for d in range(samples.dq.shape[1]):
+    for d in np.flatnonzero(_moves(samples.dq)):
         allowed = by_state if noisy and d < 3 else np.ones_like(by_state)
         coefficients[d, allowed] = fit_dof(chi[:, allowed], samples.dq[:, d], alpha, noisy)
     model = build_model(samples, spec, kept_powers, coefficients)
@@ -122,7 +124,7 @@ def fit_dof(chi: Array, target: Array, alpha: float, noisy: bool = False) -> Arr
         noisy: see `fit`.
     """
     scale = _scale(chi)
-    beta = np.linalg.lstsq(chi / scale, target, rcond=None)[0]
+    beta: Array = np.asarray(np.linalg.lstsq(chi / scale, target, rcond=None)[0])
     if noisy:
         certain = significant(chi / scale, target)
         beta = np.zeros(len(scale))
@@ -130,7 +132,8 @@ def fit_dof(chi: Array, target: Array, alpha: float, noisy: bool = False) -> Arr
     keep = prune(beta, alpha, noise_floor=1e-9 * max(float(np.abs(target).max()), 1e-9))
     result = np.zeros(chi.shape[1])
     if keep.any():
-        result[keep] = np.linalg.lstsq(chi[:, keep] / scale[keep], target, rcond=None)[0] / scale[keep]
+        standardised = np.linalg.lstsq(chi[:, keep] / scale[keep], target, rcond=None)[0]
+        result[keep] = standardised / scale[keep]
     return result
 
 
@@ -205,8 +208,17 @@ def errors_of(model: TaylorModel, samples: Samples) -> tuple[Array, Array]:
     residual = samples.dq - model.rates(samples.x)
     rmse = np.sqrt((residual**2).mean(axis=0))
     variance = samples.dq.var(axis=0)
-    r2 = np.where(variance > 1e-18, 1.0 - (residual**2).mean(axis=0) / np.maximum(variance, 1e-18), 1.0)
+    unexplained = (residual**2).mean(axis=0) / np.maximum(variance, 1e-18)
+    r2 = np.where(variance > 1e-18, 1.0 - unexplained, 1.0)
     return rmse, r2
+
+
+def _moves(dq: Array) -> NDArray[np.bool_]:
+    """Which degrees of freedom (D,) move at all, beside the fastest of their kind."""
+    size = np.sqrt((dq**2).mean(axis=0))
+    moves = np.ones(len(size), dtype=np.bool_)
+    moves[:2] = size[:2] > NEGLIGIBLE * size[:2].max()
+    return moves
 
 
 def _scale(chi: Array) -> Array:

@@ -76,3 +76,29 @@ def delayed(history, substep, delay, substeps):  # type: ignore[no-untyped-def]
     if delay <= substep:
         return 0
     return min((delay - substep + substeps - 1) // substeps, history.shape[0] - 1)
+
+
+@njit(cache=True)
+def rollout(poses, states, commands, terms, dt):  # type: ignore[no-untyped-def]
+    """Moves robots open-loop by the steps of their commands.
+
+    Args:
+        poses: (W, T + 1, 3), the first given, the others written.
+        states: (W, T + 1, S), likewise.
+        commands: (W, T, C), one row per step.
+        terms: see `rates`.
+        dt: length of a step [s].
+    """
+    size, width = states.shape[2], commands.shape[2]
+    x, dq = np.ones(size + width + 1), np.zeros(3 + size)
+    for w in range(poses.shape[0]):
+        for n in range(commands.shape[1]):
+            for i in range(size):
+                x[i] = states[w, n, i]
+            for i in range(width):
+                x[size + i] = commands[w, n, i]
+            rates(dq, x, terms)
+            poses[w, n + 1] = poses[w, n]
+            advance(poses[w, n + 1], dq, dt)
+            for i in range(size):
+                states[w, n + 1, i] = states[w, n, i] + dq[3 + i] * dt

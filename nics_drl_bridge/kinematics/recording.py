@@ -23,6 +23,12 @@ from nics_drl_bridge.kinematics.spec import RobotSpec
 
 Array = NDArray[np.float64]
 FORMAT = "nics_drl_bridge/recording/1"
+LARGEST_TURN = 1.5
+"""More than this between neighbouring samples [rad] is no robot."""
+TOO_FAST = 20.0
+"""Nor is a speed of this many times the greatest command."""
+SPEED_OVER_S = 0.5
+SLOWEST_SAMPLING_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,7 @@ class Recording:
         state: (T, S) measured state in the order of the RobotSpec, where there is one.
         wheels: (T, 2) left and right wheel speed in the encoder's units, where there are any.
         source: where it came from, for reports and errors.
+        variables: names of X = [state, command] of the robot that drove, where known.
     """
 
     command: Stream
@@ -58,6 +65,7 @@ class Recording:
     state: Stream | None = None
     wheels: Stream | None = None
     source: str = "recording"
+    variables: tuple[str, ...] = ()
 
     @property
     def streams(self) -> dict[str, Stream]:
@@ -129,17 +137,43 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
         RecordingError: a stream is empty, holds NaN, runs backwards, or has the wrong width;
             one sentence with the place.
     """
+    if recording.variables and recording.variables != spec.variable_names:
+        raise RecordingError(
+            f"{recording.source}: is a drive of a robot with {', '.join(recording.variables)}; "
+            f"the robot {spec.name!r} has {', '.join(spec.variable_names)}: choose the robot that "
+            "drove."
+        )
     width = {"command": len(spec.command), "pose": 3, "state": len(spec.state), "wheels": 2}
     for name, stream in recording.streams.items():
         _check_stream(f"{recording.source}: {name}", stream, width[name])
-    angular = np.ptp(np.unwrap(recording.pose.values[:, 2])) if len(recording.pose.t) else 0.0
-    steps = np.abs(geometry.wrap_angle(np.diff(recording.pose.values[:, 2])))
-    if angular > 0.0 and np.percentile(steps, 95) > 1.5:
-        raise RecordingError(
-            f"{recording.source}: pose: the heading jumps by {np.percentile(steps, 95):.1f} rad "
-            "between neighbouring samples; it must be in radians (degrees look like this)."
-        )
+    _check_units(recording, spec)
     return recording
+
+
+def _check_units(recording: Recording, spec: RobotSpec) -> None:
+    """Refuses a pose that only degrees, millimetres or milliseconds can explain."""
+    pose, place = recording.pose, f"{recording.source}: pose"
+    turn = np.percentile(np.abs(geometry.wrap_angle(np.diff(pose.values[:, 2]))), 95)
+    if turn > LARGEST_TURN:
+        raise RecordingError(
+            f"{place}: the heading jumps by {turn:.1f} rad between neighbouring samples; it must "
+            "be in radians (degrees look like this)."
+        )
+    speeds = [v for v in spec.command if v.cmd_vel != "angular.z"]
+    fastest = max((max(abs(v.min), abs(v.max)) for v in speeds), default=np.inf)
+    every = np.unique(np.searchsorted(pose.t, np.arange(pose.t[0], pose.t[-1], SPEED_OVER_S)))
+    step, took = np.diff(pose.values[every, :2], axis=0), np.diff(pose.t[every])
+    speed = np.percentile(np.hypot(*step.T) / np.maximum(took, 1e-9), 90) if len(took) else 0.0
+    if speed > TOO_FAST * fastest:
+        raise RecordingError(
+            f"{place}: moves at {speed:.3g} m/s, a robot whose commands end at {fastest:g} m/s; "
+            "positions must be in metres and stamps in seconds."
+        )
+    if np.median(np.diff(pose.t)) > SLOWEST_SAMPLING_S:
+        raise RecordingError(
+            f"{place}: there are {np.median(np.diff(pose.t)):.3g} s between samples; stamps must "
+            "be in seconds (milliseconds look like this)."
+        )
 
 
 def _check_stream(place: str, stream: Stream, width: int) -> None:
@@ -170,7 +204,12 @@ def save_recording(recording: Recording, path: Path) -> None:
     for name, stream in recording.streams.items():
         arrays[f"{name}_t"], arrays[name] = stream.t, stream.values
         clocks[name] = stream.clock
-    meta = {"format": FORMAT, "source": recording.source, "clocks": clocks}
+    meta = {
+        "format": FORMAT,
+        "source": recording.source,
+        "clocks": clocks,
+        "variables": recording.variables,
+    }
     write_bytes(path, npz_bytes({"meta": np.array(json.dumps(meta)), **arrays}))
 
 
@@ -193,7 +232,7 @@ def load_npz(path: Path) -> Recording:
             name: Stream(arrays[f"{name}_t"].astype(float), arrays[name].astype(float), clock)
             for name, clock in meta["clocks"].items()
         }
-        return Recording(**streams, source=str(path))
+        return Recording(**streams, source=str(path), variables=tuple(meta["variables"]))
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
     except (KeyError, TypeError) as error:

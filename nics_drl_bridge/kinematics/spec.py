@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import re
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
 
 CmdVelField = Literal["linear.x", "linear.y", "angular.z"]
 CMD_VEL_FIELDS: tuple[CmdVelField, ...] = ("linear.x", "linear.y", "angular.z")
+NOT_SI = {
+    **dict.fromkeys(("deg", "degrees"), "rad"),
+    **dict.fromkeys(("mm", "cm", "km"), "m"),
+    **dict.fromkeys(("ms", "h"), "s"),
+    "rpm": "rad/s",
+}
 POSE_RATES = ("vx", "vy", "wz")
 POSE_UNITS = ("m/s", "m/s", "rad/s")
 
@@ -25,6 +32,14 @@ class Variable(Schema):
     unit: str
     min: float
     max: float
+
+    @field_validator("unit")
+    @classmethod
+    def _si(cls, unit: str) -> str:
+        for wrong, right in NOT_SI.items():
+            if wrong in re.split(r"[^a-z]+", unit):
+                raise ValueError(f"the unit must be SI: {right} instead of {wrong}")
+        return unit
 
     @model_validator(mode="after")
     def _ordered(self) -> Variable:

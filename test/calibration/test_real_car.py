@@ -3,9 +3,11 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from drives import without
 
 from nics_drl_bridge.calibration.calibrate import calibrate
 from nics_drl_bridge.calibration.identify import identify
@@ -80,3 +82,21 @@ def test_the_benchmark_prints_one_json_object(real_drives):
     assert result["horizon_s"] == 5.0
     assert result["mean_position_error_m"] < 0.05
     assert {"mean_heading_error_rad", "mean_path_m"} <= set(result)
+
+
+@pytest.mark.parametrize("ahead", [7.0, -7.0, 1.7e9])
+def test_its_errors_do_not_depend_on_what_the_motion_capture_calls_zero(real_drives, car, ahead):
+    recording = read_recording(real_drives / "random_drive_45s")
+    pose = replace(recording.pose, t=recording.pose.t + ahead)
+    held_out = identify(replace(recording, pose=pose), car).held_out
+    assert held_out is not None
+    assert held_out.mean_position_error_m < 0.03
+
+
+def test_gaps_and_a_start_in_the_middle_do_not_spoil_its_model(real_drives, car):
+    recording = read_recording(real_drives / "random_drive_45s")
+    for gap in (12.0, 15.5, 19.0, 26.0, 33.0):
+        recording = without(recording, gap, gap + 0.4)
+    held_out = identify(without(recording, 0.0, 6.0), car).held_out
+    assert held_out is not None
+    assert held_out.mean_position_error_m < 0.03
