@@ -14,7 +14,7 @@ from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.runner import declare, run_node
+from nics_drl_bridge.nodes.runner import declare, last_word, run_node
 from nics_drl_bridge.safety.gate import Decision, Limits, Request, decide
 
 PERIOD_S = 0.05
@@ -33,9 +33,21 @@ class CommandGate(Node):
 
     def __init__(self, context: Context) -> None:
         super().__init__("command_gate", context=context)
-        declare(self, "model", "ackermann", "Folder of a SimulatorModel, or a shipped robot.")
+        declare(
+            self,
+            "model",
+            "ackermann",
+            "Folder of a SimulatorModel, or a shipped robot.",
+            read_only=True,
+        )
         age = declare(
-            self, "scan_age", 0.35, "Oldest scan behind a command [s].", low=0.01, high=10.0
+            self,
+            "scan_age",
+            0.35,
+            "Oldest scan behind a command [s].",
+            low=0.01,
+            high=10.0,
+            read_only=True,
         )
         robot = open_model(str(self.get_parameter("model").value)).robot
         self._limits = Limits(
@@ -74,7 +86,7 @@ class CommandGate(Node):
 
     def stop(self) -> None:
         """Leaves a zero command behind."""
-        self._publish(Decision(np.zeros(3), "the gate ends"))
+        last_word(self._out, conversions.twist_to_ros(np.zeros(3)))
 
 
 def main(args: list[str] | None = None) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Odometry
+from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.node import Node
 from std_srvs.srv import Trigger
@@ -27,7 +28,13 @@ class MiddlewareNode(Node):
 
     def __init__(self, context: Context) -> None:
         super().__init__("middleware_node", context=context)
-        declare(self, "model", "ackermann", "Folder of a SimulatorModel, or a shipped robot.")
+        declare(
+            self,
+            "model",
+            "ackermann",
+            "Folder of a SimulatorModel, or a shipped robot.",
+            read_only=True,
+        )
         declare(self, "map_frame", "map", "Frame id of the estimate.")
         declare(self, "base_frame", "base_link", "Frame id of the robot.")
         model = open_model(str(self.get_parameter("model").value))
@@ -35,7 +42,9 @@ class MiddlewareNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._topics = RobotTopics(self, model, on_odometry=self._publish)
         self.create_service(Trigger, "~/reset", self._on_reset)
-        self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose)
+        # Steady: diagnostics matter most when the robot's time stands still.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=steady)
 
     def _publish(self, stamp_ns: int) -> None:
         view = self._topics.middleware.view(stamp_ns)

@@ -13,7 +13,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
-from nics_drl_bridge.nodes.runner import declare, run_node
+from nics_drl_bridge.nodes.runner import declare, last_word, run_node
 from nics_drl_bridge.policy.policies import make_policy
 
 ODOM = "odom"
@@ -31,11 +31,21 @@ class PolicyNode(Node):
 
     def __init__(self, context: Context) -> None:
         super().__init__("policy_node", context=context)
-        declare(self, "model", "ackermann", "Folder of a SimulatorModel, or a shipped robot.")
-        declare(self, "policy", "go_to_goal", "Name of a policy.")
+        declare(
+            self,
+            "model",
+            "ackermann",
+            "Folder of a SimulatorModel, or a shipped robot.",
+            read_only=True,
+        )
+        declare(self, "policy", "go_to_goal", "Name of a policy.", read_only=True)
         declare(self, "base_frame", "base_link", "Frame id of the robot.")
         goal = declare(
-            self, "goal", [float("nan")] * 2, "x, y in map [m]; NaN waits for goal_pose."
+            self,
+            "goal",
+            [float("nan")] * 2,
+            "x, y in map [m]; NaN waits for goal_pose.",
+            read_only=True,
         )
         if len(goal) != 2:
             raise ConfigError(f"parameter 'goal': must be [x, y], not {list(goal)}")
@@ -61,7 +71,7 @@ class PolicyNode(Node):
         if newest[ODOM].stamp_ns < scan_ns or scan_ns <= self._acted_ns:
             return
         self._acted_ns = scan_ns
-        self._publish(self._twist(), scan_ns)
+        self._raw.publish(self._message(self._twist(), scan_ns))
 
     def _twist(self) -> NDArray[np.float64]:
         """The command (3,) for the present view; zero without a goal, at it, or at a touch."""
@@ -76,15 +86,15 @@ class PolicyNode(Node):
         action = self._policy.act(self._task.observe(view, self._goal))
         return self._task.robot.to_cmd_vel(self._task.command(action))
 
-    def _publish(self, twist: NDArray[np.float64], stamp_ns: int) -> None:
+    def _message(self, twist: NDArray[np.float64], stamp_ns: int) -> TwistStamped:
         message = TwistStamped(twist=conversions.twist_to_ros(twist))
         message.header.stamp = conversions.stamp_to_ros(stamp_ns)
         message.header.frame_id = str(self.get_parameter("base_frame").value)
-        self._raw.publish(message)
+        return message
 
     def stop(self) -> None:
         """Leaves a zero command behind."""
-        self._publish(np.zeros(3), self._acted_ns)
+        last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
 
 
 def main(args: list[str] | None = None) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
@@ -19,7 +20,7 @@ class RobotTopics:
     """Subscribes to `scan`, `odom` and `cmd_vel` and keeps the middleware up to date.
 
     Data are used at their own stamps; a command, which has none, at the stamp of the newest
-    datum before it. The first odometry fixes where `map` is, unless `start` was called.
+    datum before it. The first odometry fixes where `map` is.
 
     Args:
         node: whose topics they are.
@@ -47,6 +48,7 @@ class RobotTopics:
     def restart(self) -> None:
         """Forgets everything; the next odometry fixes `map` anew."""
         self._started = False
+        self.newest_ns = 0
 
     def view(self) -> RobotView:
         """What is known at the stamp of the newest datum."""
@@ -65,7 +67,7 @@ class RobotTopics:
     def _take_odometry(self, message: Odometry) -> None:
         stamp = conversions.stamp_from_ros(message.header.stamp)
         pose, twist = conversions.odometry_from_ros(message)
-        if not self._started:
+        if not self._started and np.isfinite(pose).all():
             self.middleware.reset(stamp, pose)
             self._started = True
         if self.middleware.odometry(stamp, self._arrival_ns(), pose, twist):
@@ -75,4 +77,8 @@ class RobotTopics:
 
     def _take_command(self, message: Twist) -> None:
         command = self._robot.from_cmd_vel(conversions.twist_from_ros(message))
+        if not np.isfinite(command).all():
+            # One NaN would make the estimate NaN for ever.
+            self.middleware.cache.reject("cmd_vel: NaN or inf")
+            return
         self.middleware.command(self.newest_ns, command)

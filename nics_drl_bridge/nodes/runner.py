@@ -12,13 +12,45 @@ from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 
-from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.errors import BackendError, BridgeError
 
 SPIN_S = 0.1
+DELIVERY_S = 0.5
 EXIT_BAD_INPUT = 2
+
+
+def open_context(args: Sequence[str] | None = None, domain_id: int | None = None) -> Context:
+    """A context of one's own, with discovery on this machine unless the environment names a range.
+
+    A robot that should be seen by others sets `ROS_AUTOMATIC_DISCOVERY_RANGE`; a simulator
+    started in a lab does not move somebody's robot.
+
+    Args:
+        args: ROS arguments.
+        domain_id: DDS domain; the environment's by default.
+
+    Raises:
+        BackendError: the arguments are wrong, or no ROS 2 middleware is there.
+    """
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    context = Context()
+    try:
+        context.init(None if args is None else list(args), domain_id=domain_id)
+    except RuntimeError as error:
+        raise BackendError(f"ROS 2 does not start: {' '.join(str(error).split())}") from None
+    return context
+
+
+def last_word(publisher: Publisher, message: Any) -> None:
+    """Publishes what has to arrive although the publisher is destroyed next."""
+    publisher.publish(message)
+    publisher.wait_for_all_acked(Duration(seconds=DELIVERY_S))
 
 
 def run_node(make: Callable[[Context], Node], args: Sequence[str] | None = None) -> None:
@@ -31,16 +63,12 @@ def run_node(make: Callable[[Context], Node], args: Sequence[str] | None = None)
         make: makes the node in a context of its own.
         args: the command line, `sys.argv` by default.
     """
-    # With no range set, discovery stays on this machine: a robot that should be seen by others
-    # sets the variable, and a simulator started in a lab does not move somebody's robot.
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopping.set())
-    context = Context()
-    context.init(list(sys.argv if args is None else args))
-    node: Node | None = None
+    context, node = None, None
     try:
+        context = open_context(sys.argv if args is None else args)
         node = make(context)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
@@ -48,15 +76,16 @@ def run_node(make: Callable[[Context], Node], args: Sequence[str] | None = None)
             while context.ok() and not stopping.is_set():
                 executor.spin_once(timeout_sec=SPIN_S)
         executor.shutdown(timeout_sec=1.0)
-    except BridgeError as error:
+    except (BridgeError, ParameterException) as error:
         sys.stderr.write(f"{error}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
     finally:
         if node is not None:
-            if context.ok() and hasattr(node, "stop"):
+            if node.context.ok() and hasattr(node, "stop"):
                 node.stop()
             node.destroy_node()
-        context.try_shutdown()
+        if context is not None:
+            context.try_shutdown()
 
 
 def declare(node: Node, name: str, default: Any, description: str, **limits: Any) -> Any:
