@@ -36,6 +36,12 @@ def _one_sentence() -> Iterator[None]:
     except BridgeError as error:
         typer.echo(f"nics: {error}", err=True)
         raise typer.Exit(EXIT_BAD_INPUT) from None
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        typer.echo(f"nics: {place}{error.strerror or error}; choose another place.", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from None
     except KeyboardInterrupt:
         typer.echo("nics: interrupted; everything that was started has ended.", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
@@ -68,16 +74,23 @@ def generate(
     lidar: Annotated[str, typer.Option(help="A shipped lidar (paper) or a YAML file.")] = "paper",
     order: Annotated[int, typer.Option(min=1, max=4, help="Order of the Taylor model.")] = 2,
     alpha: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Pruning threshold of Eq. 2.")
-    ] = 0.99,
+        str, typer.Option(help="Pruning threshold of Eq. 2, 0 to 1, or auto for the knee.")
+    ] = "0.99",
     assume_textbook: Annotated[
         bool, typer.Option(help="Fill in from the textbook what the drive did not show.")
+    ] = False,
+    strict: Annotated[
+        bool, typer.Option(help="Refuse a drive that did not move every input on its own.")
+    ] = False,
+    pictures: Annotated[
+        bool, typer.Option(help="Draw the fit into the folder pictures of the model.")
     ] = False,
 ) -> None:
     """Generates a simulator from a recording and writes it as a folder."""
     with _one_sentence():
         from nics_drl_bridge.generator import generate as generate_model
         from nics_drl_bridge.generator import save_model
+        from nics_drl_bridge.kinematics.dof import parse_alpha
         from nics_drl_bridge.kinematics.readers import read_recording
         from nics_drl_bridge.kinematics.spec import load_robot
         from nics_drl_bridge.lidar.spec import load_lidar
@@ -88,10 +101,15 @@ def generate(
             load_world(world).obstacles.radii,
             load_lidar(lidar),
         )
-        model, _ = generate_model(
-            read_recording(recording), spec, sensor, radii, order, alpha, assume=assume_textbook
+        drive = read_recording(recording)
+        model, identified = generate_model(
+            drive, spec, sensor, radii, order, parse_alpha(alpha), assume_textbook, strict
         )
         save_model(model, out)
+        if pictures:
+            from nics_drl_bridge.report.fit_pictures import write_pictures
+
+            write_pictures(spec, identified, out / "pictures")
         typer.echo(model.report.rstrip())
         typer.echo(f"model written to {out}")
 

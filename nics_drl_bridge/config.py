@@ -7,6 +7,7 @@ is a number and the second an error. Every error names file, key and the nearest
 from __future__ import annotations
 
 import re
+import reprlib
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -32,6 +33,10 @@ class _Loader(yaml.SafeLoader):
     """YAML 1.2 numbers, and no duplicate keys."""
 
 
+class _Dumper(yaml.SafeDumper):
+    """Quotes text that either `_Loader` or YAML 1.1 would take for a number."""
+
+
 _Loader.yaml_implicit_resolvers = {
     first: [
         (tag, pattern) for tag, pattern in resolvers if tag.rsplit(":", 1)[-1] in ("null", "merge")
@@ -44,19 +49,24 @@ _Loader.add_implicit_resolver(
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:int", re.compile(r"^[-+]?(?:0|[1-9][0-9]*)$"), list("-+0123456789")
 )
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(
-        r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
-        r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
-    ),
-    list("-+0123456789."),
-)
+for _kind in (_Loader, _Dumper):
+    _kind.add_implicit_resolver(
+        "tag:yaml.org,2002:float",
+        re.compile(
+            r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+            r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+        ),
+        list("-+0123456789."),
+    )
 
 
 def _mapping(loader: _Loader, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
     seen: set[Any] = set()
     for key_node, _ in node.value:
+        if not isinstance(key_node, yaml.ScalarNode):
+            raise yaml.constructor.ConstructorError(
+                None, None, "a key must be one word or number", key_node.start_mark
+            )
         key = key_node.value
         if key in seen:
             raise yaml.constructor.ConstructorError(
@@ -129,6 +139,11 @@ def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> Schema
         raise ConfigError(f"{source}: {_sentence(error, schema)}") from None
 
 
+_SHORT = reprlib.Repr()
+"""Shows a wrong value; the whole of one made of YAML aliases may not fit into memory."""
+_SHORT.maxstring = _SHORT.maxother = 80
+
+
 def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
     details = error.errors(include_url=False)
     first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
@@ -140,7 +155,7 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
     if first["type"] == "missing":
         return f"the key {key!r} is missing; add it."
     message = first["msg"].removeprefix("Value error, ").rstrip(".")
-    return f"key {key!r}: {message[0].lower() + message[1:]}, not {first['input']!r:.80}."
+    return f"key {key!r}: {message[0].lower() + message[1:]}, not {_SHORT.repr(first['input'])}."
 
 
 def _fields_at(schema: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
@@ -186,7 +201,7 @@ def load_yaml(path: Path, schema: type[SchemaT]) -> SchemaT:
 
 def dump_yaml(data: Any) -> str:
     """Writes plain data as YAML that `load_yaml` reads back to the same numbers."""
-    return yaml.safe_dump(data, sort_keys=False, allow_unicode=True, width=100)
+    return str(yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100))
 
 
 def share_folder() -> Path:

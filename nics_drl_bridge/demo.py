@@ -14,6 +14,7 @@ import numpy as np
 from nics_drl_bridge.calibration.identify import Identified
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registration import NAVIGATION, register_envs
+from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.files import write_text
 from nics_drl_bridge.generator import SimulatorModel, generate, save_model
 from nics_drl_bridge.kinematics import textbook
@@ -87,11 +88,7 @@ def run(plan: Plan, say: Say) -> Outcome:
     seeds = range(plan.episodes)
     say(f"driving {plan.episodes} episodes in process")
     here = _drive("sim", plan, model, seeds, say, {})
-    with ExitStack() as stack:
-        domain_id = _start_lockstep(plan, stack, say)
-        say(f"driving the same {plan.episodes} episodes over DDS in lock-step")
-        options = {"truth": True, "domain_id": domain_id}
-        there = _drive("dds", plan, model, seeds, say, options)
+    there = _drive_lockstep(plan, model, seeds, say)
     live = _drive_live(plan, model, say)
     report = plan.out / "report.html"
     write_text(report, _report(plan, model, identified, here, there, live))
@@ -142,17 +139,32 @@ def _drive(
         env.close()
 
 
-def _start_lockstep(plan: Plan, stack: ExitStack, say: Say) -> int:
-    """Starts simulator and middleware as processes; returns their domain id."""
+def _drive_lockstep(
+    plan: Plan, model: SimulatorModel, seeds: Sequence[int], say: Say
+) -> list[Episode]:
+    """Simulator and middleware, each a process, stepped over DDS."""
     from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
     domain_id, logs = free_domain_id(), plan.out / "logs" / "lockstep"
-    model = str(plan.out / "model")
-    simulator = {"model": model, "world": plan.world, "mode": "lockstep"}
-    for node, parameters in (("simulator_node", simulator), ("middleware_node", {"model": model})):
-        process = stack.enter_context(NodeProcess(node, logs, parameters, domain_id))
-        say(f"started {node} as process {process.pid} in ROS domain {domain_id}")
-    return domain_id
+    folder = str(plan.out / "model")
+    nodes: dict[str, dict[str, Any]] = {
+        "simulator_node": {"model": folder, "world": plan.world, "mode": "lockstep"},
+        "middleware_node": {"model": folder},
+    }
+    with ExitStack() as stack:
+        processes = []
+        for node, parameters in nodes.items():
+            process = stack.enter_context(NodeProcess(node, logs, parameters, domain_id))
+            processes.append(process)
+            say(f"started {node} as process {process.pid} in ROS domain {domain_id}")
+        say(f"driving the same {plan.episodes} episodes over DDS in lock-step")
+        options = {"truth": True, "domain_id": domain_id}
+        try:
+            return _drive("dds", plan, model, seeds, say, options)
+        except BackendError:
+            for process in processes:  # a node that has ended says why better
+                process.check()
+            raise
 
 
 @dataclass(frozen=True)
@@ -190,8 +202,12 @@ def _drive_live(plan: Plan, model: SimulatorModel, say: Say) -> Live:
         processes = []
         for node, parameters in nodes.items():
             processes.append(stack.enter_context(NodeProcess(node, logs, parameters, domain_id)))
-            if node == "simulator_node":
-                witness.sees(LIVE_TIMEOUT_S)
+            if node == "simulator_node" and not witness.sees(LIVE_TIMEOUT_S):
+                processes[0].check()
+                raise BackendError(
+                    f"{node} publishes nothing after {LIVE_TIMEOUT_S:g} s; look at its log, "
+                    f"{processes[0].log}."
+                )
         task = Navigation(model.robot, model.lidar)
         # The policy stops where it believes to be there; its odometry drifts.
         arrived = witness.arrives(goal, task.goal_radius + 0.1, LIVE_TIMEOUT_S)

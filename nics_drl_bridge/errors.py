@@ -40,10 +40,11 @@ class StaleDataError(BackendError):
     Attributes:
         topic: the topic that is late.
         age_s: seconds since its last datum, `inf` when there never was one.
+        limit_s: how old it may be [s].
     """
 
     def __init__(self, topic: str, age_s: float, limit_s: float) -> None:
-        self.topic, self.age_s = topic, age_s
+        self.topic, self.age_s, self.limit_s = topic, age_s, limit_s
         last = (
             "nothing has ever arrived"
             if age_s == float("inf")
@@ -53,6 +54,9 @@ class StaleDataError(BackendError):
             f"topic {topic!r}: no fresh data within {limit_s:.3f} s, {last}; check that its "
             "publisher runs in this ROS domain and namespace."
         )
+
+    def __reduce__(self) -> tuple[type[StaleDataError], tuple[str, float, float]]:
+        return type(self), (self.topic, self.age_s, self.limit_s)  # so that it can be pickled
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -8,6 +8,7 @@ import os
 import shutil
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -69,7 +70,7 @@ def whole_folder(path: Path, marker: str) -> Iterator[Path]:
     Raises:
         ConfigError: `path` is a file, or a folder of another kind.
     """
-    path = path.absolute()
+    path = path.resolve()  # a link stays, the folder behind it is replaced
     if path.exists() and not path.is_dir():
         raise ConfigError(f"{path}: is a file, not a folder; give the name of a folder.")
     if path.is_dir() and any(path.iterdir()) and not (path / marker).exists():
@@ -94,7 +95,12 @@ def _swap(new: Path, path: Path) -> None:
     try:
         if path.exists():
             os.replace(path, old)
-        os.replace(new, path)
+        try:
+            os.replace(new, path)
+        except BaseException:
+            if not path.exists():
+                os.rename(old, path)
+            raise
         _fsync(path.parent)
     finally:
         shutil.rmtree(old, ignore_errors=True)
@@ -116,3 +122,25 @@ def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
             np.lib.format.write_array(content, np.asanyarray(array), allow_pickle=False)
             archive.writestr(member, content.getvalue())
     return buffer.getvalue()
+
+
+def npz_arrays(data: bytes) -> dict[str, NDArray[Any]]:
+    """The arrays of an `.npz` file's content. Raises ValueError when it is damaged."""
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except (
+        AttributeError,  # a plain `.npy` file
+        EOFError,
+        KeyError,
+        MemoryError,
+        NotImplementedError,
+        OSError,
+        OverflowError,
+        RuntimeError,
+        SyntaxError,
+        TypeError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
+        raise ValueError(str(error) or type(error).__name__) from None

@@ -77,6 +77,11 @@ class SimulatorModel:
                 f"the kinematics are of {self.kinematics.variables}, the robot "
                 f"{self.robot.name!r} has {self.robot.variable_names}; generate the model anew."
             )
+        if self.kinematics.dofs != self.robot.dof_names:
+            raise ModelError(
+                f"the kinematics give the rates {self.kinematics.dofs}, the robot "
+                f"{self.robot.name!r} needs {self.robot.dof_names}; generate the model anew."
+            )
         substeps = self.control_period / self.kinematics.dt
         if round(substeps) < 1 or abs(substeps - round(substeps)) > 1e-6:
             raise ModelError(
@@ -133,8 +138,9 @@ def generate(
     lidar: LidarSpec,
     radii: tuple[float, ...],
     order: int = fit.ORDER,
-    alpha: float = fit.ALPHA,
+    alpha: fit.Alpha = fit.ALPHA,
     assume: bool = False,
+    strict: bool = False,
 ) -> tuple[SimulatorModel, Identified]:
     """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
 
@@ -144,13 +150,14 @@ def generate(
         lidar: the sensor to simulate.
         radii: of the obstacles to bake [m]; the robot's own footprint is added.
         order: of the Taylor model.
-        alpha: pruning threshold of Eq. 2.
+        alpha: pruning threshold of Eq. 2, or `auto`.
         assume: fill in from the textbook what the drive did not show, marked as assumed.
+        strict: refuse a drive that did not move every input on its own.
 
     Returns:
         The model, and all that was found out on the way.
     """
-    identified = identify(recording, robot, order=order, alpha=alpha, assume=assume)
+    identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
     table = bake(lidar, (*radii, robot.footprint_radius))
     model = SimulatorModel(
         robot, identified.model, identified.calibration, lidar, table,

@@ -22,6 +22,10 @@ STEP_RANGE_S = (0.002, 0.02)
 SMOOTHING_S = 0.1
 SMOOTHING_BURSTS = 1.5
 UNIFORM = 1e-6
+SHARED = 0.5
+"""Share of the rows that must have been taken at once, for the others to be left out."""
+STATE_GAP = 2.5
+"""Between states this many usual steps apart nothing is known of the rates."""
 
 
 def align(recording: Recording, calibration: Calibration, spec: RobotSpec) -> Samples:
@@ -42,11 +46,8 @@ def align(recording: Recording, calibration: Calibration, spec: RobotSpec) -> Sa
     Raises:
         RecordingError: the streams do not overlap in time.
     """
-    state = recording.state
-    if state is not None and calibration.is_identity and _share_uniform_stamps(recording):
-        return samples_on_one_clock(
-            recording.pose.t, recording.pose.values, state.values, recording.command.values
-        )
+    if calibration.is_identity and (shared := _shared_stamps(recording)) is not None:
+        return samples_on_one_clock(*shared)
     grid = _grid(recording, calibration)
     bursts = stamps.find_bursts(recording.pose.t)
     t = stamps.spread(recording.pose.t, bursts) + calibration.clock_offset_s
@@ -59,7 +60,10 @@ def align(recording: Recording, calibration: Calibration, spec: RobotSpec) -> Sa
         states_at(recording, calibration, spec, grid),
         held(recording.command, spec, begin, begin + step),
     )
-    return samples.rows(_outside_gaps(samples.t, t, step))
+    known = _outside_gaps(samples.t, t, step)
+    if recording.state is not None:
+        known &= _outside_gaps(samples.t, recording.state.t, step, STATE_GAP, 0.0)
+    return samples.rows(known)
 
 
 def states_at(
@@ -78,11 +82,36 @@ def states_at(
     return gains * inferred_states(recording.command, spec, lags, latency, longer)[lead:]
 
 
-def _share_uniform_stamps(recording: Recording) -> bool:
-    t = recording.pose.t
-    others = [stream.t for name, stream in recording.streams.items() if name != "wheels"]
-    same = all(len(o) == len(t) and np.array_equal(o, t) for o in others)
-    return same and float(np.ptp(np.diff(t))) < UNIFORM * max(1.0, float(t[-1] - t[0]))
+def _shared_stamps(recording: Recording) -> tuple[Array, Array, Array, Array] | None:
+    """Stamps (T,), poses, states and commands where all of them were taken at once.
+
+    None if the state was not measured, or if the stamps are not those of one uniform clock, of
+    which rows may be missing.
+    """
+    pose, state, command = recording.pose, recording.state, recording.command
+    if state is None:
+        return None
+    step = np.median(np.diff(pose.t))
+    if not step > 0.0:
+        return None
+    tick = [np.round((s.t - pose.t[0]) / step) for s in (pose, state, command)]
+    off = max(
+        float(np.abs(s.t - pose.t[0] - n * step).max())
+        for s, n in zip((pose, state, command), tick, strict=True)
+    )
+    if off > UNIFORM * max(1.0, float(pose.t[-1] - pose.t[0])):
+        return None
+    ticks, at_pose, at_state = np.intersect1d(tick[0], tick[1], return_indices=True)
+    ticks, both, at_command = np.intersect1d(ticks, tick[2], return_indices=True)
+    if len(ticks) < SHARED * max(map(len, tick)):
+        return None
+    at_pose, at_state = at_pose[both], at_state[both]
+    return (
+        pose.t[at_pose],
+        pose.values[at_pose],
+        state.values[at_state],
+        command.values[at_command],
+    )
 
 
 def _grid(recording: Recording, calibration: Calibration) -> Array:
@@ -111,8 +140,13 @@ def _half_width(calibration: Calibration) -> float:
     return SMOOTHING_S if noisy else 0.0
 
 
-def _outside_gaps(t: Array, samples: Array, step: float) -> NDArray[np.bool_]:
-    """Which steps (T,) have pose samples around them that are not far apart."""
+def _outside_gaps(
+    t: Array, samples: Array, step: float, usual: float = 3.0, least: float = MAX_GAP_S
+) -> NDArray[np.bool_]:
+    """Which steps (T,) have samples around them that are not far apart.
+
+    Not far is less than `least` [s] or `usual` times the usual time between samples.
+    """
     after = np.clip(np.searchsorted(samples, t + step / 2.0), 1, len(samples) - 1)
     gap = samples[after] - samples[after - 1]
-    return np.asarray(gap < max(MAX_GAP_S, 3.0 * float(np.median(np.diff(samples)))))
+    return np.asarray(gap < max(least, usual * float(np.median(np.diff(samples)))))

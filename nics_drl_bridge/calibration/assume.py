@@ -68,11 +68,12 @@ def _model(model: TaylorModel, rows: dict[str, dict[str, float]]) -> TaylorModel
     names.sort(key=lambda name: features.canonical(parsed[name]))
     powers = np.array([parsed[name] for name in names], dtype=np.int64)
     coefficients = np.array([[rows[dof].get(n, 0.0) for n in names] for dof in model.dofs])
-    return replace(
+    completed = replace(
         model,
         powers=powers.reshape(len(names), len(model.variables)),
         coefficients=coefficients.reshape(len(model.dofs), len(names)),
     )
+    return completed.with_errors(model.named_errors)
 
 
 def _twist_of_state(

@@ -19,7 +19,7 @@ from nics_drl_bridge.calibration.mounting import (
 from nics_drl_bridge.calibration.noise import Motion, motion, pose_noise
 from nics_drl_bridge.calibration.report import Findings, sentences
 from nics_drl_bridge.calibration.signals import held, interval_means
-from nics_drl_bridge.calibration.timing import followed, inferred_states, moved_commands
+from nics_drl_bridge.calibration.timing import LONG_STEP, followed, inferred_states, moved_commands
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.kinematics.recording import Recording, check
 from nics_drl_bridge.kinematics.spec import RobotSpec
@@ -52,7 +52,7 @@ def examine(recording: Recording, spec: RobotSpec) -> tuple[Calibration, Finding
     check(recording, spec)
     _require_state(recording, spec)
     bursts = stamps.find_bursts(recording.pose.t)
-    noise = pose_noise(recording.pose.values, bursts)
+    noise = pose_noise(recording.pose.values, bursts, recording.pose.t)
     best = stamps.newest(recording.pose.t, bursts)
     twists = motion(
         recording.pose.t[best], recording.pose.values[best], bursts, noise or (0.0, 0.0)
@@ -145,7 +145,7 @@ def _as_commands(states: Array, recording: Recording, spec: RobotSpec, latency: 
     if stream is None:
         return states[:, np.argsort(followed(spec))]
     span = np.diff(stream.t)
-    keep = span > 0.0
+    keep = (span > 0.0) & (span < LONG_STEP * np.median(span))
     rates = np.diff(stream.values, axis=0)[keep] / span[keep, None]
     before = stream.values[:-1][keep]
     begin = stream.t - latency

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from textwrap import fill
+
+import numpy as np
 
 from nics_drl_bridge.calibration.identify import Identified
 from nics_drl_bridge.calibration.open_loop import OpenLoop
+from nics_drl_bridge.kinematics.accuracy import Curve
+from nics_drl_bridge.kinematics.dof import Alpha
+from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.spec import RobotSpec
 
 WIDTH = 96
+CURVE_POINTS = 8
 
 
 def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
@@ -24,19 +31,79 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
         f"Fit report: robot {spec.name!r} from {source}",
         "",
         f"Kept {model.terms_kept} of {identified.fit.terms_total} terms, step {model.dt:g} s "
-        f"(X = {', '.join(model.variables)}):",
-        *(f"  {equation}" for equation in model.equations()),
+        f"(X = {', '.join(model.variables)}), with standard errors:",
+        *(f"  {equation}" for equation in equations_with_errors(model)),
+        "",
+        *_pruning(identified.alpha),
+        "",
+        "Cross-validated error against the number of terms, largest first, * for those kept:",
+        *(f"  {line}" for curve in identified.fit.curves for line in _curve(curve)),
         "",
         "Error of the linear fit per degree of freedom, on the part it was fitted to:",
         *_errors(identified),
         "",
         f"Open loop, on data held out from the fit (after {identified.train_until_s:.1f} s):",
         *_open_loop(identified.held_out),
+        *_held_out_rates(model),
+        "",
+        "Valid where the drive was:",
+        *_box(model, spec),
         "",
         "Found, and not learnt:",
         *(_item(note) for note in identified.notes or ("Nothing had to be corrected.",)),
     ]
     return "\n".join(lines) + "\n"
+
+
+def equations_with_errors(model: TaylorModel) -> list[str]:
+    """One line per degree of freedom: `wz = (4.63 +- 0.02)*speed*steering  [rad/s]`."""
+    errors, names, lines = model.named_errors, model.term_names, []
+    for d, dof in enumerate(model.dofs):
+        text = ""
+        for k in np.flatnonzero(model.coefficients[d]):
+            value, name = float(model.coefficients[d, k]), names[k]
+            sign = ("-" if value < 0 else "") if not text else (" - " if value < 0 else " + ")
+            mark = " (assumed)" if (dof, name) in model.assumed else ""
+            number = with_error(abs(value), errors.get(dof, {}).get(name))
+            text += f"{sign}{number}" + ("" if name == "1" else f"*{name}") + mark
+        lines.append(f"{dof} = {text or '0'}  [{model.dof_units[d]}]")
+    return lines
+
+
+def with_error(value: float, error: float | None) -> str:
+    """A number with the digits that its standard error leaves: `(4.63 +- 0.02)`."""
+    if error is None or error <= 1e-6 * value:
+        return f"{value:.5g}"
+    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 12))
+    if error < 10.0 ** -(digits - 1) * 9.5 and f"{error:.1e}"[0] != "1":
+        digits = max(digits - 1, 0)
+    return f"({value:.{digits}f} +- {error:.{digits}f})"
+
+
+def _pruning(alpha: Alpha) -> list[str]:
+    if alpha == "auto":
+        text = (
+            "Pruned (Eq. 2) per degree of freedom at the knee of its accuracy curve: the fewest "
+            "terms, largest standardised coefficient first, whose cross-validated error can't be "
+            "told from the least."
+        )
+    else:
+        text = (
+            f"Pruned by Eq. 2 at alpha = {alpha:g}, for each degree of freedom on its own; the "
+            "term that crosses the threshold is kept too."
+        )
+    return [fill(text, WIDTH)]
+
+
+def _curve(curve: Curve) -> list[str]:
+    """The error with 0, 1, 2... terms, in per cent of the rates' size."""
+    shown = min(max(CURVE_POINTS, curve.kept + 1), len(curve.error))
+    points = [
+        f"{n}{'*' if n == curve.kept else ''}: {100.0 * curve.share[n]:.3g} %" for n in range(shown)
+    ]
+    more = f" ({len(curve.error) - 1} in all)" if shown < len(curve.error) else ""
+    text = f"{curve.dof:<14} " + ", ".join(points) + more
+    return fill(text, WIDTH, subsequent_indent=" " * 15).splitlines()
 
 
 def _item(note: str) -> str:
@@ -46,8 +113,32 @@ def _item(note: str) -> str:
 def _errors(identified: Identified) -> list[str]:
     fit, model = identified.fit, identified.model
     return [
-        f"  {dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}"
-        for dof, unit, rmse, r2 in zip(model.dofs, model.dof_units, fit.rmse, fit.r2, strict=True)
+        f"  {dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}, condition number {number:.3g}"
+        for dof, unit, rmse, r2, number in zip(
+            model.dofs, model.dof_units, fit.rmse, fit.r2, fit.condition, strict=True
+        )
+    ]
+
+
+def _held_out_rates(model: TaylorModel) -> list[str]:
+    quality = model.quality
+    if quality is None or not quality.held_out_rmse:
+        return []
+    units = dict(zip(model.dofs, model.dof_units, strict=True))
+    return [
+        "  the rates there:",
+        *(
+            f"  {dof:<24} RMSE {rmse:.3g} {units[dof]}, R2 {quality.held_out_r2[dof]:.6f}"
+            for dof, rmse in quality.held_out_rmse.items()
+        ),
+    ]
+
+
+def _box(model: TaylorModel, spec: RobotSpec) -> list[str]:
+    units: Mapping[str, str] = dict(zip(spec.variable_names, spec.variable_units, strict=True))
+    return [
+        f"  {name:<24} {low:.4g} to {high:.4g} {units[name]}"
+        for name, low, high in zip(model.variables, model.low, model.high, strict=True)
     ]
 
 

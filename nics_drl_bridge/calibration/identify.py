@@ -7,15 +7,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nics_drl_bridge.calibration.align import align
+from nics_drl_bridge.calibration.assess import merged, unseen_samples, with_quality
 from nics_drl_bridge.calibration.assume import assume_textbook
 from nics_drl_bridge.calibration.calibrate import examine
 from nics_drl_bridge.calibration.calibration import Calibration
 from nics_drl_bridge.calibration.open_loop import HORIZON_S, OpenLoop, open_loop_error, windows
-from nics_drl_bridge.calibration.refine import refine, simplify
+from nics_drl_bridge.calibration.plausibility import check_axes, check_units, mirror_note
+from nics_drl_bridge.calibration.refine import refine
+from nics_drl_bridge.calibration.repair import repair
 from nics_drl_bridge.calibration.report import sentences
+from nics_drl_bridge.calibration.simplify import simplify
 from nics_drl_bridge.calibration.timing import SEARCH_S
+from nics_drl_bridge.calibration.verdict import doubts, refuse_unexcited, unlearnt
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.kinematics.fit import ALPHA, ORDER, Fit, fit
+from nics_drl_bridge.kinematics.fit import ALPHA, ORDER, Alpha, Fit, fit
 from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.recording import Recording, Samples, Stream, check
 from nics_drl_bridge.kinematics.spec import RobotSpec
@@ -28,12 +33,16 @@ class Identified:
     """All that was learnt from a recording.
 
     Attributes:
-        model: the model, refined and, on request, completed by assumption.
+        model: the model, refined and, on request, completed by assumption, with standard
+            errors and quality.
         calibration: of the recording.
         fit: the linear fit, before refinement.
         samples: that the fit used.
+        unseen: samples of the part that the fit did not see; None if there are too few.
+        recording: the whole drive, repaired.
         train_until_s: where the training part ended, from the drive's first pose [s].
         held_out: open-loop errors on the rest; None if it was too short for them.
+        alpha: of the pruning; `auto` for the knee of the accuracy curve.
         notes: sentences on what was found, what could not be learnt, what was assumed.
     """
 
@@ -41,8 +50,11 @@ class Identified:
     calibration: Calibration
     fit: Fit
     samples: Samples
+    unseen: Samples | None
+    recording: Recording
     train_until_s: float
     held_out: OpenLoop | None
+    alpha: Alpha
     notes: tuple[str, ...]
 
 
@@ -50,20 +62,24 @@ def identify(
     recording: Recording,
     spec: RobotSpec,
     order: int = ORDER,
-    alpha: float = ALPHA,
+    alpha: Alpha = ALPHA,
     train_until: float | None = None,
     assume: bool = False,
+    strict: bool = False,
 ) -> Identified:
     """Learns a robot's motion from the first part of a recording and tries it on the rest.
 
     Args:
-        recording: of a drive in which every command varied.
+        recording: of a drive in which every command varied. Single samples that jump and rows
+            that repeat are left out first.
         spec: the robot.
         order: of the Taylor expansion.
-        alpha: of the pruning (Eq. 2).
+        alpha: of the pruning (Eq. 2), or `auto`.
         train_until: end of the part to learn from, from the first pose [s]; the first two
             thirds when None.
         assume: completes the model by the textbook for inputs that never moved.
+        strict: refuses a drive that did not move every input on its own, instead of giving a
+            model without.
 
     Returns:
         Model, calibration, errors and sentences.
@@ -72,21 +88,39 @@ def identify(
         RecordingError: the recording can't be used for this robot.
         FitError: the drive does not hold enough to fit a model.
     """
-    check(recording, spec)
+    check_units(check(recording, spec), spec)
     duration = float(recording.pose.t[-1] - recording.pose.t[0])
     until = TRAIN_SHARE * duration if train_until is None else train_until
-    training = cut(recording, until)
-    calibration, findings = examine(training, spec)
-    samples = align(training, calibration, spec)
+    training, whole = repair(cut(recording, until), spec), repair(recording, spec).recording
+    check_axes(training.recording, spec)
+    calibration, findings = examine(training.recording, spec)
+    samples = align(training.recording, calibration, spec)
     linear = fit(samples, spec, order, alpha, noisy=not calibration.is_exact)
-    model, calibration, notes = _refined(linear.model, calibration, training, spec, until)
-    held_out, trial = _held_out(model, calibration, recording, spec, until, duration)
+    if strict:
+        refuse_unexcited(linear, spec)
+    exact = calibration.is_exact
+    model, calibration, notes = _refined(linear.model, calibration, training.recording, spec, until)
+    held_out, trial = _held_out(model, calibration, whole, spec, until, duration)
     calibration = replace(calibration, notes=sentences(calibration, findings, spec))
-    notes = (*calibration.notes, *notes, *_unlearnt(linear, calibration), *trial)
+    notes = (
+        *training.notes,
+        *calibration.notes,
+        *notes,
+        *mirror_note(samples, spec),
+        *unlearnt(linear, calibration, spec),
+        *doubts(linear, held_out, exact),
+        *trial,
+    )
     if assume:
         model, assumed = assume_textbook(model, spec, linear.unmoved)
         notes = (*notes, *assumed)
-    return Identified(model, calibration, linear, samples, until, held_out, notes)
+    unseen = unseen_samples(whole, calibration, spec, until)
+    as_fitted = model is linear.model
+    model = with_quality(model, linear, unseen, held_out, spec)
+    linear = replace(linear, model=model) if as_fitted else linear
+    return Identified(
+        model, calibration, linear, samples, unseen, whole, until, held_out, alpha, notes
+    )
 
 
 def cut(recording: Recording, until: float) -> Recording:
@@ -122,10 +156,11 @@ def _refined(
     """Refines a model of a real recording; that of an exact one is left alone."""
     if calibration.is_exact:
         return model, calibration, ()
-    model, calibration = _by_definition(model, calibration, spec)
+    linear = model
+    model, calibration = _by_definition(model.with_errors({}), calibration, spec)
     refined = refine(model, calibration, training, spec, 0.0, until)
     if refined is None:
-        return model, calibration, (
+        return merged(model, linear, {}), calibration, (
             "The training part is too short to refine the model by its errors over seconds; record "
             "a longer drive.",
         )  # fmt: skip
@@ -134,7 +169,8 @@ def _refined(
         "Coefficients and calibration were refined by the open-loop errors over up to 5 s: "
         f"{refined.error:.4f} m (root mean square) is left on the training part."
     )
-    return refined.model, refined.calibration, (note,)
+    errors = replace(refined.model, std_errors=refined.std_errors).named_errors
+    return merged(refined.model, linear, errors), refined.calibration, (note,)
 
 
 def _by_definition(
@@ -160,23 +196,6 @@ def _by_definition(
             coefficients[0, (model.powers == alone).all(axis=1)] = 1.0
     model = replace(model, coefficients=coefficients)
     return model, replace(calibration, responses=tuple(responses))
-
-
-def _unlearnt(linear: Fit, calibration: Calibration) -> tuple[str, ...]:
-    """A sentence on the inputs that the drive never moved."""
-    already = {r.command for r in calibration.responses} | {r.state for r in calibration.responses}
-    missing = [name for name in linear.unmoved if name not in already]
-    notes = []
-    if linear.unmoved:
-        notes.append(
-            f"The model has no terms of {', '.join(linear.unmoved)}, which never moved: it holds "
-            "for this drive's constant value only."
-        )
-    if missing:
-        notes.append(
-            f"Drive with {', '.join(missing)} changing over the whole range to learn them."
-        )
-    return tuple(notes)
 
 
 def _held_out(

@@ -125,7 +125,7 @@ def mounting_by_commands(motion: Motion, response: Array) -> Mounting | None:
         The mounting, or None if it did not move along x and y and turn.
     """
     size = np.linalg.svd(response, compute_uv=False)
-    if size[2] < MIN_SECOND * size[0]:
+    if size[2] <= MIN_SECOND * size[0]:
         return None
     gain, *_ = np.linalg.lstsq(response, motion.twist, rcond=None)
     rest = motion.twist - response @ gain

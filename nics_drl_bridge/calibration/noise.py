@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 DIFFERENCE = 6
 DIFFERENCE_GAIN = np.sqrt(924.0)  # white noise grows by this in a sixth difference
 GAUSSIAN_MAD = 0.6745
+UNEVEN = 0.5
+LEAST_WHOLE = 0.1  # of the stretches must be without a gap, to be taken alone
 NEGLIGIBLE = 1e-6  # m, rad
 REST_SAMPLES = 12
 REST_DRIFT = 3.0  # standard errors; straight motion shows at least 4
@@ -39,16 +41,23 @@ class Motion:
     twist: Array
 
 
-def pose_noise(pose: Array, bursts: Bursts | None) -> tuple[float, float] | None:
-    """Standard deviation of position [m] and heading [rad] of poses (T, 3).
+def pose_noise(
+    pose: Array, bursts: Bursts | None, t: Array | None = None
+) -> tuple[float, float] | None:
+    """Standard deviation of position [m] and heading [rad] of poses (T, 3) at times (T,).
 
-    From differences so high that motion has none; in bursts, where sample times are not known
-    well enough for that, from the stretches in which the robot stood still. None if there
-    are none.
+    From differences so high that motion has none, over stretches without a gap; in bursts,
+    where sample times are not known well enough for that, from the stretches in which the robot
+    stood still. None if there are none.
     """
     pose = unwrapped(pose)
     if bursts is None:
         rest = np.diff(pose, DIFFERENCE, axis=0) / DIFFERENCE_GAIN
+        if t is not None and len(rest):
+            span = np.diff(t)
+            even = np.abs(span - np.median(span)) < UNEVEN * np.median(span)
+            whole = np.convolve(even, np.ones(DIFFERENCE), "valid") > DIFFERENCE - 0.5
+            rest = rest[whole] if whole.mean() > LEAST_WHOLE else rest
         if len(rest) < DIFFERENCE:
             return None
         sigma = np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD

@@ -14,8 +14,8 @@ from nics_drl_bridge.calibration.calibration import Calibration
 from nics_drl_bridge.calibration.signals import held
 from nics_drl_bridge.calibration.timing import followed
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.kinematics.kernels import SERIES, rollout, term_arrays
 from nics_drl_bridge.kinematics.model import TaylorModel
-from nics_drl_bridge.kinematics.motion import rollout, term_arrays
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec
 
@@ -180,8 +180,7 @@ def _roll(model: TaylorModel, state: Array, command: Array) -> Array:
     count, steps = command.shape[:2]
     poses, states = np.zeros((count, steps + 1, 3)), np.empty((count, steps + 1, state.shape[1]))
     states[:, 0] = state
-    rollout(poses, states, np.ascontiguousarray(command), term_arrays(model), model.dt)
-    poses[..., 2] = np.unwrap(poses[..., 2], axis=1)
+    rollout(poses, states, np.ascontiguousarray(command), term_arrays(model), SERIES, model.dt)
     return poses
 
 

@@ -18,6 +18,7 @@ from nics_drl_bridge.calibration.timing import minimise, uncertainty
 from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.kinematics.statistics import clustered_errors
 
 Array = NDArray[np.float64]
 
@@ -26,9 +27,12 @@ SPACING_S = 0.25
 MIN_WINDOWS = 10
 HEADING_ARM_M = 0.3
 """A heading error counts as a position error at this distance."""
-WORTH = 0.1
-"""A term whose loss raises the error by less than this share is left out."""
 DIVERGED = 1e3
+OUTLYING = 10.0
+"""A window that ends this many times the usual error away holds a jump,"""
+OUTLYING_SHARE = 0.25
+"""if that is also more than this share of the longest path."""
+MOST_OUTLIERS = 0.3
 LEAST_SCALE = 0.05
 
 
@@ -40,11 +44,13 @@ class Refined:
         model: the model.
         calibration: with refined offset (or latency), rotation, lags and gains.
         error: root mean square of the open-loop errors on the training part [m].
+        std_errors: (D, K) standard errors of the refined coefficients; NaN for the others.
     """
 
     model: TaylorModel
     calibration: Calibration
     error: float
+    std_errors: Array
 
 
 @dataclass(frozen=True)
@@ -81,7 +87,11 @@ def refine(
     chosen = tuple(
         windows(recording, calibration, start, stop, horizon, SPACING_S) for horizon in HORIZONS_S
     )
-    chosen = tuple(w for w in chosen if len(w.start_t) >= MIN_WINDOWS)
+    chosen = tuple(
+        _without_outliers(w, model, calibration, recording, spec)
+        for w in chosen
+        if len(w.start_t) >= MIN_WINDOWS
+    )
     if not chosen:
         return None
     problem = _Problem(
@@ -100,50 +110,44 @@ def refine(
     )
     sigma = uncertainty(jacobian, rest)
     refined = _unpack(problem, model, calibration, theta, sigma)
-    return Refined(*refined, float(np.sqrt(np.mean(rest**2))))
+    error = float(np.sqrt(np.mean(rest**2)))
+    return Refined(*refined, error, _coefficient_errors(problem, jacobian, rest, refined[0]))
 
 
-def simplify(
-    refined: Refined, recording: Recording, spec: RobotSpec, start: float, stop: float
-) -> Refined:
-    """Leaves out terms of the body twist that hardly help to predict the training part.
-
-    The one that is least certain goes first; the rest is refined anew.
-    """
-    best, tried = refined, set[tuple[int, int]]()
-    limit = refined.error * (1.0 + WORTH)
-    while (weakest := _weakest(best, spec, tried)) is not None:
-        tried.add(weakest)
-        coefficients = best.model.coefficients.copy()
-        coefficients[weakest] = 0.0
-        shorter = replace(best.model, coefficients=coefficients)
-        again = refine(shorter, best.calibration, recording, spec, start, stop)
-        if again is not None and again.error < limit:
-            best = again
-    used = np.abs(best.model.coefficients).sum(axis=0) > 0.0
-    model = replace(
-        best.model,
-        powers=best.model.powers[used],
-        coefficients=np.ascontiguousarray(best.model.coefficients[:, used]),
-    )
-    return replace(best, model=model)
+def _coefficient_errors(
+    problem: _Problem, jacobian: Array, rest: Array, model: TaylorModel
+) -> Array:
+    """Standard errors (D, K); windows that share a stretch of the drive are one cluster."""
+    starts = np.concatenate([np.repeat(w.start_t, 3) for w in problem.chosen])
+    cluster = np.floor((starts - starts.min()) / max(HORIZONS_S)).astype(np.intp)
+    errors = np.full(model.coefficients.shape, np.nan)
+    count = int(problem.free.sum())
+    errors[problem.free] = clustered_errors(jacobian, rest, cluster)[:count]
+    for state in problem.spec.state:
+        tied = [_linear_term(model, problem.spec, n) for n in (state.name, str(state.follows))]
+        d = model.dofs.index(f"d_{state.name}")
+        if None in tied or not problem.free[d, tied[0]] or problem.free[d, tied[1]]:
+            continue
+        gain = abs(model.coefficients[d, tied[1]] / model.coefficients[d, tied[0]])
+        errors[d, tied[1]] = gain * errors[d, tied[0]]
+    return errors
 
 
-def _weakest(
-    refined: Refined, spec: RobotSpec, tried: set[tuple[int, int]]
-) -> tuple[int, int] | None:
-    """The free term of the twist that weighs least, standardised by the range of X."""
-    model = refined.model
-    free = free_coefficients(model, refined.calibration, spec)[:3]
-    reach = np.maximum(np.abs(model.low), np.abs(model.high))
-    size = np.abs(model.coefficients[:3]) * np.prod(reach**model.powers, axis=1)
-    size = size / np.maximum(size.sum(axis=1, keepdims=True), 1e-12)
-    order = np.argsort(np.where(free, size, np.inf), axis=None)
-    for flat in order:
-        d, k = divmod(int(flat), size.shape[1])
-        if free[d, k] and (d, k) not in tried:
-            return d, k
-    return None
+def _without_outliers(
+    chosen: Windows,
+    model: TaylorModel,
+    calibration: Calibration,
+    recording: Recording,
+    spec: RobotSpec,
+) -> Windows:
+    """Leaves out windows that a jump of the pose lies in, or at an end."""
+    error = predict(model, calibration, recording, spec, chosen) - chosen.end
+    size = np.hypot(error[:, 0], error[:, 1])
+    far = max(OUTLYING * float(np.median(size)), OUTLYING_SHARE * float(chosen.path.max()))
+    inside = size <= far
+    if inside.all() or inside.mean() < 1.0 - MOST_OUTLIERS or inside.sum() < MIN_WINDOWS:
+        return chosen
+    return Windows(*(values[inside] for values in vars(chosen).values()))
 
 
 def free_coefficients(

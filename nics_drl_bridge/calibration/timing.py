@@ -31,6 +31,8 @@ MAX_ROWS = 2000
 EXACT = 1e-6
 DIFFERENCE = 1e-4
 TOLERANCE = 1e-7
+LONG_STEP = 1.5
+"""A step this much longer than the usual one is a gap."""
 MAX_STEPS = 40
 
 
@@ -132,7 +134,8 @@ def latency_of_state(command: Stream, state: Stream, spec: RobotSpec) -> Delay |
     """
     if not moved_commands(command).any():
         return None
-    keep = np.flatnonzero(np.diff(state.t) > 0.0)
+    span = np.diff(state.t)
+    keep = np.flatnonzero((span > 0.0) & (span < LONG_STEP * np.median(span)))
     if len(keep) > MAX_ROWS:  # by the golden section: no stride that commands could share
         keep = keep[np.unique((np.arange(MAX_ROWS) * 0.6180339887 % 1.0 * len(keep)).astype(int))]
     start, end = state.t[keep], state.t[keep + 1]

@@ -124,7 +124,10 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Applies an action for one control period; see Gymnasium."""
         if self._view is None:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
-        before = self._view
+        if not np.isfinite(action).all():
+            raise gymnasium.error.InvalidAction(f"action {action!r}: holds NaN or inf.")
+        # After an error in the backend, only a reset leads back.
+        before, self._view = self._view, None
         self._view, facts = self._backend.step(self.task.command(action))
         verdict = self.task.judge(self._view, self.goal)
         terms = self.task.reward(before, self._view, self.goal, verdict)

@@ -40,7 +40,7 @@ class SimBackend:
     def reset(self, start: Start) -> RobotView:
         """Begins the episode of a seed; see `interface.Backend`."""
         self._simulator.reset([start.seed], starts=start.pose[None, None])
-        self._now_ns += self._period_ns
+        self._now_ns = 0
         self._middleware.reset(self._now_ns, start.pose)
         return self._measure()
 

@@ -90,6 +90,8 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, N
         self, actions: Observation
     ) -> tuple[Observation, NDArray[np.float64], Flags, Flags, dict[str, Any]]:
         """One control period in every world; see Gymnasium."""
+        if not np.isfinite(actions).all():
+            raise gymnasium.error.InvalidAction("actions hold NaN or inf.")
         before = self._view()
         self.simulator.step(self.task.command(actions)[:, None])
         fresh = np.flatnonzero(self._ended)

@@ -58,5 +58,8 @@ def parse_term(text: str, names: tuple[str, ...]) -> NDArray[np.int64]:
         name, _, power = factor.partition("^")
         if name not in names:
             raise ValueError(f"term {text!r} names the unknown variable {name!r}")
-        row[names.index(name)] += int(power or 1)
+        times = int(power or 1)
+        if times < 1:
+            raise ValueError(f"term {text!r} has a power below 1")
+        row[names.index(name)] += times
     return row

@@ -6,13 +6,25 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import qr
 
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.kinematics import features
+from nics_drl_bridge.kinematics.accuracy import Curve
+from nics_drl_bridge.kinematics.dof import Alpha, DofFit, fit_dof
+from nics_drl_bridge.kinematics.excitation import (
+    commands_together,
+    independent_columns,
+    levels,
+    unmoved_variables,
+)
 from nics_drl_bridge.kinematics.model import TaylorModel
+from nics_drl_bridge.kinematics.prune import prune
 from nics_drl_bridge.kinematics.recording import Samples
+from nics_drl_bridge.kinematics.robust import plausible, usual_ranges
 from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.kinematics.statistics import errors_of
+
+__all__ = ["ALPHA", "ORDER", "Alpha", "Fit", "fit", "prune"]
 
 Array = NDArray[np.float64]
 
@@ -21,12 +33,21 @@ ORDER = 2
 MIN_SAMPLES_PER_TERM = 5
 NEGLIGIBLE = 1e-3
 """A direction in which the robot moves by less than this share of the other is left at zero."""
-STILL = 1e-3
-"""A variable whose spread is below this share of its range did not move."""
-CERTAIN = 3.0
-"""A term of a noisy fit must be this many times its standard error."""
-DEPENDENT = 1e-7
-"""A standardised feature whose part orthogonal to the others is below this is a copy."""
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """What a drive moved.
+
+    Attributes:
+        unmoved: variables that the drive never moved, so that no term has them.
+        together: commands that moved, but of which one was always made of the others.
+        levels: how many different values each command took, at most 10.
+    """
+
+    unmoved: tuple[str, ...]
+    together: tuple[str, ...]
+    levels: dict[str, int]
 
 
 @dataclass(frozen=True)
@@ -34,49 +55,54 @@ class Fit:
     """A fitted model and how well it fits.
 
     Attributes:
-        model: the pruned model.
-        rmse: (D,) root mean square of dQ/dt that the model leaves over, in the dof's unit.
+        model: the pruned model, with standard errors.
+        rmse: (D,) root mean square of dQ/dt that the model leaves over, in the dof's unit;
+            outliers apart.
         r2: (D,) share of the variance explained; 1 where the dof does not move.
         terms_total: D x K before pruning.
-        unmoved: variables that the drive never moved, so that no term has them.
+        excitation: what the drive moved.
         dependent: terms that are copies of others on this drive.
+        curves: accuracy against the number of terms, of the dofs that move.
+        outliers: (D,) share of the rows that were left out as outliers.
+        condition: (D,) condition number of the standardised features that are kept.
+        samples: number of rows.
     """
 
     model: TaylorModel
     rmse: Array
     r2: Array
     terms_total: int
-    unmoved: tuple[str, ...]
+    excitation: Excitation
     dependent: tuple[str, ...]
+    curves: tuple[Curve, ...]
+    outliers: Array
+    condition: Array
+    samples: int
 
-
-def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
-    """Names of the variables of X that stayed where they were for the whole drive."""
-    limits = np.array([v.max - v.min for v in (*spec.state, *spec.command)])
-    spread = samples.x.std(axis=0)
-    return tuple(
-        name
-        for name, s, limit in zip(spec.variable_names, spread, limits, strict=True)
-        if s < STILL * limit
-    )
+    @property
+    def unmoved(self) -> tuple[str, ...]:
+        """Variables that the drive never moved, so that no term has them."""
+        return self.excitation.unmoved
 
 
 def fit(
     samples: Samples,
     spec: RobotSpec,
     order: int = ORDER,
-    alpha: float = ALPHA,
+    alpha: Alpha = ALPHA,
     noisy: bool = False,
 ) -> Fit:
     """Fits and prunes a Taylor model.
 
     Args:
-        samples: (t, Q, X, dQ) on one time axis.
+        samples: (t, Q, X, dQ) on one time axis. Rows that jump are left out as outliers.
         spec: gives names and units.
-        order: of the expansion; the paper's is 2.
-        alpha: the share of the summed standardised coefficients that the kept terms reach
-            (Eq. 2). The term that crosses the threshold is kept too: to the letter of Eq. 2 a
-            differential robot, whose wheels weigh the same, would lose one of them.
+        order: of the expansion, 1 to 4; the paper's is 2.
+        alpha: the share of the summed standardised coefficients that the kept terms of each
+            degree of freedom reach (Eq. 2). The term that crosses the threshold is kept too:
+            to the letter of Eq. 2 a differential robot, whose wheels weigh the same, would
+            lose one of them. `auto` keeps as many terms, in the same order, as the
+            cross-validated error is worth (`accuracy.knee`).
         noisy: for any recording but an exact one. Terms that can't be told from noise are
             dropped before Eq. 2 counts the rest. The body twist is then taken to be a function
             of the state alone, if there is a state, and to be zero at zero speed, if the speed
@@ -88,11 +114,65 @@ def fit(
     Raises:
         FitError: too few samples, or nothing moved.
     """
-    unmoved = unmoved_variables(samples, spec)
-    names = spec.variable_names
-    powers = features.exponents(len(names), order)
+    low, high = np.array([[v.min, v.max] for v in (*spec.state, *spec.command)]).T
+    believed = plausible(samples.x, low, high)
+    samples = samples.rows(believed)
+    excitation = excitation_of(samples, spec)
+    names, size = spec.variable_names, samples.dq.shape[1]
+    every = features.exponents(len(names), order)
+    powers = _moved_terms(samples, every, names, excitation.unmoved)
+    chi = features.evaluate(samples.x, powers)
+    independent, dependent = independent_columns(chi)
+    chi, kept = chi[:, independent], powers[independent]
+    parts = _fit_dofs(samples, spec, kept, chi, alpha, noisy, excitation.unmoved)
+    model = build_model(samples, spec, kept, *_stacked(parts, size, len(kept)))
+    rmse, r2 = _errors(model, samples, parts)
+    left_out = 1.0 - float(believed.mean())
+    return Fit(
+        model,
+        rmse,
+        r2,
+        terms_total=size * len(every),
+        excitation=excitation,
+        dependent=tuple(features.term_name(row, names) for row in powers[dependent]),
+        curves=tuple(part.curve for part in parts.values()),
+        outliers=np.array([_outliers(parts.get(d), left_out) for d in range(size)]),
+        condition=np.array([parts[d].condition if d in parts else 1.0 for d in range(size)]),
+        samples=len(samples.t),
+    )
+
+
+def excitation_of(samples: Samples, spec: RobotSpec) -> Excitation:
+    """What a drive moved."""
+    return Excitation(
+        unmoved_variables(samples, spec), commands_together(samples, spec), levels(samples, spec)
+    )
+
+
+def build_model(
+    samples: Samples, spec: RobotSpec, powers: NDArray[np.int64], coefficients: Array, errors: Array
+) -> TaylorModel:
+    """A TaylorModel of the terms that some degree of freedom keeps."""
+    used = np.abs(coefficients).sum(axis=0) > 0.0
+    return TaylorModel(
+        variables=spec.variable_names,
+        dofs=spec.dof_names,
+        dof_units=spec.dof_units,
+        powers=powers[used],
+        coefficients=coefficients[:, used],
+        dt=samples.dt,
+        low=samples.x.min(axis=0),
+        high=samples.x.max(axis=0),
+        std_errors=errors[:, used],
+    )
+
+
+def _moved_terms(
+    samples: Samples, powers: NDArray[np.int64], names: tuple[str, ...], unmoved: tuple[str, ...]
+) -> NDArray[np.int64]:
+    """The terms (K, V) of variables that moved, if there are samples enough for them."""
     still = [names.index(name) for name in unmoved]
-    moved = powers[(powers[:, still] == 0).all(axis=1)]
+    moved: NDArray[np.int64] = powers[(powers[:, still] == 0).all(axis=1)]
     if len(samples.t) < MIN_SAMPLES_PER_TERM * len(moved):
         raise FitError(
             f"{len(samples.t)} samples are too few for {len(moved)} terms; drive for longer, or "
@@ -100,55 +180,58 @@ def fit(
         )
     if len(unmoved) == len(names):
         raise FitError("nothing moved in this drive; vary every command over its range.")
-    chi = features.evaluate(samples.x, moved)
-    independent, dependent = _independent_columns(chi)
-    chi, kept_powers = chi[:, independent], moved[independent]
-    coefficients = np.zeros((samples.dq.shape[1], len(kept_powers)))
-    by_state = _through_state(kept_powers, spec, unmoved)
-    for d in np.flatnonzero(_moves(samples.dq)):
+    return moved
+
+
+def _fit_dofs(
+    samples: Samples,
+    spec: RobotSpec,
+    powers: NDArray[np.int64],
+    chi: Array,
+    alpha: Alpha,
+    noisy: bool,
+    unmoved: tuple[str, ...],
+) -> dict[int, DofFit]:
+    """Each degree of freedom that moves."""
+    labels = np.array([features.term_name(row, spec.variable_names) for row in powers])
+    by_state = _through_state(powers, spec, unmoved)
+    usual, parts = usual_ranges(samples.dq), {}
+    for d in map(int, np.flatnonzero(_moves(samples.dq))):
         allowed = by_state if noisy and d < 3 else np.ones_like(by_state)
-        coefficients[d, allowed] = fit_dof(chi[:, allowed], samples.dq[:, d], alpha, noisy)
-    model = build_model(samples, spec, kept_powers, coefficients)
+        part = fit_dof(
+            spec.dof_names[d],
+            tuple(map(str, labels[allowed])),
+            chi[:, allowed],
+            samples.dq[:, d],
+            float(usual[d]),
+            alpha,
+            noisy,
+        )
+        parts[d] = part.spread_over(allowed)
+    return parts
+
+
+def _stacked(parts: dict[int, DofFit], dofs: int, terms: int) -> tuple[Array, Array]:
+    """Coefficients and standard errors (D, K); zero for a dof that does not move."""
+    coefficients, errors = np.zeros((dofs, terms)), np.zeros((dofs, terms))
+    for d, part in parts.items():
+        coefficients[d], errors[d] = part.coefficients, part.errors
+    return coefficients, errors
+
+
+def _errors(model: TaylorModel, samples: Samples, parts: dict[int, DofFit]) -> tuple[Array, Array]:
+    """RMSE (D,) and R2 (D,) on the rows that each degree of freedom was fitted to."""
     rmse, r2 = errors_of(model, samples)
-    names_dependent = tuple(features.term_name(row, names) for row in moved[dependent])
-    return Fit(model, rmse, r2, samples.dq.shape[1] * len(powers), unmoved, names_dependent)
+    for d, part in parts.items():
+        if not part.inliers.all():
+            some = errors_of(model, samples.rows(part.inliers))
+            rmse[d], r2[d] = some[0][d], some[1][d]
+    return rmse, r2
 
 
-def fit_dof(chi: Array, target: Array, alpha: float, noisy: bool = False) -> Array:
-    """Coefficients (K,) of one degree of freedom: least squares, Eq. 2, least squares anew.
-
-    Args:
-        chi: (T, K) features.
-        target: (T,) rates.
-        alpha: see `fit`.
-        noisy: see `fit`.
-    """
-    scale = _scale(chi)
-    beta: Array = np.asarray(np.linalg.lstsq(chi / scale, target, rcond=None)[0])
-    if noisy:
-        certain = significant(chi / scale, target)
-        beta = np.zeros(len(scale))
-        beta[certain] = np.linalg.lstsq(chi[:, certain] / scale[certain], target, rcond=None)[0]
-    keep = prune(beta, alpha, noise_floor=1e-9 * max(float(np.abs(target).max()), 1e-9))
-    result = np.zeros(chi.shape[1])
-    if keep.any():
-        standardised = np.linalg.lstsq(chi[:, keep] / scale[keep], target, rcond=None)[0]
-        result[keep] = standardised / scale[keep]
-    return result
-
-
-def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.bool_]:
-    """Which of the standardised coefficients (K,) to keep (Eq. 2).
-
-    Sorted by size, those are kept whose sum stays below `alpha` of the whole, and the one
-    that crosses it. Coefficients below `noise_floor` are rounding errors and never count.
-    """
-    size = np.where(np.abs(beta) > noise_floor, np.abs(beta), 0.0)
-    order = np.argsort(-size, kind="stable")
-    before = np.cumsum(size[order]) - size[order]
-    keep = np.zeros(len(beta), dtype=np.bool_)
-    keep[order] = (before < alpha * size.sum()) & (size[order] > 0.0)
-    return keep
+def _outliers(part: DofFit | None, left_out: float) -> float:
+    inside = 1.0 if part is None else float(part.inliers.mean())
+    return 1.0 - (1.0 - left_out) * inside
 
 
 def _through_state(
@@ -163,76 +246,9 @@ def _through_state(
     return np.asarray(allowed)
 
 
-def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
-    """Which features (K,) of a noisy target (T,) can be told from noise.
-
-    The least certain goes first, until each of those left is `CERTAIN` times its standard
-    error; the error is widened for residuals that resemble their neighbours.
-    """
-    rest = target - chi @ np.linalg.lstsq(chi, target, rcond=None)[0]
-    power = max(float(rest @ rest), np.finfo(np.float64).tiny)
-    rho = min(max(float(rest[1:] @ rest[:-1]) / power, 0.0), 0.98)
-    variance = power / max(1, len(chi) - chi.shape[1]) * (1.0 + rho) / (1.0 - rho)
-    gram, moment = chi.T @ chi, chi.T @ target
-    keep = np.ones(chi.shape[1], dtype=np.bool_)
-    while keep.any():
-        inverse = np.linalg.pinv(gram[np.ix_(keep, keep)], hermitian=True)
-        beta = inverse @ moment[keep]
-        error = np.sqrt(np.maximum(np.diag(inverse) * variance, np.finfo(np.float64).tiny))
-        ratio = np.abs(beta) / error
-        if ratio.min() >= CERTAIN:
-            break
-        keep[np.flatnonzero(keep)[int(np.argmin(ratio))]] = False
-    return keep
-
-
-def build_model(
-    samples: Samples, spec: RobotSpec, powers: NDArray[np.int64], coefficients: Array
-) -> TaylorModel:
-    """A TaylorModel of the terms that some degree of freedom keeps."""
-    used = np.abs(coefficients).sum(axis=0) > 0.0
-    return TaylorModel(
-        variables=spec.variable_names,
-        dofs=spec.dof_names,
-        dof_units=spec.dof_units,
-        powers=powers[used],
-        coefficients=coefficients[:, used],
-        dt=samples.dt,
-        low=samples.x.min(axis=0),
-        high=samples.x.max(axis=0),
-    )
-
-
-def errors_of(model: TaylorModel, samples: Samples) -> tuple[Array, Array]:
-    """RMSE (D,) and R2 (D,) of the rates of a model on samples."""
-    residual = samples.dq - model.rates(samples.x)
-    rmse = np.sqrt((residual**2).mean(axis=0))
-    variance = samples.dq.var(axis=0)
-    unexplained = (residual**2).mean(axis=0) / np.maximum(variance, 1e-18)
-    r2 = np.where(variance > 1e-18, 1.0 - unexplained, 1.0)
-    return rmse, r2
-
-
 def _moves(dq: Array) -> NDArray[np.bool_]:
     """Which degrees of freedom (D,) move at all, beside the fastest of their kind."""
     size = np.sqrt((dq**2).mean(axis=0))
     moves = np.ones(len(size), dtype=np.bool_)
     moves[:2] = size[:2] > NEGLIGIBLE * size[:2].max()
     return moves
-
-
-def _scale(chi: Array) -> Array:
-    """The spread (K,) of each feature; 1 for the constant."""
-    spread = chi.std(axis=0)
-    return np.where(spread > 0.0, spread, 1.0)
-
-
-def _independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Splits columns into an independent set and copies; low orders are kept first."""
-    unit = chi / np.linalg.norm(chi, axis=0)
-    independent: list[int] = []
-    dependent: list[int] = []
-    r = np.abs(np.diag(qr(unit, mode="r")[0]))  # without pivoting: each against those before it
-    for k in range(chi.shape[1]):
-        (independent if k < len(r) and r[k] > DEPENDENT else dependent).append(k)
-    return np.array(independent, dtype=np.intp), np.array(dependent, dtype=np.intp)

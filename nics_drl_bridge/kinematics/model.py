@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.kinematics import features
+from nics_drl_bridge.kinematics.quality import Quality
 
 Array = NDArray[np.float64]
+
+
+def _unknown() -> Array:
+    return np.zeros((0, 0))
 
 
 @dataclass(frozen=True)
@@ -29,6 +35,9 @@ class TaylorModel:
         low, high: (V,) the box of X that the recording covered.
         assumed: terms (dof, term) that the drive could not show, filled in from the
             textbook's structure on request.
+        std_errors: (D, K) standard errors of the coefficients; NaN where a kept one was not
+            estimated but assumed or fixed by definition. Empty, (0, 0), where none is known.
+        quality: how well it fits; None where not known.
     """
 
     variables: tuple[str, ...]
@@ -40,6 +49,8 @@ class TaylorModel:
     low: Array
     high: Array
     assumed: tuple[tuple[str, str], ...] = ()
+    std_errors: Array = field(default_factory=_unknown)
+    quality: Quality | None = None
 
     @property
     def state_size(self) -> int:
@@ -71,6 +82,32 @@ class TaylorModel:
         dq = self.rates(x) * self.dt
         return geometry.compose(pose, geometry.exp(dq[..., :3])), state + dq[..., 3:]
 
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """K names: `1`, `speed`, `speed*steering`."""
+        return tuple(features.term_name(row, self.variables) for row in self.powers)
+
+    @property
+    def named_errors(self) -> dict[str, dict[str, float]]:
+        """Standard errors that are known, of the kept terms: dof -> term -> error."""
+        known = self.coefficients != 0.0
+        known &= np.isfinite(self.std_errors) if self.std_errors.size else False
+        names = self.term_names
+        return {
+            dof: {names[k]: float(self.std_errors[d, k]) for k in np.flatnonzero(known[d])}
+            for d, dof in enumerate(self.dofs)
+            if known[d].any()
+        }
+
+    def with_errors(self, errors: Mapping[str, Mapping[str, float]]) -> TaylorModel:
+        """The model with standard errors by dof and term; NaN where a kept term has none."""
+        if not errors:
+            return replace(self, std_errors=_unknown())
+        names = self.term_names
+        rows = [[errors.get(dof, {}).get(name, np.nan) for name in names] for dof in self.dofs]
+        known = np.array(rows, dtype=np.float64).reshape(self.coefficients.shape)
+        return replace(self, std_errors=np.where(self.coefficients != 0.0, known, 0.0))
+
     def equations(self) -> list[str]:
         """One line per degree of freedom, with units: `wz = 4.6*speed*steering  [rad/s]`."""
         lines = []
@@ -100,13 +137,18 @@ class TaylorModel:
             name: [float(low), float(high)]
             for name, low, high in zip(self.variables, self.low, self.high, strict=True)
         }
-        return {
+        data: dict[str, Any] = {
             "dt": self.dt,
             "units": dict(zip(self.dofs, self.dof_units, strict=True)),
             "terms": terms,
             "valid": box,
             "assumed": [list(pair) for pair in self.assumed],
         }
+        if self.std_errors.size:
+            data["standard_errors"] = self.named_errors
+        if self.quality is not None:
+            data["quality"] = self.quality.to_dict()
+        return data
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> TaylorModel:
@@ -124,15 +166,21 @@ class TaylorModel:
                 [[float(terms[dof].get(name, 0.0)) for name in names] for dof in dofs]
             )
             box = np.array([data["valid"][name] for name in variables], dtype=np.float64)
+            box = box.reshape(len(variables), 2)
             units, dt = tuple(data["units"][dof] for dof in dofs), float(data["dt"])
             assumed = tuple((str(dof), str(term)) for dof, term in data["assumed"])
+            errors = {
+                str(dof): {str(term): float(value) for term, value in row.items()}
+                for dof, row in data.get("standard_errors", {}).items()
+            }
+            quality = Quality.from_dict(data["quality"]) if "quality" in data else None
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ModelError(
                 f"kinematics: {error!s} is missing or wrong; generate the model anew."
             ) from None
-        if not (np.isfinite(coefficients).all() and np.isfinite(box).all() and dt > 0.0):
+        if not (np.isfinite(coefficients).all() and np.isfinite(box).all() and 0.0 < dt < np.inf):
             raise ModelError("kinematics: holds NaN, inf or dt <= 0; generate the model anew.")
         return cls(
             variables, dofs, units, powers, coefficients.reshape(len(dofs), len(names)), dt,
-            box[:, 0], box[:, 1], assumed,
-        )  # fmt: skip
+            box[:, 0], box[:, 1], assumed, quality=quality,
+        ).with_errors(errors)  # fmt: skip

@@ -8,7 +8,6 @@ axis.
 from __future__ import annotations
 
 import json
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.files import npz_bytes, write_bytes
+from nics_drl_bridge.files import npz_arrays, npz_bytes, write_bytes
 from nics_drl_bridge.kinematics.spec import RobotSpec
 
 Array = NDArray[np.float64]
@@ -29,6 +28,11 @@ TOO_FAST = 20.0
 """Nor is a speed of this many times the greatest command."""
 SPEED_OVER_S = 0.5
 SLOWEST_SAMPLING_S = 2.0
+IRREGULAR = 0.5
+"""A step whose length is off by this share of the usual one is a gap or a repetition."""
+JITTER = 1e-4
+ROUNDING_S = 1e-6
+"""Steps that differ by less are equally long, but for the rounding of their stamps."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,8 @@ class Recording:
         pose: (T, 3) x [m], y [m], heading [rad] of the tracked body, in a fixed frame.
         state: (T, S) measured state in the order of the RobotSpec, where there is one.
         wheels: (T, 2) left and right wheel speed in the encoder's units, where there are any.
+        imu: (T, 3) acceleration along x and y [m/s^2] and yaw rate [rad/s] of the sensor, where
+            there is one.
         source: where it came from, for reports and errors.
         variables: names of X = [state, command] of the robot that drove, where known.
     """
@@ -64,6 +70,7 @@ class Recording:
     pose: Stream
     state: Stream | None = None
     wheels: Stream | None = None
+    imu: Stream | None = None
     source: str = "recording"
     variables: tuple[str, ...] = ()
 
@@ -75,6 +82,8 @@ class Recording:
             named["state"] = self.state
         if self.wheels is not None:
             named["wheels"] = self.wheels
+        if self.imu is not None:
+            named["imu"] = self.imu
         return named
 
 
@@ -104,24 +113,29 @@ class Samples:
 
 
 def samples_on_one_clock(t: Array, pose: Array, state: Array, command: Array) -> Samples:
-    """Builds Samples from series that share uniform stamps.
+    """Builds Samples from series that share stamps.
 
     Args:
-        t: (T,) uniform stamps [s].
+        t: (T,) stamps [s], uniform but for gaps, repetitions and jitter.
         pose: (T, 3) pose of `base_link` at each stamp.
         state: (T, S) state at each stamp.
         command: (T, C) command held from each stamp to the next.
 
     Returns:
-        T - 1 steps.
+        A row for each of the T - 1 steps that is about as long as the others: a gap is no step,
+        nor is a repeated stamp.
     """
-    dt = float(np.median(np.diff(t)))
-    twist = geometry.log(geometry.between(pose[:-1], pose[1:])) / dt
-    rates = np.diff(state, axis=0) / dt
+    span = np.diff(t)
+    dt = float(np.median(span[span > 0.0])) if (span > 0.0).any() else 0.0
+    regular = np.abs(span - dt) < IRREGULAR * dt
+    length = np.where(np.abs(span - dt) < JITTER * dt + ROUNDING_S, dt, span)[regular, None]
+    first, last = np.flatnonzero(regular), np.flatnonzero(regular) + 1
+    twist = geometry.log(geometry.between(pose[first], pose[last])) / length
+    rates = (state[last] - state[first]) / length
     return Samples(
-        t=t[:-1],
-        q=np.concatenate([pose, state], axis=1)[:-1],
-        x=np.concatenate([state, command], axis=1)[:-1],
+        t=t[first],
+        q=np.concatenate([pose, state], axis=1)[first],
+        x=np.concatenate([state, command], axis=1)[first],
         dq=np.concatenate([twist, rates], axis=1),
         dt=dt,
     )
@@ -143,7 +157,8 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
             f"the robot {spec.name!r} has {', '.join(spec.variable_names)}: choose the robot that "
             "drove."
         )
-    width = {"command": len(spec.command), "pose": 3, "state": len(spec.state), "wheels": 2}
+    width = {"command": len(spec.command), "state": len(spec.state)}
+    width |= {"pose": 3, "wheels": 2, "imu": 3}
     for name, stream in recording.streams.items():
         _check_stream(f"{recording.source}: {name}", stream, width[name])
     _check_units(recording, spec)
@@ -159,7 +174,7 @@ def _check_units(recording: Recording, spec: RobotSpec) -> None:
             f"{place}: the heading jumps by {turn:.1f} rad between neighbouring samples; it must "
             "be in radians (degrees look like this)."
         )
-    speeds = [v for v in spec.command if v.cmd_vel != "angular.z"]
+    speeds = [v for v in spec.command if v.unit == "m/s"]
     fastest = max((max(abs(v.min), abs(v.max)) for v in speeds), default=np.inf)
     every = np.unique(np.searchsorted(pose.t, np.arange(pose.t[0], pose.t[-1], SPEED_OVER_S)))
     step, took = np.diff(pose.values[every, :2], axis=0), np.diff(pose.t[every])
@@ -220,8 +235,7 @@ def load_npz(path: Path) -> Recording:
         RecordingError: no such file, not an `.npz`, damaged, or a stream is missing.
     """
     try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
+        arrays = npz_arrays(path.read_bytes())
         meta = json.loads(str(arrays["meta"]))
         if meta["format"] != FORMAT:
             raise RecordingError(
@@ -235,12 +249,12 @@ def load_npz(path: Path) -> Recording:
         return Recording(**streams, source=str(path), variables=tuple(meta["variables"]))
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
-    except (KeyError, TypeError) as error:
+    except (AttributeError, KeyError, TypeError) as error:
         raise RecordingError(
             f"{path}: is not a recording of this package ({error}); write it with "
             "nics_drl_bridge.kinematics.recording.save_recording."
         ) from None
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, OSError) as error:
         raise RecordingError(
             f"{path}: can't be read as .npz ({error}); it may be damaged."
         ) from None

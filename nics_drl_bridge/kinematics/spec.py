@@ -60,9 +60,14 @@ class StateVariable(Variable):
 
 
 class CommandVariable(Variable):
-    """A component of the command, and the field of `cmd_vel` that carries it."""
+    """A component of the command.
 
-    cmd_vel: CmdVelField
+    Attributes:
+        cmd_vel: the field of `cmd_vel` that carries it; None for a robot that is not driven
+            over ROS 2.
+    """
+
+    cmd_vel: CmdVelField | None = None
 
 
 class RobotSpec(Schema):
@@ -98,7 +103,7 @@ class RobotSpec(Schema):
                 raise ValueError(
                     f"state {variable.name!r} follows {variable.follows!r}, which is no command"
                 )
-        fields = [c.cmd_vel for c in self.command]
+        fields = [c.cmd_vel for c in self.command if c.cmd_vel is not None]
         if len(set(fields)) != len(fields):
             raise ValueError("two commands share one field of cmd_vel")
         return self
@@ -135,7 +140,12 @@ class RobotSpec(Schema):
 
     @cached_property
     def _cmd_vel_index(self) -> NDArray[np.intp]:
-        return np.array([CMD_VEL_FIELDS.index(c.cmd_vel) for c in self.command], dtype=np.intp)
+        fields = [c.cmd_vel for c in self.command if c.cmd_vel is not None]
+        if len(fields) < len(self.command):
+            raise ConfigError(
+                f"robot {self.name!r}: a command names no field of cmd_vel; add `cmd_vel:` to it."
+            )
+        return np.array([CMD_VEL_FIELDS.index(field) for field in fields], dtype=np.intp)
 
     def to_cmd_vel(self, command: ArrayLike) -> NDArray[np.float64]:
         """Command (..., C) as `cmd_vel` (..., 3): linear.x, linear.y, angular.z."""

@@ -48,6 +48,8 @@ class LidarSpec(Schema):
             raise ValueError("range_min must be less than range_max")
         if not 0.0 < self.angle_max - self.angle_min <= 2.0 * np.pi + FULL_CIRCLE_TOLERANCE:
             raise ValueError("angle_max must exceed angle_min by at most a full circle, in radians")
+        if max(-self.angle_min, self.angle_max) > 2.0 * np.pi + FULL_CIRCLE_TOLERANCE:
+            raise ValueError("angle_min and angle_max must lie within -2 pi and 2 pi")
         return self
 
     @property

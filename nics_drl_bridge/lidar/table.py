@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ModelError
-from nics_drl_bridge.files import npz_bytes
+from nics_drl_bridge.files import npz_arrays, npz_bytes
 from nics_drl_bridge.lidar import kernels
 from nics_drl_bridge.lidar.spec import LidarSpec
 
@@ -68,9 +66,8 @@ class LidarTable:
     def parse(cls, data: bytes, source: str) -> LidarTable:
         """Reads what `dump` wrote. Raises ModelError with the file's name otherwise."""
         try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-                return cls(**{name: arrays[name] for name in arrays.files})
-        except (ValueError, TypeError, OSError, KeyError, zipfile.BadZipFile) as error:
+            return cls(**npz_arrays(data))
+        except (ValueError, TypeError) as error:
             raise ModelError(
                 f"{source}: is no lidar table ({error}); generate the model anew."
             ) from None

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import wrap_angle
-from nics_drl_bridge.kinematics.motion import term_arrays
+from nics_drl_bridge.kinematics.kernels import SERIES, term_arrays
 from nics_drl_bridge.middleware import kernels
 
 Array = NDArray[np.float64]
@@ -26,6 +26,8 @@ LEAST_TWIST_STD = 1e-3
 START_STD = 1e-3
 """How well the pose is known at a reset [m, rad]."""
 COMMANDS_KEPT = 64
+LONGEST_GAP_S = 10.0
+"""Over a longer silence, as when a clock jumps, the robot is taken to have stood still."""
 NANO = 1_000_000_000
 
 
@@ -95,6 +97,9 @@ class Estimator:
     def _carry(self, mean: Array, transition: Array, time_ns: int) -> None:
         """Moves a mean from the time of the estimate to a later one, command by command."""
         now = self.time_ns
+        if time_ns - now > LONGEST_GAP_S * NANO:
+            mean[3:] = 0.0
+            return
         for effective in [*(effective for effective, _ in self._commands), time_ns]:
             until = min(effective, time_ns)
             if until > now:
@@ -103,9 +108,9 @@ class Estimator:
 
     def _move(self, mean: Array, transition: Array, command: Array, duration_ns: int) -> None:
         steps, rest = divmod(duration_ns, self._dt_ns)
-        kernels.predict(mean, transition, command, self._dt_ns / NANO, steps, self._terms)
+        kernels.predict(mean, transition, command, self._dt_ns / NANO, steps, self._terms, SERIES)
         if rest:
-            kernels.predict(mean, transition, command, rest / NANO, 1, self._terms)
+            kernels.predict(mean, transition, command, rest / NANO, 1, self._terms, SERIES)
 
     def _command_at(self, time_ns: int) -> Array:
         """The command (C,) in effect at a time."""

@@ -7,28 +7,25 @@ import math
 import numpy as np
 from numba import njit
 
-from nics_drl_bridge.kinematics.motion import advance, rates
+from nics_drl_bridge.kinematics.kernels import advance, rates
 
 
 @njit(cache=True)
 def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
     """Derivative (3 + S, V) of `rates` by X."""
-    dof, coefficient, factors = terms
-    one = x.shape[0] - 1
+    dof, coefficient, factors, count = terms
     jacobian[:] = 0.0
     for k in range(dof.shape[0]):
-        for f in range(factors.shape[1]):
-            if factors[k, f] == one:
-                continue
+        for f in range(count[k]):
             product = coefficient[k]
-            for other in range(factors.shape[1]):
+            for other in range(count[k]):
                 if other != f:
                     product *= x[factors[k, other]]
             jacobian[dof[k], factors[k, f]] += product
 
 
 @njit(cache=True)
-def predict(mean, transition, command, dt, steps, terms):  # type: ignore[no-untyped-def]
+def predict(mean, transition, command, dt, steps, terms, series):  # type: ignore[no-untyped-def]
     """Moves the mean (3 + S) by `steps` steps of `dt` under one command (C,), in place.
 
     Args:
@@ -56,7 +53,7 @@ def predict(mean, transition, command, dt, steps, terms):  # type: ignore[no-unt
             for d in range(size):
                 step[3 + d, 3 + i] = (1.0 if d == i else 0.0) + dt * jacobian[3 + d, i]
         transition[:] = step @ transition
-        advance(mean[:3], dq, dt)
+        advance(mean[:3], dq, dt, series)
         for i in range(size):
             mean[3 + i] += dt * dq[3 + i]
 

@@ -10,7 +10,7 @@ from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.cache import TopicCache
 from nics_drl_bridge.middleware.ekf import Estimator
 
-SCAN, ODOM = "scan", "odom"
+SCAN, ODOM, CMD_VEL = "scan", "odom", "cmd_vel"
 
 
 class Middleware:
@@ -33,14 +33,18 @@ class Middleware:
         self.cache = TopicCache()
         self.estimator.reset(time_ns, pose)
 
-    def command(self, stamp_ns: int, command: ArrayLike) -> None:
-        """Notes a command (C,) that was sent to the robot."""
+    def command(self, stamp_ns: int, command: ArrayLike) -> bool:
+        """Notes a command (C,) that was sent to the robot; says whether it was used."""
+        if not np.isfinite(command).all():
+            self.cache.reject(f"{CMD_VEL}: NaN or inf")
+            return False
         self.estimator.command(stamp_ns, command)
+        return True
 
     def scan(self, stamp_ns: int, arrival_ns: int, ranges: NDArray[np.float32]) -> bool:
         """Takes a scan (B,); says whether it was used."""
         if ranges.shape != (self._beams,):
-            self.cache.reject(f"{SCAN}: {ranges.shape[0]} beams, not {self._beams}")
+            self.cache.reject(f"{SCAN}: shape {ranges.shape}, not ({self._beams},)")
             return False
         return self.cache.put(SCAN, stamp_ns, arrival_ns, ranges)
 

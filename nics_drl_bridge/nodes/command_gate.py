@@ -12,9 +12,8 @@ from rclpy.context import Context
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
-from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.runner import declare, last_word, run_node
+from nics_drl_bridge.nodes.runner import declare, declare_model, last_word, run_node
 from nics_drl_bridge.safety.gate import Decision, Limits, Request, decide
 
 PERIOD_S = 0.05
@@ -33,13 +32,7 @@ class CommandGate(Node):
 
     def __init__(self, context: Context) -> None:
         super().__init__("command_gate", context=context)
-        declare(
-            self,
-            "model",
-            "ackermann",
-            "Folder of a SimulatorModel, or a shipped robot.",
-            read_only=True,
-        )
+        robot = declare_model(self).robot
         age = declare(
             self,
             "scan_age",
@@ -49,7 +42,6 @@ class CommandGate(Node):
             high=10.0,
             read_only=True,
         )
-        robot = open_model(str(self.get_parameter("model").value)).robot
         self._limits = Limits(
             robot.to_cmd_vel(robot.command_low), robot.to_cmd_vel(robot.command_high), float(age)
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import threading
@@ -27,11 +28,13 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import RobotView, Start
 from nics_drl_bridge.middleware.view import Middleware
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.runner import last_word, open_context
 from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
 SCAN, ODOM, TRUTH = "scan", "odom", "ground_truth"
 POLL_S = 0.002
+RESET_PATIENCE_S = 1.0
 
 
 class _Mailbox:
@@ -39,30 +42,33 @@ class _Mailbox:
 
     def __init__(self) -> None:
         self._messages: dict[str, Any] = {}
+        self._arrivals: dict[str, float] = {}
         self._changed = threading.Condition()
 
     def put(self, topic: str, message: Any) -> None:
         with self._changed:
-            self._messages[topic] = message
+            self._messages[topic], self._arrivals[topic] = message, time.monotonic()
             self._changed.notify_all()
 
     def stamp_ns(self, topic: str) -> int:
-        """Of the newest message; -1 when there is none. Called with the lock held."""
+        """Of the newest message; -1 when there is none."""
         message = self._messages.get(topic)
         return -1 if message is None else conversions.stamp_from_ros(message.header.stamp)
+
+    def age_s(self, topic: str) -> float:
+        """Seconds since the newest message arrived; inf when there is none."""
+        return time.monotonic() - self._arrivals.get(topic, -math.inf)
 
     def wait(self, topics: tuple[str, ...], stamp_ns: int, timeout_s: float) -> dict[str, Any]:
         """The messages once each is at least as new as a stamp. Raises StaleDataError."""
         deadline = time.monotonic() + timeout_s
         with self._changed:
             for topic in topics:
-                while self.stamp_ns(topic) < stamp_ns:
-                    if not self._changed.wait(max(0.0, deadline - time.monotonic())) and (
-                        time.monotonic() >= deadline
-                    ):
-                        newest = self.stamp_ns(topic)
-                        age = math.inf if newest < 0 else (stamp_ns - newest) / conversions.NANO
-                        raise StaleDataError(topic, age, timeout_s)
+                if not self._changed.wait_for(
+                    lambda topic=topic: self.stamp_ns(topic) >= stamp_ns,  # type: ignore[misc]
+                    max(0.0, deadline - time.monotonic()),
+                ):
+                    raise StaleDataError(topic, self.age_s(topic), timeout_s)
             return dict(self._messages)
 
 
@@ -71,7 +77,7 @@ class DdsBackend:
 
     Each step publishes one command and returns exactly the data that are stamped one control
     period later. A node of its own in a context of its own listens in one executor thread;
-    nothing spins inside `step`. `close`, an exception and garbage collection leave a zero
+    nothing spins inside `step`. `close`, an error in `step` and garbage collection leave a zero
     command behind.
 
     Args:
@@ -97,13 +103,13 @@ class DdsBackend:
         truth: bool = False,
         domain_id: int | None = None,
     ) -> None:
-        self._robot, self._identity = model.robot, {"model": model.fingerprint, "world": world.name}
+        self._robot = model.robot
+        self._identity = {"model": model.fingerprint, "world": world.fingerprint}
         self._middleware = Middleware(model)
         self._period_ns = round(model.control_period * conversions.NANO)
         self._timeout_s, self._topics = timeout_s, (ODOM, SCAN, *((TRUTH,) if truth else ()))
         self._now_ns, self._mail = 0, _Mailbox()
-        context = Context()
-        context.init(domain_id=domain_id)
+        context = open_context(domain_id=domain_id)
         node = Node(
             "bridge_env", namespace=namespace, context=context, start_parameter_services=False
         )
@@ -122,37 +128,52 @@ class DdsBackend:
             target=_spin, args=(context, node), daemon=True, name="dds_backend"
         )
         thread.start()
-        self._closing = weakref.finalize(self, _shut_down, context, node, self._commands, thread)
-        self._wait_for_peers()
+        self._closing = weakref.finalize(self, _shut_down, context, self._commands, thread)
+        try:
+            self._wait_for_peers()
+        except BaseException:
+            self.close()
+            raise
 
     def _wait_for_peers(self) -> None:
         """Waits until every end is matched. Raises BackendError with what is missing."""
-        resolve = self._node.resolve_topic_name
+        resolve, service = self._node.resolve_topic_name, self._node.resolve_service_name
         needed: dict[str, Callable[[], bool]] = {
-            f"a subscriber of {resolve('cmd_vel')}": lambda: (
+            f"subscriber of {resolve('cmd_vel')}": lambda: (
                 self._commands.get_subscription_count() > 0
             ),
             **{
-                f"a publisher of {resolve(topic)}": lambda topic=topic: (  # type: ignore[misc]
+                f"publisher of {resolve(topic)}": lambda topic=topic: (  # type: ignore[misc]
                     self._node.count_publishers(resolve(topic)) > 0
                 )
                 for topic in self._topics
             },
-            f"the service {self._reset.srv_name}": self._reset.service_is_ready,
-            f"the service {self._parameters.srv_name}": self._parameters.service_is_ready,
+            f"service {service(self._reset.srv_name)}": self._reset.service_is_ready,
+            f"service {service(self._parameters.srv_name)}": self._parameters.service_is_ready,
         }
         deadline = time.monotonic() + self._timeout_s
         while missing := [name for name, there in needed.items() if not there()]:
             if time.monotonic() > deadline:
                 raise BackendError(
-                    f"after {self._timeout_s:g} s there is still no {' and no '.join(missing)}; "
+                    f"after {self._timeout_s:g} s there is still no {', no '.join(missing)}; "
                     "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and "
                     "namespace."
                 )
             time.sleep(POLL_S)
+        # Somebody who was killed stays in the graph for a while.
+        while self._others_command() and time.monotonic() < deadline:
+            time.sleep(POLL_S)
+        self._check_alone()
 
     def reset(self, start: Start) -> RobotView:
-        """Begins the episode of a seed in the simulator; see `interface.Backend`."""
+        """Begins the episode of a seed in the simulator; see `interface.Backend`.
+
+        Raises:
+            BackendError: the simulator refuses, or does not answer.
+            ModelError: it runs another model or world.
+            StaleDataError: its data do not arrive.
+        """
+        self._check_open()
         request = SetParametersAtomically.Request()
         request.parameters = [
             Parameter("episode_seed", value=int(start.seed)).to_parameter_msg(),
@@ -162,6 +183,19 @@ class DdsBackend:
         result = self._call(self._parameters, request).result
         if not result.successful:
             raise BackendError(f"the simulator refused the episode: {result.reason}")
+        deadline = time.monotonic() + self._timeout_s
+        while True:
+            patience_s = min(RESET_PATIENCE_S, max(0.0, deadline - time.monotonic()))
+            self._begin(start)
+            try:
+                return self._measure(patience_s)[0]
+            except StaleDataError as error:
+                # The simulator may not have discovered our subscription yet, and what it sends
+                # before that is lost: begin the same episode again.
+                if time.monotonic() >= deadline:
+                    raise StaleDataError(error.topic, error.age_s, self._timeout_s) from None
+
+    def _begin(self, start: Start) -> None:
         response = self._call(self._reset, Trigger.Request())
         if not response.success:
             raise BackendError(f"the simulator could not reset: {response.message}")
@@ -169,7 +203,10 @@ class DdsBackend:
         self._check_identity(answer)
         self._now_ns = int(answer["stamp_ns"])
         self._middleware.reset(self._now_ns, start.pose)
-        return self._measure()[0]
+
+    def _check_open(self) -> None:
+        if not self._closing.alive:
+            raise BackendError("this backend is closed; make another one.")
 
     def _check_identity(self, answer: dict[str, Any]) -> None:
         for key, mine in self._identity.items():
@@ -193,24 +230,61 @@ class DdsBackend:
         return future.result()
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
-        """Publishes a command and waits for the data after it; see `interface.Backend`."""
-        twist = self._robot.to_cmd_vel(command)
-        self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
-        self._commands.publish(conversions.twist_to_ros(twist))
-        self._now_ns += self._period_ns
-        return self._measure()
+        """Publishes a command and waits for the data after it; see `interface.Backend`.
 
-    def _measure(self) -> tuple[RobotView, dict[str, Any]]:
+        Raises:
+            BackendError: somebody else moved the simulator, or it is not in lock-step.
+            StaleDataError: the data do not arrive.
+        """
+        self._check_open()
+        try:
+            self._check_alone()
+            # Data that are there before the command would be taken for its answer.
+            self._check_stamps({topic: self._mail.stamp_ns(topic) for topic in self._topics})
+            twist = self._robot.to_cmd_vel(command)
+            self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
+            self._commands.publish(conversions.twist_to_ros(twist))
+            self._now_ns += self._period_ns
+            return self._measure(self._timeout_s)
+        except BaseException:
+            self._commands.publish(Twist())
+            raise
+
+    def _check_stamps(self, stamps: dict[str, int]) -> None:
+        """Raises BackendError when data are not stamped with the present step."""
+        for topic, stamp in stamps.items():
+            if stamp != self._now_ns:
+                off_s = (stamp - self._now_ns) / conversions.NANO
+                raise BackendError(
+                    f"topic {topic!r}: stamped {off_s:+.3f} s off the step; start the simulator "
+                    "with mode:=lockstep, and move it from here alone."
+                )
+
+    def _others_command(self) -> bool:
+        return bool(self._node.count_publishers(self._commands.topic_name) > 1)
+
+    def _check_alone(self) -> None:
+        """Raises BackendError when somebody else publishes commands too.
+
+        Each of theirs would move the simulator, and every answer after it would be to an older
+        command than ours.
+        """
+        if self._others_command():
+            topic = self._commands.topic_name
+            ends = self._node.get_publishers_info_by_topic(topic)
+            names = sorted(f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends)
+            with contextlib.suppress(ValueError):
+                names.remove(self._node.get_fully_qualified_name())
+            raise BackendError(f"{', '.join(names)} publishes {topic} too; stop it.")
+
+    def _measure(self, timeout_s: float) -> tuple[RobotView, dict[str, Any]]:
         """The view at the present stamp. Raises BackendError when the data are of another one."""
         now = self._now_ns
-        messages = self._mail.wait(self._topics, now, self._timeout_s)
-        for topic in self._topics:
-            off_ns = conversions.stamp_from_ros(messages[topic].header.stamp) - now
-            if off_ns != 0:
-                raise BackendError(
-                    f"topic {topic!r}: stamped {off_ns / conversions.NANO:+.3f} s off the step; is "
-                    "somebody else publishing cmd_vel, or the simulator not in lock-step?"
-                )
+        messages = self._mail.wait(self._topics, now, timeout_s)
+        self._check_alone()
+        self._check_stamps(
+            {t: conversions.stamp_from_ros(messages[t].header.stamp) for t in self._topics}
+        )
         arrival = time.monotonic_ns()
         pose, twist = conversions.odometry_from_ros(messages[ODOM])
         self._middleware.odometry(now, arrival, pose, twist)
@@ -239,12 +313,14 @@ def _spin(context: Context, node: Node) -> None:
         pass
     finally:
         executor.shutdown(timeout_sec=1.0)
+        node.destroy_node()
 
 
-def _shut_down(context: Context, node: Node, commands: Any, thread: threading.Thread) -> None:
-    """Leaves a zero command behind and frees the node; knows nothing of the backend object."""
+def _shut_down(context: Context, commands: Any, thread: threading.Thread) -> None:
+    """Leaves a zero command behind and ends the thread; knows nothing of the backend object."""
     if context.ok():
-        commands.publish(Twist())
-        context.shutdown()
-    thread.join(timeout=2.0)
-    node.destroy_node()
+        last_word(commands, Twist())
+        context.try_shutdown()
+    # Garbage may be collected in any thread, also in that one.
+    if thread is not threading.current_thread():
+        thread.join(timeout=2.0)

@@ -9,10 +9,9 @@ from rclpy.context import Context
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
-from nics_drl_bridge.nodes.runner import declare, run_node
+from nics_drl_bridge.nodes.runner import declare, declare_model, run_node
 
 DIAGNOSTICS_PERIOD_S = 1.0
 
@@ -28,16 +27,9 @@ class MiddlewareNode(Node):
 
     def __init__(self, context: Context) -> None:
         super().__init__("middleware_node", context=context)
-        declare(
-            self,
-            "model",
-            "ackermann",
-            "Folder of a SimulatorModel, or a shipped robot.",
-            read_only=True,
-        )
+        model = declare_model(self)
         declare(self, "map_frame", "map", "Frame id of the estimate.")
         declare(self, "base_frame", "base_link", "Frame id of the robot.")
-        model = open_model(str(self.get_parameter("model").value))
         self._filtered = self.create_publisher(Odometry, "odometry/filtered", qos.SENSOR_RELIABLE)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._topics = RobotTopics(self, model, on_odometry=self._publish)

@@ -10,10 +10,9 @@ from rclpy.node import Node
 
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
-from nics_drl_bridge.nodes.runner import declare, last_word, run_node
+from nics_drl_bridge.nodes.runner import declare, declare_model, last_word, run_node
 from nics_drl_bridge.policy.policies import make_policy
 
 ODOM = "odom"
@@ -31,13 +30,7 @@ class PolicyNode(Node):
 
     def __init__(self, context: Context) -> None:
         super().__init__("policy_node", context=context)
-        declare(
-            self,
-            "model",
-            "ackermann",
-            "Folder of a SimulatorModel, or a shipped robot.",
-            read_only=True,
-        )
+        model = declare_model(self)
         declare(self, "policy", "go_to_goal", "Name of a policy.", read_only=True)
         declare(self, "base_frame", "base_link", "Frame id of the robot.")
         goal = declare(
@@ -49,7 +42,6 @@ class PolicyNode(Node):
         )
         if len(goal) != 2:
             raise ConfigError(f"parameter 'goal': must be [x, y], not {list(goal)}")
-        model = open_model(str(self.get_parameter("model").value))
         self._task = Navigation(model.robot, model.lidar)
         self._policy = make_policy(str(self.get_parameter("policy").value), self._task)
         self._goal: NDArray[np.float64] = np.array(goal, dtype=np.float64)

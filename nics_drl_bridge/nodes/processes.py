@@ -8,33 +8,60 @@ import random
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from nics_drl_bridge.config import dump_yaml
-from nics_drl_bridge.errors import BackendError
+from nics_drl_bridge.errors import BackendError, ConfigError
 
-LAST_DOMAIN_ID = 101
-"""Above it, DDS ports may collide with those that Linux hands out."""
+LAST_DOMAIN_ID, GREATEST_DOMAIN_ID = 101, 232
+"""Above the first, DDS ports may collide with those that Linux hands out; above the other there
+are none."""
+PR_SET_PDEATHSIG = 1
 PATIENCE_S = 5.0
 LOG_LINES = 5
 
 
 def free_domain_id() -> int:
-    """The domain id of the environment, or one drawn at random so that runs keep apart."""
+    """The domain id of the environment, or one drawn at random so that runs keep apart.
+
+    Raises:
+        ConfigError: the environment's is no domain id.
+    """
     given = os.environ.get("ROS_DOMAIN_ID")
-    return int(given) if given else random.SystemRandom().randint(1, LAST_DOMAIN_ID)
+    if not given:
+        return random.SystemRandom().randint(1, LAST_DOMAIN_ID)
+    if not given.isdecimal() or int(given) > GREATEST_DOMAIN_ID:
+        raise ConfigError(
+            f"the environment variable ROS_DOMAIN_ID is {given!r}; it must be a number from 0 to "
+            f"{GREATEST_DOMAIN_ID}, or unset."
+        )
+    return int(given)
 
 
-def _die_with_parent() -> None:
-    """Linux: the child gets SIGTERM when its parent dies, however that dies."""
-    ctypes.CDLL(None).prctl(1, signal.SIGTERM)
+def _dies_with_parent() -> Callable[[], None] | None:
+    """What a child does first, on Linux: ask for SIGTERM when its parent dies, however it dies.
+
+    The library is loaded before the fork, because little is safe after it.
+    """
+    if sys.platform != "linux":
+        return None
+    prctl, parent = ctypes.CDLL(None).prctl, os.getpid()
+
+    def ask() -> None:
+        prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() != parent:  # it died in between
+            os._exit(1)
+
+    return ask
 
 
 class NodeProcess:
     """One node in a process of its own; a context manager that ends it.
+
+    On Linux the node also ends when the thread that started it does.
 
     Args:
         node: module below `nics_drl_bridge.nodes`, which is also the executable's name.
@@ -79,7 +106,7 @@ class NodeProcess:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                preexec_fn=_die_with_parent if sys.platform == "linux" else None,
+                preexec_fn=_dies_with_parent(),
             )
 
     @property

@@ -21,5 +21,9 @@ SENSOR_RELIABLE = _keep_last(10, ReliabilityPolicy.RELIABLE)
 """What the simulator offers, so that subscribers of both kinds match it; and what a lock-step
 client asks for, because there a lost datum would never be sent again."""
 
+EVERY_COMMAND = _keep_last(10, ReliabilityPolicy.RELIABLE)
+"""Commands in lock-step: each moves the world, so that a second publisher does not go unnoticed by
+replacing the first one's."""
+
 COMMAND = _keep_last(1, ReliabilityPolicy.RELIABLE)
 """Commands: only the newest counts, and it has to arrive."""

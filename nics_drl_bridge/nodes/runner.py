@@ -19,6 +19,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from nics_drl_bridge.errors import BackendError, BridgeError
+from nics_drl_bridge.generator import SimulatorModel, open_model
 
 SPIN_S = 0.1
 DELIVERY_S = 0.5
@@ -86,6 +87,12 @@ def run_node(make: Callable[[Context], Node], args: Sequence[str] | None = None)
             node.destroy_node()
         if context is not None:
             context.try_shutdown()
+
+
+def declare_model(node: Node) -> SimulatorModel:
+    """Declares the parameter `model` and opens what it names."""
+    about = "Folder of a SimulatorModel, or a shipped robot."
+    return open_model(str(declare(node, "model", "ackermann", about, read_only=True)))
 
 
 def declare(node: Node, name: str, default: Any, description: str, **limits: Any) -> Any:

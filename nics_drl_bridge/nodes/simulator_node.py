@@ -11,6 +11,8 @@ from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock as SteadyClock
+from rclpy.clock import ClockType
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -18,11 +20,11 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import SetBool, Trigger
 
+from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BridgeError, ConfigError, nearest
-from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.lidar.scanner import RENDERERS
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.runner import declare, run_node
+from nics_drl_bridge.nodes.runner import declare, declare_model, run_node
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
 
@@ -45,14 +47,14 @@ class SimulatorNode(Node):
 
     def __init__(self, context: Context) -> None:
         super().__init__("simulator_node", context=context)
+        model = declare_model(self)
         self._declare()
-        model = open_model(self._text("model"))
         world = load_world(self._text("world"))
         renderer = self._choice("renderer", RENDERERS)
         self._mode = self._choice("mode", MODES)
         self._model = model
         self._simulator = FastSimulator(model, world, renderer=renderer)  # type: ignore[arg-type]
-        self._identity = {"model": model.fingerprint, "world": world.name}
+        self._identity = {"model": model.fingerprint, "world": world.fingerprint}
         self._period_ns = round(model.control_period * conversions.NANO)
         self._now_ns = time.time_ns() // self._period_ns * self._period_ns
         self._command, self._command_ns = np.zeros(len(model.robot.command)), 0
@@ -62,14 +64,16 @@ class SimulatorNode(Node):
         self._begin()
 
     def _declare(self) -> None:
-        declare(self, "model", "ackermann", "Folder of a SimulatorModel, or a shipped robot.")
-        declare(self, "world", "arena", "World file, or the name of a shipped world.")
-        declare(self, "renderer", "baked", "Lidar: baked or exact.")
-        declare(self, "mode", "realtime", f"How time runs: {', '.join(MODES)}.")
-        declare(
-            self, "rate", 1.0, "Simulated seconds per second in realtime.", low=0.01, high=1000.0
-        )
-        declare(self, "command_timeout", 0.5, "Stops after this silence [s].", low=0.0, high=3600.0)
+        # First, so that it also judges the values that the node is started with.
+        self.add_on_set_parameters_callback(self._check_parameters)
+        world, renderer = "World file, or the name of a shipped world.", "Lidar: baked or exact."
+        declare(self, "world", "arena", world, read_only=True)
+        declare(self, "renderer", "baked", renderer, read_only=True)
+        declare(self, "mode", "realtime", f"How time runs: {', '.join(MODES)}.", read_only=True)
+        rate = "Simulated seconds per second in realtime."
+        declare(self, "rate", 1.0, rate, low=0.01, high=1000.0, read_only=True)
+        silence = "Stops after this silence on cmd_vel [simulated s]; not in lockstep."
+        declare(self, "command_timeout", 0.5, silence, low=0.0, high=3600.0)
         for frame, default in (
             ("map", "map"),
             ("odom", "odom"),
@@ -82,7 +86,6 @@ class SimulatorNode(Node):
         declare(
             self, "episode_start_given", False, "Whether episode_start holds, or the seed's own."
         )
-        self.add_on_set_parameters_callback(self._check_parameters)
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         for parameter in parameters:
@@ -115,14 +118,20 @@ class SimulatorNode(Node):
         self._odom_topic = self.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
         self._truth_topic = self.create_publisher(Odometry, "ground_truth", qos.SENSOR_RELIABLE)
         self._clock_topic = self.create_publisher(Clock, "/clock", qos.SENSOR_RELIABLE)
-        self.create_subscription(Twist, "cmd_vel", self._on_command, qos.COMMAND)
+        commands = qos.EVERY_COMMAND if self._mode == "lockstep" else qos.COMMAND
+        self.create_subscription(Twist, "cmd_vel", self._on_command, commands)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
         if self._mode == "realtime":
             period = self._model.control_period / float(self.get_parameter("rate").value)
-            self.create_timer(period, self._on_time)
         elif self._mode == "as_fast_as_possible":
-            self.create_timer(0.0, self._on_time)
+            period = 0.0
+        else:
+            return
+        # Steady: not the node's clock, which with use_sim_time would wait for this very node.
+        self.create_timer(
+            period, self._on_time, clock=SteadyClock(clock_type=ClockType.STEADY_TIME)
+        )
 
     def _on_command(self, message: Twist) -> None:
         twist = conversions.twist_from_ros(message)
@@ -142,9 +151,11 @@ class SimulatorNode(Node):
         self._advance()
 
     def _advance(self) -> None:
+        before = self._simulator.data.pose[0, 0].copy()
         self._simulator.step(self._command[None, None])
         self._now_ns += self._period_ns
-        self._publish()
+        moved = geometry.log(geometry.between(before, self._simulator.data.pose[0, 0]))
+        self._publish(moved / self._model.control_period)
 
     def _begin(self) -> None:
         given = bool(self.get_parameter("episode_start_given").value)
@@ -153,7 +164,7 @@ class SimulatorNode(Node):
         self._simulator.reset([seed], starts=start[None, None] if given else None)
         self._command = np.zeros_like(self._command)
         self._now_ns += self._period_ns
-        self._publish()
+        self._publish(np.zeros(3))
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
@@ -171,7 +182,8 @@ class SimulatorNode(Node):
         response.success, response.message = True, "paused" if self._paused else "running"
         return response
 
-    def _publish(self) -> None:
+    def _publish(self, true_twist: Array) -> None:
+        """Publishes the present data; `true_twist` (3,) is the mean of the period before."""
         data, now = self._simulator.data, self._now_ns
         map_frame, odom_frame, base, laser = (
             self._text(f"{name}_frame") for name in ("map", "odom", "base", "laser")
@@ -187,9 +199,10 @@ class SimulatorNode(Node):
         self._scan_topic.publish(
             conversions.scan_to_ros(self._model.lidar, data.ranges[0, 0], now, laser)
         )
-        self._truth_topic.publish(
-            conversions.odometry_to_ros(data.pose[0, 0], twist, now, (map_frame, base), (0.0,) * 4)
+        truth = conversions.odometry_to_ros(
+            data.pose[0, 0], true_twist, now, (map_frame, base), (0.0,) * 4
         )
+        self._truth_topic.publish(truth)
 
 
 def main(args: list[str] | None = None) -> None:

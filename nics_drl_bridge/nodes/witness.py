@@ -9,11 +9,11 @@ from types import TracebackType
 import numpy as np
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
-from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.runner import open_context
 
 
 class Witness:
@@ -27,8 +27,7 @@ class Witness:
     def __init__(self, domain_id: int | None = None, topic: str = "ground_truth") -> None:
         self._poses: list[NDArray[np.float64]] = []
         self._changed = threading.Condition()
-        self._context = Context()
-        self._context.init(domain_id=domain_id)
+        self._context = open_context(domain_id=domain_id)
         self._node = Node("witness", context=self._context, start_parameter_services=False)
         self._node.create_subscription(Odometry, topic, self._take, qos.SENSOR_RELIABLE)
         self._thread = threading.Thread(target=self._spin, daemon=True, name="witness")

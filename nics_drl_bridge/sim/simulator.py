@@ -11,12 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kinematics.motion import scratch, term_arrays
+from nics_drl_bridge.kinematics.kernels import SERIES, scratch, term_arrays
 from nics_drl_bridge.lidar.scanner import Renderer, make_scanner
 from nics_drl_bridge.sim import kernels
+from nics_drl_bridge.sim.validity import CommandBox, OutsideValidityWarning
 from nics_drl_bridge.sim.world import Scene, World, sample_scene
 
+__all__ = ["FastSimulator", "OutsideValidityWarning", "Worlds"]
+
 Array = NDArray[np.float64]
+LANES = 256
+"""So many robots move side by side: their arrays stay in the fastest cache."""
 
 
 @dataclass(frozen=True)
@@ -77,17 +82,26 @@ class FastSimulator:
         self._scanner = make_scanner(model.lidar, (*world.obstacles.radii, footprint), renderer)
         self._footprint_shape = self._scanner.table.shape_of(footprint)
         self._walls = world.all_walls()
-        self._timing = model.timing
-        self._terms = term_arrays(model.kinematics)
         self._noise = np.array([*model.noise.odometry, model.lidar.noise_std])
         self._sensor = self._scanner.arguments
-        self._scratch = scratch(model.kinematics)
+        self._motion = (term_arrays(model.kinematics), SERIES, model.timing)
+        self._room = (*scratch(model.kinematics), np.zeros((robots, 2)))
+        self._lanes = self._make_lanes(worlds, robots)
+        self._box = CommandBox(model.kinematics, model.robot)
         self.data = self._allocate(worlds, robots)
         self._fields: tuple[Any, ...] = tuple(vars(self.data).values())
 
+    def _make_lanes(self, worlds: int, robots: int) -> tuple[Array, Array, Array]:
+        """Room for the robots that move side by side: pose (6, L), x (V + 1, L), dq (D, L)."""
+        lanes = robots * min(worlds, max(1, LANES // robots))
+        kinematics = self.model.kinematics
+        x = np.ones((len(kinematics.variables) + 1, lanes))
+        return np.zeros((6, lanes)), x, np.zeros((len(kinematics.dofs), lanes))
+
     def _allocate(self, worlds: int, robots: int) -> Worlds:
         size, width = len(self.model.robot.state), len(self.model.robot.command)
-        periods = -(-self._timing[2] // self._timing[1]) + 1
+        _, substeps, delay = self.model.timing
+        periods = -(-delay // substeps) + 1
         bodies = self.world.obstacles.count + robots
         shape = (worlds, robots)
         return Worlds(
@@ -128,6 +142,7 @@ class FastSimulator:
             start = scene.starts if starts is None else np.asarray(starts, dtype=np.float64)[row]
             self._place(int(n), int(seed), scene, start)
             scenes.append(scene)
+        self._box.begin()
         kernels.scan_worlds(self._fields, chosen, self._walls, self._noise, self._sensor)
         return scenes
 
@@ -150,7 +165,8 @@ class FastSimulator:
             commands: (N, M, C) in the units and the order of the RobotSpec.
         """
         commands = np.ascontiguousarray(commands, dtype=np.float64)
+        self._box.check(commands)
         kernels.step_worlds(
-            self._fields, commands, self._walls, self._terms, self._timing,
-            self.model.robot.footprint_radius, self._noise, self._sensor, *self._scratch,
+            self._fields, commands, self._walls, self.model.robot.footprint_radius,
+            self._noise, self._sensor, self._lanes, self._motion, self._room,
         )  # fmt: skip

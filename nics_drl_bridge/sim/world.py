@@ -11,12 +11,14 @@ from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import sha256
 from nics_drl_bridge.sim import random
 
 Array = NDArray[np.float64]
 TRIES = 2000
 SCENE_STREAM = 1
 RESTARTS = 50
+GREATEST_SEED = 2**63 - 1
 
 
 class Obstacles(Schema):
@@ -66,6 +68,11 @@ class World(Schema):
             raise ValueError("goal_distance must be [least, greatest] in metres")
         return self
 
+    @property
+    def fingerprint(self) -> str:
+        """Tells two worlds apart: the name, and the first 8 digits of a SHA-256 over all of it."""
+        return f"{self.name}-{sha256(self.model_dump_json().encode())[:8]}"
+
     def all_walls(self) -> Array:
         """(W, 4) the four sides of the field, then the further walls [m]."""
         x, y = self.size[0] / 2.0, self.size[1] / 2.0
@@ -105,6 +112,8 @@ def sample_scene(world: World, footprint: float, seed: int, robots: int = 1) -> 
     Raises:
         ConfigError: the world has no room for it.
     """
+    if not 0 <= seed <= GREATEST_SEED:
+        raise ConfigError(f"seed {seed}: must be a whole number from 0 to {GREATEST_SEED}.")
     circles = np.zeros((world.obstacles.count, 3))
     starts, goals = np.zeros((robots, 3)), np.zeros((robots, 2))
     half = np.array(world.size) / 2.0

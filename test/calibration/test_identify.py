@@ -13,7 +13,7 @@ from nics_drl_bridge.calibration.identify import cut, identify
 from nics_drl_bridge.calibration.open_loop import open_loop_error, predict, windows
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.kinematics.fit import fit
-from nics_drl_bridge.kinematics.motion import rollout, term_arrays
+from nics_drl_bridge.kinematics.kernels import SERIES, rollout, term_arrays
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec
 
@@ -41,7 +41,7 @@ def test_the_kernel_moves_robots_exactly_as_the_model_does(car):
     command = rng.uniform(-0.5, 0.5, (4, 30, 2))
     poses, states = np.empty((4, 31, 3)), np.empty((4, 31, 2))
     poses[:, 0], states[:, 0] = pose, state
-    rollout(poses, states, command, term_arrays(model), model.dt)
+    rollout(poses, states, command, term_arrays(model), SERIES, model.dt)
     for n in range(30):
         pose, state = model.step(pose, state, command[:, n])
     assert np.allclose(poses[:, -1, :2], pose[:, :2], atol=1e-12)

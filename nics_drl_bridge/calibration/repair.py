@@ -1,0 +1,188 @@
+"""Repairs a recording: repeated rows, jumps of single samples, commands beyond the limits.
+
+What is left out is a gap afterwards. A recording without such faults comes back as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.calibration import stamps
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.geometry import wrap_angle
+from nics_drl_bridge.kinematics.recording import Recording, Stream
+from nics_drl_bridge.kinematics.spec import RobotSpec
+
+Array = NDArray[np.float64]
+
+NEIGHBOURS = 3
+"""A jump stands out from the median of this many samples on either side."""
+STEPS = 4.0
+"""It is larger than this many usual changes from sample to sample,"""
+USUAL = 80.0
+"""(the percentile of the changes that counts as usual: jumps in 5 % of the rows spoil 10 %)"""
+REACH = 1.5
+"""than this many times what the robot's greatest command could do meanwhile,"""
+HEADING_REACH = 0.1
+"""than this angle [rad],"""
+STATE_SHARE = 0.2
+"""and, of a state, than this share of its usual range."""
+MOST = 0.25
+"""More jumps than this share of the rows are no faults of single samples."""
+EXCESS = 0.01
+"""A command this share of its range beyond its limits is beyond them."""
+
+
+@dataclass(frozen=True)
+class Repaired:
+    """A recording that was repaired.
+
+    Attributes:
+        recording: without the faults.
+        notes: a sentence for each kind of fault.
+    """
+
+    recording: Recording
+    notes: tuple[str, ...]
+
+
+def repair(recording: Recording, spec: RobotSpec) -> Repaired:
+    """Leaves out repeated rows and jumps, and holds commands at the robot's limits."""
+    recording, repeated = _without_repetitions(recording)
+    recording, jumps = _without_jumps(recording, spec)
+    recording, beyond = _within_limits(recording, spec)
+    return Repaired(recording, (*repeated, *jumps, *beyond))
+
+
+def _with_rows(recording: Recording, name: str, keep: NDArray[np.bool_]) -> Recording:
+    """The recording with some rows (T,) only of one stream."""
+    stream = recording.streams[name]
+    some: Any = {name: replace(stream, t=stream.t[keep], values=stream.values[keep])}
+    return replace(recording, **some)
+
+
+def _without_repetitions(recording: Recording) -> tuple[Recording, list[str]]:
+    notes = []
+    for name, stream in recording.streams.items():
+        again = (np.diff(stream.t) == 0.0) & (np.diff(stream.values, axis=0) == 0.0).all(axis=1)
+        if again.any():
+            recording = _with_rows(recording, name, np.append(True, ~again))
+            notes.append(
+                f"{name}: {int(again.sum())} of {len(stream.t)} rows repeat the row before them, "
+                "stamp and all, and were left out."
+            )
+    return recording, notes
+
+
+def _without_jumps(recording: Recording, spec: RobotSpec) -> tuple[Recording, list[str]]:
+    notes = []
+    found = {"pose": _jumps_of_pose(recording.pose, spec)}
+    if recording.state is not None and spec.state:
+        found["state"] = _jumps_of_state(recording.state)
+    for name, jump in found.items():
+        share = float(jump.mean()) if len(jump) else 0.0
+        if share > MOST:
+            raise RecordingError(
+                f"{recording.source}: {name}: {share:.0%} of the rows jump away from their "
+                "neighbours and back; look for two sources that are mixed in one stream."
+            )
+        if jump.any():
+            recording = _with_rows(recording, name, ~jump)
+            notes.append(
+                f"{name}: {int(jump.sum())} of {len(jump)} rows ({share:.1%}) jump away from "
+                "their neighbours and back, and were left out as outliers."
+            )
+    return recording, notes
+
+
+def _jumps_of_pose(pose: Stream, spec: RobotSpec) -> NDArray[np.bool_]:
+    """Which poses (T,) jump in position or heading."""
+    if len(pose.t) <= 2 * NEIGHBOURS:
+        return np.zeros(len(pose.t), dtype=np.bool_)
+    t = stamps.spread(pose.t, stamps.find_bursts(pose.t))
+    span = np.zeros(len(t))
+    span[NEIGHBOURS:] = t[NEIGHBOURS:] - t[:-NEIGHBOURS]
+    span[:-NEIGHBOURS] = np.maximum(span[:-NEIGHBOURS], t[NEIGHBOURS:] - t[:-NEIGHBOURS])
+    speeds = [abs(v) for c in spec.command if c.cmd_vel != "angular.z" for v in (c.min, c.max)]
+    reach = np.maximum(REACH * max(speeds, default=0.0) * span, 1e-6)
+    out = [_stands_out(pose.values[:, i], reach) for i in (0, 1)]
+    turns = np.maximum(HEADING_REACH, reach / max(spec.footprint_radius, 1e-3) / 2.0)
+    return out[0] | out[1] | _stands_out(pose.values[:, 2], turns, turning=True)
+
+
+def _jumps_of_state(state: Stream) -> NDArray[np.bool_]:
+    """Which states (T,) jump in any component."""
+    out = np.zeros(len(state.t), dtype=np.bool_)
+    if len(state.t) <= 2 * NEIGHBOURS:
+        return out
+    for column in state.values.T:
+        low, high = np.percentile(column, (5.0, 95.0))
+        out |= _stands_out(column, np.full(len(column), max(STATE_SHARE * (high - low), 1e-9)))
+    return out
+
+
+def _stands_out(values: Array, least: Array, turning: bool = False) -> NDArray[np.bool_]:
+    """Which of values (T,) are further than `least` (T,) from both sides, the same way.
+
+    Args:
+        values: of one component.
+        least: by how much, beside `STEPS` times the usual change.
+        turning: whether they are angles; differences are then wrapped.
+    """
+    back, ahead = _differences(values, turning)
+    usual = float(np.percentile(np.abs(back[0][1:]), USUAL))
+    before, after = np.median(back, axis=0), np.median(ahead, axis=0)
+    apart = np.minimum(np.abs(before), np.abs(after))
+    return np.asarray((before * after > 0.0) & (apart > np.maximum(STEPS * usual, least)))
+
+
+def _differences(values: Array, turning: bool) -> tuple[Array, Array]:
+    """Differences (NEIGHBOURS, T) from the samples before and after; at the ends, zero."""
+    count = len(values)
+    back, ahead = np.zeros((NEIGHBOURS, count)), np.zeros((NEIGHBOURS, count))
+    for n in range(1, NEIGHBOURS + 1):
+        difference = values[n:] - values[:-n]
+        difference = wrap_angle(difference) if turning else difference
+        back[n - 1, n:], ahead[n - 1, :-n] = difference, -difference
+    return back, ahead
+
+
+def _within_limits(recording: Recording, spec: RobotSpec) -> tuple[Recording, list[str]]:
+    """Holds commands at the limits that the robot holds them at."""
+    command, margin = recording.command, EXCESS * (spec.command_high - spec.command_low)
+    values = command.values
+    beyond = (values < spec.command_low - margin) | (values > spec.command_high + margin)
+    if not beyond.any():
+        return recording, []
+    clipped = np.where(beyond, np.clip(values, spec.command_low, spec.command_high), values)
+    if _unexplained(recording, values) < _unexplained(recording, clipped):
+        return recording, [
+            "Commands were beyond the limits in the robot's YAML file, and the robot followed them "
+            "there: widen the limits, or the simulator will not go so far."
+        ]
+    notes = [
+        f"{c.name} was beyond the robot's limits, {c.min:g} to {c.max:g} {c.unit}, in {share:.0%} "
+        "of the rows: it was taken as held at them; the model says nothing of the range beyond."
+        for c, share in zip(spec.command, beyond.mean(axis=0), strict=True)
+        if share > 0.0
+    ]
+    return replace(recording, command=replace(command, values=clipped)), notes
+
+
+def _unexplained(recording: Recording, command: Array) -> float:
+    """What commands (T, C) leave unexplained of the measured state's rates; 0 without a state."""
+    state = recording.state
+    if state is None or len(state.t) < 2:
+        return 0.0
+    span = np.diff(state.t)
+    keep = span > 0.0
+    rates = np.diff(state.values, axis=0)[keep] / span[keep, None]
+    row = np.searchsorted(recording.command.t, state.t[:-1][keep] + 1e-9, "right") - 1
+    u = command[np.clip(row, 0, len(command) - 1)]
+    chi = np.concatenate([np.ones((len(u), 1)), state.values[:-1][keep], u], axis=1)
+    rest = rates - chi @ np.linalg.lstsq(chi, rates, rcond=None)[0]
+    return float(((rest / np.maximum(rates.std(axis=0), 1e-9)) ** 2).mean())

@@ -1,0 +1,73 @@
+"""What a bag's messages tell: rows of numbers, and the message types that rosbags lacks."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from nics_drl_bridge.kinematics import topic_roles
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+Row = tuple[float, float, float]
+
+NANO = 1_000_000_000
+ACKERMANN_DEFINITION = (
+    "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
+    "float32 acceleration\nfloat32 jerk\n"
+)
+ACKERMANN_STAMPED_DEFINITION = "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
+
+
+def typestore() -> Typestore:
+    """The messages of ROS 2, and those of Ackermann drives."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(ACKERMANN_DEFINITION, topic_roles.ACKERMANN))
+    store.register(get_types_from_msg(ACKERMANN_STAMPED_DEFINITION, topic_roles.ACKERMANN_STAMPED))
+    return store
+
+
+def stamp(message: Any) -> int:
+    """The stamp of a message's header [ns]."""
+    time = message.header.stamp
+    return int(time.sec) * NANO + int(time.nanosec)
+
+
+def command_row(message: Any) -> Row:
+    """linear.x, linear.y, angular.z; of an Ackermann drive the speed and the steering angle."""
+    drive = getattr(message, "drive", message)
+    if hasattr(drive, "steering_angle"):
+        return drive.speed, 0.0, drive.steering_angle
+    twist = getattr(message, "twist", message)
+    return twist.linear.x, twist.linear.y, twist.angular.z
+
+
+def _place(message: Any) -> tuple[Any, Any]:
+    """Position and quaternion of any message that has them."""
+    if hasattr(message, "transform"):
+        return message.transform.translation, message.transform.rotation
+    pose = getattr(message.pose, "pose", message.pose)
+    return pose.position, pose.orientation
+
+
+def quaternion(message: Any) -> tuple[float, float, float, float]:
+    """x, y, z, w of a message's pose."""
+    q = _place(message)[1]
+    return q.x, q.y, q.z, q.w
+
+
+def pose_row(message: Any) -> Row:
+    """Position x, y [m] and heading [rad]."""
+    position, q = _place(message)
+    heading = np.arctan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y**2 + q.z**2))
+    return position.x, position.y, float(heading)
+
+
+def imu_row(message: Any) -> Row:
+    """Acceleration along x and y [m/s^2], yaw rate [rad/s]."""
+    acceleration = message.linear_acceleration
+    return acceleration.x, acceleration.y, message.angular_velocity.z

@@ -1,0 +1,168 @@
+"""Stamps: the time axis of each stream of a bag, and whose clock made it.
+
+A message has two times: when the bag received it, and, if it has a header, the stamp that its
+sender put there. The header's is the better one, for it does not shake with the transport; but a
+Twist has none, and the sender's clock may be another one than the recorder's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.kinematics.recording import Stream
+from nics_drl_bridge.kinematics.topic_roles import Stamps
+
+Array = NDArray[np.float64]
+Nanoseconds = NDArray[np.int64]
+
+NANO = 1e-9
+RECEIVE, HEADER = "receive", "header"
+SAME_CLOCK_S = (-0.001, 0.05)
+"""Headers this much before their receipt [s], in the median, are of the recorder's own clock."""
+MAX_WANDER_S = 1.0
+"""Between headers of one clock and their receipt, the delay varies by less than this [s]."""
+ROBOT_STREAMS = ("command", "state", "wheels", "imu")
+"""What a robot's own computer makes: these have to share a clock."""
+
+
+@dataclass(frozen=True)
+class TopicData:
+    """What was read from a topic.
+
+    Attributes:
+        topic: its name.
+        receive_ns: (T,) when each message was received [ns].
+        header_ns: (T,) stamps of the headers [ns]; None where the type has no header.
+        values: (T, D).
+    """
+
+    topic: str
+    receive_ns: Nanoseconds
+    header_ns: Nanoseconds | None
+    values: Array
+
+    def rows(self, keep: NDArray[np.bool_]) -> TopicData:
+        """The messages for which `keep` (T,) is true."""
+        header = None if self.header_ns is None else self.header_ns[keep]
+        return TopicData(self.topic, self.receive_ns[keep], header, self.values[keep])
+
+
+def streams(data: Mapping[str, TopicData], stamps: Stamps, place: str) -> dict[str, Stream]:
+    """Gives each stream its time axis.
+
+    With `auto`, a stream is stamped by its headers where it has some. Headers that lie less
+    than 50 ms before their receipt are of the recorder's clock, which is also that of streams
+    without header (clock `receive`). Others are of a foreign clock (`header`): their stamps
+    are moved by the median delay, so that the offset left for calibration to find is small.
+    Command, state, wheels and IMU are put on one clock, by receipt if need be.
+
+    Args:
+        data: messages by stream name; empty ones are not allowed.
+        stamps: which of the two times to take.
+        place: the recording's name, for errors.
+
+    Returns:
+        Streams by name; their times begin near 0.
+
+    Raises:
+        RecordingError: headers are missing, of several clocks, or run backwards.
+    """
+    if stamps == "receive":
+        return _by_receipt(data, _origin(data))
+    headers = {name: _header(part, stamps, place) for name, part in data.items()}
+    if stamps == "header":
+        origin = min(int(ns.min()) for ns in headers.values() if ns is not None)
+        return {
+            name: Stream(_seconds(ns - origin), data[name].values, HEADER)
+            for name, ns in headers.items()
+            if ns is not None
+        }
+    return _auto(data, headers, place)
+
+
+def _auto(
+    data: Mapping[str, TopicData], headers: Mapping[str, Nanoseconds | None], place: str
+) -> dict[str, Stream]:
+    clocks = _clocks(data, headers, place)
+    robot = {clocks[name][0] for name in ROBOT_STREAMS if name in data}
+    origin, made = _origin(data), {}
+    for name, part in data.items():
+        ns, (clock, shift) = headers[name], clocks[name]
+        if ns is None or (len(robot) > 1 and name in ROBOT_STREAMS):
+            made.update(_by_receipt({name: part}, origin))
+        else:
+            made[name] = Stream(_seconds(ns + shift - origin), part.values, clock)
+    return made
+
+
+def _clocks(
+    data: Mapping[str, TopicData], headers: Mapping[str, Nanoseconds | None], place: str
+) -> dict[str, tuple[str, int]]:
+    """The clock of each stream, and what brings its stamps near the recorder's clock [ns]."""
+    foreign: dict[str, int] = {}
+    clocks = {}
+    for name, part in data.items():
+        ns = headers[name]
+        if ns is None:
+            clocks[name] = (RECEIVE, 0)
+            continue
+        delay = part.receive_ns - ns
+        median = int(np.median(delay))
+        if np.ptp(delay) * NANO > MAX_WANDER_S:
+            raise RecordingError(
+                f"{place}: topic {part.topic!r}: its header stamps lie {delay.min() * NANO:.3f} to "
+                f"{delay.max() * NANO:.3f} s before their receipt: they are of several clocks, or "
+                "of a simulated time at another rate; set `stamps` to receive, or to header if "
+                "every topic has headers."
+            )
+        if SAME_CLOCK_S[0] <= median * NANO <= SAME_CLOCK_S[1]:
+            clocks[name] = (RECEIVE, 0)
+            continue
+        alike = (c for c, d in foreign.items() if abs(d - median) * NANO < SAME_CLOCK_S[1])
+        clock = next(alike, f"{HEADER} of {part.topic}" if foreign else HEADER)
+        clocks[name] = (clock, foreign.setdefault(clock, median))
+    return clocks
+
+
+def _header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
+    """The header stamps of a topic, checked; None where there are none."""
+    ns, topic = part.header_ns, f"{place}: topic {part.topic!r}"
+    empty = np.zeros(0, bool) if ns is None else ns == 0
+    if ns is None or empty.all():
+        if stamps == "header":
+            raise RecordingError(
+                f"{topic}: its messages have no header stamps; set `stamps` to auto or receive."
+            )
+        return None
+    if empty.any():
+        raise RecordingError(
+            f"{topic}: {empty.sum()} of {len(ns)} headers have no stamp; set `stamps` to receive."
+        )
+    for k in np.flatnonzero(np.diff(ns) < 0)[:1]:
+        raise RecordingError(
+            f"{topic}: the header stamps run backwards at message {k + 1}, by "
+            f"{(ns[k] - ns[k + 1]) * NANO:.3f} s; set `stamps` to receive, or cut the bag there."
+        )
+    return ns
+
+
+def _origin(data: Mapping[str, TopicData]) -> int:
+    return min(int(part.receive_ns.min()) for part in data.values())
+
+
+def _by_receipt(data: Mapping[str, TopicData], origin: int) -> dict[str, Stream]:
+    made = {}
+    for name, part in data.items():
+        order = np.argsort(part.receive_ns, kind="stable")
+        t = _seconds(part.receive_ns[order] - origin)
+        made[name] = Stream(t, part.values[order], RECEIVE)
+    return made
+
+
+def _seconds(ns: Nanoseconds) -> Array:
+    return np.asarray(ns * NANO, dtype=np.float64)

@@ -1,0 +1,215 @@
+"""Pictures of a fit: what it learnt from, how well it predicts, what each term is worth."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from nics_drl_bridge.calibration.identify import Identified
+from nics_drl_bridge.calibration.open_loop import HORIZON_S, Windows, predict, windows
+from nics_drl_bridge.calibration.signals import held
+from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.kinematics.recording import Samples
+from nics_drl_bridge.kinematics.spec import RobotSpec
+
+Array = NDArray[np.float64]
+
+MEASURED, MODEL, OTHER = "#1f6fb2", "#d1495b", "#8d99ae"
+SHOWN_S = 8.0
+PATHS, POINTS = 6, 40
+SETTLED_S = 1.0
+LEAST_SHARE = 1e-12
+LEAST_RATE = 1e-6
+
+
+def write_pictures(spec: RobotSpec, identified: Identified, folder: Path) -> tuple[Path, ...]:
+    """Writes the pictures of a fit as PNG files.
+
+    Args:
+        spec: the robot.
+        identified: all that was learnt.
+        folder: to write them into; it is made if it is not there.
+
+    Returns:
+        The files.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for name, png in fit_pictures(spec, identified).items():
+        write_bytes(folder / f"{name}.png", png)
+        files.append(folder / f"{name}.png")
+    return tuple(files)
+
+
+def fit_pictures(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
+    """The pictures of a fit by name, each a PNG.
+
+    `accuracy` is there always; `paths` and `residuals` if data was held out from the fit,
+    `alignment` if a command changed.
+    """
+    pictures = {"accuracy": accuracy(identified)}
+    if identified.held_out is not None:
+        pictures["paths"] = held_out_paths(spec, identified)
+    if identified.unseen is not None and np.abs(identified.unseen.dq).max() > LEAST_RATE:
+        pictures["residuals"] = residuals(identified, identified.unseen)
+    if (np.ptp(identified.recording.command.values, axis=0) > 0.0).any():
+        pictures["alignment"] = alignment(spec, identified)
+    return pictures
+
+
+def accuracy(identified: Identified) -> bytes:
+    """Cross-validated error against the number of terms, a line per degree of freedom."""
+    figure = Figure(figsize=(7.5, 4.5), layout="constrained")
+    axes = figure.subplots()
+    for n, curve in enumerate(identified.fit.curves):
+        share = np.maximum(curve.share, LEAST_SHARE)
+        line = axes.plot(share, marker=".", color=f"C{n}", label=curve.dof)[0]
+        axes.plot(
+            curve.kept,
+            share[curve.kept],
+            "o",
+            markersize=10,
+            fillstyle="none",
+            color=line.get_color(),
+        )
+    axes.plot([], [], "o", markersize=10, fillstyle="none", color="#333333", label="kept")
+    axes.set_yscale("log")
+    axes.set_xlabel("number of terms, largest standardised coefficient first (Eq. 2)")
+    axes.set_ylabel("cross-validated error / size of the rates")
+    longest = max((len(curve.error) for curve in identified.fit.curves), default=2)
+    axes.set_xlim(-0.3, longest - 0.7)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False, fontsize=9)
+    return _png(figure)
+
+
+def held_out_paths(spec: RobotSpec, identified: Identified) -> bytes:
+    """Open-loop predictions on unseen data beside the measured paths, from the same start."""
+    recording, calibration = identified.recording, identified.calibration
+    duration = float(recording.pose.t[-1] - recording.pose.t[0])
+    free = max(duration - identified.train_until_s - HORIZON_S, 0.0)
+    chosen = windows(
+        recording, calibration, identified.train_until_s, duration, HORIZON_S, free / PATHS
+    )
+    predicted = _predicted(spec, identified, chosen)
+    count = min(len(predicted), PATHS)
+    figure = Figure(figsize=(3.4 * min(count, 3), 3.4 * -(-count // 3) + 0.4), layout="constrained")
+    grid = figure.subplots(-(-count // 3), min(count, 3), squeeze=False).ravel()
+    for n, (axes, path) in enumerate(zip(grid, predicted, strict=False)):
+        during = (recording.pose.t >= chosen.start_t[n]) & (recording.pose.t <= chosen.end_t[n])
+        truth = recording.pose.values[during]
+        axes.plot(*truth[:, :2].T, color=MEASURED, linewidth=3.5, alpha=0.55, label="measured")
+        axes.plot(*path[:, :2].T, color=MODEL, linestyle="--", label="predicted")
+        axes.plot(*truth[0, :2], "o", color="#333333", markersize=5, label="start")
+        axes.set_aspect("equal", adjustable="datalim")
+        apart = float(np.hypot(*(path[-1] - chosen.end[n])[:2]))
+        axes.set_title(f"{apart:.3f} m apart after {HORIZON_S:g} s", fontsize=10)
+        axes.set_xlabel("x [m]")
+        axes.set_ylabel("y [m]")
+    for axes in grid[count:]:
+        axes.set_axis_off()
+    handles, labels = grid[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
+    return _png(figure)
+
+
+def residuals(identified: Identified, unseen: Samples) -> bytes:
+    """Rates on unseen data against those of the model, and what is left over, in time."""
+    model = identified.model
+    predicted, t = model.rates(unseen.x), unseen.t - unseen.t[0]
+    shown = t < SHOWN_S
+    moving = np.flatnonzero(np.abs(unseen.dq).max(axis=0) > LEAST_RATE)
+    figure = Figure(figsize=(9.0, 1.7 * len(moving) + 0.6), layout="constrained")
+    grid = figure.subplots(len(moving), 1, sharex=True, squeeze=False).ravel()
+    for d, axes in zip(map(int, moving), grid, strict=True):
+        rest = unseen.dq[:, d] - predicted[:, d]
+        axes.plot(t[shown], unseen.dq[shown, d], color=MEASURED, linewidth=2.5, alpha=0.55)
+        axes.plot(t[shown], predicted[shown, d], color=MODEL, linestyle="--", linewidth=1.2)
+        axes.plot(t[shown], rest[shown], color=OTHER, linewidth=0.8)
+        axes.set_ylabel(f"{model.dofs[d]} [{model.dof_units[d]}]", fontsize=8)
+        axes.grid(alpha=0.3)
+    grid[-1].set_xlabel("time since the end of the training part [s]")
+    for color, label in ((MEASURED, "measured"), (MODEL, "model"), (OTHER, "residual")):
+        grid[0].plot([], [], color=color, label=label)
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper center", ncols=3,
+                  frameon=False)  # fmt: skip
+    return _png(figure)
+
+
+def alignment(spec: RobotSpec, identified: Identified) -> bytes:
+    """Each command that changed, as stamped and as it takes effect, and the rate it moves most."""
+    samples, calibration = identified.samples, identified.calibration
+    command = identified.recording.command
+    moved = np.flatnonzero(np.ptp(command.values, axis=0) > 0.0)
+    figure = Figure(figsize=(9.0, 2.5 * len(moved) + 0.6), layout="constrained")
+    grid = figure.subplots(len(moved), 1, sharex=True, squeeze=False).ravel()
+    begin = samples.t[0] + SETTLED_S
+    shown = (samples.t >= begin) & (samples.t < begin + SHOWN_S)
+    t = samples.t[shown]
+    for axes, c in zip(grid, moved, strict=True):
+        name, unit = spec.command[c].name, spec.command[c].unit
+        for delay, style, label in ((0.0, ":", "as stamped"), (None, "-", "as it takes effect")):
+            late = calibration.command_latency_s if delay is None else delay
+            value = held(command, spec, t - late, t - late + samples.dt)[:, c]
+            axes.plot(t - begin, value, style, color=MODEL, linewidth=1.4, label=label)
+        axes.set_ylabel(f"{name} [{unit}]", fontsize=9, color=MODEL)
+        _response(axes, samples, shown, len(spec.state) + int(c), identified)
+    grid[-1].set_xlabel("time on the commands' clock [s]")
+    handles, labels = grid[0].get_legend_handles_labels()
+    handles.append(Line2D([], [], color=MEASURED, linewidth=2.5, alpha=0.55))
+    figure.legend(handles, [*labels, "response"], loc="outside upper center", ncols=3,
+                  frameon=False)  # fmt: skip
+    grid[0].set_title(
+        f"clock offset {calibration.clock_offset_s:.4g} s, command latency "
+        f"{calibration.command_latency_s:.4g} s", fontsize=10,
+    )  # fmt: skip
+    return _png(figure)
+
+
+def _response(
+    axes: Axes, samples: Samples, shown: NDArray[np.bool_], variable: int, identified: Identified
+) -> None:
+    """Draws the part of the body twist that goes most with a variable of X."""
+    twist, wanted = samples.dq[:, :3], samples.x[:, variable]
+    with np.errstate(all="ignore"):
+        alike = np.abs([np.corrcoef(twist[:, d], wanted)[0, 1] for d in range(3)])
+    d = int(np.argmax(np.nan_to_num(alike)))
+    other = axes.twinx()
+    other.plot(
+        samples.t[shown] - samples.t[0] - SETTLED_S, twist[shown, d],
+        color=MEASURED, linewidth=2.5, alpha=0.55,
+    )  # fmt: skip
+    model = identified.model
+    other.set_ylabel(f"{model.dofs[d]} [{model.dof_units[d]}]", fontsize=9, color=MEASURED)
+
+
+def _predicted(spec: RobotSpec, identified: Identified, chosen: Windows) -> Array:
+    """Open-loop paths (W, n, 3) over windows."""
+    shares = np.linspace(0.02, 1.0, POINTS)
+    ends = [chosen.start_t + share * (chosen.end_t - chosen.start_t) for share in shares]
+    poses = [
+        predict(
+            identified.model,
+            identified.calibration,
+            identified.recording,
+            spec,
+            replace(chosen, end_t=end),
+        )
+        for end in ends
+    ]
+    return np.stack([chosen.start, *poses], axis=1)
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()

@@ -1,0 +1,77 @@
+"""Validity: warns when a simulator is asked for what its model's drive never showed."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.kinematics import features
+from nics_drl_bridge.kinematics.model import TaylorModel
+from nics_drl_bridge.kinematics.spec import RobotSpec
+
+Array = NDArray[np.float64]
+
+TOLERANCE = 0.05
+"""Share of a command's limits by which it may leave the range that was driven."""
+EVERY = 16
+"""Commands are looked at in the first step after a reset and then every so many steps."""
+
+
+class OutsideValidityWarning(UserWarning):
+    """Commands lie outside the range that the model's recording covered."""
+
+
+class CommandBox:
+    """The range of commands that a model was fitted to.
+
+    Variables whose effect was assumed, not learnt, are let through.
+
+    Args:
+        model: the kinematics.
+        robot: names and limits of the commands.
+    """
+
+    def __init__(self, model: TaylorModel, robot: RobotSpec) -> None:
+        margin = TOLERANCE * (robot.command_high - robot.command_low)
+        first = len(robot.state)
+        self._low: Array = model.low[first:] - margin
+        self._high: Array = model.high[first:] + margin
+        assumed = _assumed(model)
+        for i, name in enumerate(robot.variable_names[first:]):
+            if name in assumed:
+                self._low[i], self._high[i] = -np.inf, np.inf
+        self._names = robot.variable_names[first:]
+        self._range = model.low[first:], model.high[first:]
+        self._steps, self._armed = 0, True
+
+    def begin(self) -> None:
+        """Begins an episode: the next step is looked at, and may warn once."""
+        self._steps, self._armed = 0, True
+
+    def check(self, commands: Array) -> None:
+        """Warns once per episode of commands (..., C) outside the range."""
+        steps, self._steps = self._steps, self._steps + 1
+        if not self._armed or steps % EVERY:
+            return
+        flat = commands.reshape(-1, commands.shape[-1])
+        least, most = flat.min(axis=0), flat.max(axis=0)
+        outside = (least < self._low) | (most > self._high)
+        if outside.any():
+            self._armed = False
+            i = int(np.argmax(outside))
+            value = least[i] if least[i] < self._low[i] else most[i]
+            warnings.warn(
+                f"{self._names[i]} is {value:.4g}, but the model was fitted to "
+                f"{self._range[0][i]:.4g} to {self._range[1][i]:.4g} only: its motion there is "
+                "extrapolated; record a drive that covers it.",
+                OutsideValidityWarning,
+                stacklevel=3,
+            )
+
+
+def _assumed(model: TaylorModel) -> set[str]:
+    """Names of the variables in assumed terms."""
+    powers = [features.parse_term(term, model.variables) for _, term in model.assumed]
+    return {model.variables[v] for row in powers for v in np.flatnonzero(row)}

@@ -1,0 +1,233 @@
+from __future__ import annotations
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from robots import direct_model, field
+
+from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.registration import MAX_EPISODE_STEPS, NAVIGATION, register_envs
+from nics_drl_bridge.env.sim_backend import SimBackend
+from nics_drl_bridge.errors import ConfigError, ModelError
+from nics_drl_bridge.interface import Backend
+
+STILL = np.zeros(3, np.float32)
+
+
+@pytest.fixture
+def env():
+    """The robot whose twist is its command, in a field without obstacles."""
+    made = BridgeEnv(model=direct_model(), world=field())
+    yield made
+    made.close()
+
+
+def made(**arguments):
+    register_envs()
+    return gymnasium.make(NAVIGATION, **arguments)
+
+
+def drive(env, seed, actions, **options):
+    observation, info = env.reset(seed=seed, options=options or None)
+    steps = [(observation, 0.0, False, info["pose"])]
+    for action in actions:
+        observation, reward, ended, _, info = env.step(action)
+        steps.append((observation, reward, ended, info["pose"]))
+    return steps
+
+
+def assert_same(one, other):
+    for a, b in zip(one, other, strict=True):
+        assert all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+def random_actions(env, count, seed=0):
+    size = env.action_space.shape[0]
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, size)).astype(np.float32)
+
+
+@pytest.mark.parametrize("robot", ["ackermann", "differential", "mecanum"])
+def test_gymnasiums_checker_finds_nothing_to_warn_of(robot):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Distance and twist have no limits: a finite one would have to cut observations.
+        for side in ("minimum value is -infinity", "maximum value is infinity"):
+            warnings.filterwarnings("ignore", f".*A Box observation space {side}")
+        env = made(backend="sim", model=robot)
+        check_env(env.unwrapped)
+        env.close()
+
+
+def test_registering_twice_changes_nothing():
+    register_envs()
+    spec = gymnasium.spec(NAVIGATION)
+    register_envs()
+    assert gymnasium.spec(NAVIGATION) is spec
+    assert spec.max_episode_steps == MAX_EPISODE_STEPS
+
+
+def test_the_same_seed_and_actions_give_the_same_bits_in_another_env():
+    one, other = BridgeEnv(), BridgeEnv()
+    actions = random_actions(one, 30)
+    assert_same(drive(one, 7, actions), drive(other, 7, actions))
+
+
+def test_an_episode_does_not_depend_on_those_before_it():
+    env = BridgeEnv()
+    actions = random_actions(env, 25)
+    first = drive(env, 3, actions)
+    drive(env, 4, random_actions(env, 11, seed=1))
+    assert_same(first, drive(env, 3, actions))
+
+
+def test_resets_without_a_seed_follow_from_the_last_seed():
+    def starts(env):
+        env.reset(seed=5)
+        return [env.reset()[1]["episode_seed"] for _ in range(5)]
+
+    one, other = starts(BridgeEnv()), starts(BridgeEnv())
+    assert one == other
+    assert len(set(one)) == 5
+
+
+def test_two_envs_in_one_process_do_not_disturb_each_other():
+    actions = random_actions(BridgeEnv(), 20)
+    alone = drive(BridgeEnv(), 1, actions)
+    one, other = BridgeEnv(), BridgeEnv(model=direct_model(), world=field())
+    observation, info = one.reset(seed=1)
+    together = [(observation, 0.0, False, info["pose"])]
+    other.reset(seed=2)
+    for action in actions:
+        other.step(STILL)
+        observation, reward, ended, _, info = one.step(action)
+        together.append((observation, reward, ended, info["pose"]))
+    assert_same(alone, together)
+
+
+def test_start_and_goal_can_be_given(env):
+    _, info = env.reset(seed=0, options={"start": (1.0, -1.0, 0.5), "goal": (-1.0, 1.0)})
+    assert info["pose"] == pytest.approx([1.0, -1.0, 0.5])
+    assert info["goal"] == pytest.approx([-1.0, 1.0])
+
+
+def test_driving_to_the_goal_ends_in_success(env):
+    env.reset(seed=0, options={"start": (0.0, 0.0, 0.0), "goal": (1.05, 0.0)})
+    total, approach = 0.0, 0.0
+    for _ in range(20):
+        _, reward, terminated, truncated, info = env.step(np.array([0.5, 0.0, 0.0], np.float32))
+        assert reward == pytest.approx(sum(info["reward_terms"].values()))
+        total += reward
+        approach += info["reward_terms"]["progress"]
+        if terminated:
+            break
+    assert terminated
+    assert not truncated
+    assert info["is_success"]
+    assert not info["collision"]
+    assert approach == pytest.approx(0.8, abs=0.05)
+    assert total == pytest.approx(10.0 + approach - 0.01 * 8)
+
+
+def test_driving_into_a_wall_ends_in_a_collision(env):
+    env.reset(seed=0, options={"start": (2.0, 0.0, 0.0), "goal": (-1.0, 0.0)})
+    for _ in range(20):
+        _, reward, terminated, _, info = env.step(np.array([0.5, 0.0, 0.0], np.float32))
+        if terminated:
+            break
+    assert terminated
+    assert info["collision"]
+    assert not info["is_success"]
+    assert reward < -9.0
+    assert info["true_pose"][0] < 3.0 - 0.2
+
+
+def test_a_time_limit_truncates_and_never_terminates():
+    env = made(model=direct_model(), world=field())
+    env.reset(seed=0, options={"start": (0.0, 0.0, 0.0), "goal": (2.0, 0.0)})
+    for step in range(1, MAX_EPISODE_STEPS + 1):
+        _, _, terminated, truncated, info = env.step(STILL)
+        assert not terminated
+        assert truncated == (step == MAX_EPISODE_STEPS)
+    assert not info["is_success"]
+
+
+def test_the_env_answers_to_the_command_just_given(env):
+    env.reset(seed=0, options={"start": (0.0, 0.0, 0.0), "goal": (2.0, 0.0)})
+    for share in (0.1, 0.4, -0.2):
+        before = env.step(STILL)[4]["true_pose"]
+        observation, *_, info = env.step(np.array([share, 0.0, 0.0], np.float32))
+        assert info["true_pose"][0] - before[0] == pytest.approx(2.0 * share * 0.1)
+        assert observation[-3] == pytest.approx(2.0 * share, abs=1e-3)
+        assert info["scan_age_s"] == info["odom_age_s"] == 0.0
+
+
+def test_a_step_before_the_first_reset_is_refused(env):
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(STILL)
+
+
+def test_infos_of_earlier_steps_do_not_change(env):
+    _, first = env.reset(seed=0)
+    kept = {name: np.array(first[name]) for name in ("goal", "pose", "start")}
+    observation, *_, second = env.step(np.ones(3, np.float32))
+    seen, pose = observation.copy(), second["true_pose"].copy()
+    env.step(np.ones(3, np.float32))
+    env.reset(seed=1)
+    assert all(np.array_equal(first[name], array) for name, array in kept.items())
+    assert np.array_equal(observation, seen)
+    assert np.array_equal(second["true_pose"], pose)
+
+
+class Recorder:
+    """A backend of one's own: it remembers what it was told."""
+
+    def __init__(self):
+        self.inner = SimBackend(direct_model(), field())
+        self.commands, self.closed = [], 0
+
+    def reset(self, start):
+        return self.inner.reset(start)
+
+    def step(self, command):
+        self.commands.append(command)
+        return self.inner.step(command)
+
+    def close(self):
+        self.closed += 1
+
+
+def test_any_object_with_reset_step_and_close_is_a_backend():
+    backend = Recorder()
+    assert isinstance(backend, Backend)
+    env = BridgeEnv(backend, model=direct_model(), world=field())
+    env.reset(seed=0)
+    env.step(np.array([1.0, -1.0, 0.0], np.float32))
+    env.close()
+    assert np.array_equal(backend.commands, [[2.0, -2.0, 0.0]])
+    assert backend.closed == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "sentence"),
+    [
+        ({"backend": "sin"}, ConfigError, "unknown backend 'sin'; did you mean 'sim'?"),
+        ({"model": "akermann"}, ModelError, "did you mean 'ackermann'?"),
+        ({"world": "arema"}, ConfigError, "did you mean 'arena'?"),
+    ],
+)
+def test_an_unknown_name_gives_the_nearest(arguments, error, sentence):
+    with pytest.raises(error) as caught:
+        BridgeEnv(**arguments)
+    assert sentence in str(caught.value)
+
+
+def test_the_exact_renderer_sees_nearly_the_same():
+    baked = BridgeEnv()
+    exact = BridgeEnv(backend_options={"renderer": "exact"})
+    for seed in range(5):
+        one, other = (env.reset(seed=seed)[0] for env in (baked, exact))
+        assert np.array_equal(one[720:], other[720:])
+        assert np.sqrt(((one - other) ** 2).mean()) < 0.01

@@ -1,0 +1,234 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import direct_model, field
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.kinematics.kernels import SERIES, rates, scratch, term_arrays
+from nics_drl_bridge.middleware import kernels
+from nics_drl_bridge.middleware.ekf import Estimator
+from nics_drl_bridge.sim.simulator import FastSimulator
+
+ROBOTS = ("ackermann", "differential", "mecanum")
+SECOND = 1_000_000_000
+PERIOD = SECOND // 10
+
+
+def numerical_jacobian(function, x, step=1e-6):
+    columns = []
+    for i in range(len(x)):
+        ahead, behind = x.copy(), x.copy()
+        ahead[i] += step
+        behind[i] -= step
+        columns.append((function(ahead) - function(behind)) / (2.0 * step))
+    return np.stack(columns, axis=1)
+
+
+def random_mean(model, rng):
+    state = [rng.uniform(v.min, v.max) / 2.0 for v in model.robot.state]
+    return np.array([*rng.normal(size=2), rng.uniform(-2.5, 2.5), *state])
+
+
+def random_command(model, rng):
+    return rng.uniform(model.robot.command_low, model.robot.command_high)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_derivative_of_the_rates_is_the_numerical_one(robot):
+    model, rng = builtin_model(robot), np.random.default_rng(0)
+    terms = term_arrays(model.kinematics)
+    for _ in range(10):
+        x, dq = scratch(model.kinematics)
+        x[:-1] = rng.uniform(-1.0, 1.0, len(x) - 1)
+
+        def of(inputs, dq=dq):
+            rates(dq, np.append(inputs, 1.0), terms)
+            return dq.copy()
+
+        jacobian = np.full((len(dq), len(x) - 1), np.nan)
+        kernels.rates_jacobian(jacobian, x, terms)
+        assert jacobian == pytest.approx(numerical_jacobian(of, x[:-1]), abs=1e-6)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize(("dt", "steps"), [(0.01, 1), (0.01, 10), (0.003, 1)])
+def test_the_transition_is_the_numerical_derivative_of_the_motion(robot, dt, steps):
+    model, rng = builtin_model(robot), np.random.default_rng(1)
+    terms = term_arrays(model.kinematics)
+    for _ in range(10):
+        mean, command = random_mean(model, rng), random_command(model, rng)
+
+        def of(start, command=command):
+            end = start.copy()
+            kernels.predict(end, np.eye(len(end)), command, dt, steps, terms, SERIES)
+            end[2] = start[2] + geometry.wrap_angle(end[2] - start[2])
+            return end
+
+        transition, moved = np.eye(len(mean)), mean.copy()
+        kernels.predict(moved, transition, command, dt, steps, terms, SERIES)
+        assert transition == pytest.approx(numerical_jacobian(of, mean), abs=2e-5)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_expected_twist_has_the_numerical_derivative(robot):
+    model, rng = builtin_model(robot), np.random.default_rng(2)
+    terms = term_arrays(model.kinematics)
+    for _ in range(10):
+        mean, command = random_mean(model, rng), random_command(model, rng)
+        twist, derivative = kernels.twist_of(mean, command, terms)
+        x = np.concatenate([mean[3:], command])
+        assert twist == pytest.approx(model.kinematics.rates(x)[:3], abs=1e-12)
+        expected = numerical_jacobian(lambda m, c=command: kernels.twist_of(m, c, terms)[0], mean)
+        assert derivative == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_prediction_is_the_motion_of_the_model():
+    model = builtin_model("differential")
+    estimator = Estimator(model)
+    estimator.reset(0, [1.0, 2.0, 3.0])
+    estimator.command(0, [0.6, 1.5])
+    estimator.predict(SECOND)
+    pose, state = np.array([1.0, 2.0, 3.0]), np.zeros(2)
+    for _ in range(100):
+        pose, state = model.kinematics.step(pose, state, [0.6, 1.5])
+    found, _ = estimator.at(SECOND)
+    assert geometry.between(pose, found) == pytest.approx(np.zeros(3), abs=1e-6)
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.03, 0.25])
+def test_a_command_acts_one_latency_after_it_was_sent(latency):
+    estimator = Estimator(direct_model(latency))
+    estimator.reset(0, np.zeros(3))
+    estimator.command(PERIOD, [1.0, 0.0, 0.0])
+    estimator.command(4 * PERIOD, [0.0, 0.0, 0.0])
+    for tenths in range(10):
+        pose, twist = estimator.at(tenths * PERIOD)
+        now = tenths * 0.1
+        assert pose[0] == pytest.approx(np.clip(now - 0.1 - latency, 0.0, 0.3), abs=1e-9)
+        moving = 0.1 + latency < now - 1e-9 <= 0.4 + latency
+        assert twist[0] == pytest.approx(float(moving))
+
+
+def test_looking_ahead_does_not_move_the_filter():
+    estimator = Estimator(builtin_model("ackermann"))
+    estimator.reset(0, np.zeros(3))
+    estimator.command(0, [0.8, 0.2])
+    estimator.predict(SECOND)
+    before = (estimator.time_ns, *estimator.at(SECOND), estimator.covariance)
+    ahead, _ = estimator.at(5 * SECOND)
+    assert np.linalg.norm(ahead[:2] - before[1][:2]) > 0.5
+    after = (estimator.time_ns, *estimator.at(SECOND), estimator.covariance)
+    assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+def test_an_earlier_time_changes_nothing():
+    estimator = Estimator(builtin_model("ackermann"))
+    estimator.reset(SECOND, [1.0, 2.0, 0.5])
+    covariance = estimator.covariance
+    estimator.predict(SECOND // 2)
+    assert estimator.time_ns == SECOND
+    assert np.array_equal(estimator.covariance, covariance)
+    assert estimator.at(0)[0] == pytest.approx([1.0, 2.0, 0.5])
+
+
+@pytest.mark.parametrize(("believed", "measured"), [(3.13, -3.13), (-3.13, 3.13)])
+def test_a_heading_is_corrected_the_short_way_round(believed, measured):
+    estimator = Estimator(direct_model())
+    estimator.reset(0, [0.0, 0.0, believed])
+    estimator.predict(SECOND)
+    for _ in range(50):
+        estimator.update_pose([0.0, 0.0, measured], [0.01, 0.01, 0.01])
+        heading = estimator.at(SECOND)[0][2]
+        assert -np.pi <= heading < np.pi
+        assert abs(heading) > 3.12
+    assert abs(geometry.wrap_angle(heading - measured)) < 0.002
+
+
+def simulated_drive(model, seconds, seed, pose_std=None):
+    """Errors (T, 3) of the estimate, of the odometry, and the covariances on the way."""
+    simulator, estimator = FastSimulator(model, field(60.0)), Estimator(model)
+    rng = np.random.default_rng(seed)
+    start = np.array([0.0, 0.0, 3.0])
+    simulator.reset([seed], starts=start[None, None])
+    estimator.reset(0, start)
+    errors, drifts, covariances = [], [], []
+    command = random_command(model, rng)
+    for step in range(seconds * 10):
+        if step % 5 == 0:
+            command = random_command(model, rng)
+        estimator.command(step * PERIOD, command)
+        simulator.step(command[None, None])
+        now = (step + 1) * PERIOD
+        estimator.predict(now)
+        estimator.update_twist(simulator.data.twist[0, 0])
+        true = simulator.data.pose[0, 0]
+        if pose_std is not None and step % 10 == 9:
+            estimator.update_pose(true + rng.normal(size=3) * pose_std, np.full(3, pose_std))
+        errors.append(geometry.between(true, estimator.at(now)[0]))
+        drifts.append(geometry.between(true, simulator.data.odom[0, 0]))
+        covariances.append(estimator.covariance[:3, :3])
+    return np.array(errors), np.array(drifts), np.array(covariances)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_with_measured_poses_the_estimate_stays_at_the_truth(robot):
+    model = builtin_model(robot)
+    for seed in range(3):
+        errors, _, covariances = simulated_drive(model, 30, seed, pose_std=0.02)
+        assert np.abs(errors[100:]).max() < 0.1
+        assert np.sqrt((errors[100:, :2] ** 2).mean()) < 0.03
+        assert np.linalg.eigvalsh(covariances).min() > 0.0
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_estimate_by_odometry_alone_errs_no_more_than_it_claims(robot):
+    model = builtin_model(robot)
+    for seed in range(3):
+        errors, _, covariances = simulated_drive(model, 20, seed)
+        heading = np.sqrt(covariances[:, 2, 2])
+        away = np.sqrt(covariances[:, 0, 0] + covariances[:, 1, 1])
+        assert (np.abs(errors[:, 2]) < 4.0 * heading).all()
+        assert (np.linalg.norm(errors[:, :2], axis=1) < 4.0 * away).all()
+
+
+def test_a_wrong_belief_about_the_pose_is_mended_by_measurements():
+    estimator = Estimator(builtin_model("ackermann"))
+    estimator.reset(0, [0.0, 0.0, 0.0])
+    truth = np.array([0.5, -0.3, 2.9])
+    for second in range(1, 61):
+        estimator.predict(second * SECOND)
+        estimator.update_pose(truth, [0.01, 0.01, 0.01])
+    assert geometry.between(truth, estimator.at(60 * SECOND)[0]) == pytest.approx(
+        np.zeros(3), abs=0.01
+    )
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_covariance_stays_positive_definite_over_ten_thousand_random_steps(robot):
+    model, rng = builtin_model(robot), np.random.default_rng(3)
+    estimator = Estimator(model)
+    now = 0
+    estimator.reset(now, np.zeros(3))
+    for step in range(10_000):
+        now += int(rng.integers(1, PERIOD))
+        kind = step % 4 if step % 7 else 4
+        if kind < 2:
+            estimator.command(now, random_command(model, rng))
+        estimator.predict(now)
+        if kind in (1, 2):
+            estimator.update_twist(rng.normal(size=3))
+        elif kind == 3:
+            estimator.update_pose(rng.normal(size=3), 10.0 ** rng.uniform(-4.0, 1.0, 3))
+        if step % 100 == 99:
+            covariance = estimator.covariance
+            assert np.isfinite(estimator.at(now)[0]).all()
+            assert covariance == pytest.approx(covariance.T, abs=1e-9)
+            scale = np.sqrt(np.diag(covariance))
+            assert np.linalg.eigvalsh(covariance / np.outer(scale, scale)).min() > 0.0
+
+
+def test_the_same_data_give_the_same_bits():
+    one, other = (simulated_drive(builtin_model("mecanum"), 3, 5) for _ in range(2))
+    assert all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+from domains import claimed_domain
+
+from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.generator import SimulatorModel, builtin_model, save_model
+
+# Modules below import rclpy, so the fixtures import them: without ROS 2 every test here skips.
+
+
+@pytest.fixture(scope="session")
+def model() -> SimulatorModel:
+    """A car; driven once, so that the nodes of the tests find everything compiled."""
+    built = builtin_model("ackermann")
+    env = BridgeEnv(model=built)
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    return built
+
+
+@pytest.fixture(scope="session")
+def model_folder(model: SimulatorModel, tmp_path_factory: pytest.TempPathFactory) -> str:
+    folder = tmp_path_factory.mktemp("model") / "ackermann"
+    save_model(model, folder)
+    return str(folder)
+
+
+@pytest.fixture
+def domain_id() -> Iterator[int]:
+    with claimed_domain() as claimed:
+        yield claimed
+
+
+@pytest.fixture(scope="module")
+def module_domain_id() -> Iterator[int]:
+    with claimed_domain() as claimed:
+        yield claimed
+
+
+@pytest.fixture(scope="module")
+def launch(
+    model_folder: str, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Callable[..., Any]]:
+    """Starts nodes, `launch(node, domain_id, **parameters)`; they end with the module."""
+    from nics_drl_bridge.nodes.processes import NodeProcess
+
+    numbers = itertools.count()
+    with ExitStack() as started:
+
+        def start(
+            node: str,
+            domain_id: int,
+            namespace: str = "",
+            remap: dict[str, str] | None = None,
+            **parameters: Any,
+        ) -> NodeProcess:
+            folder: Path = tmp_path_factory.mktemp(f"{node}_{next(numbers)}")
+            parameters = {"model": model_folder} | parameters
+            process = NodeProcess(node, folder, parameters, domain_id, namespace, remap)
+            return started.enter_context(process)
+
+        yield start
+
+
+@pytest.fixture(scope="module")
+def meet() -> Iterator[Callable[..., Any]]:
+    """Makes peers, `meet(domain_id)`; all are closed with the module."""
+    from nodes.peer import Peer
+
+    peers = []
+
+    def make(domain_id: int, namespace: str = "") -> Peer:
+        peers.append(Peer(domain_id, namespace))
+        return peers[-1]
+
+    yield make
+    for each in peers:
+        each.close()

@@ -1,0 +1,92 @@
+"""The test's own end of the topics: a node in a context of its own."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.runner import open_context
+
+DEADLINE_S = 30.0
+NUMBERS = itertools.count()
+
+
+class Peer:
+    """Listens, speaks and calls; spins in place, only ever until something is the case."""
+
+    def __init__(self, domain_id: int, namespace: str = "") -> None:
+        self.context = open_context(domain_id=domain_id)
+        self.node = Node(
+            f"peer_{next(NUMBERS)}",
+            namespace=namespace,
+            context=self.context,
+            start_parameter_services=False,
+        )
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+
+    def until(
+        self, condition: Callable[[], Any], what: str, deadline_s: float = DEADLINE_S
+    ) -> float:
+        """Spins until a condition holds; returns how long that took [s]."""
+        began = time.monotonic()
+        while not condition():
+            assert time.monotonic() - began < deadline_s, f"not within {deadline_s} s: {what}"
+            self._executor.spin_once(timeout_sec=0.05)
+        return time.monotonic() - began
+
+    def another(self, messages: list[Any], what: str) -> Any:
+        """The next message in a list that `listen` gave."""
+        known = len(messages)
+        self.until(lambda: len(messages) > known, f"another {what}")
+        return messages[-1]
+
+    def listen(self, kind: Any, topic: str, quality: Any = qos.SENSOR_RELIABLE) -> list[Any]:
+        """A list that each message of a topic is appended to."""
+        received: list[Any] = []
+        self.node.create_subscription(kind, topic, received.append, quality)
+        return received
+
+    def speak(self, kind: Any, topic: str, subscribers: int = 1) -> Any:
+        """A publisher that the given number of subscribers have found."""
+        publisher = self.node.create_publisher(kind, topic, qos.COMMAND)
+        self.until(
+            lambda: publisher.get_subscription_count() >= subscribers, f"a subscriber of {topic}"
+        )
+        return publisher
+
+    def call(self, kind: Any, service: str, request: Any = None) -> Any:
+        """The answer of a service."""
+        client = self.node.create_client(kind, service)
+        self.until(client.service_is_ready, f"the service {service}")
+        future = client.call_async(kind.Request() if request is None else request)
+        self.until(future.done, f"an answer of {service}")
+        self.node.destroy_client(client)
+        return future.result()
+
+    def set_parameters(self, node: str, **values: Any) -> Any:
+        """What a node says to new values of its parameters."""
+        request = SetParametersAtomically.Request()
+        request.parameters = [
+            Parameter(name, value=value).to_parameter_msg() for name, value in values.items()
+        ]
+        return self.call(
+            SetParametersAtomically, f"{node}/set_parameters_atomically", request
+        ).result
+
+    def close(self) -> None:
+        self._executor.shutdown(timeout_sec=1.0)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+def stamp_ns(message: Any) -> int:
+    return conversions.stamp_from_ros(message.header.stamp)

@@ -1,0 +1,284 @@
+from __future__ import annotations
+
+import gc
+import signal
+
+import gymnasium
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from domains import claimed_domain
+from geometry_msgs.msg import Twist
+
+from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.sim_backend import SimBackend
+from nics_drl_bridge.errors import BackendError, ModelError, StaleDataError
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.interface import Start
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.dds_backend import DdsBackend
+from nics_drl_bridge.sim.world import load_world
+
+pytestmark = pytest.mark.ros
+
+TIMEOUT_S = 30.0
+SHORT_S = 2.0
+NAMESPACE = "fleet/car_1"
+START = Start(seed=3, pose=np.array([0.5, -0.5, 1.0]))
+
+
+@pytest.fixture(scope="module")
+def arena():
+    return load_world("arena")
+
+
+@pytest.fixture(scope="module")
+def simulator(launch, module_domain_id):
+    """The domain of a simulator in lock-step, and its process."""
+    process = launch("simulator_node", module_domain_id, mode="lockstep")
+    yield module_domain_id, process
+    process.check()
+
+
+@pytest.fixture
+def connect(simulator, model, arena):
+    """Makes backends on that simulator; all are closed with the test."""
+    made = []
+
+    def make(**options):
+        options = {"domain_id": simulator[0], "timeout_s": TIMEOUT_S} | options
+        made.append(DdsBackend(options.pop("model", model), options.pop("world", arena), **options))
+        return made[-1]
+
+    yield make
+    for backend in made:
+        backend.close()
+
+
+@pytest.fixture
+def own_simulator(launch, domain_id, model, arena):
+    """A backend on a simulator that the test may harm, in a namespace."""
+    process = launch("simulator_node", domain_id, namespace=NAMESPACE, mode="lockstep")
+    backend = DdsBackend(
+        model, arena, namespace=NAMESPACE, domain_id=domain_id, timeout_s=TIMEOUT_S
+    )
+    yield backend, process, domain_id
+    backend.close()
+    process.close()
+
+
+@pytest.fixture(scope="module")
+def commands_heard(simulator, meet):
+    """Speed of each command that reaches somebody else than the simulator."""
+    peer = meet(simulator[0])
+    return peer, peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND)
+
+
+def episodes(env, seeds, steps, rng):
+    """All that an env tells, under random commands, over several episodes."""
+    told = []
+    for seed in seeds:
+        observation, info = env.reset(seed=seed)
+        told.append((observation, 0.0, False, info["pose"], info["start"]))
+        for _ in range(steps):
+            observation, reward, ended, _, info = env.step(
+                rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
+            )
+            told.append((observation, reward, ended, info["pose"], info["true_pose"]))
+    return [np.array(column, dtype=np.float64) for column in zip(*told, strict=True)]
+
+
+def drive(backend, speed=0.5, steps=3):
+    backend.reset(START)
+    for _ in range(steps):
+        backend.step(np.array([speed, 0.0]))
+
+
+def zero_follows(commands_heard, act):
+    """Waits until the last command that is heard after an act is zero."""
+    peer, heard = commands_heard
+    heard.clear()
+    act()
+    peer.until(lambda: heard and heard[-1] == Twist(), "a zero command")
+
+
+def test_it_gives_the_numbers_of_the_simulator_in_process(simulator, model, arena):
+    options = {"domain_id": simulator[0], "truth": True, "timeout_s": TIMEOUT_S}
+    seeds, steps = (7, 8, 7, 2**31 - 1), 30
+    here = BridgeEnv("sim", model, arena)
+    there = BridgeEnv("dds", model, arena, backend_options=options)
+    try:
+        told_here = episodes(here, seeds, steps, np.random.default_rng(0))
+        told_there = episodes(there, seeds, steps, np.random.default_rng(0))
+    finally:
+        there.close()
+    assert len(told_here[0]) == len(seeds) * (steps + 1)
+    *seen, truth = (np.abs(a - b).max() for a, b in zip(told_here, told_there, strict=True))
+    assert seen == [0.0] * 4  # observation, reward, end and estimate, to the bit
+    assert truth < 1e-12  # a quaternion rounds its heading
+
+
+def test_each_view_is_of_the_step_and_one_control_period_after_the_last(connect, model):
+    backend = connect()
+    assert backend.reset(START).pose == pytest.approx(START.pose)
+    stamps = []
+    for _ in range(5):
+        view, facts = backend.step(np.array([0.5, 0.0]))
+        assert (view.scan_age_s, view.odom_age_s) == (0.0, 0.0)
+        assert view.stamp_s == facts["stamp_ns"] * 1e-9
+        stamps.append(facts["stamp_ns"])
+    assert set(np.diff(stamps)) == {round(model.control_period * conversions.NANO)}
+
+    with pytest.raises(BackendError, match=r"refused the episode.*episode_seed"):
+        backend.reset(Start(-1, START.pose))
+    with pytest.raises(BackendError, match=r"refused the episode.*three finite numbers"):
+        backend.reset(Start(0, np.array([0.0, np.nan, 0.0])))
+    drive(backend)
+
+
+def test_another_model_is_refused_by_its_fingerprint(connect):
+    other = builtin_model("differential")
+    backend = connect(model=other)
+    with pytest.raises(ModelError, match=f"'{other.fingerprint}'.*same model"):
+        backend.reset(START)
+
+
+def test_another_world_is_refused_even_under_the_same_name(connect, arena):
+    backend = connect(world=arena.model_copy(update={"size": (6.0, 6.5)}))
+    with pytest.raises(ModelError, match="same world"):
+        backend.reset(START)
+
+
+def test_without_a_simulator_the_error_names_all_that_is_missing(model, arena, domain_id):
+    with pytest.raises(BackendError) as caught:
+        DdsBackend(model, arena, namespace="car", domain_id=domain_id, timeout_s=0.5)
+    for missing in (
+        "no subscriber of /car/cmd_vel",
+        "no publisher of /car/scan",
+        "no publisher of /car/odom",
+        "no service /car/simulator_node/reset",
+        "mode:=lockstep",
+    ):
+        assert missing in str(caught.value)
+    assert "ground_truth" not in str(caught.value)
+
+
+def test_close_leaves_a_zero_command_behind(connect, commands_heard):
+    backend = connect()
+    drive(backend)
+    zero_follows(commands_heard, backend.close)
+    backend.close()  # twice does no harm
+    with pytest.raises(BackendError, match="closed"):
+        backend.step(np.zeros(2))
+    with pytest.raises(BackendError, match="closed"):
+        backend.reset(START)
+
+
+def test_an_error_in_a_step_leaves_a_zero_command_and_wants_a_reset(
+    connect, model, arena, commands_heard, monkeypatch
+):
+    env = BridgeEnv(connect(), model, arena)
+    action = np.ones(2, np.float32)
+    env.reset(seed=0)
+    with pytest.raises(gymnasium.error.InvalidAction, match="NaN"):
+        env.step(action * np.nan)
+    env.step(action)  # nothing was sent, so nothing is lost
+
+    def interrupted():
+        with pytest.raises(KeyboardInterrupt):
+            env.step(action)
+
+    def fails(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(env._backend, "_measure", fails)
+        zero_follows(commands_heard, interrupted)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(action)
+    env.reset(seed=0)
+    env.step(action)
+
+
+def test_garbage_collection_leaves_a_zero_command_behind(simulator, model, arena, commands_heard):
+    env = BridgeEnv("dds", model, arena, backend_options={"domain_id": simulator[0]})
+    env.myself = env  # a cycle, which only the collector ends
+    env.reset(seed=3)
+    env.step(np.array([1.0, 0.0], np.float32))
+
+    def forget():
+        nonlocal env
+        del env
+        gc.collect()
+
+    zero_follows(commands_heard, forget)
+
+
+def test_somebody_else_who_moves_the_simulator_is_found_out(connect, commands_heard, monkeypatch):
+    peer, _ = commands_heard
+    backend = connect()
+    drive(backend)
+    intruder = peer.speak(Twist, "cmd_vel", subscribers=2)  # the simulator, and the listener
+    try:
+        with monkeypatch.context() as patch:  # first by its deeds alone
+            patch.setattr(backend, "_others_command", lambda: False)
+            backend.reset(START)
+            intruder.publish(Twist())
+            peer.until(lambda: backend._mail.stamp_ns("odom") > backend._now_ns, "its effect")
+            with pytest.raises(BackendError, match=r"'odom': stamped \+0\.100 s off the step"):
+                backend.step(np.array([0.5, 0.0]))
+        peer.until(backend._others_command, "the backend sees the intruder")
+        named = f"/{peer.node.get_name()} publishes /cmd_vel too"
+        with pytest.raises(BackendError, match=named):
+            backend.reset(START)
+        with pytest.raises(BackendError, match=named):
+            backend.step(np.array([0.5, 0.0]))
+    finally:
+        peer.node.destroy_publisher(intruder)
+    peer.until(lambda: not backend._others_command(), "the intruder is gone")
+    drive(backend)
+
+
+def test_in_a_namespace_it_notices_the_death_of_its_simulator(own_simulator):
+    backend, process, _ = own_simulator
+    drive(backend)
+    process._process.kill()
+    backend._timeout_s = SHORT_S
+    with pytest.raises(StaleDataError, match="no fresh data within 2") as caught:
+        backend.step(np.array([0.5, 0.0]))
+    assert caught.value.topic == "odom"
+    assert SHORT_S < caught.value.age_s < 60.0
+    with pytest.raises(BackendError, match="no answer within 2 s"):
+        backend.reset(START)
+
+
+def test_a_simulator_that_hangs_is_noticed_and_serves_again_when_it_wakes(own_simulator):
+    backend, process, _ = own_simulator
+    drive(backend)
+    process._process.send_signal(signal.SIGSTOP)
+    backend._timeout_s, hung_ns = 0.5, backend._now_ns
+    with pytest.raises(StaleDataError):
+        backend.step(np.array([0.5, 0.0]))
+    process._process.send_signal(signal.SIGCONT)
+    backend._timeout_s = TIMEOUT_S
+    drive(backend)
+    assert backend._now_ns > hung_ns
+
+
+def test_two_backends_in_two_domains_do_not_hear_each_other(connect, launch, model, arena):
+    with claimed_domain() as other_domain:
+        launch("simulator_node", other_domain, mode="lockstep")
+        one = connect()
+        two = connect(domain_id=other_domain)
+        alone = SimBackend(model, arena)
+        for backend in (one, two, alone):
+            backend.reset(START)
+        for k in range(10):
+            one.step(np.array([0.9, 0.5]))
+            two.step(np.array([0.2, 0.1 * k]))
+            alone.step(np.array([0.9, 0.5]))
+        here, there, expected = (b.step(np.zeros(2))[0] for b in (one, two, alone))
+        assert here.pose.tolist() == expected.pose.tolist()
+        assert np.abs(there.pose - expected.pose).max() > 0.1

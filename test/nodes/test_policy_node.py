@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import LaserScan
+
+from nics_drl_bridge.nodes import conversions, qos
+from nodes.peer import stamp_ns
+
+pytestmark = pytest.mark.ros
+
+RATE = 4.0
+
+
+@pytest.fixture(scope="module")
+def driving(launch, meet, module_domain_id):
+    """A policy whose commands move a simulator without a gate between, and what is said."""
+    peer = meet(module_domain_id)
+    said = {
+        "scan": peer.listen(LaserScan, "scan"),
+        "ground_truth": peer.listen(Odometry, "ground_truth"),
+        "cmd_vel_raw": peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND),
+    }
+    commands = peer.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
+    peer.node.create_subscription(
+        TwistStamped, "cmd_vel_raw", lambda raw: commands.publish(raw.twist), qos.COMMAND
+    )
+    start = {"episode_start": [-2.0, 0.0, 0.0], "episode_start_given": True}
+    simulator = launch("simulator_node", module_domain_id, world="empty", rate=RATE, **start)
+    policy = launch("policy_node", module_domain_id, base_frame="car")
+    goals = peer.speak(PoseStamped, "goal_pose")
+    peer.until(lambda: all(said.values()), "all topics")
+    yield peer, said, goals, policy
+    simulator.check()
+
+
+def speed(said):
+    return said["cmd_vel_raw"][-1].twist.linear.x
+
+
+def test_each_command_is_stamped_with_the_scan_it_was_computed_from(driving):
+    peer, said, _, _ = driving
+    known = len(said["cmd_vel_raw"])
+    peer.until(lambda: len(said["cmd_vel_raw"]) >= known + 10, "10 commands")
+    commands = [stamp_ns(raw) for raw in said["cmd_vel_raw"]]
+    assert set(commands[1:]) <= {stamp_ns(scan) for scan in said["scan"]}
+    assert (np.diff(commands) > 0).all()  # one for each scan at most
+    assert said["cmd_vel_raw"][-1].header.frame_id == "car"
+
+
+def test_without_a_goal_it_stands_still(driving):
+    _, said, _, _ = driving
+    assert [raw.twist for raw in said["cmd_vel_raw"]] == [Twist()] * len(said["cmd_vel_raw"])
+
+
+def test_a_goal_by_topic_is_driven_to_and_stopped_at(driving):
+    peer, said, goals, _ = driving
+    goal = PoseStamped()
+    goal.pose.position.x, goal.pose.position.y = 0.0, 0.5
+    goals.publish(goal)
+    peer.until(lambda: speed(said) > 0.1, "driving")
+    peer.until(lambda: speed(said) == 0.0, "a stop")
+    truth = conversions.odometry_from_ros(said["ground_truth"][-1])[0]
+    assert math.dist(truth[:2], (0.0, 0.5)) < 0.5
+    known = len(said["cmd_vel_raw"])
+    peer.until(lambda: len(said["cmd_vel_raw"]) >= known + 10, "10 more commands")
+    assert [raw.twist for raw in said["cmd_vel_raw"][known:]] == [Twist()] * 10
+
+
+def test_a_goal_that_is_no_number_stops_it_and_the_next_one_moves_it(driving):
+    peer, said, goals, _ = driving
+    goal = PoseStamped()
+    goal.pose.position.x = 2.0
+    goals.publish(goal)
+    peer.until(lambda: speed(said) > 0.1, "driving")
+    goal.pose.position.x = math.nan
+    goals.publish(goal)
+    peer.until(lambda: speed(said) == 0.0, "a stop")
+
+
+def test_it_leaves_a_zero_command_behind(driving):
+    peer, said, goals, policy = driving
+    goal = PoseStamped()
+    goal.pose.position.x, goal.pose.position.y = 2.0, -1.0
+    goals.publish(goal)
+    peer.until(lambda: speed(said) > 0.1, "driving")
+    assert policy.close() == 0
+    peer.until(lambda: said["cmd_vel_raw"][-1].twist == Twist(), "a zero command")
+    assert "Traceback" not in policy.log.read_text(encoding="utf-8")

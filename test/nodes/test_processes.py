@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from sensor_msgs.msg import LaserScan
+
+from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.nodes import processes
+from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+
+pytestmark = pytest.mark.ros
+
+NODES = ("simulator_node", "middleware_node", "policy_node", "command_gate")
+ENDED_S = 5.0
+PARENT = """
+import sys, time
+from pathlib import Path
+from nics_drl_bridge.nodes.processes import NodeProcess
+with NodeProcess("command_gate", Path(sys.argv[1]), {}, int(sys.argv[2])) as node:
+    print(node.pid, flush=True)
+    sys.stdin.read()
+"""
+
+
+def alive(pid):
+    """Whether a process runs; one that ended and was not waited for does not."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state != "Z"
+
+
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_every_node_ends_in_order_at_a_signal(launch, meet, domain_id, ending):
+    peer = meet(domain_id)
+    started = {node: launch(node, domain_id, namespace="robot") for node in NODES}
+
+    def running():
+        names = dict(peer.node.get_node_names_and_namespaces())
+        return all(names.get(node) == "/robot" for node in NODES)
+
+    peer.until(running, "all nodes")
+    began = time.monotonic()
+    for process in started.values():
+        process._process.send_signal(ending)
+    for node, process in started.items():
+        assert process._process.wait(ENDED_S) == 0, node
+        log = process.log.read_text(encoding="utf-8")
+        assert "Traceback" not in log, log
+    print(f"all ended {time.monotonic() - began:.2f} s after the {ending.name}")
+
+
+def test_a_node_dies_with_its_parent_however_that_dies(tmp_path, domain_id, meet):
+    parent = subprocess.Popen(
+        [sys.executable, "-c", PARENT, str(tmp_path), str(domain_id)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        child = int(parent.stdout.readline())
+        assert alive(child)
+        parent.kill()
+        parent.wait()
+        meet(domain_id).until(lambda: not alive(child), "the end of the child")
+    finally:
+        parent.kill()
+        parent.communicate()
+
+
+def test_leaving_the_block_ends_a_node_that_runs_and_one_that_hangs(
+    tmp_path, domain_id, meet, monkeypatch
+):
+    peer = meet(domain_id)
+    scans = peer.listen(LaserScan, "scan")
+    with NodeProcess("simulator_node", tmp_path / "runs", {}, domain_id) as node:
+        peer.until(lambda: scans, "a scan")
+        node.check()
+    assert not alive(node.pid)
+    monkeypatch.setattr(processes, "PATIENCE_S", 0.5)
+    with NodeProcess("command_gate", tmp_path / "hangs", {}, domain_id) as node:
+        peer.until(lambda: "command_gate" in peer.node.get_node_names(), "the gate")
+        os.kill(node.pid, signal.SIGSTOP)
+    assert not alive(node.pid)
+    assert node.close() == -signal.SIGKILL
+
+
+def test_a_node_that_ended_by_itself_is_named_with_its_code_and_log(tmp_path, domain_id, meet):
+    with NodeProcess("policy_node", tmp_path, {"policy": "go_to_gaol"}, domain_id) as node:
+        meet(domain_id).until(lambda: node._process.poll() is not None, "its end")
+        expected = (
+            "policy_node ended with code 2: unknown policy 'go_to_gaol'; did you mean "
+            f"'go_to_goal'? (its log is {node.log})."
+        )
+        with pytest.raises(BackendError, match=f"^{re.escape(expected)}$"):
+            node.check()
+
+
+def test_names_can_be_remapped(tmp_path, domain_id, meet):
+    peer = meet(domain_id)
+    scans = peer.listen(LaserScan, "lidar/front")
+    remap = {"scan": "lidar/front"}
+    with NodeProcess("simulator_node", tmp_path, {}, domain_id, remap=remap):
+        peer.until(lambda: scans, "a scan")
+
+
+def test_the_domain_id_is_the_environments_or_drawn(monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "42")
+    assert free_domain_id() == 42
+    monkeypatch.delenv("ROS_DOMAIN_ID")
+    drawn = {free_domain_id() for _ in range(50)}
+    assert len(drawn) > 10
+    assert all(0 < domain_id < 102 for domain_id in drawn)
+
+
+@pytest.mark.parametrize("given", ["seven", "-1", "1.5", "233"])
+def test_a_wrong_domain_id_of_the_environment_is_one_sentence(monkeypatch, given):
+    monkeypatch.setenv("ROS_DOMAIN_ID", given)
+    with pytest.raises(ConfigError, match=f"ROS_DOMAIN_ID is '{given}'"):
+        free_domain_id()

@@ -1,0 +1,370 @@
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from domains import claimed_domain
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import LaserScan
+from std_srvs.srv import SetBool, Trigger
+
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.sim.world import load_world
+from nodes.peer import stamp_ns
+
+pytestmark = pytest.mark.ros
+
+FRAMES = {"map_frame": "field", "odom_frame": "wheels", "base_frame": "car", "laser_frame": "eye"}
+READY_S = 5.0
+TOPICS = {"scan": LaserScan, "odom": Odometry, "ground_truth": Odometry}
+
+
+class Watched:
+    """A simulator node and all that it says."""
+
+    def __init__(self, peer, ready_s):
+        self.peer, self.ready_s = peer, ready_s
+        self.said = {topic: peer.listen(kind, topic) for topic, kind in TOPICS.items()}
+        self.clock = peer.listen(Clock, "/clock")
+        self.commands = peer.speak(Twist, "cmd_vel")
+
+    def reset(self, **episode):
+        """Resets until the data of it arrive: a first one may come before discovery is over."""
+        if episode:
+            assert self.peer.set_parameters("simulator_node", **episode).successful
+        for _ in range(20):
+            answer = self.peer.call(Trigger, "simulator_node/reset")
+            assert answer.success, answer.message
+            facts = json.loads(answer.message)
+            if self.has(facts["stamp_ns"], patience_s=1.5):
+                return facts
+        raise AssertionError(f"no data after a reset: {facts}")
+
+    def has(self, stamp, patience_s=30.0):
+        """Whether all topics come to a stamp."""
+        try:
+            self.peer.until(lambda: min(self.newest()) >= stamp, f"data of {stamp}", patience_s)
+        except AssertionError:
+            return False
+        return True
+
+    def newest(self):
+        yield from (stamp_ns(said[-1]) if said else -1 for said in self.said.values())
+        yield conversions.stamp_from_ros(self.clock[-1].clock) if self.clock else -1
+
+    def command(self, speed, steering=0.0):
+        self.commands.publish(conversions.twist_to_ros([speed, 0.0, steering]))
+
+    def step(self, speed, steering=0.0):
+        """A command, and the stamps of all that came of it."""
+        known = {topic: len(said) for topic, said in self.said.items()}
+        now = stamp_ns(self.said["odom"][-1])
+        self.command(speed, steering)
+        assert self.has(now + 1), "nothing came of a command"
+        return {topic: [stamp_ns(m) for m in self.said[topic][n:]] for topic, n in known.items()}
+
+
+@pytest.fixture(scope="module")
+def lockstep(launch, meet, module_domain_id):
+    peer, began = meet(module_domain_id), time.monotonic()
+    process = launch(
+        "simulator_node", module_domain_id, mode="lockstep", renderer="exact", **FRAMES
+    )
+    watched = Watched(peer, 0.0)
+    watched.ready_s = time.monotonic() - began
+    watched.reset()
+    yield watched
+    process.check()
+
+
+@pytest.fixture(scope="module")
+def realtime(launch, meet):
+    with claimed_domain() as domain_id:
+        process = launch("simulator_node", domain_id, rate=2.0, world="empty", use_sim_time=True)
+        watched = Watched(meet(domain_id), 0.0)
+        assert watched.has(0), "the simulator says nothing"
+        yield watched
+        process.check()
+
+
+@pytest.fixture
+def period_ns(model):
+    return round(model.control_period * conversions.NANO)
+
+
+def test_it_is_ready_within_seconds(lockstep):
+    print(f"ready {lockstep.ready_s:.2f} s after its start, wanted within {READY_S} s")
+    assert lockstep.ready_s < 6 * READY_S  # an idle machine takes a quarter of the wanted time
+
+
+def test_each_command_brings_exactly_one_scan_and_odometry_one_period_later(lockstep, period_ns):
+    now = lockstep.reset()["stamp_ns"]
+    for k in range(1, 31):
+        expected = [now + k * period_ns]
+        assert lockstep.step(0.5, 0.1) == dict.fromkeys(TOPICS, expected)
+
+
+def test_without_a_command_its_time_stands_still(lockstep, period_ns):
+    now = lockstep.reset()["stamp_ns"]
+    for _ in range(5):  # each call makes the node spin
+        lockstep.peer.call(SetBool, "simulator_node/pause", SetBool.Request(data=False))
+    assert set(lockstep.newest()) == {now}
+
+
+def test_a_paused_simulator_ignores_commands_until_it_goes_on(lockstep, period_ns):
+    now = lockstep.reset()["stamp_ns"]
+    lockstep.peer.call(SetBool, "simulator_node/pause", SetBool.Request(data=True))
+    lockstep.command(0.5)
+    lockstep.peer.call(SetBool, "simulator_node/pause", SetBool.Request(data=False))
+    assert set(lockstep.newest()) == {now}
+    assert lockstep.step(0.0) == {topic: [now + period_ns] for topic in TOPICS}
+
+
+def test_the_clock_and_all_stamps_only_ever_grow_also_across_resets(lockstep):
+    for _ in range(3):
+        lockstep.reset()
+        lockstep.step(0.5)
+        lockstep.step(0.5)
+    clock = [conversions.stamp_from_ros(message.clock) for message in lockstep.clock]
+    assert len(clock) > 9
+    assert all(a < b for a, b in itertools.pairwise(clock))
+    for said in lockstep.said.values():
+        assert all(stamp_ns(a) < stamp_ns(b) for a, b in itertools.pairwise(said))
+    assert abs(clock[0] * 1e-9 - time.time()) < 600.0  # it began at the system's time
+
+
+def test_a_reset_answers_with_the_first_stamp_and_what_it_runs(lockstep, model):
+    facts = lockstep.reset()
+    assert set(lockstep.newest()) == {facts["stamp_ns"]}
+    assert facts["model"] == model.fingerprint
+    assert facts["world"] == load_world("arena").fingerprint
+
+
+def test_a_reset_begins_where_the_parameters_say(lockstep):
+    lockstep.reset(episode_seed=3, episode_start=[0.5, -0.25, 1.0], episode_start_given=True)
+    for topic in ("odom", "ground_truth"):
+        pose, twist = conversions.odometry_from_ros(lockstep.said[topic][-1])
+        assert pose == pytest.approx([0.5, -0.25, 1.0])
+        assert twist.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_the_same_seed_and_commands_give_the_same_data_again(lockstep):
+    def drive(seed):
+        lockstep.reset(episode_seed=seed, episode_start_given=False)
+        for k in range(10):
+            lockstep.step(0.6, 0.3 * math.sin(k))
+        pose, twist = conversions.odometry_from_ros(lockstep.said["odom"][-1])
+        return [*pose, *twist, *lockstep.said["scan"][-1].ranges]
+
+    first = drive(5)
+    assert drive(5) == first
+    assert drive(6) != first
+
+
+@pytest.mark.parametrize(
+    ("values", "reason"),
+    [
+        ({"episode_seed": -1}, "episode_seed must be 0 or more"),
+        ({"episode_start": [1.0, 2.0]}, "three finite numbers"),
+        ({"episode_start": [1.0, 2.0, math.nan]}, "three finite numbers"),
+        ({"episode_start": [1.0, 2.0, math.inf]}, "three finite numbers"),
+        ({"episode_seed": 1.5}, "type"),
+        ({"mode": "realtime"}, "read-only"),
+        ({"model": "mecanum"}, "read-only"),
+        ({"world": "empty"}, "read-only"),
+        ({"rate": 3.0}, "read-only"),
+    ],
+)
+def test_a_parameter_it_cant_use_is_refused_with_the_reason(lockstep, values, reason):
+    result = lockstep.peer.set_parameters("simulator_node", **values)
+    assert not result.successful
+    assert reason in result.reason
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_command_that_is_no_number_is_ignored(lockstep, period_ns, bad):
+    now = lockstep.reset()["stamp_ns"]
+    lockstep.command(bad)
+    lockstep.command(0.0, bad)
+    assert lockstep.step(0.5) == {topic: [now + period_ns] for topic in TOPICS}
+    assert np.isfinite(conversions.odometry_from_ros(lockstep.said["odom"][-1])[0]).all()
+
+
+def test_the_header_of_its_scan_equals_the_lidar(lockstep, model):
+    lockstep.reset()
+    scan, lidar = lockstep.said["scan"][-1], model.lidar
+    assert len(scan.ranges) == lidar.beams
+    assert scan.angle_min == pytest.approx(lidar.angles[0])
+    assert scan.angle_max == pytest.approx(lidar.angles[-1])
+    assert scan.angle_increment == pytest.approx(lidar.angle_increment)
+    assert (scan.range_min, scan.range_max) == pytest.approx((lidar.range_min, lidar.range_max))
+    assert scan.scan_time == pytest.approx(1.0 / lidar.rate)
+
+
+def test_its_ranges_are_returns_within_the_limits_or_infinite(lockstep, model):
+    lockstep.reset(episode_seed=0, episode_start=[0.0, 0.0, 0.0], episode_start_given=True)
+    ranges = np.array(lockstep.said["scan"][-1].ranges)
+    returns = ranges[np.isfinite(ranges)]
+    assert len(returns) > 10
+    assert returns.min() >= np.float32(model.lidar.range_min)
+    assert returns.max() <= np.float32(model.lidar.range_max)
+    assert (ranges[~np.isfinite(ranges)] == np.inf).all()  # the walls are 3 m away and more
+
+
+def test_a_wall_nearer_than_the_least_range_is_reported_as_minus_infinity(lockstep):
+    lockstep.reset(episode_start=[2.98, 0.0, 0.0], episode_start_given=True)
+    ranges = np.array(lockstep.said["scan"][-1].ranges)
+    assert ranges[len(ranges) // 2] == -np.inf  # straight ahead
+
+
+def test_all_frames_are_those_of_the_parameters(lockstep):
+    scan, odom, truth = (lockstep.said[topic][-1] for topic in TOPICS)
+    assert scan.header.frame_id == "eye"
+    assert (odom.header.frame_id, odom.child_frame_id) == ("wheels", "car")
+    assert (truth.header.frame_id, truth.child_frame_id) == ("field", "car")
+
+
+def test_the_covariance_of_its_odometry_is_filled_and_grows_on_the_way(lockstep):
+    def variance():
+        odom = lockstep.said["odom"][-1]
+        return np.array([np.diag(np.reshape(part.covariance, (6, 6))) for part in
+                         (odom.pose, odom.twist)])  # fmt: skip
+
+    lockstep.reset()
+    before = variance()
+    assert (before > 0.0).all()
+    for _ in range(20):
+        lockstep.step(0.0)
+    after = variance()
+    assert after[0, 0] > before[0, 0]
+    assert after[0, 5] > before[0, 5]
+    assert (after[1] == before[1]).all()
+
+
+def test_the_true_twist_is_how_the_true_pose_moves(lockstep, model):
+    lockstep.reset(episode_seed=0, episode_start=[0.0, 0.0, 0.0], episode_start_given=True)
+    lockstep.step(0.6)
+    before = conversions.odometry_from_ros(lockstep.said["ground_truth"][-1])[0]
+    lockstep.step(0.6)
+    after, twist = conversions.odometry_from_ros(lockstep.said["ground_truth"][-1])
+    assert twist[0] * model.control_period == pytest.approx(math.dist(after[:2], before[:2]))
+    assert twist[0] > 0.1
+
+
+def test_listeners_of_best_effort_hear_it_too(lockstep):
+    heard = [lockstep.peer.listen(kind, topic, qos.SENSOR) for topic, kind in TOPICS.items()]
+    lockstep.reset()
+    for _ in range(50):
+        lockstep.step(0.0)
+        if all(heard):
+            return
+    raise AssertionError("best-effort subscribers hear nothing")
+
+
+def test_in_real_time_it_publishes_at_about_the_rate(realtime, period_ns):
+    scans = realtime.said["scan"]
+    known, began = len(scans), time.monotonic()
+    realtime.peer.until(lambda: len(scans) >= known + 40, "40 scans")
+    rate = 40 / (time.monotonic() - began)
+    print(f"{rate:.1f} scans/s, wanted 20")
+    assert 10.0 < rate < 24.0
+    stamps = [stamp_ns(scan) for scan in scans[known:]]
+    assert set(np.diff(stamps)) == {period_ns}
+
+
+def test_in_real_time_it_stops_the_robot_when_commands_end(realtime):
+    odom, speed = realtime.said["odom"], 0.0
+    while speed < 0.3:
+        realtime.command(0.5)
+        speed = realtime.peer.another(odom, "odometry").twist.twist.linear.x
+    ended = stamp_ns(odom[-1])
+    while abs(speed) > 0.05:
+        speed = realtime.peer.another(odom, "odometry").twist.twist.linear.x
+        assert stamp_ns(odom[-1]) - ended < 10 * conversions.NANO
+    assert 0.4 < (stamp_ns(odom[-1]) - ended) * 1e-9 < 2.0  # simulated; the limit is 0.5 s
+
+
+def test_nan_does_not_keep_the_last_command_alive(realtime):
+    odom = realtime.said["odom"]
+
+    def repeat(speed, until, what):
+        for _ in range(200):
+            if until(odom[-1].twist.twist.linear.x):
+                return
+            realtime.command(speed)
+            realtime.peer.another(odom, "odometry")
+        raise AssertionError(what)
+
+    repeat(0.5, lambda speed: speed > 0.3, "driving")
+    repeat(math.nan, lambda speed: abs(speed) < 0.05, "standing still although NaN keeps coming")
+
+
+def test_as_fast_as_possible_it_outruns_the_clock(launch, meet, domain_id):
+    process = launch("simulator_node", domain_id, mode="as_fast_as_possible")
+    peer = meet(domain_id)
+    scans = peer.listen(LaserScan, "scan")
+    peer.until(lambda: scans, "a scan")
+    began, first = time.monotonic(), stamp_ns(scans[-1])
+    peer.until(lambda: stamp_ns(scans[-1]) - first > 20 * conversions.NANO, "20 simulated s")
+    factor = 20.0 / (time.monotonic() - began)
+    print(f"{factor:.0f} times faster than the clock")
+    assert factor > 2.0
+    process.close()
+
+
+REFUSED = {
+    "mode:=lockstp": "parameter 'mode': unknown value 'lockstp'; did you mean 'lockstep'?",
+    "model:=ackerman": "unknown robot 'ackerman'; did you mean 'ackermann'?",
+    "model:=/no/such/folder": "/no/such/folder: no such folder",
+    "world:=areena": "unknown world 'areena'; did you mean 'arena'?",
+    "rate:=fast": "'rate'",
+    "rate:=-1.0": "rate",
+    "episode_start:=[1.0, 2.0]": "three finite numbers",
+    "no parameter": "ROS 2 does not start",
+}
+
+
+@pytest.fixture(scope="module")
+def refusals():
+    """What each of the wrong parameters leads to: exit code and standard error."""
+    with claimed_domain() as domain_id:
+        command = [sys.executable, "-m", "nics_drl_bridge.nodes.simulator_node", "--ros-args", "-p"]
+        started = {
+            parameter: subprocess.Popen(
+                [*command, parameter],
+                env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+            for parameter in REFUSED
+        }
+        try:
+            yield {
+                parameter: (process.communicate(timeout=90.0)[1], process.returncode)
+                for parameter, process in started.items()
+            }
+        finally:
+            for process in started.values():
+                process.kill()
+
+
+@pytest.mark.parametrize(("parameter", "sentence"), REFUSED.items())
+def test_a_wrong_parameter_ends_it_with_code_2_and_one_sentence(refusals, parameter, sentence):
+    error, code = refusals[parameter]
+    assert code == 2, error
+    assert sentence in error
+    ours = [line for line in error.splitlines() if not line.startswith("[ERROR]")]  # rcl's own
+    assert len(ours) == 1, error

@@ -1,0 +1,80 @@
+"""A robot whose motion is known in closed form: each command is a component of its twist."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nics_drl_bridge.calibration.calibration import Calibration
+from nics_drl_bridge.generator import Noise, SimulatorModel
+from nics_drl_bridge.kinematics.model import TaylorModel
+from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.lidar.table import bake
+from nics_drl_bridge.sim.world import World
+
+FOOTPRINT = 0.2
+RADIUS = 0.25
+
+DIRECT = RobotSpec.model_validate(
+    {
+        "name": "direct",
+        "footprint_radius": FOOTPRINT,
+        "command": [
+            {"name": "forward", "unit": "m/s", "min": -2.0, "max": 2.0, "cmd_vel": "linear.x"},
+            {"name": "left", "unit": "m/s", "min": -2.0, "max": 2.0, "cmd_vel": "linear.y"},
+            {"name": "turn", "unit": "rad/s", "min": -2.0, "max": 2.0, "cmd_vel": "angular.z"},
+        ],
+    }
+)
+
+
+def lidar(**changes) -> LidarSpec:
+    """A lidar with few beams all around."""
+    data = {
+        "beams": 72,
+        "angle_min": -np.pi,
+        "angle_max": np.pi,
+        "range_min": 0.05,
+        "range_max": 3.0,
+        "rate": 10.0,
+    }
+    return LidarSpec.model_validate(data | changes)
+
+
+def direct_model(
+    latency: float = 0.0,
+    odometry: tuple[float, float] = (0.0, 0.0),
+    sensor: LidarSpec | None = None,
+) -> SimulatorModel:
+    """A model without state, whose twist is its command; steps of 10 ms, periods of 0.1 s."""
+    sensor = sensor or lidar()
+    kinematics = TaylorModel(
+        variables=DIRECT.variable_names,
+        dofs=DIRECT.dof_names,
+        dof_units=DIRECT.dof_units,
+        powers=np.eye(3, dtype=np.int64),
+        coefficients=np.eye(3),
+        dt=0.01,
+        low=DIRECT.command_low,
+        high=DIRECT.command_high,
+    )
+    return SimulatorModel(
+        DIRECT,
+        kinematics,
+        Calibration(command_latency_s=latency),
+        sensor,
+        bake(sensor, (RADIUS, FOOTPRINT)),
+        Noise(odom_linear_std=odometry[0], odom_angular_std=odometry[1]),
+    )
+
+
+def field(size: float = 6.0, count: int = 0, **changes) -> World:
+    """A square field with `count` obstacles."""
+    data = {
+        "name": "field",
+        "size": [size, size],
+        "obstacles": {"count": count, "radii": [RADIUS], "gap": 0.3},
+        "clearance": 0.1,
+        "goal_distance": [1.0, 3.0],
+    }
+    return World.model_validate(data | changes)

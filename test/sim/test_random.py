@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from scipy import stats
+
+from nics_drl_bridge.sim import random
+
+
+@njit
+def draws(function, seeds, streams, counters):
+    out = np.empty((len(seeds), len(streams), len(counters)))
+    for i in range(len(seeds)):
+        for j in range(len(streams)):
+            for k in range(len(counters)):
+                out[i, j, k] = function(seeds[i], streams[j], counters[k])
+    return out
+
+
+def test_uniform_draws_are_uniform_in_the_half_open_unit_interval():
+    sample = draws(random.uniform, np.arange(10), np.arange(4), np.arange(5000)).ravel()
+    assert sample.min() >= 0.0
+    assert sample.max() < 1.0
+    assert stats.kstest(sample, "uniform").pvalue > 1e-3
+    assert len(np.unique(sample)) == sample.size
+
+
+def test_normal_draws_are_standard_normal():
+    sample = draws(random.normal, np.arange(10), np.arange(4), np.arange(5000)).ravel()
+    assert np.isfinite(sample).all()
+    assert stats.kstest(sample, "norm").pvalue > 1e-3
+
+
+def test_neighbours_in_seed_stream_and_counter_are_not_correlated():
+    sample = draws(random.uniform, np.arange(100), np.arange(2), np.arange(100)) - 0.5
+    limit = 4.5 / np.sqrt(sample.size / 2) / 12.0
+    for axis in range(3):
+        ahead = np.take(sample, np.arange(1, sample.shape[axis]), axis=axis)
+        behind = np.take(sample, np.arange(sample.shape[axis] - 1), axis=axis)
+        assert abs((ahead * behind).mean()) < limit
+
+
+def test_a_draw_depends_on_its_three_numbers_alone():
+    seeds, streams, counters = np.arange(5), np.arange(3), np.arange(7)
+    all_of_them = draws(random.normal, seeds, streams, counters)
+    assert np.array_equal(draws(random.normal, seeds[::-1], streams, counters)[::-1], all_of_them)
+    assert np.array_equal(draws(random.normal, seeds[3:4], streams, counters)[0], all_of_them[3])
+    swapped = draws(random.normal, np.array([1]), np.array([2]), np.array([3]))
+    assert swapped != draws(random.normal, np.array([2]), np.array([1]), np.array([3]))
+
+
+def test_large_and_negative_seeds_give_draws_of_their_own():
+    seeds = np.array([0, 1, -1, 2**31 - 1, 2**62, -(2**62)])
+    sample = draws(random.uniform, seeds, np.arange(1), np.arange(1)).ravel()
+    assert len(np.unique(sample)) == len(seeds)

@@ -1,0 +1,260 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from robots import FOOTPRINT, RADIUS, direct_model, field, lidar
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.sim.simulator import FastSimulator, Worlds
+from nics_drl_bridge.sim.world import load_world
+
+ORIGIN = np.zeros((1, 1, 3))
+PERIOD = 0.1
+
+
+def noisy_model(**changes):
+    return direct_model(odometry=(0.05, 0.03), sensor=lidar(noise_std=0.01, **changes))
+
+
+def drive(simulator, seeds, commands, starts=None):
+    """Everything that every period of a drive of commands (T, N, M, C) gave."""
+    simulator.reset(seeds, starts=starts)
+    history = []
+    for command in commands:
+        simulator.step(command)
+        history.append({name: array.copy() for name, array in vars(simulator.data).items()})
+    return history
+
+
+def random_commands(model, steps, worlds, robots, seed=0):
+    rng = np.random.default_rng(seed)
+    low, high = model.robot.command_low, model.robot.command_high
+    return rng.uniform(low, high, (steps, worlds, robots, len(low)))
+
+
+def assert_same(one, other, names, rows=slice(None), other_rows=slice(None)):
+    for a, b in zip(one, other, strict=True):
+        for name in names:
+            assert np.array_equal(a[name][rows], b[name][other_rows]), name
+
+
+ALL = tuple(entry.name for entry in dataclasses.fields(Worlds))
+
+
+@pytest.mark.parametrize("renderer", ["baked", "exact"])
+def test_the_same_seeds_give_the_same_bits_in_another_simulator(renderer):
+    model, world = noisy_model(), field(5.0, count=4)
+    commands = random_commands(model, 15, 3, 2)
+    one, other = (
+        drive(FastSimulator(model, world, 3, 2, renderer), [4, 5, 6], commands) for _ in range(2)
+    )
+    assert_same(one, other, ALL)
+    again = drive(FastSimulator(model, world, 3, 2, renderer), [7, 5, 6], commands)
+    assert not np.array_equal(again[-1]["twist"][0], one[-1]["twist"][0])
+
+
+@pytest.mark.parametrize("robot", ["direct", "ackermann", "mecanum"])
+@pytest.mark.parametrize("batch", [4, 16, 300])
+def test_a_world_gives_the_same_bits_in_a_batch_of_any_size(robot, batch):
+    model = noisy_model() if robot == "direct" else builtin_model(robot)
+    radii = [RADIUS] if robot == "direct" else [model.robot.footprint_radius]
+    world = field(5.0, obstacles={"count": 3, "radii": radii, "gap": 0.3})
+    commands = random_commands(model, 25, batch, 1)
+    together = drive(FastSimulator(model, world, batch), range(batch), commands)
+    single = FastSimulator(model, world)
+    touched = 0
+    for n in (0, 1, 2, 3, batch // 2, batch - 1):
+        alone = drive(single, [n], commands[:, n : n + 1])
+        assert_same(alone, together, ALL, other_rows=slice(n, n + 1))
+        touched += alone[-1]["collided"].sum()
+    assert 0 < together[-1]["collided"].sum() < batch
+
+
+def test_beginning_one_world_anew_leaves_the_others_alone():
+    model, world = noisy_model(), field(5.0, count=3)
+    commands = random_commands(model, 10, 3, 1)
+    plain = drive(FastSimulator(model, world, 3), [1, 2, 3], commands)
+    simulator = FastSimulator(model, world, 3)
+    simulator.reset([1, 2, 3])
+    for step, command in enumerate(commands):
+        if step == 5:
+            simulator.reset([9], worlds=[1])
+        simulator.step(command)
+    for name in ALL:
+        assert np.array_equal(getattr(simulator.data, name)[[0, 2]], plain[-1][name][[0, 2]])
+    assert simulator.data.steps.tolist() == [10, 5, 10]
+    fresh = drive(FastSimulator(model, world), [9], commands[5:, 1:2])
+    for name in ALL:
+        assert np.array_equal(getattr(simulator.data, name)[1], fresh[-1][name][0]), name
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.01, 0.03, 0.09, 0.1, 0.11, 0.25, 0.4])
+def test_a_command_takes_effect_after_exactly_its_latency(latency):
+    commands = np.zeros((12, 1, 1, 3))
+    commands[:, 0, 0, 0] = np.random.default_rng(1).uniform(-1.0, 1.0, 12)
+    history = drive(FastSimulator(direct_model(latency), field()), [0], commands, ORIGIN)
+    # A command of period k acts during [k T + latency, (k + 1) T + latency).
+    for period, data in enumerate(history):
+        now = (period + 1) * PERIOD
+        acted = np.clip(now - latency - np.arange(12) * PERIOD, 0.0, PERIOD)
+        expected = acted @ commands[:, 0, 0, 0]
+        assert data["pose"][0, 0] == pytest.approx([expected, 0.0, 0.0], abs=1e-12), period
+        newest = np.floor((now - 0.01 - latency) / PERIOD + 1e-9)
+        speed = commands[int(newest), 0, 0, 0] if newest >= 0 else 0.0
+        assert data["twist"][0, 0, 0] == pytest.approx(speed)
+
+
+def test_a_reset_forgets_commands_on_their_way():
+    simulator = FastSimulator(direct_model(latency=0.3), field())
+    drive(simulator, [0], np.ones((2, 1, 1, 3)), ORIGIN)
+    simulator.reset([0], starts=ORIGIN)
+    for _ in range(5):
+        simulator.step(np.zeros((1, 1, 3)))
+    assert not simulator.data.pose.any()
+
+
+def test_robots_move_as_the_readable_model_does():
+    model = builtin_model("differential")
+    commands = random_commands(model, 20, 1, 1) * [0.3, 1.0]
+    history = drive(FastSimulator(model, load_world("empty")), [0], commands, ORIGIN)
+    pose, state = np.zeros(3), np.zeros(len(model.robot.state))
+    for command, data in zip(commands, history, strict=True):
+        for _ in range(model.timing[1]):
+            pose, state = model.kinematics.step(pose, state, command[0, 0])
+        assert data["state"][0, 0] == pytest.approx(state, abs=1e-10)
+        assert geometry.between(pose, data["pose"][0, 0]) == pytest.approx(np.zeros(3), abs=1e-10)
+
+
+def test_a_robot_stops_at_a_wall_and_is_marked():
+    history = drive(
+        FastSimulator(direct_model(), field(2.0)), [0], np.tile([1.0, 0.0, 0.0], (15, 1, 1, 1)),
+        ORIGIN,
+    )  # fmt: skip
+    x = np.array([data["pose"][0, 0, 0] for data in history])
+    collided = np.array([data["collided"][0, 0] for data in history])
+    assert x[:7] == pytest.approx(0.1 * np.arange(1, 8))
+    assert not collided[:7].any()
+    assert collided[8:].all()
+    assert 1.0 - FOOTPRINT <= x[-1] <= 1.0 - FOOTPRINT + 0.01 + 1e-9
+    assert (x[8:] == x[8]).all()
+
+
+def test_no_robot_ever_enters_anything_by_more_than_two_steps():
+    step = np.sqrt(2.0) * 0.01 + 1e-9  # [m], as fast as its commands allow
+    model, world = direct_model(), field(4.0, count=3)
+    simulator = FastSimulator(model, world, 32, 3)
+    scenes = simulator.reset(range(32))
+    for command in random_commands(model, 40, 32, 3):
+        simulator.step(command)
+        pose = simulator.data.pose
+        assert (np.abs(pose[..., :2]) <= 2.0 - FOOTPRINT + 2.0 * step).all()
+        for n, scene in enumerate(scenes):
+            away = np.linalg.norm(pose[n, :, None, :2] - scene.circles[:, :2], axis=-1)
+            assert (away >= FOOTPRINT + RADIUS - 2.0 * step).all()
+            others = np.linalg.norm(pose[n, :, None, :2] - pose[n, None, :, :2], axis=-1)
+            assert (others + np.eye(3) >= 2.0 * FOOTPRINT - 2.0 * step).all()
+    assert 0 < simulator.data.collided.sum() < 96
+
+
+def test_a_robot_that_touched_nothing_is_not_marked():
+    history = drive(
+        FastSimulator(direct_model(), field()), [0], np.tile([0.0, 0.0, 2.0], (30, 1, 1, 1)), ORIGIN
+    )
+    assert not history[-1]["collided"].any()
+
+
+@pytest.mark.parametrize("renderer", ["baked", "exact"])
+def test_robots_see_each_other_and_not_themselves(renderer):
+    starts = np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]])
+    simulator = FastSimulator(direct_model(), field(8.0), 1, 2, renderer)
+    simulator.reset([0], starts=starts)
+    for expected in (1.0, 0.9, 0.8):
+        ahead, behind = simulator.data.ranges[0, 0, 36], simulator.data.ranges[0, 1, 0]
+        assert ahead == pytest.approx(expected - FOOTPRINT, abs=1e-3)
+        assert behind == pytest.approx(expected - FOOTPRINT, abs=1e-3)
+        assert np.isinf(simulator.data.ranges[0, 0, 0])
+        simulator.step([[[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])
+
+
+def test_robots_that_touch_are_both_marked():
+    starts = np.array([[[0.0, 0.0, 0.0], [0.6, 0.0, 0.0]]])
+    commands = np.tile([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], (6, 1, 1, 1))
+    history = drive(FastSimulator(direct_model(), field(8.0), 1, 2), [0], commands, starts)
+    assert history[-1]["pose"][0, 0, 0] == pytest.approx(0.2, abs=0.0101)
+    assert history[-1]["collided"][0].tolist() == [1, 1]
+
+
+def test_a_robot_that_touched_a_wall_may_leave_it_again():
+    there, back = np.tile([1.0, 0.0, 0.0], (10, 1, 1, 1)), np.tile([-1.0, 0.0, 0.0], (5, 1, 1, 1))
+    simulator = FastSimulator(direct_model(), field(2.0))
+    history = drive(simulator, [0], np.concatenate([there, back]), ORIGIN)
+    assert history[9]["collided"].all()
+    assert history[-1]["pose"][0, 0, 0] == pytest.approx(history[9]["pose"][0, 0, 0] - 0.5)
+
+
+def test_without_noise_odometry_is_the_truth():
+    model = direct_model()
+    commands = random_commands(model, 60, 4, 1, seed=2) * 0.3
+    for data in drive(FastSimulator(model, field(20.0), 4), range(4), commands):
+        assert not data["collided"].any()
+        off = geometry.between(data["pose"], data["odom"])
+        assert np.abs(off).max() < 1e-12
+    assert data["twist"] == pytest.approx(commands[-1])
+
+
+def test_odometry_drifts_with_the_configured_deviation():
+    worlds, steps, linear, angular = 3000, 25, 0.05, 0.03
+    model = direct_model(odometry=(linear, angular))
+    simulator = FastSimulator(model, field(), worlds)
+    starts = np.zeros((worlds, 1, 3))
+    history = drive(simulator, range(worlds), np.zeros((steps, worlds, 1, 3)), starts)
+    twists = np.array([data["twist"][:, 0] for data in history])
+    assert twists.std(axis=(0, 1)) == pytest.approx([linear, linear, angular], rel=0.02)
+    assert np.abs(twists.mean(axis=(0, 1))).max() < 0.001
+    final = history[-1]["odom"][:, 0]
+    walk = PERIOD * np.sqrt(steps)
+    assert final.std(axis=0) == pytest.approx(np.array([linear, linear, angular]) * walk, rel=0.05)
+    assert not history[-1]["pose"].any()
+    for k in range(3):  # each period draws anew, independent of the one before
+        correlation = np.corrcoef(twists[:-1, :, k].ravel(), twists[1:, :, k].ravel())[0, 1]
+        assert abs(correlation) < 0.02
+
+
+def test_ranges_have_the_configured_noise_within_their_limits():
+    std = 0.02
+    model = direct_model(sensor=lidar(noise_std=std, range_max=2.5))
+    clean = direct_model(sensor=lidar(range_max=2.5))
+    worlds = 200
+    starts = np.tile([0.3, -0.2, 0.4], (worlds, 1, 1))
+    noisy, true = (FastSimulator(m, field(4.0), worlds) for m in (model, clean))
+    for simulator in (noisy, true):
+        simulator.reset(range(worlds), starts=starts)
+    expected, seen = true.data.ranges, noisy.data.ranges
+    inside = np.isfinite(expected) & (expected < 2.4)
+    difference = seen[inside] - expected[inside]
+    assert difference.std() == pytest.approx(std, rel=0.02)
+    assert abs(difference.mean()) < 0.001
+    assert np.array_equal(np.isfinite(seen), np.isfinite(expected))
+    assert seen[np.isfinite(seen)].max() <= 2.5
+
+
+def test_a_scan_after_reset_is_there_before_the_first_step():
+    simulator = FastSimulator(direct_model(), field(4.0))
+    simulator.reset([0], starts=ORIGIN)
+    assert simulator.data.ranges[0, 0, 36] == pytest.approx(2.0, abs=1e-5)
+
+
+def test_goals_are_those_of_the_scene():
+    simulator = FastSimulator(direct_model(), field(), 2)
+    scenes = simulator.reset([5, 6])
+    assert np.array_equal(simulator.goals, [scene.goals for scene in scenes])
+
+
+@pytest.mark.parametrize(("worlds", "robots"), [(0, 1), (1, 0)])
+def test_a_simulator_of_nothing_is_refused(worlds, robots):
+    with pytest.raises(ConfigError, match="at least 1 world and 1 robot"):
+        FastSimulator(direct_model(), field(), worlds, robots)

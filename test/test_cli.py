@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge import __version__
+from nics_drl_bridge.generator import load_model
+from nics_drl_bridge.kinematics import textbook
+from nics_drl_bridge.kinematics.recording import save_recording
+from nics_drl_bridge.kinematics.spec import load_robot
+
+MODEL_FILES = {"model.yaml", "lidar_table.npz", "report.txt"}
+
+
+def nics(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "nics_drl_bridge.cli", *map(str, words)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=100)
+
+
+def refused(done: subprocess.CompletedProcess[str]) -> str:
+    """The one sentence that a command ended with."""
+    assert done.returncode == 2, done.stderr
+    (sentence,) = done.stderr.splitlines()
+    assert sentence.startswith("nics: ")
+    return sentence
+
+
+def names(folder: Path) -> set[str]:
+    """All that lies in a folder, hidden or not."""
+    return set(os.listdir(folder))
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    path = tmp_path_factory.mktemp("drive") / "drive.npz"
+    car = load_robot("ackermann")
+    save_recording(textbook.record(car, np.random.default_rng(0), duration=30.0), path)
+    return path
+
+
+def csv_folder(path: Path, bad_row: str = "") -> Path:
+    """Half a minute of a car under motion capture."""
+    path.mkdir()
+    t = np.arange(0.0, 30.0, 0.1)
+    commands = [f"0.5,0.0,{second:.3f}" for second in t]
+    poses = [f"{0.5 * s:.4f},0.0,0.0,0.0,0.0,0.0,1.0,{int(s * 1e9)}" for s in t]
+    if bad_row:
+        poses[7] = bad_row
+    (path / "cmd.csv").write_text("\n".join(commands), encoding="utf-8")
+    (path / "vrpn.csv").write_text("\n".join(poses), encoding="utf-8")
+    return path
+
+
+def test_it_tells_its_version_and_its_commands(tmp_path):
+    assert nics("--version", cwd=tmp_path).stdout == f"{__version__}\n"
+    told = nics("--help", cwd=tmp_path)
+    assert told.returncode == 0
+    assert {"generate", "demo"} <= set(told.stdout.split())
+
+
+def test_an_unknown_command_or_option_is_refused(tmp_path):
+    for words in (("genrate",), ("generate", "drive.npz", "--output", "model")):
+        done = nics(*words, cwd=tmp_path)
+        assert done.returncode == 2
+        assert "Traceback" not in done.stderr
+    assert names(tmp_path) == set()
+
+
+def test_generate_makes_a_model_of_a_recording_and_replaces_it(drive, tmp_path):
+    first = nics("generate", drive, "--out", "models/car", cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    assert first.stdout.endswith("model written to models/car\n")
+    assert names(tmp_path / "models") == {"car"}
+    assert names(tmp_path / "models" / "car") == MODEL_FILES
+    model = load_model(tmp_path / "models" / "car")
+    assert model.robot.name == "ackermann"
+    assert model.report.rstrip() in first.stdout
+    again = nics("generate", drive, "--out", "models/car", "--alpha", "0.9", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert names(tmp_path / "models") == {"car"}
+    assert load_model(tmp_path / "models" / "car").fingerprint != model.fingerprint
+
+
+def test_generate_reads_the_folder_of_a_real_drive(shared_recordings, tmp_path):
+    folder = shared_recordings / "xtark_ackermann" / "random_drive_45s"
+    done = nics("generate", folder, "--out", "car", "--assume-textbook", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert names(tmp_path / "car") == MODEL_FILES
+
+
+def test_a_missing_recording_is_one_sentence(tmp_path):
+    for name in ("drive.npz", "drive"):
+        sentence = refused(nics("generate", name, "--out", "car", cwd=tmp_path))
+        assert name in sentence
+        assert "no such file" in sentence
+    assert names(tmp_path) == set()
+
+
+def test_an_empty_folder_names_the_files_that_are_needed(tmp_path):
+    (tmp_path / "drive").mkdir()
+    sentence = refused(nics("generate", "drive", "--out", "car", cwd=tmp_path))
+    assert "cmd.csv" in sentence
+    assert "vrpn.csv" in sentence
+    assert names(tmp_path) == {"drive"}
+
+
+def test_a_row_with_nan_is_named(tmp_path):
+    csv_folder(tmp_path / "drive", "0.1,nan,0.0,0.0,0.0,0.0,1.0,700000000")
+    sentence = refused(nics("generate", "drive", "--out", "car", cwd=tmp_path))
+    assert "vrpn.csv: row 8 holds NaN" in sentence
+    assert names(tmp_path) == {"drive"}
+
+
+def test_a_damaged_npz_is_one_sentence(drive, tmp_path):
+    data = drive.read_bytes()
+    (tmp_path / "torn.npz").write_bytes(data[: len(data) // 2])
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    before = names(tmp_path)
+    for name in ("torn.npz", "other.npz"):
+        assert name in refused(nics("generate", name, "--out", "car", cwd=tmp_path))
+    assert names(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("option", "name", "hint"),
+    [
+        ("--robot", "ackerman", "did you mean 'ackermann'?"),
+        ("--robot", "robot.yaml", "robot.yaml: no such file"),
+        ("--world", "areena", "did you mean 'arena'?"),
+        ("--lidar", "papper", "did you mean 'paper'?"),
+    ],
+)
+def test_an_unknown_name_comes_with_the_nearest(drive, tmp_path, option, name, hint):
+    sentence = refused(nics("generate", drive, "--out", "car", option, name, cwd=tmp_path))
+    assert name in sentence
+    assert hint in sentence
+    assert names(tmp_path) == set()
+
+
+def test_what_lies_at_the_place_of_the_model_is_left_alone(drive, tmp_path):
+    (tmp_path / "file").write_text("mine", encoding="utf-8")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "thesis.tex").write_text("mine", encoding="utf-8")
+    before = names(tmp_path)
+    for out, reason in (("file", "is a file"), ("folder", "holds other files")):
+        assert reason in refused(nics("generate", drive, "--out", out, cwd=tmp_path))
+    assert names(tmp_path) == before
+    assert names(tmp_path / "folder") == {"thesis.tex"}
+    assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"
+
+
+def test_a_recording_of_another_robot_is_refused(drive, tmp_path):
+    refused(nics("generate", drive, "--out", "car", "--robot", "mecanum", cwd=tmp_path))
+    assert names(tmp_path) == set()

@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from html.parser import HTMLParser
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from domains import claimed_domain
+
+DEADLINE_S = 90.0
+LAST_LINE = r"demo: in process 2/2, over DDS 2/2, report (.+/report\.html)"
+
+
+def needs_ros(test):
+    """Marks a test that drives over ROS 2, and skips it where there is none."""
+    reason = "needs ROS 2: rclpy is not installed"
+    return pytest.mark.ros(pytest.mark.skipif(find_spec("rclpy") is None, reason=reason)(test))
+
+
+class Running:
+    """A demo as a process, with the lines it printed so far."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.process, self.lines = process, []
+        self._changed = threading.Condition()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        for line in self.process.stdout:
+            with self._changed:
+                self.lines.append(line.rstrip("\n"))
+                self._changed.notify_all()
+
+    def until(self, pattern: str) -> None:
+        """Waits for a line that matches."""
+        with self._changed:
+            came = self._changed.wait_for(
+                lambda: any(re.search(pattern, line) for line in self.lines), DEADLINE_S
+            )
+        assert came, f"no line {pattern!r}; {self.lines}"
+
+
+@contextmanager
+def demo(*words: object, cwd: Path) -> Iterator[Running]:
+    with claimed_domain() as domain_id:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "nics_drl_bridge.cli", "demo", *map(str, words)],
+            cwd=cwd,
+            env=os.environ | {"ROS_DOMAIN_ID": str(domain_id), "PYTHONUNBUFFERED": "1"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        try:
+            yield Running(process)
+        finally:
+            process.kill()
+            process.wait()
+
+
+def processes_below(folder: Path) -> list[str]:
+    """Command lines of the processes that work with files in a folder."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            try:
+                line = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+                at = os.readlink(entry / "cwd")
+            except OSError:
+                continue
+            if line and at == str(folder):
+                found.append(line)
+    return found
+
+
+class Sources(HTMLParser):
+    """What a page shows, and what it loads."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags, self.loads = [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.loads += [value for name, value in attrs if name in ("src", "href", "data")]
+
+
+@needs_ros
+def test_it_goes_the_whole_road_and_leaves_a_report(tmp_path):
+    with demo("--episodes", 2, "--out", "out", cwd=tmp_path) as running:
+        assert running.process.wait(DEADLINE_S) == 0, running.process.stderr.read()
+        running.until("^demo: ")
+        (report,) = re.fullmatch(LAST_LINE, running.lines[-1]).groups()
+        assert processes_below(tmp_path) == []
+    assert any("the deployed nodes reached the goal" in line for line in running.lines)
+    text = (tmp_path / report).read_text(encoding="utf-8")
+    page = Sources()
+    page.feed(text)
+    assert page.tags.count("img") == 2
+    assert page.tags.count("tr") == 3  # a heading, and two episodes
+    assert page.loads  # all of it is inside
+    assert all(source.startswith("data:image/png;base64,") for source in page.loads)
+    assert "script" not in page.tags
+    for words in ("Fit report", "2 of 2 episodes", "over DDS", "The robot reached its goal"):
+        assert words in text
+    # Commands go through a quaternion and back at most: the two drives are the same drive.
+    deviations = re.findall(r"<td>([0-9.e+-]+)</td></tr>", text)
+    assert len(deviations) == 2
+    assert max(map(float, deviations)) < 1e-6
+
+
+@needs_ros
+@pytest.mark.parametrize(
+    ("phase", "pattern", "episodes"),
+    [
+        ("in process", "^  seed 0: ", 1000),
+        ("over DDS", "^driving the same .* over DDS", 50),
+        ("in real time", "^deploying ", 1),
+    ],
+)
+def test_ctrl_c_ends_it_and_all_that_it_started(tmp_path, phase, pattern, episodes):
+    with demo("--episodes", episodes, "--world", "empty", "--out", "out", cwd=tmp_path) as running:
+        running.until(pattern)
+        if phase != "in process":
+            wait_for(lambda: len(processes_below(tmp_path)) > 1, "a node")
+        os.kill(running.process.pid, signal.SIGINT)
+        assert running.process.wait(30.0) == 130
+        assert processes_below(tmp_path) == []
+        error = running.process.stderr.read()
+        assert error == "nics: interrupted; everything that was started has ended.\n"
+
+
+def wait_for(condition, what):
+    """Waits until something holds that nobody announces."""
+    deadline, once = time.monotonic() + DEADLINE_S, threading.Event()
+    while not condition():
+        assert time.monotonic() < deadline, f"no {what}"
+        once.wait(0.01)
+
+
+@pytest.mark.parametrize("words", [("--recording", "drive"), ("--robot", "ackerman"),
+                                   ("--world", "areena"), ("--out", "file")])  # fmt: skip
+def test_bad_input_ends_it_with_code_2_and_one_sentence(tmp_path, words):
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "drive" / "cmd.csv").write_text("0.5,nan,0.0\n", encoding="utf-8")
+    (tmp_path / "drive" / "vrpn.csv").write_text("", encoding="utf-8")
+    (tmp_path / "file").write_text("mine", encoding="utf-8")
+    with demo(*words, cwd=tmp_path) as running:
+        assert running.process.wait(DEADLINE_S) == 2
+        (sentence,) = running.process.stderr.read().splitlines()
+    assert sentence.startswith("nics: ")
+    assert words[1].removesuffix("drive") in sentence
+    assert not list(tmp_path.rglob(".*"))
+    assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"

@@ -1,0 +1,203 @@
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge import files
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import npz_bytes, sha256, whole_folder, write_bytes, write_text
+
+MARKER = "model.yaml"
+
+
+class Crash(BaseException):
+    """What a kill looks like from inside."""
+
+
+def tree(folder):
+    """Every file below a folder with its content."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+@pytest.fixture
+def old(tmp_path):
+    """A folder of the right kind, written earlier."""
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / MARKER).write_text("old")
+    (folder / "extra").write_text("old too")
+    return folder
+
+
+def fill(folder):
+    (folder / MARKER).write_text("new")
+    (folder / "sub").mkdir()
+    (folder / "sub" / "deep").write_text("deep")
+
+
+def test_a_file_is_written_with_its_folders_and_replaced_whole(tmp_path):
+    path = tmp_path / "a" / "b" / "file"
+    write_bytes(path, b"long content")
+    write_bytes(path, b"short")
+    assert tree(tmp_path) == {"a/b/file": b"short"}
+    assert path.stat().st_mode & 0o777 == 0o644
+
+
+def test_text_is_written_as_utf_8(tmp_path):
+    write_text(tmp_path / "file", "größe\n")
+    assert (tmp_path / "file").read_bytes() == "größe\n".encode()
+
+
+@pytest.mark.parametrize("moment", ["fsync", "chmod", "replace"])
+def test_a_crash_while_writing_leaves_the_old_file_and_no_other(tmp_path, monkeypatch, moment):
+    path = tmp_path / "file"
+    write_bytes(path, b"old")
+
+    def crash(*_):
+        raise Crash
+
+    monkeypatch.setattr(os, moment, crash)
+    with pytest.raises(Crash):
+        write_bytes(path, b"new")
+    assert tree(tmp_path) == {"file": b"old"}
+
+
+def test_a_killed_writer_leaves_one_whole_version(tmp_path):
+    path = tmp_path / "file"
+    code = (
+        "import sys, itertools\n"
+        "from pathlib import Path\n"
+        "from nics_drl_bridge.files import write_bytes\n"
+        "for i in itertools.count():\n"
+        "    write_bytes(Path(sys.argv[1]), bytes([i % 256]) * 4_000_000)\n"
+        "    print(i, flush=True)\n"
+    )
+    for _ in range(3):
+        writer = subprocess.Popen([sys.executable, "-c", code, path], stdout=subprocess.PIPE)
+        assert writer.stdout is not None
+        for _ in range(3):
+            writer.stdout.readline()
+        writer.kill()
+        writer.wait()
+        writer.stdout.close()
+        content = path.read_bytes()
+        assert len(content) == 4_000_000
+        assert len(set(content)) == 1
+
+
+def test_a_finished_folder_takes_the_place_of_the_old_one(old):
+    with whole_folder(old, MARKER) as temporary:
+        fill(temporary)
+        assert tree(old)[MARKER] == b"old"
+    assert tree(old.parent) == {f"out/{MARKER}": b"new", "out/sub/deep": b"deep"}
+    assert old.stat().st_mode & 0o777 == 0o755
+
+
+def test_a_new_folder_is_made_with_those_above_it(tmp_path):
+    with whole_folder(tmp_path / "a" / "b", MARKER) as temporary:
+        fill(temporary)
+    assert set(tree(tmp_path)) == {f"a/b/{MARKER}", "a/b/sub/deep"}
+
+
+@pytest.mark.parametrize("error", [Crash, KeyboardInterrupt, OSError])
+def test_an_error_inside_leaves_the_old_folder_and_no_other(old, error):
+    before = tree(old.parent)
+
+    def write_half():
+        with whole_folder(old, MARKER) as temporary:
+            fill(temporary)
+            raise error
+
+    with pytest.raises(error):
+        write_half()
+    assert tree(old.parent) == before
+    assert os.listdir(old.parent) == ["out"]
+
+
+@pytest.mark.parametrize("call", [1, 2])
+def test_a_rename_that_fails_leaves_the_old_folder(old, monkeypatch, call):
+    before, rename, calls = tree(old.parent), os.replace, []
+
+    def failing(source, target):
+        calls.append(source)
+        if len(calls) == call:
+            raise OSError("no space left on device")
+        rename(source, target)
+
+    monkeypatch.setattr(files.os, "replace", failing)
+
+    def write():
+        with whole_folder(old, MARKER) as temporary:
+            fill(temporary)
+
+    with pytest.raises(OSError, match="no space"):
+        write()
+    assert tree(old.parent) == before
+
+
+def test_a_folder_of_somebody_else_is_never_replaced(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with (
+        pytest.raises(ConfigError, match=r"holds other files and no 'model\.yaml'"),
+        whole_folder(tmp_path, MARKER),
+    ):
+        pass
+    assert tree(tmp_path) == {"thesis.tex": b"years of work"}
+
+
+def test_a_file_is_not_taken_for_a_folder(tmp_path):
+    (tmp_path / "out").write_text("a file")
+    with (
+        pytest.raises(ConfigError, match="is a file, not a folder"),
+        whole_folder(tmp_path / "out", MARKER),
+    ):
+        pass
+    assert tree(tmp_path) == {"out": b"a file"}
+
+
+def test_an_empty_folder_is_filled(tmp_path):
+    (tmp_path / "out").mkdir()
+    with whole_folder(tmp_path / "out", MARKER) as temporary:
+        fill(temporary)
+    assert f"out/{MARKER}" in tree(tmp_path)
+
+
+def test_a_link_stays_a_link_and_its_folder_is_replaced(old):
+    link = old.parent / "latest"
+    link.symlink_to("out")
+    with whole_folder(link, MARKER) as temporary:
+        fill(temporary)
+    assert link.is_symlink()
+    assert (old / MARKER).read_text() == "new"
+
+
+def test_equal_arrays_give_equal_bytes_and_read_back():
+    arrays = {"a": np.arange(5), "b": np.ones((2, 3), np.float32)}
+    data = npz_bytes(arrays)
+    assert data == npz_bytes({name: array.copy() for name, array in arrays.items()})
+    with np.load(io.BytesIO(data), allow_pickle=False) as read:
+        assert read["b"].dtype == np.float32
+        assert all(np.array_equal(read[name], array) for name, array in arrays.items())
+
+
+def test_the_bytes_of_arrays_do_not_hold_the_date():
+    assert b"\x00\x00\x21\x00" in npz_bytes({"a": np.zeros(1)})[:20]  # 1 January 1980
+
+
+def test_objects_are_refused_since_they_would_have_to_be_unpickled():
+    with pytest.raises(ValueError, match="allow_pickle"):
+        npz_bytes({"a": np.array([object()])})
+
+
+def test_the_checksum_is_sha_256():
+    empty = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
+    assert sha256(b"") == empty

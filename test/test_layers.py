@@ -1,0 +1,210 @@
+"""Imports run one way, each library has one home, and importing the package costs nothing."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = "nics_drl_bridge"
+
+# From the bottom up. What stands on one line does not import each other.
+LAYERS = (
+    ("errors", "geometry", "interface"),
+    ("files", "config"),
+    ("kinematics", "lidar"),
+    ("calibration",),
+    ("generator",),
+    ("sim", "highfidelity", "middleware"),
+    ("env",),
+    ("policy", "safety"),
+    ("report",),
+    ("nodes",),
+    ("demo",),
+    ("cli",),
+)
+
+# Library -> where it may be imported; * of a message package stands for any name.
+HOMES = {
+    "rclpy": ("nodes/*",),
+    "*_msgs": ("nodes/*",),
+    "std_srvs": ("nodes/*",),
+    "builtin_interfaces": ("nodes/*",),
+    "ament_index_python": ("nodes/*",),
+    "filterpy": ("middleware/ekf.py",),
+    "matplotlib": ("report/*",),
+    "yaml": ("config.py",),
+    "typer": ("cli.py",),
+    "gymnasium": ("env/*", "policy/*", "demo.py"),
+    "numba": ("*kernels.py", "sim/random.py", "sim/world.py", "lidar/scanner.py"),
+    "mujoco": ("highfidelity/*",),
+    "torch": ("policy/train*.py",),
+    "stable_baselines3": ("policy/train*.py",),
+    "onnx": ("policy/*",),
+    "onnxruntime": ("policy/*",),
+    "pettingzoo": ("env/*",),
+    "rosbags": ("kinematics/*",),
+}
+
+
+def imports_of(path: Path, package: Path) -> set[str]:
+    """Every module that a file imports, at its top or inside a function, by its full name."""
+    found = set()
+    here = (package.name, *path.relative_to(package).parent.parts)
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            above = ".".join(here[: len(here) - node.level + 1]) if node.level else ""
+            module = ".".join(part for part in (above, node.module) if part)
+            found |= {f"{module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            found |= {a.value for a in node.args if isinstance(a, ast.Constant)}
+    return found
+
+
+def layer_of(part: str) -> int | None:
+    return next((level for level, parts in enumerate(LAYERS) if part in parts), None)
+
+
+def wrong_directions(package: Path) -> list[str]:
+    """A sentence for each import that runs up or sideways."""
+    wrong = []
+    for path in sorted(package.rglob("*.py")):
+        place = path.relative_to(package)
+        own = place.parts[0].removesuffix(".py")
+        if own == "__init__":
+            continue
+        if layer_of(own) is None:
+            wrong.append(f"{place}: {own!r} stands in no layer")
+            continue
+        for module in sorted(imports_of(path, package)):
+            first, _, rest = module.partition(".")
+            part = rest.partition(".")[0]
+            if first != package.name or part == own or layer_of(part) is None:
+                continue
+            if layer_of(part) >= layer_of(own):
+                wrong.append(f"{place}: imports {module}")
+    return wrong
+
+
+def strangers(package: Path) -> list[str]:
+    """A sentence for each library that is imported away from its home."""
+    wrong = []
+    for path in sorted(package.rglob("*.py")):
+        place = path.relative_to(package).as_posix()
+        for library in sorted({module.partition(".")[0] for module in imports_of(path, package)}):
+            for name, homes in HOMES.items():
+                away = not any(fnmatch(place, home) for home in homes)
+                if fnmatch(library, name) and away:
+                    wrong.append(f"{place}: imports {library}")
+    return wrong
+
+
+def test_imports_run_one_way():
+    assert wrong_directions(ROOT / PACKAGE) == []
+
+
+def test_each_library_is_imported_at_its_home_only():
+    assert strangers(ROOT / PACKAGE) == []
+
+
+@pytest.fixture
+def package(tmp_path):
+    """A small package without a fault."""
+    folder = tmp_path / PACKAGE
+    for name, text in {
+        "__init__.py": "",
+        "errors.py": "import numpy",
+        "config.py": "import yaml\nfrom nics_drl_bridge.errors import E",
+        "kinematics/spec.py": "from nics_drl_bridge import config\nfrom . import model",
+        "kinematics/model.py": "",
+        "kinematics/kernels.py": "from numba import njit",
+        "sim/world.py": "from nics_drl_bridge.kinematics.spec import S",
+        "nodes/gate.py": "import rclpy.node\nfrom sensor_msgs.msg import LaserScan",
+    }.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def test_a_package_without_a_fault_passes(package):
+    assert wrong_directions(package) == []
+    assert strangers(package) == []
+
+
+@pytest.mark.parametrize(
+    ("file", "line"),
+    [
+        ("errors.py", "from nics_drl_bridge.config import C"),
+        ("errors.py", "import nics_drl_bridge.cli"),
+        ("kinematics/model.py", "from nics_drl_bridge.sim.world import W"),
+        ("kinematics/model.py", "from nics_drl_bridge import generator"),
+        ("kinematics/model.py", "from nics_drl_bridge.lidar import spec"),
+        ("kinematics/model.py", "from ..env import navigation"),
+        ("kinematics/model.py", "from .. import cli"),
+        ("sim/world.py", "def f():\n    from nics_drl_bridge.middleware.view import M"),
+        ("sim/world.py", "import importlib\nimportlib.import_module('nics_drl_bridge.nodes.gate')"),
+        ("sim/world.py", "if TYPE_CHECKING:\n    from nics_drl_bridge.report import page"),
+        ("policy/act.py", "from nics_drl_bridge.safety.gate import decide"),
+        ("nowhere/new.py", ""),
+    ],
+)
+def test_an_import_that_runs_up_or_sideways_is_found(package, file, line):
+    (package / file).parent.mkdir(exist_ok=True)
+    (package / file).write_text(line)
+    (sentence,) = wrong_directions(package)
+    assert sentence.startswith(f"{file}: ")
+
+
+@pytest.mark.parametrize(
+    ("file", "line"),
+    [
+        ("sim/world.py", "import rclpy"),
+        ("env/task.py", "def f():\n    from geometry_msgs.msg import Twist"),
+        ("sim/world.py", "from yaml import safe_load"),
+        ("middleware/view.py", "import filterpy.kalman"),
+        ("kinematics/model.py", "from numba import njit"),
+        ("lidar/table.py", "import numba as nb"),
+        ("generator.py", "import matplotlib.pyplot as plt"),
+        ("sim/world.py", "import gymnasium"),
+        ("sim/world.py", "from importlib import import_module\nimport_module('std_srvs.srv')"),
+    ],
+)
+def test_a_library_away_from_home_is_found(package, file, line):
+    (package / file).parent.mkdir(exist_ok=True)
+    (package / file).write_text(line)
+    (sentence,) = strangers(package)
+    assert sentence.startswith(f"{file}: imports ")
+
+
+def modules_after(code: str) -> set[str]:
+    """The top-level modules that are loaded in a fresh process after some code."""
+    ask = f"import sys\n{code}\nprint(*{{name.partition('.')[0] for name in sys.modules}})"
+    done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+def test_importing_the_package_imports_nothing_heavy():
+    loaded = modules_after(f"import {PACKAGE}")
+    assert PACKAGE in loaded
+    heavy = {"numpy", "numba", "scipy", "gymnasium", "matplotlib", "pydantic", "filterpy", "torch"}
+    assert not loaded & (heavy | {"rclpy"})
+
+
+@pytest.mark.timeout(300)  # without numba's caches, all kernels are compiled here
+def test_an_env_in_process_imports_neither_ros_nor_pictures():
+    loaded = modules_after(
+        "from nics_drl_bridge.env.bridge_env import BridgeEnv\n"
+        "env = BridgeEnv(backend='sim')\n"
+        "env.reset(seed=0)\n"
+        "env.step(env.action_space.sample())\n"
+        "env.close()"
+    )
+    assert {PACKAGE, "gymnasium", "numba"} <= loaded
+    assert not loaded & {"rclpy", "sensor_msgs", "geometry_msgs", "matplotlib", "typer", "mujoco"}
