@@ -31,6 +31,8 @@ EXTRAS = {
         f"{wheel}; {ROS_WHEELS_EXIST}"
         for wheel in ("ros-rclpy", "ros-common-interfaces", "ros-rmw-fastrtps-cpp")
     ],
+    "bags": ["rosbags>=0.11,<0.12"],
+    "mujoco": ["mujoco>=3.3"],
     "test": [
         "build",
         "colcon-bash",

@@ -24,6 +24,7 @@ from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.policy.evaluation import Episode, deviation, drive_all, successes
 from nics_drl_bridge.policy.policies import make_policy
+from nics_drl_bridge.report.fit_pictures import accuracy
 from nics_drl_bridge.report.page import Block, Code, Picture, Table, page
 from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.sim.world import load_world, sample_scene
@@ -244,6 +245,10 @@ def _report(
             [
                 "Generated from " + str(plan.recording or "a textbook drive") + ".",
                 Code(model.report),
+                Picture(
+                    accuracy(identified),
+                    "What each further term is worth; circles mark how many are kept.",
+                ),
             ],
         ),
         (

@@ -19,7 +19,13 @@ from nics_drl_bridge.calibration.mounting import (
 from nics_drl_bridge.calibration.noise import Motion, motion, pose_noise
 from nics_drl_bridge.calibration.report import Findings, sentences
 from nics_drl_bridge.calibration.signals import held, interval_means
-from nics_drl_bridge.calibration.timing import LONG_STEP, followed, inferred_states, moved_commands
+from nics_drl_bridge.calibration.timing import (
+    LONG_STEP,
+    followed,
+    fresh,
+    inferred_states,
+    moved_commands,
+)
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.kinematics.recording import Recording, check
 from nics_drl_bridge.kinematics.spec import RobotSpec
@@ -121,11 +127,9 @@ def _mounting(
     cmd_vel = spec.to_cmd_vel(command)
     expected = _expected(recording, spec, twists, timing)
     if any(c.cmd_vel == "linear.y" for c in spec.command):
-        response = (
-            expected
-            if recording.state is None
-            else _as_commands(expected, recording, spec, timing.latency)
-        )
+        response = command
+        if spec.state:
+            response = _as_commands(expected, recording, spec, timing.latency)
         return mounting_by_commands(twists, spec.to_cmd_vel(response))
     found = mounting_without_lateral_motion(twists, cmd_vel[:, 0])
     speed = _speed_index(spec)
@@ -146,6 +150,7 @@ def _as_commands(states: Array, recording: Recording, spec: RobotSpec, latency: 
         return states[:, np.argsort(followed(spec))]
     span = np.diff(stream.t)
     keep = (span > 0.0) & (span < LONG_STEP * np.median(span))
+    keep &= fresh(recording.command, stream.t[:-1] - latency)
     rates = np.diff(stream.values, axis=0)[keep] / span[keep, None]
     before = stream.values[:-1][keep]
     begin = stream.t - latency

@@ -71,12 +71,15 @@ def equations_with_errors(model: TaylorModel) -> list[str]:
 
 
 def with_error(value: float, error: float | None) -> str:
-    """A number with the digits that its standard error leaves: `(4.63 +- 0.02)`."""
+    """A number with the digits that its standard error leaves: `(4.63 +- 0.02)`.
+
+    An error that begins with a 1 has two digits. One of rounding only is not shown.
+    """
     if error is None or error <= 1e-6 * value:
         return f"{value:.5g}"
-    digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 12))
-    if error < 10.0 ** -(digits - 1) * 9.5 and f"{error:.1e}"[0] != "1":
-        digits = max(digits - 1, 0)
+    exponent = int(np.floor(np.log10(error)))
+    leading = error / 10.0**exponent
+    digits = max(0, -exponent + (leading < 1.95 or leading >= 9.5))
     return f"({value:.{digits}f} +- {error:.{digits}f})"
 
 

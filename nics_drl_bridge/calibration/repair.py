@@ -21,17 +21,17 @@ Array = NDArray[np.float64]
 
 NEIGHBOURS = 3
 """A jump stands out from the median of this many samples on either side."""
-STEPS = 4.0
+STEPS = 6.0
 """It is larger than this many usual changes from sample to sample,"""
-USUAL = 80.0
-"""(the percentile of the changes that counts as usual: jumps in 5 % of the rows spoil 10 %)"""
+USUAL = 60.0
+"""(the percentile of the changes that counts as usual: jumps in 20 % of the rows spoil 40 %)"""
 REACH = 1.5
 """than this many times what the robot's greatest command could do meanwhile,"""
 HEADING_REACH = 0.1
 """than this angle [rad],"""
 STATE_SHARE = 0.2
 """and, of a state, than this share of its usual range."""
-MOST = 0.25
+MOST = 0.15
 """More jumps than this share of the rows are no faults of single samples."""
 EXCESS = 0.01
 """A command this share of its range beyond its limits is beyond them."""

@@ -72,7 +72,7 @@ def interval_means(t: Array, values: Array, start: Array, end: Array) -> Array:
         (np.interp(end, t, column) - np.interp(start, t, column)) / (end - start)
         for column in area.T
     ]
-    return np.stack(means, axis=1)
+    return np.stack(means, axis=1) if means else np.zeros((len(start), 0))
 
 
 def unwrapped(pose: Array) -> Array:

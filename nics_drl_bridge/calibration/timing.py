@@ -33,6 +33,7 @@ DIFFERENCE = 1e-4
 TOLERANCE = 1e-7
 LONG_STEP = 1.5
 """A step this much longer than the usual one is a gap."""
+REGULAR = 0.8
 MAX_STEPS = 40
 
 
@@ -125,6 +126,19 @@ def delay_of_response(
     found[free] = np.exp(theta[1:])
     spread[free] = sigma[1:] * found[free]
     return Delay(float(theta[0]), float(sigma[0]), found, spread, explained)
+
+
+def fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
+    """Whether the command was recorded at times (n,), or its row may be missing.
+
+    Of commands that are recorded now and then only, each is taken to hold until the next.
+    """
+    span = np.diff(command.t)
+    usual = float(np.median(span)) if len(span) else 0.0
+    if not (span < LONG_STEP * usual).mean() > REGULAR:
+        return np.ones(len(start), dtype=np.bool_)
+    row = np.searchsorted(command.t, start + 1e-9, "right") - 1
+    return np.asarray(np.append(span, 0.0)[np.clip(row, 0, None)] < LONG_STEP * usual)
 
 
 def latency_of_state(command: Stream, state: Stream, spec: RobotSpec) -> Delay | None:

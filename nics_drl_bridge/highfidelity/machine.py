@@ -2,7 +2,9 @@
 
 MuJoCo solves the contact of each wheel with the floor; nothing ties the robot to its textbook
 kinematics. Tyres are ellipsoids: a round tread touches a plane in one point, which neither jumps
-from edge to edge, as a cylinder's contact does, nor scrubs when the robot turns.
+from edge to edge, as a cylinder's contact does, nor scrubs when the robot turns. Contacts have no
+friction against spinning, and nothing is dragged over the floor: in MuJoCo's elliptic cones a
+contact that slides for long pushes itself off the floor and chatters.
 """
 
 from __future__ import annotations
@@ -39,8 +41,8 @@ class Physics:
     wheel_mass: float = 0.15
     friction: float = 1.0
     acceleration: float = 5.0
-    softness: float = 0.01
-    bearing: float = 1e-5
+    softness: float = 0.005
+    bearing: float = 1e-6
     rollers: int = 12
 
 

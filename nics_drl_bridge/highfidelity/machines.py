@@ -88,7 +88,9 @@ def ackermann_angles(steering: float, half_ratio: float) -> tuple[float, float]:
         half_ratio: half the track by the wheelbase.
     """
     t = np.tan(steering)
-    return float(np.arctan(t / (1.0 - half_ratio * t))), float(np.arctan(t / (1.0 + half_ratio * t)))
+    return float(np.arctan(t / (1.0 - half_ratio * t))), float(
+        np.arctan(t / (1.0 + half_ratio * t))
+    )
 
 
 def _car_wheels(
@@ -143,7 +145,10 @@ def differential(p: Parameters, step: float, physics: Physics) -> Machine:
       </body>"""
         for side, y in sides
     )
-    robot = f"""{machine.chassis(physics.mass, (-0.05 * track, 0, -0.4 * radius), (track, 0.7 * track, 0.03))}
+    # Low and just behind the axle: braking must not tip the robot over its wheels, and a mass far
+    # behind would push it further into every turn.
+    centre, size = (-0.06 * track, 0.0, -0.55 * radius), (track, 0.7 * track, 0.03)
+    robot = f"""{machine.chassis(physics.mass, centre, size)}
       <body pos="{behind:.6g} 0 {ball - radius:.6g}">
         <joint type="ball" damping="{physics.bearing}"/>
         <geom class="tread" type="sphere" size="{ball:.6g}" mass="0.03"/>
@@ -168,9 +173,7 @@ def mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
         p["wheel_lag"], radius, step, physics,
     )  # fmt: skip
     x, y = p["half_length"], p["half_width"]
-    names = tuple(
-        f"{place}_{side}" for place in ("front", "rear") for side in ("left", "right")
-    )
+    names = tuple(f"{place}_{side}" for place in ("front", "rear") for side in ("left", "right"))
     places = ((x, y, -1), (x, -y, 1), (-x, y, 1), (-x, -y, -1))
     wheels = "".join(
         roller_wheel(name, (px, py), lean, radius, physics)

@@ -119,7 +119,7 @@ class MujocoRobot:
         self._mujoco.mj_step(self._model, self._data, nstep=steps)
 
     def _check_upright(self) -> None:
-        w, x, y, z = self._data.qpos[3:7]
+        x, y = self._data.qpos[4:6]
         upright = 1.0 - 2.0 * (x * x + y * y)
         if not upright > np.cos(LARGEST_TILT_RAD):
             raise BackendError(

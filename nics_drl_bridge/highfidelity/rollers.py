@@ -8,7 +8,7 @@ from nics_drl_bridge.highfidelity.machine import Physics
 
 THICKNESS = 0.25
 """Radius of a roller at its middle, per radius of the wheel."""
-ROLLER_MASS = 0.008
+ROLLER_MASS = 0.005
 
 
 def roller_size(radius: float, rollers: int) -> tuple[float, float]:
@@ -52,7 +52,7 @@ def roller_wheel(
         x, z = -(radius - a) * s, -(radius - a) * c
         rows.append(f"""
         <body pos="{x:.8g} 0 {z:.8g}" zaxis="{c:.8g} {lean} {-s:.8g}">
-          <joint axis="0 0 1" damping="{physics.bearing}" armature="1e-6"/>
+          <joint axis="0 0 1" damping="{physics.bearing}" armature="2e-7"/>
           <geom class="tread" type="ellipsoid" mass="{ROLLER_MASS}" size="{a:.8g} {a:.8g} {b:.8g}"/>
         </body>""")
     return f"""

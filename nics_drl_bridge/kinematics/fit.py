@@ -17,6 +17,7 @@ from nics_drl_bridge.kinematics.excitation import (
     levels,
     unmoved_variables,
 )
+from nics_drl_bridge.kinematics.instruments import reestimated, states_are_noisy
 from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.prune import prune
 from nics_drl_bridge.kinematics.recording import Samples
@@ -208,6 +209,9 @@ def _fit_dofs(
             noisy,
         )
         parts[d] = part.spread_over(allowed)
+    if states_are_noisy(samples, spec):
+        for d in [d for d in parts if d >= 3]:
+            parts[d] = reestimated(parts[d], d, samples, powers, len(spec.state))
     return parts
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.kinematics.model import TaylorModel
 
 Array = NDArray[np.float64]
@@ -25,15 +26,24 @@ Terms = tuple[NDArray[np.int64], Array, NDArray[np.int64], NDArray[np.int64]]
 SERIES: Array = np.array([1 / 6, 1 / 120, 1 / 5040, 1 / 2, 1 / 24, 1 / 720])
 """Coefficients of sin(t) / t and (1 - cos(t)) / t; exact to 1e-14 for turns below 0.1 rad a step,
 to 1e-8 below 0.5."""
+GREATEST_ORDER = 4
 
 
 def term_arrays(model: TaylorModel) -> Terms:
     """The kept terms: dof (T,), coefficient (T,), factors (T, order), factors in use (T,).
 
     A factor is a place in `x`; the unused ones point at its last entry, which is 1.
+
+    Raises:
+        ModelError: a term is of a higher order than the kernels know.
     """
     one = len(model.variables)
     order = max(1, int(model.powers.sum(axis=1).max(initial=1)))
+    if order > GREATEST_ORDER:
+        raise ModelError(
+            f"the kinematics have a term of order {order}; the greatest is {GREATEST_ORDER}: "
+            "generate the model anew."
+        )
     dofs, places = np.nonzero(model.coefficients)
     factors = np.full((len(dofs), order), one, dtype=np.int64)
     for row, k in enumerate(places):
@@ -138,12 +148,17 @@ def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
             other = x[factors[k, 1]]
             for i in range(n):
                 rate[i] += value * one[i] * other[i]
-        else:
+        elif count[k] == 3:
+            other, third = x[factors[k, 1]], x[factors[k, 2]]
             for i in range(n):
-                product = value
-                for factor in range(count[k]):
-                    product *= x[factors[k, factor], i]
-                rate[i] += product
+                rate[i] += value * one[i] * other[i] * third[i]
+        elif count[k] == 4:
+            other, third, last = x[factors[k, 1]], x[factors[k, 2]], x[factors[k, 3]]
+            for i in range(n):
+                rate[i] += value * one[i] * other[i] * third[i] * last[i]
+        else:  # the constant
+            for i in range(n):
+                rate[i] += value
 
 
 @njit(cache=True)

@@ -29,6 +29,8 @@ MOST = 0.2
 BEYOND = 0.5
 """A variable this share of its range beyond its limits was not measured but made up."""
 GAUSSIAN_MAD = 0.6745
+BULK_PERCENTILE, GAUSSIAN_BULK = 90.0, 1.645
+"""Once there are outliers, the misfit of the rest is judged by its tail, not by its middle."""
 
 
 def inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
@@ -48,7 +50,7 @@ def inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
     bulk = np.argsort(np.abs(target - np.median(target)), kind="stable")[:count]
     for start in (np.argsort(plain, kind="stable")[:count], bulk):
         rest = _concentrated(chi, target, start)
-        inside = rest <= max(FAR * _sigma(rest), least)
+        inside = rest <= FAR * float(np.percentile(rest, BULK_PERCENTILE)) / GAUSSIAN_BULK
         if inside.mean() >= 1.0 - MOST:
             return np.asarray(inside)
     return everything

@@ -31,15 +31,21 @@ def standard_errors(chi: Array, residual: Array) -> Array:
         return np.full(terms, np.nan)
     scale = np.maximum(np.linalg.norm(chi, axis=0), np.finfo(np.float64).tiny)
     unit = chi / scale
-    scores = unit * residual[:, None]
+    middle = long_run(unit, residual)
+    inverse = np.linalg.pinv(unit.T @ unit, hermitian=True)
+    covariance = inverse @ middle @ inverse * count / (count - terms)
+    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)) / scale)
+
+
+def long_run(chi: Array, residual: Array) -> Array:
+    """Covariance (K, K) of the sum of features (T, K) times residuals (T,), alike for a while."""
+    scores = chi * residual[:, None]
     middle = scores.T @ scores
     reach = correlation_reach(residual)
     for lag in range(1, reach + 1):
         cross = scores[lag:].T @ scores[:-lag]
         middle += (1.0 - lag / (reach + 1.0)) * (cross + cross.T)
-    inverse = np.linalg.pinv(unit.T @ unit, hermitian=True)
-    covariance = inverse @ middle @ inverse * count / (count - terms)
-    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)) / scale)
+    return np.asarray(middle)
 
 
 def clustered_errors(jacobian: Array, residual: Array, cluster: NDArray[np.intp]) -> Array:

@@ -42,13 +42,11 @@ def with_jumps(recording: Recording, share: float = 0.05, seed: int = 0) -> Reco
     return recording
 
 
-def same_terms(a, b, rel: float) -> None:
-    terms, others = a.model.to_dict()["terms"], b.model.to_dict()["terms"]
-    for dof, row in others.items():
-        scale = max((abs(value) for value in row.values()), default=1.0)
-        assert set(terms[dof]) == set(row), dof
-        for name, value in row.items():
-            assert terms[dof][name] == pytest.approx(value, abs=rel * scale), (dof, name)
+def same_motion(a, b, share: float) -> None:
+    """The rates of two models differ by less than a share of their size, at clean samples."""
+    rates, others = a.model.rates(b.samples.x), b.model.rates(b.samples.x)
+    apart = np.sqrt(((rates - others) ** 2).mean(axis=0))
+    assert (apart <= share * np.maximum(np.sqrt((others**2).mean(axis=0)), 1e-2)).all(), apart
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -67,7 +65,7 @@ def test_an_exact_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
     plain = drive(spec, duration=40.0)
     clean, faulty = identify(plain, spec), identify(with_jumps(plain), spec)
     assert any("jump away" in note for note in faulty.notes)
-    same_terms(faulty, clean, 0.02)
+    same_motion(faulty, clean, 0.02)
     assert faulty.held_out.mean_position_error_m < clean.held_out.mean_position_error_m + 0.01
 
 
@@ -76,7 +74,7 @@ def test_a_noisy_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
     spec = load_robot(name)
     plain = drive(spec, noise=(5e-4, 1e-3), rotation=0.3)
     clean, faulty = identify(plain, spec), identify(with_jumps(plain), spec)
-    same_terms(faulty, clean, 0.05)
+    same_motion(faulty, clean, 0.05)
     assert faulty.held_out.mean_position_error_m < clean.held_out.mean_position_error_m + 0.02
 
 
@@ -93,8 +91,8 @@ def test_an_exact_fit_survives_ten_per_cent_of_the_rows_missing(name, apart):
         kept[1000:1030] = False
     clean, gappy = identify(plain, spec), identify(some(plain, keep), spec)
     assert gappy.calibration.is_exact
-    same_terms(gappy, clean, 0.02)
-    assert gappy.fit.rmse == pytest.approx(clean.fit.rmse, rel=0.3, abs=1e-9)
+    same_motion(gappy, clean, 0.02)
+    assert gappy.fit.rmse == pytest.approx(clean.fit.rmse, rel=0.3, abs=1e-6)
 
 
 def test_a_noisy_fit_survives_both(differential):
@@ -104,7 +102,7 @@ def test_a_noisy_fit_survives_both(differential):
     keep["command"][:] = True
     clean = identify(plain, differential)
     faulty = identify(some(with_jumps(plain), keep), differential)
-    same_terms(faulty, clean, 0.03)
+    same_motion(faulty, clean, 0.03)
     assert faulty.calibration.command_latency_s == pytest.approx(0.05, abs=3e-3)
 
 
@@ -135,8 +133,8 @@ def test_rows_of_samples_that_jump_are_left_out_of_the_fit(car):
     clean = fit(samples, car)
     faulty = fit(Samples(samples.t, samples.q, x, dq, samples.dt), car)
     terms, others = faulty.model.to_dict()["terms"], clean.model.to_dict()["terms"]
-    assert terms["vx"] == pytest.approx(others["vx"], rel=1e-5)
-    assert terms["d_speed"] == pytest.approx(others["d_speed"], rel=1e-5)
+    for dof in ("vx", "d_speed", "d_steering"):
+        assert terms[dof] == pytest.approx(others[dof], rel=1e-5)
     assert terms["wz"]["speed*steering"] == pytest.approx(others["wz"]["speed*steering"], rel=0.05)
     assert 0.02 < faulty.outliers[0] < 0.12
     assert clean.outliers == pytest.approx(0.0)
@@ -145,6 +143,6 @@ def test_rows_of_samples_that_jump_are_left_out_of_the_fit(car):
 def test_a_stream_that_is_mixed_of_two_is_refused(car):
     recording = drive(car, duration=20.0)
     values = recording.pose.values.copy()
-    values[::3] += 4.0
+    values[::5, :2] += 0.5
     with pytest.raises(RecordingError, match="two sources that are mixed"):
         identify(replace(recording, pose=replace(recording.pose, values=values)), car)

@@ -14,7 +14,7 @@ from nics_drl_bridge.highfidelity.machines import build_machine
 from nics_drl_bridge.highfidelity.robot import MujocoRobot, Reading
 from nics_drl_bridge.highfidelity.rollers import roller_size
 from nics_drl_bridge.kinematics.recording import check
-from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
 from nics_drl_bridge.kinematics.textbook import textbook
 
 NAMES = ("ackermann", "differential", "mecanum")
@@ -73,14 +73,15 @@ def test_it_turns_with_the_curvature_of_the_textbook(robots, name, command):
     expected = book.twist(book.target(np.array(command)))
     left, _ = steady(robot, command)
     right, _ = steady(robot, [*command[:-1], -command[-1]])
-    assert left[2] / left[0] == pytest.approx(expected[2] / expected[0], rel=0.1)
+    # The motors give way under load, as those of a real robot do.
+    assert left[2] / left[0] == pytest.approx(expected[2] / expected[0], rel=0.15)
     assert right[2] == pytest.approx(-left[2], rel=0.02)
 
 
 @needs_mujoco
 def test_a_mecanum_robot_moves_sideways_to_the_left(robots):
     twist, reading = steady(robots["mecanum"], [0.0, 0.5, 0.0])
-    assert twist[1] == pytest.approx(0.5, rel=0.2)
+    assert twist[1] == pytest.approx(0.5, rel=0.1)
     assert abs(twist[0]) < 0.02
     assert abs(reading.pose[2]) < 0.05
 
@@ -116,21 +117,24 @@ def test_a_command_of_nan_is_refused(robots):
 
 
 @needs_mujoco
-def test_slippery_ground_makes_a_car_understeer(robots):
+def test_on_slippery_ground_a_car_slides_out_of_its_turn(robots):
     """The contact is real: the wheels hold a turn by friction alone."""
     ice = MujocoRobot(robots["ackermann"].spec, replace(Physics(), friction=0.1))
     dry, _ = steady(robots["ackermann"], [1.0, 0.4])
     icy, _ = steady(ice, [1.0, 0.4])
-    assert icy[2] < 0.7 * dry[2]
+    assert abs(dry[1]) < 0.02 * dry[0]
+    assert abs(icy[1]) > 0.1 * abs(icy[0])
 
 
 @needs_mujoco
 def test_a_robot_that_falls_over_says_so(robots):
-    wild = replace(Physics(), friction=3.0, acceleration=60.0)
-    robot = MujocoRobot(robots["differential"].spec, wild)
+    data = robots["ackermann"].spec.model_dump()
+    data["command"][0]["max"] = 8.0
+    fast = RobotSpec.model_validate(data)
+    robot = MujocoRobot(fast, replace(Physics(), friction=5.0, acceleration=20.0))
+    robot.step([8.0, 0.0], 1.0)
     with pytest.raises(BackendError, match="fallen over"):
-        for k in range(40):
-            robot.step([float(k % 2), 0.0], 0.25)
+        robot.step([8.0, 0.5], 0.5)
 
 
 @needs_mujoco
@@ -177,7 +181,7 @@ def test_a_spec_without_a_length_is_refused_by_its_name():
     data = load_robot("ackermann").model_dump()
     del data["parameters"]["wheelbase"]
     with pytest.raises(ConfigError, match="wheelbase"):
-        build_machine(type(load_robot("ackermann")).model_validate(data))
+        build_machine(RobotSpec.model_validate(data))
 
 
 def test_a_missing_library_is_one_sentence_that_names_the_fix(monkeypatch):

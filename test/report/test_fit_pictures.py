@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge.calibration.fit_report import fit_report, with_error
+from nics_drl_bridge.calibration.identify import identify
+from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.kinematics.textbook import record
+from nics_drl_bridge.report.fit_pictures import fit_pictures, write_pictures
+
+PNG = b"\x89PNG"
+
+
+@pytest.fixture(scope="module")
+def found():
+    spec = load_robot("differential")
+    return spec, identify(record(spec, np.random.default_rng(0), 30.0), spec, alpha="auto")
+
+
+def test_every_picture_of_a_fit_is_drawn(found, tmp_path):
+    files = write_pictures(*found, tmp_path / "pictures")
+    assert {f.stem for f in files} == {"accuracy", "alignment", "paths", "residuals"}
+    assert all(f.read_bytes().startswith(PNG) for f in files)
+
+
+def test_a_short_drive_has_fewer_pictures():
+    spec = load_robot("ackermann")
+    short = identify(record(spec, np.random.default_rng(0), 9.0), spec)
+    pictures = fit_pictures(spec, short)
+    assert "paths" not in pictures
+    assert "accuracy" in pictures
+
+
+def test_the_report_names_errors_pruning_and_validity(found):
+    spec, identified = found
+    text = fit_report("here", spec, identified)
+    for part in ("with standard errors", "Eq. 2", "knee", "condition number", "Valid where"):
+        assert part in text
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (4.63123, 0.0213, "(4.63 +- 0.02)"),
+        (123.4, 17.0, "(123 +- 17)"),
+        (0.025, 9.7e-5, "(0.025000 +- 0.000097)"),
+        (1234.0, 230.0, "(1234 +- 230)"),
+        (5.0, 1e-9, "5"),
+        (5.0, None, "5"),
+    ],
+)
+def test_a_number_has_the_digits_that_its_error_leaves(value, error, text):
+    assert with_error(value, error) == text
