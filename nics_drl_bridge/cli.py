@@ -75,7 +75,7 @@ def generate(
     order: Annotated[int, typer.Option(min=1, max=4, help="Order of the Taylor model.")] = 2,
     alpha: Annotated[
         str, typer.Option(help="Pruning threshold of Eq. 2, 0 to 1, or auto for the knee.")
-    ] = "0.99",
+    ] = "auto",
     assume_textbook: Annotated[
         bool, typer.Option(help="Fill in from the textbook what the drive did not show.")
     ] = False,

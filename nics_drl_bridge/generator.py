@@ -138,7 +138,7 @@ def generate(
     lidar: LidarSpec,
     radii: tuple[float, ...],
     order: int = fit.ORDER,
-    alpha: fit.Alpha = fit.ALPHA,
+    alpha: fit.Alpha = "auto",
     assume: bool = False,
     strict: bool = False,
 ) -> tuple[SimulatorModel, Identified]:

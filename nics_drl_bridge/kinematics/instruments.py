@@ -22,7 +22,7 @@ from nics_drl_bridge.kinematics.statistics import long_run
 
 Array = NDArray[np.float64]
 
-NOISY = 2e-3
+NOISY = 5e-4
 """A measured state is noisy from this share of its range on."""
 SAME_STEP, ROUNDING_S = 1e-3, 1e-6
 WEAK = 1e4

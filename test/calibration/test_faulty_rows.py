@@ -146,3 +146,14 @@ def test_a_stream_that_is_mixed_of_two_is_refused(car):
     values[::5, :2] += 0.5
     with pytest.raises(RecordingError, match="two sources that are mixed"):
         identify(replace(recording, pose=replace(recording.pose, values=values)), car)
+
+
+def test_noise_of_the_measured_state_does_not_bend_its_lag(differential):
+    plain = drive(differential, noise=(5e-4, 1e-3))
+    noise = np.random.default_rng(0).normal(size=plain.state.values.shape) * 0.2
+    state = replace(plain.state, values=plain.state.values + noise)
+    model = identify(replace(plain, state=state), differential).model
+    value = model.to_dict()["terms"]["d_left_wheel"]["left_wheel"]
+    error = model.named_errors["d_left_wheel"]["left_wheel"]
+    assert error < 0.2
+    assert abs(value - (np.exp(-0.1) - 1.0) / 0.01) < 3.0 * error
