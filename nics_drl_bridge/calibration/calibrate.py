@@ -155,11 +155,13 @@ def _as_commands(states: Array, recording: Recording, spec: RobotSpec, latency: 
     before = stream.values[:-1][keep]
     begin = stream.t - latency
     u = held(recording.command, spec, begin[:-1][keep], begin[1:][keep])
-    chi = np.concatenate([before, u, np.ones((len(u), 1))], axis=1)
-    beta = np.linalg.lstsq(chi, rates, rcond=1e-9)[0]
-    size = states.shape[1]
+    # More wheels than ways to move differ by slip alone, which says nothing of the commands.
+    ways = np.linalg.svd(before, full_matrices=False)[2][: u.shape[1]].T
+    chi = np.concatenate([before @ ways, u, np.ones((len(u), 1))], axis=1)
+    beta = np.linalg.lstsq(chi, rates @ ways, rcond=1e-9)[0]
+    size = ways.shape[1]
     steady = -np.linalg.pinv(beta[:size].T, rcond=1e-6) @ beta[size:-1].T
-    return np.asarray(states @ np.linalg.pinv(steady).T)
+    return np.asarray(states @ ways @ np.linalg.pinv(steady).T)
 
 
 def _speed_index(spec: RobotSpec) -> int | None:

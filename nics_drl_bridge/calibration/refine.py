@@ -100,7 +100,7 @@ def refine(
         chosen,
         free_coefficients(model, calibration, spec),
         _free_time(calibration),
-        "rotation_rad" in calibration.uncertainty and not calibration.is_exact,
+        _may_turn(calibration, spec),
     )
     theta = _pack(problem, model, calibration)
     scale = np.maximum(np.abs(theta), LEAST_SCALE)
@@ -184,6 +184,16 @@ def _linear_term(model: TaylorModel, spec: RobotSpec, name: str) -> int | None:
     wanted = np.array([v == name for v in spec.variable_names], dtype=np.int64)
     hits = np.flatnonzero((model.powers == wanted).all(axis=1))
     return int(hits[0]) if len(hits) else None
+
+
+def _may_turn(calibration: Calibration, spec: RobotSpec) -> bool:
+    """Whether the rotation may move.
+
+    It is known by the direction in which a robot can't move. One that moves in every direction
+    would be described as well in any other frame, with other coefficients.
+    """
+    everywhere = any(command.cmd_vel == "linear.y" for command in spec.command)
+    return "rotation_rad" in calibration.uncertainty and not calibration.is_exact and not everywhere
 
 
 def _free_time(calibration: Calibration) -> str | None:
