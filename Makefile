@@ -28,7 +28,7 @@ FOREIGN_ROS := $(if $(BASE)$(SYSTEM_ROS),$(if $(SYSTEM_ROS),,$(shell $(BASE) -c 
 	'import importlib.util as u; s = u.find_spec("rclpy"); print(s.origin if s else "")')))
 WHEELS_EXIST := $(filter Linux-x86_64,$(shell uname -s)-$(shell uname -m))
 ROS := $(if $(SYSTEM_ROS),system,$(if $(WHEELS_EXIST),wheels,none))
-EXTRAS := $(if $(SYSTEM_ROS),test,dev)
+EXTRAS := $(if $(SYSTEM_ROS),dev-without-ros,dev)
 
 # Written last, so a half-built .venv has none and is built anew; its name says for which Python
 # and which ROS 2 the environment is.

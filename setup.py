@@ -50,7 +50,9 @@ EXTRAS = {
         "types-PyYAML",
     ],
 }
-EXTRAS["dev"] = sorted({requirement for extra in EXTRAS.values() for requirement in extra})
+# What `make setup` installs: where a ROS 2 is sourced, and where none is.
+EXTRAS["dev-without-ros"] = [one for name in EXTRAS if name != "ros" for one in EXTRAS[name]]
+EXTRAS["dev"] = EXTRAS["dev-without-ros"] + EXTRAS["ros"]
 
 
 def text_of(tag: str) -> str:
@@ -92,10 +94,10 @@ setup(
     entry_points={
         "console_scripts": [
             f"nics = {PACKAGE}.cli:main",
-            f"simulator_node = {PACKAGE}.nodes.simulator_node:main",
-            f"middleware_node = {PACKAGE}.nodes.middleware_node:main",
-            f"policy_node = {PACKAGE}.nodes.policy_node:main",
-            f"command_gate = {PACKAGE}.nodes.command_gate:main",
+            f"simulator_node = {PACKAGE}.nodes.start:simulator_node",
+            f"middleware_node = {PACKAGE}.nodes.start:middleware_node",
+            f"policy_node = {PACKAGE}.nodes.start:policy_node",
+            f"command_gate = {PACKAGE}.nodes.start:command_gate",
         ],
         # For tools that list environments; gymnasium itself stopped reading this in 1.0.
         "gymnasium.envs": [f"NicsBridge = {PACKAGE}.env.registration:register_envs"],

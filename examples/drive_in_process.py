@@ -2,6 +2,7 @@
 
 import gymnasium
 
+import nics_drl_bridge  # noqa: F401 - makes the environments known
 from nics_drl_bridge.policy.policies import make_policy
 
 env = gymnasium.make("NicsBridge/Navigation-v0", backend="sim", model="ackermann", world="arena")

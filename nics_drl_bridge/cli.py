@@ -101,7 +101,7 @@ def generate(
             load_world(world).obstacles.radii,
             load_lidar(lidar),
         )
-        drive = read_recording(recording)
+        drive = read_recording(recording, spec)
         model, identified = generate_model(
             drive, spec, sensor, radii, order, parse_alpha(alpha), assume_textbook, strict
         )

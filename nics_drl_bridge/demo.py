@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from nics_drl_bridge.calibration.identify import Identified
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registration import NAVIGATION, register_envs
-from nics_drl_bridge.errors import BackendError
+from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError
 from nics_drl_bridge.files import write_text
 from nics_drl_bridge.generator import SimulatorModel, generate, save_model
 from nics_drl_bridge.kinematics import textbook
@@ -85,6 +86,8 @@ def run(plan: Plan, say: Say) -> Outcome:
     Raises:
         BridgeError: a bad recording or name, or a node that does not come up.
     """
+    if find_spec("rclpy") is None:
+        raise ConfigError(f"the demo {MISSING_ROS.format(module='rclpy')}")
     model, identified = _generate(plan, say)
     seeds = range(plan.episodes)
     say(f"driving {plan.episodes} episodes in process")
@@ -100,7 +103,7 @@ def _generate(plan: Plan, say: Say) -> tuple[SimulatorModel, Identified]:
     robot, world = load_robot(plan.robot), load_world(plan.world)
     source = plan.recording or _record(robot, plan.out / "recording.npz", say)
     say(f"generating a simulator of the robot {robot.name!r} from {source}")
-    recording = read_recording(source)
+    recording = read_recording(source, robot)
     # A demo has to steer, even if the drive never did; the report names what is assumed.
     model, identified = generate(
         recording, robot, load_lidar("paper"), world.obstacles.radii, assume=True

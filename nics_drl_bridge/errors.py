@@ -9,6 +9,11 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+MISSING_ROS = (
+    "needs the module {module!r}; source your ROS 2 installation, or "
+    "pip install 'nics_drl_bridge[ros]'."
+)
+
 
 class BridgeError(Exception):
     """Base of all errors that come from what the user gave."""

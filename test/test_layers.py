@@ -15,7 +15,7 @@ PACKAGE = "nics_drl_bridge"
 
 # From the bottom up. What stands on one line does not import each other.
 LAYERS = (
-    ("errors", "geometry", "interface"),
+    ("errors", "geometry", "interface", "discovery"),
     ("files", "config"),
     ("kinematics", "lidar"),
     ("calibration",),

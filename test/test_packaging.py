@@ -230,6 +230,16 @@ def test_every_requirement_is_pinned_to_a_version_that_it_allows(metadata: Messa
         assert one.specifier.contains(pins[canonicalize_name(one.name)]), one
 
 
+def test_a_sourced_ros_2_replaces_the_ros_wheels_and_nothing_else(metadata: Message) -> None:
+    everything, without_ros, ros = (
+        {one.name for one in requirements(metadata, extra)}
+        for extra in ("dev", "dev-without-ros", "ros")
+    )
+    assert everything - without_ros == ros
+    for extra in metadata.get_all("Provides-Extra", []):
+        assert {one.name for one in requirements(metadata, extra)} <= everything
+
+
 def test_the_changelog_has_a_section_for_this_version() -> None:
     manifest = (ROOT / "package.xml").read_text(encoding="utf-8")
     (version,) = re.findall("<version>(.*)</version>", manifest)

@@ -19,7 +19,7 @@ from nics_drl_bridge.calibration.report import sentences
 from nics_drl_bridge.calibration.simplify import simplify
 from nics_drl_bridge.calibration.timing import SEARCH_S
 from nics_drl_bridge.calibration.verdict import doubts, refuse_unexcited, unlearnt
-from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.kinematics.fit import ALPHA, ORDER, Alpha, Fit, fit
 from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.recording import Recording, Samples, Stream, check
@@ -95,7 +95,10 @@ def identify(
     check_axes(training.recording, spec)
     calibration, findings = examine(training.recording, spec)
     samples = align(training.recording, calibration, spec)
-    linear = fit(samples, spec, order, alpha, noisy=not calibration.is_exact)
+    try:
+        linear = fit(samples, spec, order, alpha, noisy=not calibration.is_exact)
+    except FitError as error:
+        raise FitError(f"{recording.source}: {error}") from None
     if strict:
         refuse_unexcited(linear, spec)
     exact = calibration.is_exact

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.navigation import Navigation, Verdict
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend, RobotView, Start
 from nics_drl_bridge.sim.world import World, load_world, sample_scene
@@ -170,8 +170,5 @@ def make_backend(name: str, model: SimulatorModel, world: World, **options: Any)
     try:
         made: Backend = getattr(import_module(module), factory)(model, world, **options)
     except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"backend {name!r} needs the module {error.name!r}; source your ROS 2 installation, or "
-            "pip install 'nics_drl_bridge[ros]'."
-        ) from None
+        raise ConfigError(f"backend {name!r} {MISSING_ROS.format(module=error.name)}") from None
     return made

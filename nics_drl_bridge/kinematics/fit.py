@@ -180,7 +180,9 @@ def _moved_terms(
             "lower the order."
         )
     if len(unmoved) == len(names):
-        raise FitError("nothing moved in this drive; vary every command over its range.")
+        raise FitError(
+            "no command ever changed, so nothing can be learnt; vary each over its range."
+        )
     return moved
 
 

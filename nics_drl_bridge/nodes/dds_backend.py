@@ -275,7 +275,10 @@ class DdsBackend:
             names = sorted(f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends)
             with contextlib.suppress(ValueError):
                 names.remove(self._node.get_fully_qualified_name())
-            raise BackendError(f"{', '.join(names)} publishes {topic} too; stop it.")
+            # A node's name travels apart from its publishers, and may not be here yet.
+            known = [name for name in names if "_UNKNOWN_" not in name]
+            who = ", ".join(known) or "somebody"
+            raise BackendError(f"{who} publishes {topic} too; stop it.")
 
     def _measure(self, timeout_s: float) -> tuple[RobotView, dict[str, Any]]:
         """The view at the present stamp. Raises BackendError when the data are of another one."""

@@ -67,7 +67,7 @@ def test_its_model_is_short_and_steers_by_assumption_only(found):
 
 
 def test_a_drive_of_constant_command_is_refused(real_drives, car):
-    with pytest.raises(FitError, match="nothing moved"):
+    with pytest.raises(FitError, match="no command ever changed"):
         identify(read_recording(real_drives / "constant_drive_51s"), car)
 
 

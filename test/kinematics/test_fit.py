@@ -118,7 +118,7 @@ def test_a_command_that_never_moved_is_named_and_gets_no_term():
 
 def test_a_drive_of_constant_commands_is_refused():
     x = np.full((400, 2), 0.3)
-    with pytest.raises(FitError, match="nothing moved in this drive"):
+    with pytest.raises(FitError, match="no command ever changed"):
         fit(samples_of(x, rates_of(x)), PAIR)
 
 

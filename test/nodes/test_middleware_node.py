@@ -161,7 +161,7 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(launch, meet, domain_
         "scan received": "1",
         "odom received": "2",
     }
-    peer.until(lambda: print(counts()) or counts() == wanted, f"the counts {wanted}", 6.0)
+    peer.until(lambda: counts() == wanted, f"the counts {wanted}")
     assert status().level == DiagnosticStatus.OK
     assert status().message == "receiving"
 
