@@ -30,7 +30,7 @@ class _Registering(Loader):
         if module.__spec__ is not None:
             module.__spec__.loader = self._loader
         self._loader.exec_module(module)
-        import_module(REGISTRATION).register_envs()
+        import_module(REGISTRATION)  # registers as it is imported
 
 
 class _Finder(MetaPathFinder):

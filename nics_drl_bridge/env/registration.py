@@ -9,7 +9,7 @@ MAX_EPISODE_STEPS = 300
 
 
 def register_envs() -> None:
-    """Registers every environment; Gymnasium calls it through the package's entry point."""
+    """Registers every environment; importing this module does it too."""
     if NAVIGATION not in gymnasium.registry:
         gymnasium.register(
             NAVIGATION,
@@ -17,3 +17,6 @@ def register_envs() -> None:
             vector_entry_point="nics_drl_bridge.env.vector_env:NavigationVectorEnv",
             max_episode_steps=MAX_EPISODE_STEPS,
         )
+
+
+register_envs()
