@@ -231,11 +231,11 @@ def test_every_requirement_is_pinned_to_a_version_that_it_allows(metadata: Messa
 
 
 def test_a_sourced_ros_2_replaces_the_ros_wheels_and_nothing_else(metadata: Message) -> None:
-    everything, without_ros, ros = (
+    core, everything, without_ros, ros = (
         {one.name for one in requirements(metadata, extra)}
-        for extra in ("dev", "dev-without-ros", "ros")
+        for extra in ("", "dev", "dev-without-ros", "ros")
     )
-    assert everything - without_ros == ros - without_ros
+    assert everything - without_ros == ros - core
     for extra in metadata.get_all("Provides-Extra", []):
         assert {one.name for one in requirements(metadata, extra)} <= everything
 
