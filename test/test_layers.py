@@ -15,7 +15,7 @@ PACKAGE = "nics_drl_bridge"
 
 # From the bottom up. What stands on one line does not import each other.
 LAYERS = (
-    ("errors", "geometry", "interface", "discovery"),
+    ("errors", "geometry", "random_kernels", "interface", "discovery"),
     ("files", "config"),
     ("kinematics", "lidar"),
     ("calibration",),
@@ -41,7 +41,7 @@ HOMES = {
     "yaml": ("config.py",),
     "typer": ("cli.py",),
     "gymnasium": ("env/*", "policy/*", "demo.py"),
-    "numba": ("*kernels.py", "sim/random.py", "sim/world.py", "lidar/scanner.py"),
+    "numba": ("*kernels.py", "sim/world.py", "lidar/scanner.py"),
     "mujoco": ("highfidelity/*",),
     "torch": ("policy/train*.py",),
     "stable_baselines3": ("policy/train*.py",),

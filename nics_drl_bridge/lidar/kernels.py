@@ -18,14 +18,14 @@ ROUNDING = 1e-6
 """A beam this near to an edge, in beams, is tried; the exact test decides."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _lower(out, i, value):  # type: ignore[no-untyped-def]
     """Fuses one return into beam i of a full or partial circle."""
     if value < out[i]:
         out[i] = value
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def beam_span(low, high, beams, count):  # type: ignore[no-untyped-def]
     """First beam index and number of beams in the angles [low, high].
 
@@ -40,7 +40,7 @@ def beam_span(low, high, beams, count):  # type: ignore[no-untyped-def]
     return first, max(last - first + 1, 0)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def circle(out, directions, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
     """Exact ranges to a circle at (x, y)."""
     d2 = x * x + y * y
@@ -72,7 +72,7 @@ def circle(out, directions, beams, x, y, radius, range_max):  # type: ignore[no-
                 _lower(out, i, c * x + s * y - math.sqrt(rest))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def segment(out, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
     """Exact ranges to the straight wall from (x1, y1) to (x2, y2)."""
     count = out.shape[0]
@@ -100,89 +100,51 @@ def segment(out, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-
                     _lower(out, i, distance)
 
 
-@njit(cache=True)
-def baked_circle(out, beams, x, y, radius, shape, table, rows, first, start, fine):  # type: ignore[no-untyped-def]
-    """Looks a circle up in a table and turns its rows to its bearing (Eq. 3).
-
-    Two rows, of the grid distances on both sides of the true one, are blended. Their ranges
-    are stored at `fine` points per beam, so that the bearing is met to 1/(2 fine) of a beam.
-    Which beams hit follows from the true distance, not from a row: a silhouette on the wrong
-    side of a beam is by far the largest error of a plain look-up.
-
-    Args:
-        out: (B,) scan.
-        beams: see the module.
-        x, y: centre of the circle.
-        radius: of the circle.
-        shape: index of the circle's radius in the table.
-        table: (shapes, 3) nearest grid distance, grid step, number of grid distances.
-        rows: (R,) float32 ranges of all rows, one after the other.
-        first: (shapes, distances) offset of each row's first point from the bearing [points].
-        start: (shapes, distances + 1) where each row begins in `rows`.
-        fine: points per beam.
-    """
-    count = out.shape[0]
-    distance = math.sqrt(x * x + y * y)
-    place = (distance - table[shape, 0]) / table[shape, 1]
-    lower = int(place)
-    if place < 0.0 or place > table[shape, 2] - 1.0:
-        return
-    upper = min(lower + 1, int(table[shape, 2]) - 1)
-    blend = np.float32(place - lower)
-    begin, last = start[shape, lower], start[shape, lower + 1] - start[shape, lower] - 1
-    begin2, last2 = start[shape, upper], start[shape, upper + 1] - start[shape, upper] - 1
-    if last < 0 or last2 < 0:
-        return
-    skip = first[shape, lower] - first[shape, upper]
-    half = math.asin(min(radius / distance, 1.0))
-    bearing = math.atan2(y, x)
-    turns = 1 if beams[2] > 0.0 else 3
-    for turn in range(turns):
-        turned = bearing if turns == 1 else bearing + (turn - 1) * TWO_PI
-        i, hits = beam_span(turned - half, turned + half, beams, count)
-        if hits <= 0:
-            continue
-        offset = i - (turned - beams[0]) / beams[1]
-        if turns == 1:
-            offset -= count * math.floor(offset / count + 0.5)
-        j = math.floor(offset * fine + 0.5) - first[shape, lower]
-        for _ in range(hits):
-            value = rows[begin + min(max(j, 0), last)]
-            value += blend * (rows[begin2 + min(max(j + skip, 0), last2)] - value)
-            _lower(out, i, value)
-            j += fine
-            i += 1
-            if i >= count:
-                i -= count
+@njit(cache=True, error_model="numpy")
+def polygon(out, directions, beams, x, y, c, s, corners):  # type: ignore[no-untyped-def]
+    """Exact ranges to the outline `corners` (V, 2), turned by (c, s), with its origin at (x, y)."""
+    last = corners.shape[0] - 1
+    ax, ay = turned(x, y, c, s, corners[last])
+    for v in range(last + 1):
+        bx, by = turned(x, y, c, s, corners[v])
+        segment(out, directions, beams, ax, ay, bx, by)
+        ax, ay = bx, by
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
+def turned(x, y, c, s, corner):  # type: ignore[no-untyped-def]
+    """Where a corner (2,) lies when its shape is turned by (c, s) and put at (x, y)."""
+    return x + c * corner[0] - s * corner[1], y + s * corner[0] + c * corner[1]
+
+
+@njit(cache=True, error_model="numpy")
 def clear(out):  # type: ignore[no-untyped-def]
     """Begins a scan: no return anywhere."""
     for i in range(out.shape[0]):
         out[i] = np.inf
 
 
-@njit(cache=True)
-def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
-    """Ends a scan: too far is `inf`, too close is `-inf` (REP-117)."""
-    for i in range(out.shape[0]):
-        if out[i] > range_max:
-            out[i] = np.inf
-        elif out[i] < range_min:
-            out[i] = -np.inf
+@njit(cache=True, error_model="numpy")
+def finish(ranges, n, m, line, range_min, range_max):  # type: ignore[no-untyped-def]
+    """Ends a scan: `line` into `ranges` (N, M, B); too far `inf`, too close `-inf` (REP-117)."""
+    low, high = np.float32(range_min), np.float32(range_max)
+    for i in range(ranges.shape[2]):
+        value = line[i]
+        value = value if value <= high else np.float32(np.inf)
+        ranges[n, m, i] = value if value >= low else np.float32(-np.inf)
 
 
-@njit(cache=True)
-def to_sensor(pose, mount):  # type: ignore[no-untyped-def]
-    """x, y, cos, sin of the lidar in the world, from the robot's pose (3,) and the mount (3,)."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    x = pose[0] + c * mount[0] - s * mount[1]
-    y = pose[1] + s * mount[0] + c * mount[1]
-    return x, y, math.cos(pose[2] + mount[2]), math.sin(pose[2] + mount[2])
+@njit(cache=True, error_model="numpy")
+def to_sensor(poses, n, m, mount):  # type: ignore[no-untyped-def]
+    """x, y, heading, cos, sin of a lidar in its world, from poses (N, M, 3) and the mount (3,)."""
+    c, s = math.cos(poses[n, m, 2]), math.sin(poses[n, m, 2])
+    x = poses[n, m, 0] + c * mount[0] - s * mount[1]
+    y = poses[n, m, 1] + s * mount[0] + c * mount[1]
+    heading = poses[n, m, 2] + mount[2]
+    return x, y, heading, math.cos(heading), math.sin(heading)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def walls_into(out, directions, beams, sx, sy, c, s, walls):  # type: ignore[no-untyped-def]
     """Fuses straight walls (W, 4), given in the world, into a scan from (sx, sy, c, s)."""
     for w in range(walls.shape[0]):
@@ -193,32 +155,15 @@ def walls_into(out, directions, beams, sx, sy, c, s, walls):  # type: ignore[no-
         segment(out, directions, beams, ax, ay, bx, by)
 
 
-@njit(cache=True)
-def scan(out, pose, circles, walls, sensor):  # type: ignore[no-untyped-def]
-    """One scan (B,) from a robot's pose (3,).
-
-    Args:
-        out: (B,) result.
-        pose: (3,) of `base_link` in the world.
-        circles: (K, 4) x, y, radius [m], index of the radius in the table.
-        walls: (W, 4) x1, y1, x2, y2 [m].
-        sensor: see `scanner.Scanner.arguments`.
-    """
-    mount, directions, beams, limits, baked, lookup = sensor
-    clear(out)
-    sx, sy, c, s = to_sensor(pose, mount)
-    table, rows, first, start, fine = lookup
-    for k in range(circles.shape[0]):
-        dx, dy, radius = circles[k, 0] - sx, circles[k, 1] - sy, circles[k, 2]
-        reach = limits[1] + radius
-        if radius <= 0.0 or dx * dx + dy * dy > reach * reach:
-            continue
-        x, y = c * dx + s * dy, c * dy - s * dx
-        if baked and dx * dx + dy * dy > radius * radius:
-            baked_circle(
-                out, beams, x, y, radius, int(circles[k, 3]), table, rows, first, start, fine
-            )
-        else:
-            circle(out, directions, beams, x, y, radius, limits[1])
-    walls_into(out, directions, beams, sx, sy, c, s, walls)
-    finish(out, limits[0], limits[1])
+@njit(cache=True, error_model="numpy")
+def body_into(out, directions, beams, sx, sy, c, s, body, corners, corner, range_max):  # type: ignore[no-untyped-def]
+    """Fuses one body (7,), see `shapes.BODY`, into a scan from (sx, sy, c, s)."""
+    dx, dy = body[0] - sx, body[1] - sy
+    x, y = c * dx + s * dy, c * dy - s * dx
+    shape = int(body[6])
+    begin, end = corner[shape], corner[shape + 1]
+    if begin == end:
+        circle(out, directions, beams, x, y, body[5], range_max)
+    else:
+        cos, sin = body[3] * c + body[4] * s, body[4] * c - body[3] * s
+        polygon(out, directions, beams, x, y, cos, sin, corners[begin:end])

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.lidar import kernels
+from nics_drl_bridge.lidar import scan_kernels
+from nics_drl_bridge.lidar.baked_kernels import BLOCK, COLUMNS
+from nics_drl_bridge.lidar.shapes import BODY, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.lidar.table import LidarTable, bake
+from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.table import LidarTable
 
-Renderer = Literal["baked", "exact"]
-RENDERERS: tuple[Renderer, ...] = ("baked", "exact")
+Renderer = Literal["auto", "baked", "exact"]
+RENDERERS: tuple[Renderer, ...] = ("auto", "baked", "exact")
+Room = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]]
+NO_WALLS = np.zeros((0, 4))
+FEW_CORNERS = 2
+"""A shape of so few corners is scanned exactly by `auto`: that is as fast as a look-up."""
 
 
 @dataclass(frozen=True)
@@ -23,64 +31,94 @@ class Scanner:
 
     Attributes:
         spec: the lidar.
-        table: for the baked renderer.
-        renderer: `baked` looks circles up; `exact` computes every ray. Walls are exact in
-            both: a straight wall costs no more than a row of a table.
+        table: of the shapes that may stand around.
+        renderer: `baked` looks every shape up; `exact` computes every ray; `auto` takes what is
+            faster for each shape. Straight walls are exact in all: they cost no more than a
+            row of a table.
     """
 
     spec: LidarSpec
     table: LidarTable
-    renderer: Renderer = "baked"
+    renderer: Renderer = "auto"
 
-    @property
+    @cached_property
     def arguments(self) -> tuple[Any, ...]:
         """What the kernels take as `sensor`.
 
-        Mount (3,), directions (B, 2), beams (angle_min, angle_increment, 1 for a full circle),
-        limits (range_min, range_max), whether circles are looked up, the table's arrays.
+        Mount (3,), directions (B, 2), beams (angle_min, angle_increment, 1 for a full circle,
+        B), limits (range_min, range_max), whether each shape is looked up (H,), the outlines, the
+        table's arrays.
         """
-        spec = self.spec
-        beams = np.array([spec.angle_min, spec.angle_increment, float(spec.full_circle)])
+        spec, table = self.spec, self.table
+        beams = (spec.angle_min, spec.angle_increment, float(spec.full_circle), float(spec.beams))
         limits = np.array([spec.range_min, spec.range_max])
-        baked = self.renderer == "baked"
-        return np.array(spec.mount), spec.directions, beams, limits, baked, self.table.lookup
+        return (
+            np.array(spec.mount),
+            np.stack([np.cos(spec.angles), np.sin(spec.angles)], axis=1),
+            np.array(beams),
+            limits,
+            self._looked_up(),
+            table.outlines.arguments,
+            table.lookup,
+        )
 
-    def scan(self, poses: ArrayLike, circles: ArrayLike, walls: ArrayLike) -> NDArray[np.float32]:
+    def _looked_up(self) -> NDArray[np.uint8]:
+        """(H,) 1 where a shape is looked up."""
+        corners = np.diff(self.table.outlines.corner)
+        if self.renderer == "exact":
+            return np.zeros(len(corners), np.uint8)
+        if self.renderer == "baked":
+            return np.ones(len(corners), np.uint8)
+        return ((corners == 0) | (corners > FEW_CORNERS)).astype(np.uint8)
+
+    def room(self, bodies: int) -> Room:
+        """Scratch that one thread needs to scan a world of so many bodies."""
+        line = np.empty(self.spec.beams + BLOCK, np.float32)
+        bodies = (bodies // BLOCK + 1) * BLOCK
+        return line, np.ones((COLUMNS, bodies)), np.zeros((2, bodies), np.int64)
+
+    def place(self, shapes: Sequence[Shape], poses: ArrayLike) -> NDArray[np.float64]:
+        """Bodies (..., K, 7) of K shapes at poses (..., K, 3): x, y [m], heading [rad].
+
+        Raises:
+            ModelError: a shape is not in the table.
+        """
+        poses = np.asarray(poses, dtype=np.float64)
+        index = [self.table.outlines.index_of(shape) for shape in shapes]
+        return place(poses, self.table.outlines.radii[index], index)
+
+    def scan(
+        self,
+        poses: ArrayLike,
+        bodies: ArrayLike,
+        walls: ArrayLike = NO_WALLS,
+        out: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
         """Scans of several robots, each in a world of its own.
 
         Args:
             poses: (N, 3) of `base_link` in the world.
-            circles: (N, K, 3) x, y, radius [m]; a radius of 0 is no circle.
+            bodies: (N, K, 7) what `place` gave.
             walls: (W, 4) x1, y1, x2, y2 [m], the same in every world.
+            out: (N, B) where to write, a new array by default.
 
         Returns:
             (N, B) ranges [m]: `inf` no return, `-inf` too close (REP-117).
         """
         poses = np.atleast_2d(np.asarray(poses, dtype=np.float64))
-        shaped = self.with_shapes(np.asarray(circles, dtype=np.float64).reshape(len(poses), -1, 3))
+        bodies = np.asarray(bodies, dtype=np.float64).reshape(len(poses), -1, BODY)
         walls = np.asarray(walls, dtype=np.float64).reshape(-1, 4)
-        out = np.empty((len(poses), self.spec.beams), np.float32)
-        _scan_batch(out, poses, shaped, walls, self.arguments)
+        out = np.empty((len(poses), self.spec.beams), np.float32) if out is None else out
+        worlds = np.arange(len(poses))
+        room = self.room(bodies.shape[1])
+        scan_kernels.scan_worlds(
+            out[:, None], poses[:, None], worlds, bodies, -1, walls, self.arguments, room
+        )
         return out
-
-    def with_shapes(self, circles: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Circles (..., 3) with the index of their radius in the table behind: (..., 4)."""
-        shape = np.zeros(circles.shape[:-1])
-        if self.renderer == "baked":
-            for radius in np.unique(circles[..., 2]):
-                if radius > 0.0:
-                    shape[circles[..., 2] == radius] = self.table.shape_of(float(radius))
-        return np.concatenate([circles, shape[..., None]], axis=-1)
 
 
 def make_scanner(
-    spec: LidarSpec, radii: tuple[float, ...], renderer: Renderer = "baked"
+    spec: LidarSpec, shapes: Sequence[Shape], renderer: Renderer = "auto"
 ) -> Scanner:
-    """A scanner with a table for circles of the given radii, baked now."""
-    return Scanner(spec, bake(spec, radii), renderer)
-
-
-@njit(cache=True)
-def _scan_batch(out, poses, circles, walls, sensor):  # type: ignore[no-untyped-def]
-    for n in range(poses.shape[0]):
-        kernels.scan(out[n], poses[n], circles[n], walls, sensor)
+    """A scanner with a table for the given shapes, baked now."""
+    return Scanner(spec, bake(spec, shapes), renderer)

@@ -3,14 +3,40 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
+from nics_drl_bridge.lidar.faults import SKEW, LidarFaults
 
 FULL_CIRCLE_TOLERANCE = 1e-6
+NoReturn = Literal["inf", "zero", "nan", "range_max"]
+
+
+class ScanHeader(NamedTuple):
+    """The fields of a LaserScan that follow from the lidar, by their names there.
+
+    Attributes:
+        angle_min: of the first beam [rad].
+        angle_max: of the last beam, also of a full circle [rad].
+        angle_increment: between neighbouring beams [rad].
+        time_increment: between neighbouring beams [s]; 0 where all are measured at once,
+            negative where the device turns clockwise.
+        scan_time: between scans [s].
+        range_min: nearest return [m].
+        range_max: farthest return [m].
+    """
+
+    angle_min: float
+    angle_max: float
+    angle_increment: float
+    time_increment: float
+    scan_time: float
+    range_min: float
+    range_max: float
 
 
 class LidarSpec(Schema):
@@ -30,6 +56,10 @@ class LidarSpec(Schema):
         rate: scans per second [Hz].
         mount: x [m], y [m], heading [rad] of `laser` in `base_link`.
         noise_std: standard deviation of a range [m].
+        frame: id of the lidar's own frame.
+        no_return: what the device puts on the wire where nothing came back: `inf` (REP-117),
+            `zero`, `nan` or `range_max`. Inside the package it is `inf`; see `lidar.rep117`.
+        faults: what else the device does to its ranges.
     """
 
     name: str = "lidar"
@@ -41,6 +71,9 @@ class LidarSpec(Schema):
     rate: float = Field(gt=0.0)
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
     noise_std: float = Field(default=0.0, ge=0.0)
+    frame: str = Field(default="laser", min_length=1)
+    no_return: NoReturn = "inf"
+    faults: LidarFaults = LidarFaults()
 
     @model_validator(mode="after")
     def _consistent(self) -> LidarSpec:
@@ -50,6 +83,10 @@ class LidarSpec(Schema):
             raise ValueError("angle_max must exceed angle_min by at most a full circle, in radians")
         if max(-self.angle_min, self.angle_max) > 2.0 * np.pi + FULL_CIRCLE_TOLERANCE:
             raise ValueError("angle_min and angle_max must lie within -2 pi and 2 pi")
+        if self.faults.quantisation > self.range_max - self.range_min:
+            raise ValueError("faults.quantisation must be less than range_max - range_min")
+        if self.no_return == "zero" and self.range_min == 0.0:
+            raise ValueError("range_min must be greater than 0 where no_return is zero")
         return self
 
     @property
@@ -72,6 +109,39 @@ class LidarSpec(Schema):
     def directions(self) -> NDArray[np.float32]:
         """(B, 2) cosine and sine of each beam's direction."""
         return np.stack([np.cos(self.angles), np.sin(self.angles)], axis=1).astype(np.float32)
+
+    @property
+    def scan_time(self) -> float:
+        """Time from one scan to the next [s]."""
+        return 1.0 / self.rate
+
+    @property
+    def beam_time(self) -> float:
+        """Time between neighbouring beams of a device that turns once per scan [s]."""
+        return self.scan_time * self.angle_increment / (2.0 * np.pi)
+
+    @property
+    def sweep_time(self) -> float:
+        """Time that a device which turns once per scan spends on its beams [s]."""
+        return self.beam_time * self.beams
+
+    @cached_property
+    def header(self) -> ScanHeader:
+        """Every field of a LaserScan but stamp, frame and ranges."""
+        return ScanHeader(
+            angle_min=float(self.angles[0]),
+            angle_max=float(self.angles[-1]),
+            angle_increment=self.angle_increment,
+            time_increment=self.beam_time * SKEW[self.faults.skew],
+            scan_time=self.scan_time,
+            range_min=self.range_min,
+            range_max=self.range_max,
+        )
+
+    @property
+    def fault_parameters(self) -> NDArray[np.float64]:
+        """The faults of this lidar as the row (P,) that the kernels take."""
+        return self.faults.parameters(self.noise_std)
 
 
 def load_lidar(name: str) -> LidarSpec:

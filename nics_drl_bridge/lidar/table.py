@@ -1,117 +1,128 @@
-"""Baked lidar tables: every circle scanned beforehand, at every distance (Sec. IV-B)."""
+"""LidarTable: the rows of every shape, at every distance and rotation (Sec. IV-B)."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, ValidationError, field_validator
 
+from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.files import npz_arrays, npz_bytes
-from nics_drl_bridge.lidar import kernels
-from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.lidar.shapes import SHAPES, Circle, Outlines, Shape
 
-DISTANCES = 200
-FINE = 4
+
+class Density(Schema):
+    """How finely a table is sampled.
+
+    Attributes:
+        distances: grid distances, from the shape's own radius to out of range.
+        rotations: grid rotations in a full turn; a shape that looks the same after a part of a
+            turn is baked for that part only.
+        phases: points per beam, 1, 2, 4 or 8.
+    """
+
+    distances: int = Field(default=100, ge=3, le=10_000)
+    rotations: int = Field(default=240, ge=1, le=100_000)
+    phases: int = 4
+
+    @field_validator("phases")
+    @classmethod
+    def _power_of_two(cls, phases: int) -> int:
+        if phases not in (1, 2, 4, 8):
+            raise ValueError("phases must be 1, 2, 4 or 8")
+        return phases
 
 
 @dataclass(frozen=True)
 class LidarTable:
-    """The ranges that circles give, as rows over angle, for a grid of distances.
+    """The ranges that shapes give, as rows over angle, for a grid of distance and rotation.
 
-    A circle looks the same from all sides, so its own rotation needs no rows. A row holds
-    only the directions that hit, at `FINE` points per beam, around the bearing of the circle.
+    A cell is one grid distance at one grid rotation. Its row holds only the directions that the
+    shape can cover until the next cells, as many times as there are phases: the points of one
+    phase stand one beam apart, so that the beams of a scan find theirs one after the other.
 
     Attributes:
-        radii: (H,) radius of each circle [m], ascending.
-        grid: (H, 3) nearest distance [m], step [m], number of distances.
-        rows: (R,) float32 ranges [m], all rows one after the other.
-        first: (H, distances) int32 offset of a row's first point from the bearing [points].
-        start: (H, distances + 1) int64 where each row begins in `rows`.
+        shapes: H of them.
+        density: of the grid.
+        grid: (H, 3) greatest grid distance [m], grid rotations in the part of a turn after which
+            the shape looks the same, first cell.
+        start: (cells,) int32 where each row begins in `rows`.
+        cell: (cells, 6) int16 first beam of the row from the bearing, its width in beams, two
+            corners of the hull that can be the right edge, two that can be the left.
+        rows: (R,) float32 ranges [m].
     """
 
-    radii: NDArray[np.float64]
+    shapes: tuple[Shape, ...]
+    density: Density
     grid: NDArray[np.float64]
+    start: NDArray[np.int32]
+    cell: NDArray[np.int16]
     rows: NDArray[np.float32]
-    first: NDArray[np.int32]
-    start: NDArray[np.int64]
 
-    def shape_of(self, radius: float) -> int:
-        """Index of a radius. Raises ModelError when it was not baked."""
-        found = np.flatnonzero(np.abs(self.radii - radius) < 1e-9)
-        if not len(found):
-            raise ModelError(
-                f"a circle of radius {radius} m is not in the lidar table "
-                f"(it holds {', '.join(f'{r:g}' for r in self.radii)} m); generate the model for "
-                "this world."
-            )
-        return int(found[0])
+    @cached_property
+    def outlines(self) -> Outlines:
+        """The shapes as arrays."""
+        return Outlines.of(self.shapes)
 
-    @property
-    def lookup(self) -> tuple[object, ...]:
-        """The arrays in the order that the kernel takes."""
-        return self.grid, self.rows, self.first, self.start, FINE
+    @cached_property
+    def lookup(self) -> tuple[Any, ...]:
+        """What the kernels take.
+
+        Per shape (H, 11): radius [m], cells per metre, distances, rotations per radian, grid
+        rotations in a part of a turn, parts, 1 / (grid rotations x parts), first cell, first corner of the
+        hull, corners per part, 1 for a circle; then `start`, `cell`, `rows`, log2 of the phases,
+        the hulls.
+        """
+        outlines, distances = self.outlines, self.density.distances
+        of = np.zeros((len(self.shapes), 11))
+        of[:, 0] = outlines.radii
+        of[:, 1] = (distances - 1) / (self.grid[:, 0] - outlines.radii)
+        of[:, 2] = distances
+        of[:, 4], of[:, 5] = self.grid[:, 1], outlines.orders
+        of[:, 3] = of[:, 4] * of[:, 5] / (2.0 * np.pi)
+        of[:, 6] = 1.0 / (of[:, 4] * of[:, 5])
+        of[:, 7], of[:, 8] = self.grid[:, 2], outlines.hull[:-1]
+        of[:, 9] = np.diff(outlines.hull) / 2 / outlines.orders
+        of[:, 10] = [isinstance(shape, Circle) for shape in self.shapes]
+        phases = self.density.phases
+        return of, self.start, self.cell, self.rows, phases.bit_length() - 1, outlines.hulls
 
     @property
     def memory(self) -> int:
         """Memory of the table [bytes]."""
-        return sum(a.nbytes for a in (self.radii, self.grid, self.rows, self.first, self.start))
+        return sum(a.nbytes for a in (self.grid, self.start, self.cell, self.rows))
 
     def dump(self) -> bytes:
         """The table as the content of an `.npz` file."""
-        return npz_bytes(vars(self))
+        return npz_bytes(
+            {
+                "about": np.frombuffer(self._about().encode(), np.uint8),
+                "grid": self.grid,
+                "start": self.start,
+                "cell": self.cell,
+                "rows": self.rows,
+            }
+        )
+
+    def _about(self) -> str:
+        shapes = SHAPES.dump_python(self.shapes, mode="json")
+        return json.dumps({"shapes": shapes, "density": self.density.model_dump()})
 
     @classmethod
     def parse(cls, data: bytes, source: str) -> LidarTable:
         """Reads what `dump` wrote. Raises ModelError with the file's name otherwise."""
         try:
-            return cls(**npz_arrays(data))
-        except (ValueError, TypeError) as error:
+            arrays = npz_arrays(data)
+            about = json.loads(arrays.pop("about").tobytes())
+            shapes = SHAPES.validate_python(about["shapes"])
+            return cls(shapes, Density(**about["density"]), **arrays)
+        except (KeyError, TypeError, ValueError, ValidationError) as error:
             raise ModelError(
                 f"{source}: is no lidar table ({error}); generate the model anew."
             ) from None
-
-
-def bake(spec: LidarSpec, radii: tuple[float, ...], distances: int = DISTANCES) -> LidarTable:
-    """Scans circles on the lidar's main axis, at a grid of distances, with the exact scanner.
-
-    Args:
-        spec: the lidar.
-        radii: of the circles [m].
-        distances: how many, from touching the circle to out of range.
-
-    Returns:
-        The table.
-    """
-    ordered = np.unique(np.asarray(radii, dtype=np.float64))
-    grid, first = np.zeros((len(ordered), 3)), np.zeros((len(ordered), distances), np.int32)
-    start = np.zeros((len(ordered), distances + 1), np.int64)
-    rows: list[NDArray[np.float32]] = []
-    filled = 0
-    for h, radius in enumerate(ordered):
-        at = np.linspace(radius, spec.range_max + radius, distances)
-        grid[h] = at[0], at[1] - at[0], distances
-        for d, distance in enumerate(at):
-            first[h, d], row = _scan_on_axis(spec, radius, max(distance, radius * (1 + 1e-6)))
-            rows.append(row)
-            start[h, d], filled = filled, filled + len(row)
-        start[h, distances] = filled
-    return LidarTable(ordered, grid, np.concatenate([*rows, np.empty(0, np.float32)]), first, start)
-
-
-def _scan_on_axis(
-    spec: LidarSpec, radius: float, distance: float
-) -> tuple[int, NDArray[np.float32]]:
-    """The points that hit a circle straight ahead: offset of the first, and their ranges."""
-    step = spec.angle_increment / FINE
-    half = int(np.arcsin(min(radius / distance, 1.0)) / step + 1e-6)
-    angles = np.arange(-half, half + 1) * step
-    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1).astype(np.float32)
-    out = np.full(len(angles), np.inf, np.float32)
-    beams = np.array([angles[0], step, 0.0])
-    kernels.circle(out, directions, beams, distance, 0.0, radius, np.inf)
-    hits = np.flatnonzero(np.isfinite(out))
-    if not len(hits):
-        return 0, out[:0]
-    return int(hits[0]) - half, out[hits[0] : hits[-1] + 1]

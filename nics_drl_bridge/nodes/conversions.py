@@ -12,6 +12,7 @@ from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
 from sensor_msgs.msg import LaserScan
 
+from nics_drl_bridge.lidar.rep117 import from_device, to_device
 from nics_drl_bridge.lidar.spec import LidarSpec
 
 Array = NDArray[np.float64]
@@ -54,20 +55,18 @@ def twist_from_ros(message: Twist) -> Array:
 def scan_to_ros(
     spec: LidarSpec, ranges: NDArray[np.float32], time_ns: int, frame: str
 ) -> LaserScan:
-    """Ranges (B,) as a LaserScan; every header field follows from the spec."""
+    """Ranges (B,) as the LaserScan of the device; every header field follows from the spec."""
     message = LaserScan()
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
-    message.angle_min, message.angle_max = float(spec.angles[0]), float(spec.angles[-1])
-    message.angle_increment = spec.angle_increment
-    message.scan_time = 1.0 / spec.rate
-    message.range_min, message.range_max = spec.range_min, spec.range_max
-    message.ranges = array.array("f", np.ascontiguousarray(ranges, np.float32).tobytes())
+    for field, value in spec.header._asdict().items():
+        setattr(message, field, value)
+    message.ranges = array.array("f", to_device(ranges, spec).tobytes())
     return message
 
 
-def scan_from_ros(message: LaserScan) -> NDArray[np.float32]:
-    """Ranges (B,) of a LaserScan."""
-    return np.array(message.ranges, dtype=np.float32)
+def scan_from_ros(spec: LidarSpec, message: LaserScan) -> NDArray[np.float32]:
+    """Ranges (B,) of a LaserScan of the device, REP-117."""
+    return from_device(message.ranges, spec)
 
 
 def odometry_to_ros(

@@ -103,7 +103,7 @@ class DdsBackend:
         truth: bool = False,
         domain_id: int | None = None,
     ) -> None:
-        self._robot = model.robot
+        self._robot, self._lidar = model.robot, model.lidar
         self._identity = {"model": model.fingerprint, "world": world.fingerprint}
         self._middleware = Middleware(model)
         self._period_ns = round(model.control_period * conversions.NANO)
@@ -291,7 +291,7 @@ class DdsBackend:
         arrival = time.monotonic_ns()
         pose, twist = conversions.odometry_from_ros(messages[ODOM])
         self._middleware.odometry(now, arrival, pose, twist)
-        self._middleware.scan(now, arrival, conversions.scan_from_ros(messages[SCAN]))
+        self._middleware.scan(now, arrival, conversions.scan_from_ros(self._lidar, messages[SCAN]))
         facts: dict[str, Any] = {"stamp_ns": now}
         if TRUTH in self._topics:
             facts["true_pose"] = conversions.odometry_from_ros(messages[TRUTH])[0]

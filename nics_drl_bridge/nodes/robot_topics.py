@@ -36,7 +36,7 @@ class RobotTopics:
         on_odometry: Callable[[int], None] | None = None,
         on_scan: Callable[[int], None] | None = None,
     ) -> None:
-        self._node, self._robot = node, model.robot
+        self._node, self._robot, self._lidar = node, model.robot, model.lidar
         self.middleware = Middleware(model)
         self.newest_ns = 0
         self._started = False
@@ -59,7 +59,8 @@ class RobotTopics:
 
     def _take_scan(self, message: LaserScan) -> None:
         stamp = conversions.stamp_from_ros(message.header.stamp)
-        if self.middleware.scan(stamp, self._arrival_ns(), conversions.scan_from_ros(message)):
+        ranges = conversions.scan_from_ros(self._lidar, message)
+        if self.middleware.scan(stamp, self._arrival_ns(), ranges):
             self.newest_ns = max(self.newest_ns, stamp)
             if self._on_scan is not None:
                 self._on_scan(stamp)

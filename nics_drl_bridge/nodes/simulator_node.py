@@ -48,7 +48,7 @@ class SimulatorNode(Node):
     def __init__(self, context: Context) -> None:
         super().__init__("simulator_node", context=context)
         model = declare_model(self)
-        self._declare()
+        self._declare(model.lidar.frame)
         world = load_world(self._text("world"))
         renderer = self._choice("renderer", RENDERERS)
         self._mode = self._choice("mode", MODES)
@@ -63,7 +63,7 @@ class SimulatorNode(Node):
         self._open_topics()
         self._begin()
 
-    def _declare(self) -> None:
+    def _declare(self, laser_frame: str) -> None:
         # First, so that it also judges the values that the node is started with.
         self.add_on_set_parameters_callback(self._check_parameters)
         world, renderer = "World file, or the name of a shipped world.", "Lidar: baked or exact."
@@ -78,7 +78,7 @@ class SimulatorNode(Node):
             ("map", "map"),
             ("odom", "odom"),
             ("base", "base_link"),
-            ("laser", "laser"),
+            ("laser", laser_frame),
         ):
             declare(self, f"{frame}_frame", default, f"Frame id of {default}.")
         declare(self, "episode_seed", 0, "Seed of the episode that ~/reset begins.")

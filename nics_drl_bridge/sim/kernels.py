@@ -11,13 +11,11 @@ import math
 import numpy as np
 from numba import njit
 
+from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kinematics.kernels import advance, delayed, move, rates, run, wrap
+from nics_drl_bridge.lidar import fault_kernels
 from nics_drl_bridge.lidar import kernels as lidar
-from nics_drl_bridge.sim import random
 from nics_drl_bridge.sim.world import wall_distance
-
-ODOMETRY_STREAM = 2
-RANGE_STREAM = 3
 
 
 @njit(cache=True)
@@ -175,7 +173,7 @@ def measure(odom, twist, before, after, now, seed, counter, std, period, series)
     noise = np.zeros(3)
     for i in range(3):
         if std[i // 2] > 0.0:
-            noise[i] = std[i // 2] * random.normal(seed, ODOMETRY_STREAM, 3 * counter + i)
+            noise[i] = std[i // 2] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter + i)
         twist[i] = now[i] + noise[i]
     c, s = math.cos(before[2]), math.sin(before[2])
     dx, dy = after[0] - before[0], after[1] - before[1]
@@ -189,24 +187,20 @@ def measure(odom, twist, before, after, now, seed, counter, std, period, series)
 
 
 @njit(cache=True)
-def scan_robot(ranges, pose, me, bodies, walls, sensor, noise_std, seed, counter):  # type: ignore[no-untyped-def]
-    """One scan (B,) of everything but the robot itself, with Gaussian noise.
+def scan_robot(ranges, pose, me, bodies, walls, sensor, faults, seed, counter):  # type: ignore[no-untyped-def]
+    """One scan (B,) of everything but the robot itself, with the faults of its device.
 
     Args:
         me: row of the robot in `bodies`.
         sensor: see `lidar.scanner.Scanner.arguments`.
-        noise_std: of a range [m].
+        faults: (P,) of this robot, see `lidar.fault_kernels`.
+        seed, counter: of the random draws.
     """
     own = bodies[me, 2]
     bodies[me, 2] = 0.0
     lidar.scan(ranges, pose, bodies, walls, sensor)
     bodies[me, 2] = own
-    if noise_std > 0.0:
-        count, limits = ranges.shape[0], sensor[3]
-        for i in range(count):
-            if np.isfinite(ranges[i]):
-                draw = random.normal(seed, RANGE_STREAM, counter * count + i)
-                ranges[i] = min(max(ranges[i] + noise_std * draw, limits[0]), limits[1])
+    fault_kernels.distort(ranges, sensor[3], faults, seed, counter)
 
 
 @njit(cache=True)
@@ -218,11 +212,11 @@ def step_worlds(arrays, commands, walls, footprint, noise, sensor, lanes, motion
         commands: (N, M, C).
         walls: (W, 4).
         footprint: radius [m].
-        noise: odometry linear and angular, range: standard deviations.
+        noise: standard deviation of the odometry, linear [m/s] and angular [rad/s].
         sensor: see `lidar.scanner.Scanner.arguments`.
         lanes, motion, room: see the functions above.
     """
-    pose, state, history, bodies, odom, twist, ranges, collided, steps, seeds = arrays
+    pose, state, history, bodies, odom, twist, ranges, collided, steps, seeds, faults = arrays
     worlds, robots = pose.shape[0], pose.shape[1]
     before = pose.copy()
     for h in range(history.shape[2] - 1, 0, -1):
@@ -245,11 +239,11 @@ def step_worlds(arrays, commands, walls, footprint, noise, sensor, lanes, motion
             _rates_now(dq, x, state[n, m], history[n, m], terms, timing)
             measure(
                 odom[n, m], twist[n, m], before[n, m], pose[n, m], dq,
-                seeds[n], counter, noise[:2], period, motion[1],
+                seeds[n], counter, noise, period, motion[1],
             )  # fmt: skip
             scan_robot(
                 ranges[n, m], pose[n, m], bodies.shape[1] - robots + m, bodies[n], walls, sensor,
-                noise[2], seeds[n], counter,
+                faults[n, m], seeds[n], counter,
             )  # fmt: skip
 
 
@@ -263,13 +257,13 @@ def _rates_now(dq, x, state, history, terms, timing):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def scan_worlds(arrays, chosen, walls, noise, sensor):  # type: ignore[no-untyped-def]
+def scan_worlds(arrays, chosen, walls, sensor):  # type: ignore[no-untyped-def]
     """Scans of the worlds `chosen` (n,) as they stand, after a reset."""
-    pose, _, _, bodies, _, _, ranges, _, steps, seeds = arrays
+    pose, _, _, bodies, _, _, ranges, _, steps, seeds, faults = arrays
     for n in chosen:
         robots = pose.shape[1]
         for m in range(robots):
             scan_robot(
                 ranges[n, m], pose[n, m], bodies.shape[1] - robots + m, bodies[n], walls, sensor,
-                noise[2], seeds[n], steps[n] * robots + m,
+                faults[n, m], seeds[n], steps[n] * robots + m,
             )  # fmt: skip

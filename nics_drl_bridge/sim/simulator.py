@@ -39,6 +39,8 @@ class Worlds:
         collided: (N, M) 1 once a robot has touched something.
         steps: (N,) control periods since the reset.
         seeds: (N,) of the episode.
+        faults: (N, M, P) faults of each robot's lidar, columns as in `lidar.fault_kernels`; those
+            of the model unless written to, as domain randomisation does. A reset keeps them.
     """
 
     pose: Array
@@ -51,6 +53,7 @@ class Worlds:
     collided: NDArray[np.uint8]
     steps: NDArray[np.int64]
     seeds: NDArray[np.int64]
+    faults: Array
 
 
 class FastSimulator:
@@ -82,7 +85,7 @@ class FastSimulator:
         self._scanner = make_scanner(model.lidar, (*world.obstacles.radii, footprint), renderer)
         self._footprint_shape = self._scanner.table.shape_of(footprint)
         self._walls = world.all_walls()
-        self._noise = np.array([*model.noise.odometry, model.lidar.noise_std])
+        self._noise = np.array(model.noise.odometry)
         self._sensor = self._scanner.arguments
         self._motion = (term_arrays(model.kinematics), SERIES, model.timing)
         self._room = (*scratch(model.kinematics), np.zeros((robots, 2)))
@@ -115,6 +118,7 @@ class FastSimulator:
             collided=np.zeros(shape, np.uint8),
             steps=np.zeros(worlds, np.int64),
             seeds=np.zeros(worlds, np.int64),
+            faults=np.tile(self.model.lidar.fault_parameters, (*shape, 1)),
         )
 
     def reset(
@@ -143,7 +147,7 @@ class FastSimulator:
             self._place(int(n), int(seed), scene, start)
             scenes.append(scene)
         self._box.begin()
-        kernels.scan_worlds(self._fields, chosen, self._walls, self._noise, self._sensor)
+        kernels.scan_worlds(self._fields, chosen, self._walls, self._sensor)
         return scenes
 
     def _place(self, n: int, seed: int, scene: Scene, start: Array) -> None:

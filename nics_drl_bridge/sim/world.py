@@ -9,14 +9,13 @@ from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
-from nics_drl_bridge.sim import random
 
 Array = NDArray[np.float64]
 TRIES = 2000
-SCENE_STREAM = 1
 RESTARTS = 50
 GREATEST_SEED = 2**63 - 1
 
@@ -171,8 +170,8 @@ def _draw(seed, half, space, radii, walls, circles, starts, goals):  # type: ign
 
 @njit(cache=True)
 def _point(seed, counter, half):  # type: ignore[no-untyped-def]
-    x = (2.0 * random.uniform(seed, SCENE_STREAM, counter) - 1.0) * half[0]
-    y = (2.0 * random.uniform(seed, SCENE_STREAM, counter + 1) - 1.0) * half[1]
+    x = (2.0 * random.uniform(seed, random.SCENE_STREAM, counter) - 1.0) * half[0]
+    y = (2.0 * random.uniform(seed, random.SCENE_STREAM, counter + 1) - 1.0) * half[1]
     return x, y
 
 
@@ -182,7 +181,7 @@ def _place_circles(seed, counter, half, space, radii, walls, circles):  # type: 
         placed = False
         for _ in range(TRIES):
             x, y = _point(seed, counter, half)
-            radius = radii[int(random.uniform(seed, SCENE_STREAM, counter + 2) * len(radii))]
+            radius = radii[int(random.uniform(seed, random.SCENE_STREAM, counter + 2) * len(radii))]
             counter += 3
             if wall_distance(x, y, walls) > radius and _free(
                 x, y, radius + space[4], circles, k, walls[:0]
@@ -204,7 +203,7 @@ def _place_robots(seed, counter, half, space, walls, circles, starts, goals):  #
         for _ in range(TRIES):
             x, y = _point(seed, counter, half)
             gx, gy = _point(seed, counter + 2, half)
-            heading = (2.0 * random.uniform(seed, SCENE_STREAM, counter + 4) - 1.0) * np.pi
+            heading = (2.0 * random.uniform(seed, random.SCENE_STREAM, counter + 4) - 1.0) * np.pi
             counter += 5
             distance = np.hypot(gx - x, gy - y)
             if not space[2] <= distance <= space[3]:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from robots import lidar
 
-from nics_drl_bridge.config import validate
+from nics_drl_bridge.config import find_config, validate
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.faults import LidarFaults
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 
 
@@ -40,9 +41,76 @@ def test_directions_are_cosine_and_sine_of_the_angles():
     assert np.allclose(spec.directions[:, 1], np.sin(spec.angles), atol=1e-6)
 
 
-def test_the_papers_lidar_is_shipped():
-    spec = load_lidar("paper")
-    assert (spec.beams, spec.range_max, spec.full_circle) == (720, 3.0, True)
+# Beams, field of view [deg], resolution [deg], range_min [m], range_max [m], rate [Hz], standard
+# deviation at 1 m [m], no return on the wire: as the data sheets and drivers named in the files.
+DATA_SHEETS = {
+    "paper": (720, 360.0, 0.5, 0.05, 3.0, 10.0, 0.0, "inf"),
+    "paper_12m": (720, 360.0, 0.5, 0.15, 12.0, 10.0, 0.0, "inf"),
+    "rplidar_a1": (360, 360.0, 1.0, 0.15, 12.0, 5.5, 0.005, "inf"),
+    "rplidar_a2": (800, 360.0, 0.45, 0.15, 12.0, 10.0, 0.005, "inf"),
+    "hokuyo_ust_10lx": (1081, 270.0, 0.25, 0.06, 10.0, 40.0, 0.03, "nan"),
+    "sick_tim571": (811, 270.0, 1.0 / 3.0, 0.05, 25.0, 15.0, 0.02, "zero"),
+    "turtlebot3_lds_02": (360, 360.0, 1.0, 0.16, 8.0, 5.0, 0.0155, "nan"),
+}
+
+
+def test_every_shipped_lidar_has_a_row_of_its_data_sheet_and_names_its_source():
+    files = {path.stem: path for path in find_config("paper", "lidars").parent.glob("*.yaml")}
+    assert set(files) == set(DATA_SHEETS)
+    for path in files.values():
+        assert path.read_text(encoding="utf-8").startswith("# ")
+
+
+@pytest.mark.parametrize("name", DATA_SHEETS)
+def test_a_shipped_lidar_is_that_of_its_data_sheet(name):
+    beams, view, resolution, range_min, range_max, rate, std, no_return = DATA_SHEETS[name]
+    spec = load_lidar(name)
+    assert spec.name == name
+    assert spec.beams == beams
+    assert np.degrees(spec.angle_max - spec.angle_min) == pytest.approx(view)
+    assert np.degrees(spec.angle_increment) == pytest.approx(resolution)
+    assert (spec.range_min, spec.range_max, spec.rate) == (range_min, range_max, rate)
+    assert spec.noise_std + spec.faults.noise_proportional == pytest.approx(std)
+    assert spec.no_return == no_return
+
+
+@pytest.mark.parametrize("name", ["paper", "paper_12m"])
+def test_the_papers_lidars_have_no_faults(name):
+    spec = load_lidar(name)
+    assert (spec.noise_std, spec.faults) == (0.0, LidarFaults())
+
+
+@pytest.mark.parametrize("start", [-np.pi, 0.0, -1.0])
+@pytest.mark.parametrize("full", [True, False])
+@pytest.mark.parametrize("beams", [2, 3, 7, 360, 811, 1081, 7200, 100_000])
+def test_readers_of_the_header_count_the_beams_in_float32(beams, full, start):
+    spec = lidar(beams=beams, angle_min=start, angle_max=start + (2.0 * np.pi if full else 4.0))
+    low, high, step = (np.float32(value) for value in spec.header[:3])
+    assert round(float((high - low) / step)) + 1 == beams
+    assert round(float(high) - float(low), 12) < round(2.0 * np.pi, 12)
+
+
+def test_the_header_is_that_of_the_beams():
+    spec = lidar(beams=100, angle_min=-1.0, angle_max=2.0, rate=20.0)
+    header = spec.header
+    assert (header.angle_min, header.angle_max) == (spec.angles[0], spec.angles[-1])
+    assert header.angle_increment == spec.angle_increment
+    assert (header.scan_time, header.time_increment) == (0.05, 0.0)
+    assert (header.range_min, header.range_max) == (spec.range_min, spec.range_max)
+
+
+def test_a_turn_takes_one_scan_time_and_a_part_of_it_less():
+    assert lidar(beams=400, rate=4.0).beam_time == pytest.approx(0.25 / 400)
+    assert lidar(beams=400, rate=4.0).sweep_time == pytest.approx(0.25)
+    hokuyo = load_lidar("hokuyo_ust_10lx")  # a turn of 25 ms has 1440 steps
+    assert hokuyo.beam_time == pytest.approx(0.025 / 1440)
+    assert hokuyo.sweep_time == pytest.approx(0.025 * 1081 / 1440)
+
+
+@pytest.mark.parametrize(("skew", "sign"), [("counter_clockwise", 1.0), ("clockwise", -1.0)])
+def test_the_time_increment_has_the_sign_of_the_turn(skew, sign):
+    spec = lidar(beams=400, rate=4.0, faults={"skew": skew})
+    assert spec.header.time_increment == pytest.approx(sign * 0.25 / 400)
 
 
 @pytest.mark.parametrize(
@@ -60,6 +128,13 @@ def test_the_papers_lidar_is_shipped():
         ({"noise_std": -1.0}, "key 'noise_std'"),
         ({"range_max": float("inf")}, "key 'range_max'"),
         ({"beem": 3}, "did you mean 'beams'"),
+        ({"frame": ""}, "key 'frame'"),
+        ({"no_return": "minus one"}, "key 'no_return'"),
+        ({"no_return": "zero", "range_min": 0.0}, "range_min must be greater than 0"),
+        ({"faults": {"dropout": 1.5}}, "key 'faults.dropout'"),
+        ({"faults": {"dropout": 0.6, "dropout_far": 0.6}}, "must add up to at most 1"),
+        ({"faults": {"quantisation": 4.0}}, "faults.quantisation must be less than"),
+        ({"faults": {"quantization": 0.1}}, "did you mean 'quantisation'"),
     ],
 )
 def test_a_lidar_that_cant_be_is_refused_in_one_sentence(changes, sentence):

@@ -83,7 +83,7 @@ def test_every_header_field_of_a_scan_follows_from_the_lidar(spec):
     # What RViz and every costmap compute.
     beams = (message.angle_max - message.angle_min) / message.angle_increment + 1
     assert beams == pytest.approx(len(message.ranges), abs=1e-3)
-    assert message.time_increment == 0.0
+    assert message.time_increment == 0.0  # all beams are measured at once
     assert message.scan_time == pytest.approx(1.0 / spec.rate)
     assert (message.range_min, message.range_max) == pytest.approx((spec.range_min, spec.range_max))
 
@@ -93,7 +93,8 @@ def test_ranges_keep_their_infinities_nan_and_bits():
         beams=6, angle_min=-1.0, angle_max=1.0, range_min=0.1, range_max=8.0, rate=10.0
     )
     ranges = np.array([np.inf, -np.inf, np.nan, 0.1, np.pi, 7.999999], np.float32)
-    back = conversions.scan_from_ros(over_the_wire(conversions.scan_to_ros(spec, ranges, 0, "l")))
+    message = over_the_wire(conversions.scan_to_ros(spec, ranges, 0, "l"))
+    back = conversions.scan_from_ros(spec, message)
     assert back.dtype == np.float32
     assert back.tobytes() == ranges.tobytes()
 
@@ -109,6 +110,26 @@ def test_ranges_of_a_slice_are_those_of_the_slice():
 
 def test_ranges_taken_from_a_message_are_a_copy():
     message = LaserScan(ranges=[1.0, 2.0])
-    ranges = conversions.scan_from_ros(message)
+    ranges = conversions.scan_from_ros(FORWARD, message)
     ranges[0] = 9.0
     assert message.ranges[0] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("no_return", "wire"), [("inf", math.inf), ("zero", 0.0), ("range_max", 8.0), ("nan", math.nan)]
+)
+def test_no_return_travels_in_the_words_of_the_device_and_comes_back_as_inf(no_return, wire):
+    spec = FORWARD.model_copy(update={"no_return": no_return})
+    ranges = np.full(spec.beams, np.inf, np.float32)
+    ranges[0], ranges[1] = 1.5, -np.inf
+    message = over_the_wire(conversions.scan_to_ros(spec, ranges, 0, "laser"))
+    assert list(message.ranges[:2]) == [1.5, -math.inf]
+    assert message.ranges[2] == pytest.approx(wire, nan_ok=True)
+    assert np.array_equal(conversions.scan_from_ros(spec, message), ranges)
+
+
+def test_a_device_that_turns_while_it_measures_says_so_in_the_header():
+    spec = FORWARD.model_validate(FORWARD.model_dump() | {"faults": {"skew": "counter_clockwise"}})
+    message = conversions.scan_to_ros(spec, np.ones(spec.beams, np.float32), 0, "laser")
+    # 3 rad of a turn that takes 50 ms, in 180 steps.
+    assert message.time_increment == pytest.approx(0.05 * 3.0 / (2.0 * math.pi) / 180)

@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 from scipy import stats
 
-from nics_drl_bridge.sim import random
+from nics_drl_bridge import random_kernels as random
 
 
 @njit

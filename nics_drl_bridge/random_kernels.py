@@ -1,7 +1,8 @@
 """Counter-based random numbers: the same draw for the same (seed, stream, counter).
 
 No state is kept, so a world draws the same numbers whatever batch or thread it runs in.
-SplitMix64 (Steele, Lea, Flood 2014) mixes the counters; Box-Muller makes normals.
+SplitMix64 (Steele, Lea, Flood 2014) mixes the counters; Box-Muller makes normals. The streams
+of the package are named here, so that no two purposes share their draws.
 """
 
 from __future__ import annotations
@@ -10,6 +11,12 @@ import math
 
 import numpy as np
 from numba import njit
+
+SCENE_STREAM = 1
+ODOMETRY_STREAM = 2
+RANGE_STREAM = 3
+DROPOUT_STREAM = 4
+GHOST_STREAM = 5
 
 
 @njit(cache=True)

@@ -1,0 +1,111 @@
+"""Compiled inner loops of baking: a shape on the lidar's main axis, scanned beforehand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from nics_drl_bridge.lidar import kernels
+
+
+@njit(cache=True)
+def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[no-untyped-def]
+    """Outermost directions of a shape straight ahead, and the corners that make them.
+
+    Args:
+        hull: (V, 2) of its convex hull [m]; unused for a circle.
+        radius: of a circle [m], 0 for another shape.
+        distances: (D,) of its origin [m].
+        turns: (T,) its rotation [rad].
+        edges: (T, D, 2) result: right and left edge [rad].
+        hints: (T, D, 2) result: index of the corner at each.
+    """
+    for t in range(turns.shape[0]):
+        c, s = math.cos(turns[t]), math.sin(turns[t])
+        for d in range(distances.shape[0]):
+            if radius > 0.0:
+                half = math.asin(min(radius / distances[d], 1.0))
+                edges[t, d, 0], edges[t, d, 1] = -half, half
+                hints[t, d] = 0
+                continue
+            rx, ry = kernels.turned(distances[d], 0.0, c, s, hull[0])
+            lx, ly = rx, ry
+            right = left = 0
+            for v in range(1, hull.shape[0]):
+                x, y = kernels.turned(distances[d], 0.0, c, s, hull[v])
+                if rx * y - ry * x < 0.0:
+                    rx, ry, right = x, y, v
+                if lx * y - ly * x > 0.0:
+                    lx, ly, left = x, y, v
+            edges[t, d, 0], edges[t, d, 1] = math.atan2(ry, rx), math.atan2(ly, lx)
+            hints[t, d, 0], hints[t, d, 1] = right, left
+
+
+@njit(cache=True)
+def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # type: ignore[no-untyped-def]
+    """Ranges (P,) of a shape straight ahead, continued beyond its edges.
+
+    Args:
+        fine: (P,) result [m].
+        directions, beams: of the P points, see `kernels`.
+        corners: (V, 2) of its outline, none for a circle [m].
+        radius: of a circle [m].
+        distance: of its origin [m].
+        cos, sin: of its rotation.
+        edge: (2,) its right and left edge [rad].
+    """
+    kernels.clear(fine)
+    if corners.shape[0] == 0:
+        kernels.circle(fine, directions, beams, distance, 0.0, radius, np.inf)
+    else:
+        kernels.polygon(fine, directions, beams, distance, 0.0, cos, sin, corners)
+    count = fine.shape[0]
+    first = min(max(int(math.ceil((edge[0] - beams[0]) / beams[1])), 0), count - 1)
+    last = max(min(int(math.floor((edge[1] - beams[0]) / beams[1])), count - 1), 0)
+    while first < last and not np.isfinite(fine[first]):
+        first += 1
+    while last > first and not np.isfinite(fine[last]):
+        last -= 1
+    if not np.isfinite(fine[first]):  # thinner than the points: seen by none
+        fine[:] = distance
+        return
+    fine[:first] = fine[first]
+    fine[last + 1 :] = fine[last]
+
+
+@njit(cache=True)
+def into_phases(rows, fine, width, phases):  # type: ignore[no-untyped-def]
+    """Sorts points (width * phases,) so that those of one phase stand together."""
+    for phase in range(phases):
+        for k in range(width):
+            rows[phase * width + k] = fine[k * phases + phase]
+
+
+@njit(cache=True)
+def rows_of_turn(rows, starts, begins, widths, corners, radius, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
+    """All rows of one rotation.
+
+    Args:
+        rows: (R,) float32 result: the table's ranges [m].
+        starts: (D,) where each row begins in `rows`.
+        begins: (D,) first beam of each row, from the bearing.
+        widths: (D,) beams of each row.
+        corners, radius: see `row`.
+        distances: (D,) [m].
+        turn: rotation [rad].
+        edges: (D, 2) [rad].
+        step: angle between beams [rad].
+        phases: points per beam.
+    """
+    c, s = math.cos(turn), math.sin(turn)
+    for d in range(distances.shape[0]):
+        points = widths[d] * phases
+        angles = (begins[d] * phases + np.arange(points)) * (step / phases)
+        directions = np.empty((points, 2))
+        directions[:, 0], directions[:, 1] = np.cos(angles), np.sin(angles)
+        fine = np.empty(points, np.float32)
+        beams = (angles[0], step / phases, 0.0)
+        row(fine, directions, beams, corners, radius, distances[d], c, s, edges[d])
+        into_phases(rows[starts[d] : starts[d] + points], fine, widths[d], phases)

@@ -1,0 +1,143 @@
+"""Compiled faults of a lidar: what a real device does to the ranges that it should measure.
+
+The order is that of the device: skew (the beams look from different poses), geometry (the
+scanner), then what is too close, noise, quantisation and dropouts, by `distort`. The faults of
+one robot are a row (P,) of numbers, so that each robot of a batch may have its own; a fault
+whose numbers are 0 costs nothing and draws nothing.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from nics_drl_bridge import random_kernels as random
+
+# Columns of a row of faults; `faults.LidarFaults` says what they mean.
+NOISE_STD, NOISE_PROPORTIONAL, DROPOUT, DROPOUT_FAR, TOO_CLOSE, QUANTISATION, SKEW = range(7)
+PARAMETERS = 7
+
+# Values of the column TOO_CLOSE.
+AS_MINUS_INF, AS_RANGE_MIN, AS_NO_RETURN, AS_GHOST = range(4)
+
+# Values of the column SKEW.
+CLOCKWISE, AT_ONCE, COUNTER_CLOCKWISE = -1, 0, 1
+
+ROUNDING = 1e-9
+"""Of a multiple of the quantisation step, in metres."""
+
+
+@njit(cache=True)
+def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-def]
+    """Does to one exact scan what the device does to it.
+
+    Args:
+        ranges: (B,) float32, REP-117, in place [m].
+        limits: range_min and range_max [m]; a return stays within them.
+        faults: (P,) see the columns above.
+        seed: of the random draws.
+        counter: of the scan; the same seed and counter give the same bits in any batch.
+    """
+    if faults[TOO_CLOSE] != AS_MINUS_INF:
+        _too_close(ranges, limits, faults[TOO_CLOSE], seed, counter)
+    if faults[NOISE_STD] > 0.0 or faults[NOISE_PROPORTIONAL] > 0.0:
+        _noise(ranges, limits, faults[NOISE_STD], faults[NOISE_PROPORTIONAL], seed, counter)
+    if faults[QUANTISATION] > 0.0:
+        _quantise(ranges, limits, faults[QUANTISATION])
+    if faults[DROPOUT] > 0.0 or faults[DROPOUT_FAR] > 0.0:
+        _drop(ranges, limits, faults[DROPOUT], faults[DROPOUT_FAR], seed, counter)
+
+
+@njit(cache=True)
+def _too_close(ranges, limits, behaviour, seed, counter):  # type: ignore[no-untyped-def]
+    count = ranges.shape[0]
+    for i in range(count):
+        if ranges[i] != -np.inf:
+            continue
+        if behaviour == AS_RANGE_MIN:
+            ranges[i] = limits[0]
+        elif behaviour == AS_NO_RETURN:
+            ranges[i] = np.inf
+        else:
+            draw = random.uniform(seed, random.GHOST_STREAM, counter * count + i)
+            ranges[i] = limits[0] + draw * (limits[1] - limits[0])
+
+
+@njit(cache=True)
+def _noise(ranges, limits, std, proportional, seed, counter):  # type: ignore[no-untyped-def]
+    count = ranges.shape[0]
+    for i in range(count):
+        if np.isfinite(ranges[i]):
+            draw = random.normal(seed, random.RANGE_STREAM, counter * count + i)
+            noisy = ranges[i] + (std + proportional * ranges[i]) * draw
+            ranges[i] = min(max(noisy, limits[0]), limits[1])
+
+
+@njit(cache=True)
+def _quantise(ranges, limits, step):  # type: ignore[no-untyped-def]
+    for i in range(ranges.shape[0]):
+        if np.isfinite(ranges[i]):
+            value = math.floor(ranges[i] / step + 0.5) * step
+            if value > limits[1] + ROUNDING:
+                value -= step
+            elif value < limits[0] - ROUNDING:
+                value += step
+            ranges[i] = value
+
+
+@njit(cache=True)
+def _drop(ranges, limits, share, far, seed, counter):  # type: ignore[no-untyped-def]
+    count = ranges.shape[0]
+    for i in range(count):
+        if ranges[i] < np.inf:
+            reach = max(ranges[i], 0.0) / limits[1]
+            draw = random.uniform(seed, random.DROPOUT_STREAM, counter * count + i)
+            if draw < share + far * reach * reach:
+                ranges[i] = np.inf
+
+
+@njit(cache=True)
+def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
+    """The pose `ago` seconds before a pose, at a constant body twist, along the exact arc.
+
+    Args:
+        out: (3,) result; its heading is not wrapped.
+        pose: (3,) x [m], y [m], heading [rad].
+        twist: (3,) vx [m/s], vy [m/s], wz [rad/s].
+        ago: [s].
+    """
+    turn = -twist[2] * ago
+    half = 0.5 * turn
+    # The chord of the arc, which points half the turn away: |chord| = arc * sin(half) / half.
+    chord = 1.0 - half * half / 6.0 if abs(half) < 1e-4 else math.sin(half) / half
+    c, s = math.cos(pose[2] + half), math.sin(pose[2] + half)
+    x, y = -twist[0] * ago * chord, -twist[1] * ago * chord
+    out[0] = pose[0] + c * x - s * y
+    out[1] = pose[1] + s * x + c * y
+    out[2] = pose[2] + turn
+
+
+@njit(cache=True)
+def slice_poses(out, pose, twist, sweep, direction):  # type: ignore[no-untyped-def]
+    """Where the robot was when each of G equal groups of beams was measured.
+
+    Group g holds the beams from `g * B // G` to `(g + 1) * B // G`; its pose is that of the
+    middle of its time. The sweep ends at `pose`: the newest beam is the last one, or beam 0
+    of a device that turns clockwise.
+
+    Args:
+        out: (G, 3) result; headings are not wrapped.
+        pose: (3,) at the end of the sweep.
+        twist: (3,) body twist during the sweep.
+        sweep: from the first beam to the last [s].
+        direction: of the column SKEW.
+    """
+    count = out.shape[0]
+    for g in range(count):
+        ago = 0.0
+        if direction != AT_ONCE:
+            later = count - 1 - g if direction > AT_ONCE else g
+            ago = sweep * (later + 0.5) / count
+        slice_pose(out[g], pose, twist, ago)

@@ -1,0 +1,266 @@
+"""The shapes of obstacles and footprints, and the arrays that the kernels know them by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, TypeAdapter, field_validator, model_validator
+
+from nics_drl_bridge.config import Schema
+from nics_drl_bridge.errors import ModelError
+
+Array = NDArray[np.float64]
+MOST_CORNERS = 16_384
+SAME_PLACE = 1e-9
+"""Corners this near to each other, in parts of the shape's radius, coincide."""
+
+
+class Circle(Schema):
+    """A disc around its own origin.
+
+    Attributes:
+        radius: [m].
+    """
+
+    kind: Literal["circle"] = "circle"
+    radius: float = Field(gt=0.0)
+
+    @cached_property
+    def outline(self) -> Array:
+        """(0, 2): a circle has no corners."""
+        return np.zeros((0, 2))
+
+
+class Rectangle(Schema):
+    """A square, a box, a strip: around its own origin, along its own axes.
+
+    Attributes:
+        size: length along x and width along y [m].
+    """
+
+    kind: Literal["rectangle"] = "rectangle"
+    size: tuple[float, float]
+
+    @model_validator(mode="after")
+    def _extended(self) -> Rectangle:
+        if min(self.size) <= 0.0:
+            raise ValueError("size must be greater than 0; a wall without thickness is a segment")
+        return self
+
+    @cached_property
+    def outline(self) -> Array:
+        """(4, 2) corners, counter-clockwise [m]."""
+        x, y = self.size[0] / 2.0, self.size[1] / 2.0
+        return np.array([(x, y), (-x, y), (-x, -y), (x, -y)])
+
+    @property
+    def radius(self) -> float:
+        """Of the circle around the origin that holds the shape [m]."""
+        return _reach(self.outline)
+
+
+class Polygon(Schema):
+    """Any outline of straight edges, convex or concave; the last corner joins the first.
+
+    Attributes:
+        points: corners in the shape's own frame, either way round [m].
+    """
+
+    kind: Literal["polygon"] = "polygon"
+    points: tuple[tuple[float, float], ...] = Field(min_length=3, max_length=MOST_CORNERS)
+
+    @field_validator("points")
+    @classmethod
+    def _distinct(cls, points: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+        if len(set(points)) < 3:
+            raise ValueError("a polygon needs at least 3 different corners")
+        return points
+
+    @cached_property
+    def outline(self) -> Array:
+        """(V, 2) corners, counter-clockwise [m]."""
+        corners = np.array(self.points, dtype=np.float64)
+        x, y = corners.T
+        twice_area = np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)
+        return corners if twice_area >= 0.0 else np.ascontiguousarray(corners[::-1])
+
+    @property
+    def radius(self) -> float:
+        """Of the circle around the origin that holds the shape [m]."""
+        return _reach(self.outline)
+
+
+class Segment(Schema):
+    """A straight wall without thickness.
+
+    Attributes:
+        ends: its two ends in the shape's own frame [m].
+    """
+
+    kind: Literal["segment"] = "segment"
+    ends: tuple[tuple[float, float], tuple[float, float]]
+
+    @model_validator(mode="after")
+    def _extended(self) -> Segment:
+        if self.ends[0] == self.ends[1]:
+            raise ValueError("ends must be two different points")
+        return self
+
+    @cached_property
+    def outline(self) -> Array:
+        """(2, 2) ends [m]."""
+        return np.array(self.ends, dtype=np.float64)
+
+    @property
+    def radius(self) -> float:
+        """Of the circle around the origin that holds the shape [m]."""
+        return _reach(self.outline)
+
+
+Shape = Annotated[Circle | Rectangle | Polygon | Segment, Field(discriminator="kind")]
+SHAPES: TypeAdapter[tuple[Shape, ...]] = TypeAdapter(tuple[Shape, ...])
+SQUARE = Rectangle(size=(0.3, 0.3))
+STRIP = Rectangle(size=(0.6, 0.06))
+
+BODY = 7
+"""Columns of a placed body: x, y, heading, cos, sin, radius (0: none), index of its shape."""
+X, Y, HEADING, COS, SIN, RADIUS, SHAPE = range(BODY)
+
+
+def _reach(outline: Array) -> float:
+    return float(np.hypot(*outline.T).max())
+
+
+def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
+    """Puts shapes into a world.
+
+    Args:
+        poses: (..., 3) x, y [m], heading [rad] of each shape's own frame.
+        radii: (...) of each shape [m]; 0 where there is none.
+        shapes: (...) index of each shape.
+
+    Returns:
+        (..., 7) bodies, see `BODY`.
+    """
+    poses = np.asarray(poses, dtype=np.float64)
+    bodies = np.empty((*poses.shape[:-1], BODY))
+    bodies[..., :3] = poses
+    bodies[..., COS], bodies[..., SIN] = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    bodies[..., RADIUS], bodies[..., SHAPE] = radii, shapes
+    return bodies
+
+
+def convex_hull(points: Array) -> Array:
+    """(P, 2) corners of the convex hull, counter-clockwise, without those on its edges.
+
+    The monotone chain of Andrew (1979).
+    """
+    ordered = sorted({(float(x), float(y)) for x, y in points})
+    if len(ordered) < 3:
+        return np.array(ordered)
+    reach = _reach(points)
+
+    def half(corners: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+        chain: list[tuple[float, float]] = []
+        for x, y in corners:
+            while len(chain) > 1:
+                (ax, ay), (bx, by) = chain[-2:]
+                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 1e-12 * reach * reach:
+                    break
+                chain.pop()
+            chain.append((x, y))
+        return chain[:-1]
+
+    return np.array(half(ordered) + half(ordered[::-1]))
+
+
+def rotational_order(outline: Array, hull: Array) -> int:
+    """How often a shape looks the same in one turn: a square 4 times, most shapes once."""
+    if len(outline) < 3:
+        return 1
+    tolerance = SAME_PLACE * _reach(outline)
+    for order in range(len(outline), 1, -1):
+        if len(outline) % order or len(hull) % order:
+            continue
+        angle = 2.0 * np.pi / order
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        if all(
+            np.abs(corners @ turn - np.roll(corners, -len(corners) // order, axis=0)).max()
+            < tolerance
+            for corners in (outline, hull)
+        ):
+            return order
+    return 1
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """Some shapes as flat arrays.
+
+    Attributes:
+        shapes: H of them.
+        corners: (sum V, 2) corners of all outlines, one after the other [m].
+        corner: (H + 1,) where each outline begins in `corners`; a circle has none.
+        hulls: corners of all convex hulls, each written twice, so that an index may run over
+            its end; a circle has its centre.
+        hull: (H + 1,) where each hull begins in `hulls`.
+        radii: (H,) [m].
+        orders: (H,) rotational order.
+    """
+
+    shapes: tuple[Shape, ...]
+    corners: Array
+    corner: NDArray[np.int64]
+    hulls: Array
+    hull: NDArray[np.int64]
+    radii: Array
+    orders: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, shapes: Sequence[Shape]) -> Outlines:
+        """The arrays of some shapes."""
+        outlines = [shape.outline for shape in shapes]
+        hulls = [convex_hull(o) if len(o) else np.zeros((1, 2)) for o in outlines]
+        orders = [rotational_order(o, h) for o, h in zip(outlines, hulls, strict=True)]
+        twice = [np.concatenate([hull, hull]) for hull in hulls]
+        nothing = np.zeros((0, 2))
+        return cls(
+            tuple(shapes),
+            np.concatenate([nothing, *outlines]),
+            np.cumsum([0, *map(len, outlines)]),
+            np.concatenate([nothing, *twice]),
+            np.cumsum([0, *map(len, twice)]),
+            np.array([shape.radius for shape in shapes], dtype=np.float64),
+            np.array(orders, dtype=np.int64),
+        )
+
+    @property
+    def arguments(self) -> tuple[Array, NDArray[np.int64]]:
+        """What the exact kernels need: corners, and where each outline begins."""
+        return self.corners, self.corner
+
+    def index_of(self, shape: Shape) -> int:
+        """Where a shape stands. Raises ModelError when it is none of them."""
+        try:
+            return self.shapes.index(shape)
+        except ValueError:
+            raise ModelError(
+                f"the shape {describe(shape)} is not in the lidar table, which holds "
+                f"{', '.join(map(describe, self.shapes)) or 'none'}; bake it as well."
+            ) from None
+
+
+def describe(shape: Shape) -> str:
+    """A shape in a few words."""
+    if isinstance(shape, Circle):
+        return f"circle of radius {shape.radius:g} m"
+    if isinstance(shape, Rectangle):
+        return f"rectangle of {shape.size[0]:g} x {shape.size[1]:g} m"
+    if isinstance(shape, Segment):
+        return f"segment of {np.hypot(*np.subtract(*shape.ends)):.3g} m"
+    return f"polygon of {len(shape.points)} corners, radius {shape.radius:.3g} m"
