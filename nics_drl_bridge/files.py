@@ -55,6 +55,31 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode())
 
 
+def check_folder(path: Path, marker: str) -> Path:
+    """Makes sure that `whole_folder` can make a folder, without making anything.
+
+    Returns:
+        The path without links: a link stays, the folder behind it is replaced.
+
+    Raises:
+        ConfigError: `path` is a file, a folder of another kind, or lies where nothing can be
+            written.
+    """
+    path = path.resolve()
+    if path.exists() and not path.is_dir():
+        raise ConfigError(f"{path}: is a file, not a folder; give the name of a folder.")
+    if path.is_dir() and any(path.iterdir()) and not (path / marker).exists():
+        raise ConfigError(
+            f"{path}: holds other files and no {marker!r}; give a new folder, or empty this one."
+        )
+    above = next(parent for parent in path.parents if parent.exists())
+    if not above.is_dir():
+        raise ConfigError(f"{path}: {above} is a file, not a folder; choose another place.")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise ConfigError(f"{path}: {above} can't be written to; choose another place.")
+    return path
+
+
 @contextmanager
 def whole_folder(path: Path, marker: str) -> Iterator[Path]:
     """Gives a temporary folder that takes the place of `path` when the block ends well.
@@ -68,15 +93,9 @@ def whole_folder(path: Path, marker: str) -> Iterator[Path]:
         The temporary folder, beside `path`. After an error nothing is left of it.
 
     Raises:
-        ConfigError: `path` is a file, or a folder of another kind.
+        ConfigError: see `check_folder`.
     """
-    path = path.resolve()  # a link stays, the folder behind it is replaced
-    if path.exists() and not path.is_dir():
-        raise ConfigError(f"{path}: is a file, not a folder; give the name of a folder.")
-    if path.is_dir() and any(path.iterdir()) and not (path / marker).exists():
-        raise ConfigError(
-            f"{path}: holds other files and no {marker!r}; give a new folder, or empty this one."
-        )
+    path = check_folder(path, marker)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
     try:

@@ -13,9 +13,10 @@ from pydantic import Field
 from nics_drl_bridge.calibration.calibration import Calibration
 from nics_drl_bridge.calibration.fit_report import fit_report
 from nics_drl_bridge.calibration.identify import Identified, identify
+from nics_drl_bridge.calibration.noise_model import Noise
 from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError, ModelError
-from nics_drl_bridge.files import sha256, whole_folder, write_bytes, write_text
+from nics_drl_bridge.files import check_folder, sha256, whole_folder, write_bytes, write_text
 from nics_drl_bridge.kinematics import fit, textbook
 from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.recording import Recording
@@ -23,28 +24,22 @@ from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import LidarTable, bake
 
-FORMAT = "nics_drl_bridge/simulator_model/1"
+__all__ = [
+    "Noise",
+    "SimulatorModel",
+    "builtin_model",
+    "check_place",
+    "generate",
+    "load_model",
+    "open_model",
+    "save_model",
+]
+
+FORMAT = "nics_drl_bridge/simulator_model/2"
 MODEL_FILE, TABLE_FILE, REPORT_FILE = "model.yaml", "lidar_table.npz", "report.txt"
 CONTROL_PERIOD_S = 0.1
 DEFAULT_LIDAR = "paper"
 BUILTIN_SEED = 0
-
-
-class Noise(Schema):
-    """How wrong the wheels' odometry is, as standard deviations of the measured twist.
-
-    Attributes:
-        odom_linear_std: [m/s].
-        odom_angular_std: [rad/s].
-    """
-
-    odom_linear_std: float = Field(default=0.01, ge=0.0)
-    odom_angular_std: float = Field(default=0.01, ge=0.0)
-
-    @property
-    def odometry(self) -> tuple[float, float]:
-        """Linear [m/s] and angular [rad/s]."""
-        return self.odom_linear_std, self.odom_angular_std
 
 
 @dataclass(frozen=True)
@@ -57,7 +52,7 @@ class SimulatorModel:
         calibration: clock offset, latency, sensor frames, noise of the recording.
         lidar: the sensor.
         table: baked ranges of circles.
-        noise: of the odometry.
+        noise: of sensors and motion, see `Noise`.
         control_period: time between commands [s]; a whole number of `kinematics.dt`.
         report: how the model came about, as text for people.
     """
@@ -161,6 +156,7 @@ def generate(
     table = bake(lidar, (*radii, robot.footprint_radius))
     model = SimulatorModel(
         robot, identified.model, identified.calibration, lidar, table,
+        identified.noise,
         report=fit_report(recording.source, robot, identified),
     )  # fmt: skip
     return model, identified
@@ -183,7 +179,17 @@ def open_model(name: str) -> SimulatorModel:
     try:
         return builtin_model(name)
     except ConfigError as error:
-        raise ModelError(f"{error} (or the folder of a model).") from None
+        reason = str(error).removesuffix(".")
+        raise ModelError(f"{reason}; there is no folder of this name either.") from None
+
+
+def check_place(folder: Path) -> None:
+    """Makes sure, before the work of a fit, that `save_model` can write to a folder.
+
+    Raises:
+        ConfigError: the folder holds something else, or nothing can be written there.
+    """
+    check_folder(folder, MODEL_FILE)
 
 
 def save_model(model: SimulatorModel, folder: Path) -> None:

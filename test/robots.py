@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from nics_drl_bridge.calibration.calibration import Calibration
-from nics_drl_bridge.generator import Noise, SimulatorModel
+from nics_drl_bridge.calibration.noise_model import Level, Noise
+from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.lidar.spec import LidarSpec
@@ -64,7 +65,10 @@ def direct_model(
         Calibration(command_latency_s=latency),
         sensor,
         bake(sensor, (RADIUS, FOOTPRINT)),
-        Noise(odom_linear_std=odometry[0], odom_angular_std=odometry[1]),
+        Noise(
+            odom_linear=Level(std=odometry[0], unit="m/s"),
+            odom_angular=Level(std=odometry[1], unit="rad/s"),
+        ),
     )
 
 

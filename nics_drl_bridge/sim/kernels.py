@@ -18,6 +18,7 @@ from nics_drl_bridge.sim.world import wall_distance
 
 ODOMETRY_STREAM = 2
 RANGE_STREAM = 3
+DRIFT_STREAM = 4
 
 
 @njit(cache=True)
@@ -189,6 +190,32 @@ def measure(odom, twist, before, after, now, seed, counter, std, period, series)
 
 
 @njit(cache=True)
+def disturb(pose, state, std, seed, counter, period, series):  # type: ignore[no-untyped-def]
+    """Moves a robot by what its model does not explain, growing with the root of the time.
+
+    Args:
+        pose: (3,), in place.
+        state: (S,), in place.
+        std: (3 + S,) along x, y and heading of the body, and of the state, after a second.
+        seed, counter: of the random draws.
+        period: [s].
+        series: see `kinematics.kernels`.
+    """
+    # Uniform draws of this variance are cheap, and over some periods they add up to a normal one.
+    count, scale = std.shape[0], math.sqrt(12.0 * period)
+    aside = np.zeros(3)
+    for i in range(count):
+        if std[i] > 0.0:
+            share = random.uniform(seed, DRIFT_STREAM, counter * count + i) - 0.5
+            draw = scale * std[i] * share
+            if i < 3:
+                aside[i] = draw
+            else:
+                state[i - 3] += draw
+    advance(pose, aside, 1.0, series)
+
+
+@njit(cache=True)
 def scan_robot(ranges, pose, me, bodies, walls, sensor, noise_std, seed, counter):  # type: ignore[no-untyped-def]
     """One scan (B,) of everything but the robot itself, with Gaussian noise.
 
@@ -218,7 +245,8 @@ def step_worlds(arrays, commands, walls, footprint, noise, sensor, lanes, motion
         commands: (N, M, C).
         walls: (W, 4).
         footprint: radius [m].
-        noise: odometry linear and angular, range: standard deviations.
+        noise: standard deviations of the odometry, linear and angular, of a range, and (3 + S)
+            of the drift after a second.
         sensor: see `lidar.scanner.Scanner.arguments`.
         lanes, motion, room: see the functions above.
     """
@@ -238,8 +266,14 @@ def step_worlds(arrays, commands, walls, footprint, noise, sensor, lanes, motion
     x, dq, _ = room
     terms, _, timing = motion
     period = timing[0] * timing[1]
+    first, drifts = bodies.shape[1] - robots, noise[3:].any()
     for n in range(worlds):
         steps[n] += 1
+        for m in range(robots):
+            if drifts and collided[n, m] == 0:
+                counter = steps[n] * robots + m
+                disturb(pose[n, m], state[n, m], noise[3:], seeds[n], counter, period, motion[1])
+                bodies[n, first + m, 0], bodies[n, first + m, 1] = pose[n, m, 0], pose[n, m, 1]
         for m in range(robots):
             counter = steps[n] * robots + m
             _rates_now(dq, x, state[n, m], history[n, m], terms, timing)

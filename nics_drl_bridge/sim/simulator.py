@@ -82,7 +82,8 @@ class FastSimulator:
         self._scanner = make_scanner(model.lidar, (*world.obstacles.radii, footprint), renderer)
         self._footprint_shape = self._scanner.table.shape_of(footprint)
         self._walls = world.all_walls()
-        self._noise = np.array([*model.noise.odometry, model.lidar.noise_std])
+        drift = model.noise.simulated_drift(model.robot)
+        self._noise = np.array([*model.noise.odometry, model.lidar.noise_std, *drift])
         self._sensor = self._scanner.arguments
         self._motion = (term_arrays(model.kinematics), SERIES, model.timing)
         self._room = (*scratch(model.kinematics), np.zeros((robots, 2)))

@@ -11,6 +11,7 @@ from geometry_msgs.msg import Quaternion
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import LaserScan
 
+from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.nodes import conversions
 
@@ -112,3 +113,12 @@ def test_ranges_taken_from_a_message_are_a_copy():
     ranges = conversions.scan_from_ros(message)
     ranges[0] = 9.0
     assert message.ranges[0] == 1.0
+
+
+def test_a_state_is_told_by_joints_of_its_names():
+    car = load_robot("ackermann")
+    message = over_the_wire(conversions.joints_to_ros(car, [0.7, -0.3], 5_000_000_007))
+    assert conversions.stamp_from_ros(message.header.stamp) == 5_000_000_007
+    assert message.name == ["speed", "steering"]
+    assert list(message.velocity) == [0.7, 0.0]
+    assert list(message.position) == [0.0, -0.3]
