@@ -98,6 +98,7 @@ setup(
             f"middleware_node = {PACKAGE}.nodes.start:middleware_node",
             f"policy_node = {PACKAGE}.nodes.start:policy_node",
             f"command_gate = {PACKAGE}.nodes.start:command_gate",
+            f"record_node = {PACKAGE}.nodes.start:record_node",
         ],
         # For tools that list environments; gymnasium itself stopped reading this in 1.0.
         "gymnasium.envs": [f"NicsBridge = {PACKAGE}.env.registration:register_envs"],

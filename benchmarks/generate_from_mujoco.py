@@ -1,10 +1,10 @@
 """Robots in MuJoCo: how well, and how much faster, does the generated model predict them?
 
-Each robot drives in MuJoCo, on real wheels with contact; a model is fitted to that drive. Then
-the robot drives anew, with other seeds and commands held for other times, and the model predicts
-the pose 5 s ahead by the commands alone, from every tenth of a second. The poses are those of
-base_link on the clock of the commands, so that there is nothing to calibrate. Speed is simulated
-seconds per second of one thread, both sides in this run.
+Each robot drives in MuJoCo, on real wheels with contact, and a model is made of that drive as
+`nics generate` makes it: calibration, fit, pruning at the knee, refinement; the same settings for
+all robots. Then the robot drives anew, with other seeds and commands held for other times, and the
+model predicts the pose 5 s ahead by the commands alone, from every tenth of a second. Speed is
+simulated seconds per second of one thread, both sides in this run.
 """
 
 from __future__ import annotations
@@ -17,48 +17,40 @@ from collections.abc import Callable
 
 import numpy as np
 
-from nics_drl_bridge.calibration.align import align
-from nics_drl_bridge.calibration.calibration import Calibration
+from nics_drl_bridge.calibration.identify import Identified, identify
 from nics_drl_bridge.calibration.open_loop import open_loop_error
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.highfidelity.drive import record
 from nics_drl_bridge.highfidelity.robot import MujocoRobot
-from nics_drl_bridge.kinematics.fit import fit
 from nics_drl_bridge.kinematics.kernels import SERIES, rollout, run, term_arrays
 from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
 
-ORDER_ALPHA = {"ackermann": (3, 0.99), "differential": (2, 0.99), "mecanum": (2, 0.999)}
-"""Of the Taylor model and of its pruning (Eq. 2). The tangent of a steering angle asks for more
-than the paper's order 2. Four wheels that move in three ways make large terms that nearly cancel:
-at 0.99 the mecanum robot loses small ones that matter, and its error grows tenfold."""
-UNSEEN = ((201, 0.5), (202, 1.0), (203, 0.3))
-"""Seed of each unseen drive, and how long it holds a command [s]."""
+ROBOTS = ("ackermann", "differential", "mecanum")
+FIRST_SEED = 201
+HOLDS_S = (0.5, 1.0, 0.3, 2.0)
+"""How long the unseen drives hold a command, in turn [s]."""
 BATCH, HOLDS = 1024, 20
 ROUNDS = 3
 
 
-def learn(recording: Recording, spec: RobotSpec) -> TaylorModel:
-    """Fits a model to a recording that needs no calibration."""
-    samples = align(recording, Calibration(), spec)
-    order, alpha = ORDER_ALPHA[spec.name]
-    return fit(samples, spec, order, alpha, noisy=True).model
-
-
-def errors(model: TaylorModel, drives: list[Recording], spec: RobotSpec) -> dict[str, float]:
+def errors(found: Identified, drives: list[Recording], spec: RobotSpec) -> dict[str, float]:
     """Mean errors of the predictions on unseen drives, each as long as the others."""
-    found = [open_loop_error(model, Calibration(), d, spec, 0.0, d.pose.t[-1]) for d in drives]
-    shares = [f.mean_position_error_m / f.mean_path_m for f in found]
-    path = float(np.mean([f.mean_path_m for f in found]))
-    position = float(np.mean([f.mean_position_error_m for f in found]))
+    results = [
+        open_loop_error(found.model, found.calibration, d, spec, 0.0, d.pose.t[-1]) for d in drives
+    ]
+    shares = [f.mean_position_error_m / f.mean_path_m for f in results]
+    path = float(np.mean([f.mean_path_m for f in results]))
+    position = float(np.mean([f.mean_position_error_m for f in results]))
     return {
         "position_error_over_path": position / path,
         "worst_drive_error_over_path": max(shares),
         "mean_position_error_m": position,
-        "mean_heading_error_rad": float(np.mean([f.mean_heading_error_rad for f in found])),
+        "mean_heading_error_rad": float(np.mean([f.mean_heading_error_rad for f in results])),
         "mean_path_m": path,
-        "windows": sum(f.windows for f in found),
+        "unseen_drives": len(drives),
+        "windows": sum(f.windows for f in results),
     }
 
 
@@ -127,30 +119,34 @@ def best_time(work: Callable[[], None]) -> float:
     return min(times)
 
 
-def measure(name: str, train: float, unseen: float) -> dict[str, float]:
+def measure(name: str, given: argparse.Namespace) -> dict[str, float]:
     """All figures of one robot."""
     spec = load_robot(name)
     robot = MujocoRobot(spec)
-    recording = record(robot, np.random.default_rng(0), train)
+    recording = record(robot, np.random.default_rng(given.seed), given.train)
     drives = [
-        record(robot, np.random.default_rng(seed), unseen, hold=hold) for seed, hold in UNSEEN
+        record(
+            robot,
+            np.random.default_rng(FIRST_SEED + n),
+            given.unseen,
+            hold=HOLDS_S[n % len(HOLDS_S)],
+        )
+        for n in range(given.drives)
     ]
     begin = time.perf_counter()
-    model = learn(recording, spec)
-    seconds = time.perf_counter() - begin
+    found = identify(recording, spec, alpha="auto")
+    seconds, model = time.perf_counter() - begin, found.model
     physics = mujoco_speed(robot, 4.0)
     batched, single = batched_speed(model, spec), single_speed(model, spec)
     return {
-        **errors(model, drives, spec),
+        **errors(found, drives, spec),
         "speed_up_batched": batched / physics,
         "speed_up_single": single / physics,
         "mujoco_seconds_per_second": physics,
         "model_seconds_per_second_batched": batched,
         "model_seconds_per_second_single": single,
         "terms_kept": model.terms_kept,
-        "order": ORDER_ALPHA[name][0],
-        "alpha": ORDER_ALPHA[name][1],
-        "seconds_to_fit": seconds,
+        "seconds_to_identify": seconds,
     }
 
 
@@ -171,10 +167,12 @@ def main() -> int:
     parser.add_argument(
         "--unseen", type=float, default=20.0, help="length of each unseen drive [s]"
     )
-    parser.add_argument("--robots", nargs="+", choices=list(ORDER_ALPHA), default=list(ORDER_ALPHA))
+    parser.add_argument("--drives", type=int, default=8, help="number of unseen drives")
+    parser.add_argument("--seed", type=int, default=0, help="of the drive to learn")
+    parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS))
     given = parser.parse_args()
     try:
-        robots = {name: measure(name, given.train, given.unseen) for name in given.robots}
+        robots = {name: measure(name, given) for name in given.robots}
     except BridgeError as error:
         print(error, file=sys.stderr)
         return 2

@@ -11,7 +11,7 @@ from nics_drl_bridge.sim.world import load_world
 
 robot, world = load_robot("differential"), load_world("arena")
 recording = textbook.record(robot, np.random.default_rng(0))
-model, _ = generate(recording, robot, load_lidar("paper"), world.obstacles.radii)
+model, _ = generate(recording, robot, load_lidar("paper"), world.shapes)
 print(model.report)
 
 simulator = FastSimulator(model, world, worlds=64)

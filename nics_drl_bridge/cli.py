@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +12,10 @@ import typer
 
 from nics_drl_bridge import __version__
 from nics_drl_bridge.errors import BridgeError
+
+# Before numpy is first imported: on matrices as small as a fit's, several threads wait for each
+# other, and on a busy machine a fit takes ten times as long.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -25,6 +30,17 @@ app = typer.Typer(
 RobotOption = Annotated[str, typer.Option(help="A shipped robot (ackermann) or a YAML file.")]
 WorldOption = Annotated[
     str, typer.Option("--world", "--scene", help="A shipped world (arena) or a YAML file.")
+]
+TopicsOption = Annotated[
+    Path | None, typer.Option(help="YAML file that says which topic of a bag plays which role.")
+]
+TopicOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ROLE=TOPIC",
+        help="The same for one role, as cmd_vel=/car/drive; may be given several times. Roles: "
+        "cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.",
+    ),
 ]
 
 
@@ -67,9 +83,13 @@ def _options(
 
 @app.command()
 def generate(
-    recording: Annotated[Path, typer.Argument(help="An .npz recording, or a folder of CSV files.")],
+    recording: Annotated[
+        Path, typer.Argument(help="A rosbag2, an .npz recording, or a folder of CSV files.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder of the model to write.")],
     robot: RobotOption = "ackermann",
+    topics: TopicsOption = None,
+    topic: TopicOption = None,
     world: WorldOption = "arena",
     lidar: Annotated[str, typer.Option(help="A shipped lidar (paper) or a YAML file.")] = "paper",
     order: Annotated[int, typer.Option(min=1, max=4, help="Order of the Taylor model.")] = 2,
@@ -88,22 +108,21 @@ def generate(
 ) -> None:
     """Generates a simulator from a recording and writes it as a folder."""
     with _one_sentence():
+        from nics_drl_bridge.generator import check_place, save_model
         from nics_drl_bridge.generator import generate as generate_model
-        from nics_drl_bridge.generator import save_model
         from nics_drl_bridge.kinematics.dof import parse_alpha
         from nics_drl_bridge.kinematics.readers import read_recording
         from nics_drl_bridge.kinematics.spec import load_robot
+        from nics_drl_bridge.kinematics.topic_roles import topic_roles
         from nics_drl_bridge.lidar.spec import load_lidar
         from nics_drl_bridge.sim.world import load_world
 
-        spec, radii, sensor = (
-            load_robot(robot),
-            load_world(world).obstacles.radii,
-            load_lidar(lidar),
-        )
-        drive = read_recording(recording, spec)
+        check_place(out)
+        spec, sensor, threshold = load_robot(robot), load_lidar(lidar), parse_alpha(alpha)
+        shapes = load_world(world).shapes
+        drive = read_recording(recording, spec, topic_roles(topics, topic or ()))
         model, identified = generate_model(
-            drive, spec, sensor, radii, order, parse_alpha(alpha), assume_textbook, strict
+            drive, spec, sensor, shapes, order, threshold, assume_textbook, strict
         )
         save_model(model, out)
         if pictures:
@@ -112,6 +131,56 @@ def generate(
             write_pictures(spec, identified, out / "pictures")
         typer.echo(model.report.rstrip())
         typer.echo(f"model written to {out}")
+
+
+@app.command()
+def record(
+    out: Annotated[Path, typer.Option(help="An .npz file, or the folder of a rosbag2, to write.")],
+    robot: RobotOption = "ackermann",
+    bound: Annotated[
+        float, typer.Option(help="Radius of the circle around the start to keep within [m].")
+    ] = 2.0,
+    duration: Annotated[float, typer.Option(help="Of the drive [s].")] = 60.0,
+    speed: Annotated[float, typer.Option(help="Share of the greatest speeds to use.")] = 1.0,
+    seed: Annotated[int, typer.Option(help="Of the pattern.")] = 0,
+    namespace: Annotated[str, typer.Option(help="Namespace of the robot's topics.")] = "",
+    remap: Annotated[
+        list[str] | None, typer.Option(help="A topic's other name, as in odom:=/wheel_odometry.")
+    ] = None,
+    topics: Annotated[
+        Path | None, typer.Option(help="YAML file that names the joints of state and wheels.")
+    ] = None,
+    stamped: Annotated[bool, typer.Option(help="Send cmd_vel as TwistStamped.")] = False,
+    use_sim_time: Annotated[
+        bool, typer.Option("--use-sim-time", help="Take the time from /clock.")
+    ] = False,
+    preview: Annotated[
+        bool, typer.Option("--preview", help="Show what the drive will be, and stop.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask before the robot moves.")] = False,
+) -> None:
+    """Drives a robot over ROS 2 so that it shows its whole motion, and records it."""
+    with _one_sentence():
+        from nics_drl_bridge.nodes import recorder
+
+        order = recorder.Order(
+            robot, out, bound, duration, speed, seed, namespace, tuple(remap or ()), topics,
+            stamped, use_sim_time,
+        )  # fmt: skip
+        if not preview:
+            recorder.require_ros()  # first: where ROS 2 comes from wheels it begins Python anew
+        for line in recorder.preview(order):
+            typer.echo(line)
+        if preview:
+            return
+        if not yes and not typer.confirm("Drive the robot now?"):
+            typer.echo("nothing was driven or recorded.")
+            return
+        lines, whole = recorder.drive(order)
+        for line in lines:
+            typer.echo(line)
+        if not whole:
+            raise typer.Exit(EXIT_INTERRUPTED)
 
 
 @app.command()

@@ -239,6 +239,6 @@ def find_config(name: str, kind: str) -> Path:
         known = [file.stem for file in folder.glob("*.yaml")]
         raise ConfigError(
             f"unknown {kind.removesuffix('s')} {name!r}; {nearest(name, known)} "
-            f"(or give the path of a YAML file)"
+            "(or give the path of a YAML file)."
         )
     return path

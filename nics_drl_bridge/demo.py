@@ -25,6 +25,7 @@ from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.policy.evaluation import Episode, deviation, drive_all, successes
 from nics_drl_bridge.policy.policies import make_policy
+from nics_drl_bridge.report.calibration_pictures import CAPTIONS, calibration_pictures
 from nics_drl_bridge.report.fit_pictures import accuracy
 from nics_drl_bridge.report.page import Block, Code, Picture, Table, page
 from nics_drl_bridge.report.pictures import trajectories
@@ -105,9 +106,7 @@ def _generate(plan: Plan, say: Say) -> tuple[SimulatorModel, Identified]:
     say(f"generating a simulator of the robot {robot.name!r} from {source}")
     recording = read_recording(source, robot)
     # A demo has to steer, even if the drive never did; the report names what is assumed.
-    model, identified = generate(
-        recording, robot, load_lidar("paper"), world.obstacles.radii, assume=True
-    )
+    model, identified = generate(recording, robot, load_lidar("paper"), world.shapes, assume=True)
     save_model(model, plan.out / "model")
     say(model.report.rstrip())
     return model, identified
@@ -251,6 +250,10 @@ def _report(
                 Picture(
                     accuracy(identified),
                     "What each further term is worth; circles mark how many are kept.",
+                ),
+                *(
+                    Picture(picture, CAPTIONS[name])
+                    for name, picture in calibration_pictures(model.robot, identified).items()
                 ),
             ],
         ),

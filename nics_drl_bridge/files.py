@@ -6,18 +6,22 @@ import hashlib
 import io
 import os
 import shutil
+import struct
 import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
+
+_LOCAL_HEADER = struct.Struct("<4s5H3L2H")
+"""Of a zip entry; the last two are the lengths of its name and of its further fields."""
 
 
 def _fsync(path: Path) -> None:
@@ -55,6 +59,31 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode())
 
 
+def check_folder(path: Path, marker: str) -> Path:
+    """Makes sure that `whole_folder` can make a folder, without making anything.
+
+    Returns:
+        The path without links: a link stays, the folder behind it is replaced.
+
+    Raises:
+        ConfigError: `path` is a file, a folder of another kind, or lies where nothing can be
+            written.
+    """
+    path = path.resolve()
+    if path.exists() and not path.is_dir():
+        raise ConfigError(f"{path}: is a file, not a folder; give the name of a folder.")
+    if path.is_dir() and any(path.iterdir()) and not (path / marker).exists():
+        raise ConfigError(
+            f"{path}: holds other files and no {marker!r}; give a new folder, or empty this one."
+        )
+    above = next(parent for parent in path.parents if parent.exists())
+    if not above.is_dir():
+        raise ConfigError(f"{path}: {above} is a file, not a folder; choose another place.")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise ConfigError(f"{path}: {above} can't be written to; choose another place.")
+    return path
+
+
 @contextmanager
 def whole_folder(path: Path, marker: str) -> Iterator[Path]:
     """Gives a temporary folder that takes the place of `path` when the block ends well.
@@ -68,15 +97,9 @@ def whole_folder(path: Path, marker: str) -> Iterator[Path]:
         The temporary folder, beside `path`. After an error nothing is left of it.
 
     Raises:
-        ConfigError: `path` is a file, or a folder of another kind.
+        ConfigError: see `check_folder`.
     """
-    path = path.resolve()  # a link stays, the folder behind it is replaced
-    if path.exists() and not path.is_dir():
-        raise ConfigError(f"{path}: is a file, not a folder; give the name of a folder.")
-    if path.is_dir() and any(path.iterdir()) and not (path / marker).exists():
-        raise ConfigError(
-            f"{path}: holds other files and no {marker!r}; give a new folder, or empty this one."
-        )
+    path = check_folder(path, marker)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
     try:
@@ -111,17 +134,69 @@ def sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """The content of an `.npz` file; equal arrays give equal bytes, unlike `numpy.savez`."""
+ALIGNMENT = 64
+_PADDING = 0xD935
+"""Id of a zip entry's field that only fills up, the one that Android's zipalign takes."""
+
+
+def npz_bytes(arrays: Mapping[str, NDArray[Any]], packed: bool = True) -> bytes:
+    """The content of an `.npz` file; equal arrays give equal bytes, unlike `numpy.savez`.
+
+    Args:
+        arrays: by name.
+        packed: compressed; otherwise aligned so that `npz_mapped` can map them.
+    """
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(buffer, "w") as archive:
         for name, array in arrays.items():
             member = zipfile.ZipInfo(f"{name}.npy")  # dated 1980, not today
-            member.compress_type = zipfile.ZIP_DEFLATED
+            member.compress_type = zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED
             content = io.BytesIO()
             np.lib.format.write_array(content, np.asanyarray(array), allow_pickle=False)
+            if not packed:
+                begin = buffer.tell() + _LOCAL_HEADER.size + len(member.filename) + 4
+                fill = -begin % ALIGNMENT
+                member.extra = struct.pack("<HH", _PADDING, fill) + bytes(fill)
             archive.writestr(member, content.getvalue())
     return buffer.getvalue()
+
+
+def npz_mapped(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of an `.npz` file, mapped into memory: processes that map it share its pages.
+
+    They are copied when written to, the file stays. What is compressed is read instead.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    arrays = {}
+    try:
+        with zipfile.ZipFile(path) as archive, path.open("rb") as file:
+            for member in archive.infolist():
+                name = member.filename.removesuffix(".npy")
+                if member.compress_type != zipfile.ZIP_STORED:
+                    content = io.BytesIO(archive.read(member))
+                    arrays[name] = np.lib.format.read_array(content, allow_pickle=False)
+                    continue
+                file.seek(member.header_offset)
+                fields = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
+                file.seek(fields[-2] + fields[-1], os.SEEK_CUR)
+                version = np.lib.format.read_magic(file)
+                shape, fortran, dtype = _array_header(file, version)
+                size = int(np.prod(shape)) * dtype.itemsize
+                if fortran or dtype.hasobject or file.tell() + size > path.stat().st_size:
+                    raise ValueError(f"the array {name!r} is of a wrong kind or cut off")
+                mapped = np.memmap(path, dtype, "c", file.tell(), shape) if size else None
+                arrays[name] = np.zeros(shape, dtype) if mapped is None else np.asarray(mapped)
+    except (OSError, struct.error, zipfile.BadZipFile, zlib.error, KeyError, EOFError) as error:
+        raise ValueError(str(error) or type(error).__name__) from None
+    return arrays
+
+
+def _array_header(file: BinaryIO, version: tuple[int, int]) -> tuple[Any, bool, np.dtype[Any]]:
+    if version == (1, 0):
+        return np.lib.format.read_array_header_1_0(file)
+    return np.lib.format.read_array_header_2_0(file)
 
 
 def npz_arrays(data: bytes) -> dict[str, NDArray[Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -13,38 +14,35 @@ from pydantic import Field
 from nics_drl_bridge.calibration.calibration import Calibration
 from nics_drl_bridge.calibration.fit_report import fit_report
 from nics_drl_bridge.calibration.identify import Identified, identify
+from nics_drl_bridge.calibration.noise_model import Noise
 from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError, ModelError
-from nics_drl_bridge.files import sha256, whole_folder, write_bytes, write_text
+from nics_drl_bridge.files import check_folder, sha256, whole_folder, write_bytes, write_text
 from nics_drl_bridge.kinematics import fit, textbook
 from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
+from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.shapes import Circle, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
-from nics_drl_bridge.lidar.table import LidarTable, bake
+from nics_drl_bridge.lidar.table import LidarTable
 
-FORMAT = "nics_drl_bridge/simulator_model/1"
+__all__ = [
+    "Noise",
+    "SimulatorModel",
+    "builtin_model",
+    "check_place",
+    "generate",
+    "load_model",
+    "open_model",
+    "save_model",
+]
+
+FORMAT = "nics_drl_bridge/simulator_model/2"
 MODEL_FILE, TABLE_FILE, REPORT_FILE = "model.yaml", "lidar_table.npz", "report.txt"
 CONTROL_PERIOD_S = 0.1
 DEFAULT_LIDAR = "paper"
 BUILTIN_SEED = 0
-
-
-class Noise(Schema):
-    """How wrong the wheels' odometry is, as standard deviations of the measured twist.
-
-    Attributes:
-        odom_linear_std: [m/s].
-        odom_angular_std: [rad/s].
-    """
-
-    odom_linear_std: float = Field(default=0.01, ge=0.0)
-    odom_angular_std: float = Field(default=0.01, ge=0.0)
-
-    @property
-    def odometry(self) -> tuple[float, float]:
-        """Linear [m/s] and angular [rad/s]."""
-        return self.odom_linear_std, self.odom_angular_std
 
 
 @dataclass(frozen=True)
@@ -56,8 +54,8 @@ class SimulatorModel:
         kinematics: the fitted, pruned Taylor model.
         calibration: clock offset, latency, sensor frames, noise of the recording.
         lidar: the sensor.
-        table: baked ranges of circles.
-        noise: of the odometry.
+        table: baked ranges of the obstacles' shapes and of the robot itself.
+        noise: of sensors and motion, see `Noise`.
         control_period: time between commands [s]; a whole number of `kinematics.dt`.
         report: how the model came about, as text for people.
     """
@@ -136,7 +134,7 @@ def generate(
     recording: Recording,
     robot: RobotSpec,
     lidar: LidarSpec,
-    radii: tuple[float, ...],
+    shapes: Sequence[Shape],
     order: int = fit.ORDER,
     alpha: fit.Alpha = "auto",
     assume: bool = False,
@@ -148,7 +146,7 @@ def generate(
         recording: a drive of the robot.
         robot: what state and command are.
         lidar: the sensor to simulate.
-        radii: of the obstacles to bake [m]; the robot's own footprint is added.
+        shapes: of the obstacles to bake; the robot's own footprint is added.
         order: of the Taylor model.
         alpha: pruning threshold of Eq. 2, or `auto`.
         assume: fill in from the textbook what the drive did not show, marked as assumed.
@@ -158,9 +156,10 @@ def generate(
         The model, and all that was found out on the way.
     """
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
-    table = bake(lidar, (*radii, robot.footprint_radius))
+    table = bake(lidar, (*shapes, Circle(radius=robot.footprint_radius)))
     model = SimulatorModel(
         robot, identified.model, identified.calibration, lidar, table,
+        identified.noise,
         report=fit_report(recording.source, robot, identified),
     )  # fmt: skip
     return model, identified
@@ -183,7 +182,17 @@ def open_model(name: str) -> SimulatorModel:
     try:
         return builtin_model(name)
     except ConfigError as error:
-        raise ModelError(f"{error} (or the folder of a model).") from None
+        reason = str(error).removesuffix(".")
+        raise ModelError(f"{reason}; there is no folder of this name either.") from None
+
+
+def check_place(folder: Path) -> None:
+    """Makes sure, before the work of a fit, that `save_model` can write to a folder.
+
+    Raises:
+        ConfigError: the folder holds something else, or nothing can be written there.
+    """
+    check_folder(folder, MODEL_FILE)
 
 
 def save_model(model: SimulatorModel, folder: Path) -> None:
@@ -214,7 +223,7 @@ def load_model(folder: Path) -> SimulatorModel:
             "anew."
         )
     file = validate(data, _File, str(path))
-    table = _load_table(folder / TABLE_FILE, file.lidar_table_sha256)
+    table = LidarTable.load(folder / TABLE_FILE, file.lidar_table_sha256)
     try:
         return SimulatorModel(
             file.robot,
@@ -228,17 +237,3 @@ def load_model(folder: Path) -> SimulatorModel:
         )
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from None
-
-
-def _load_table(path: Path, checksum: str) -> LidarTable:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ModelError(
-            f"{path}: can't be read ({error.strerror}); generate the model anew."
-        ) from None
-    if sha256(data) != checksum:
-        raise ModelError(
-            f"{path}: does not match its checksum in {MODEL_FILE}; generate the model anew."
-        )
-    return LidarTable.parse(data, str(path))

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from nics_drl_bridge.calibration.calibration import Calibration
-from nics_drl_bridge.generator import Noise, SimulatorModel
+from nics_drl_bridge.calibration.noise_model import Level, Noise
+from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.lidar.table import bake
 from nics_drl_bridge.sim.world import World
 
 FOOTPRINT = 0.2
@@ -63,8 +65,11 @@ def direct_model(
         kinematics,
         Calibration(command_latency_s=latency),
         sensor,
-        bake(sensor, (RADIUS, FOOTPRINT)),
-        Noise(odom_linear_std=odometry[0], odom_angular_std=odometry[1]),
+        bake(sensor, (Circle(radius=RADIUS), Circle(radius=FOOTPRINT))),
+        Noise(
+            odom_linear=Level(std=odometry[0], unit="m/s"),
+            odom_angular=Level(std=odometry[1], unit="rad/s"),
+        ),
     )
 
 

@@ -10,7 +10,14 @@ import pytest
 
 from nics_drl_bridge import files
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import npz_bytes, sha256, whole_folder, write_bytes, write_text
+from nics_drl_bridge.files import (
+    check_folder,
+    npz_bytes,
+    sha256,
+    whole_folder,
+    write_bytes,
+    write_text,
+)
 
 MARKER = "model.yaml"
 
@@ -162,6 +169,17 @@ def test_a_file_is_not_taken_for_a_folder(tmp_path):
     ):
         pass
     assert tree(tmp_path) == {"out": b"a file"}
+
+
+def test_a_place_is_checked_without_making_anything(tmp_path, monkeypatch):
+    assert check_folder(tmp_path / "a" / "b", "model.yaml") == tmp_path / "a" / "b"
+    (tmp_path / "file").write_text("mine", encoding="utf-8")
+    with pytest.raises(ConfigError, match="is a file, not a folder; choose another place"):
+        check_folder(tmp_path / "file" / "b", "model.yaml")
+    monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)
+    with pytest.raises(ConfigError, match=f"{tmp_path} can't be written to"):
+        check_folder(tmp_path / "a" / "b", "model.yaml")
+    assert os.listdir(tmp_path) == ["file"]
 
 
 def test_an_empty_folder_is_filled(tmp_path):

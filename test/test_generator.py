@@ -11,6 +11,7 @@ from robots import direct_model, field
 
 from nics_drl_bridge import generator
 from nics_drl_bridge.calibration.calibration import Calibration
+from nics_drl_bridge.calibration.noise_model import Level
 from nics_drl_bridge.config import dump_yaml, parse_yaml
 from nics_drl_bridge.errors import BridgeError, ConfigError, ModelError
 from nics_drl_bridge.generator import (
@@ -94,7 +95,7 @@ def test_the_fingerprint_is_the_same_in_another_process():
 
 def test_every_part_that_the_simulator_uses_changes_the_fingerprint():
     model = direct_model()
-    noise = model.noise.model_copy(update={"odom_linear_std": 0.5})
+    noise = model.noise.model_copy(update={"odom_linear": Level(std=0.5, unit="m/s")})
     table = replace(model.table, rows=model.table.rows * np.float32(1.01))
     others = [
         direct_model(latency=0.1),
@@ -222,8 +223,11 @@ def test_a_model_is_opened_by_folder_or_by_the_name_of_a_robot(saved):
     ],
 )
 def test_a_name_that_is_no_model_is_refused(name, sentence):
-    with pytest.raises(ModelError, match=sentence):
+    with pytest.raises(ModelError) as caught:
         open_model(name)
+    assert sentence in str(caught.value)
+    assert ") (" not in str(caught.value)
+    assert not str(caught.value).endswith("..")
 
 
 def test_a_folder_without_a_model_is_refused(tmp_path):

@@ -16,7 +16,9 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "nics_drl_bridge"
-EXECUTABLES = {"nics", "simulator_node", "middleware_node", "policy_node", "command_gate"}
+EXECUTABLES = {
+    "nics", "simulator_node", "middleware_node", "policy_node", "command_gate", "record_node"
+}  # fmt: skip
 VERSION = "9.8.7"  # written into the package.xml of the copy, and nowhere else
 
 # Files added to the copy, deeper than any of today's: packaging that lists folders by hand,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.calibration import stamps
 from nics_drl_bridge.calibration.calibration import Calibration, Response
 from nics_drl_bridge.calibration.clocks import Timing, if_certain, timing_of
+from nics_drl_bridge.calibration.jackknife import jackknifed
 from nics_drl_bridge.calibration.mounting import (
     Mounting,
     lateral_lever,
@@ -26,6 +27,7 @@ from nics_drl_bridge.calibration.timing import (
     inferred_states,
     moved_commands,
 )
+from nics_drl_bridge.calibration.wheels import wheel_scales, wheels_swapped
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.kinematics.recording import Recording, check
 from nics_drl_bridge.kinematics.spec import RobotSpec
@@ -59,10 +61,7 @@ def examine(recording: Recording, spec: RobotSpec) -> tuple[Calibration, Finding
     _require_state(recording, spec)
     bursts = stamps.find_bursts(recording.pose.t)
     noise = pose_noise(recording.pose.values, bursts, recording.pose.t)
-    best = stamps.newest(recording.pose.t, bursts)
-    twists = motion(
-        recording.pose.t[best], recording.pose.values[best], bursts, noise or (0.0, 0.0)
-    )
+    twists = tracked_twists(recording)
     if len(twists.start) < stamps.MIN_STAMPS:
         raise RecordingError(
             f"{recording.source}: pose: only {len(twists.start)} usable intervals; record a drive "
@@ -77,12 +76,13 @@ def examine(recording: Recording, spec: RobotSpec) -> tuple[Calibration, Finding
         position_noise_m=noise[0] if noise else 0.0,
         heading_noise_rad=noise[1] if noise else 0.0,
         uncertainty=timing.sigma,
-        wheels_swapped=_wheels_swapped(recording, twists, timing.offset),
+        wheels_swapped=wheels_swapped(recording, twists, timing.offset),
     )
     calibration = _mounted(calibration, mounting)
     calibration = replace(
         calibration, responses=_responses(recording, spec, twists, calibration, timing)
     )
+    calibration = wheel_scales(recording, twists, calibration)
     findings = Findings(
         bursts=bursts,
         noise_known=noise is not None,
@@ -93,6 +93,14 @@ def examine(recording: Recording, spec: RobotSpec) -> tuple[Calibration, Finding
         unmoved=_unmoved(recording, spec),
     )
     return calibration, findings
+
+
+def tracked_twists(recording: Recording) -> Motion:
+    """Body twists of the tracked body over intervals as long as their noise asks for."""
+    t, pose = recording.pose.t, recording.pose.values
+    bursts = stamps.find_bursts(t)
+    best = stamps.newest(t, bursts)
+    return motion(t[best], pose[best], bursts, pose_noise(pose, bursts, t) or (0.0, 0.0))
 
 
 def _require_state(recording: Recording, spec: RobotSpec) -> None:
@@ -122,25 +130,39 @@ def _expected(recording: Recording, spec: RobotSpec, twists: Motion, timing: Tim
 def _mounting(
     recording: Recording, spec: RobotSpec, twists: Motion, timing: Timing
 ) -> Mounting | None:
+    if any(c.cmd_vel == "linear.y" for c in spec.command):
+        return jackknifed(
+            recording,
+            twists,
+            timing.offset,
+            lambda drive, rows: _by_commands(drive, spec, rows, timing),
+        )
     start, end = twists.start + timing.offset, twists.end + timing.offset
     command = held(recording.command, spec, start - timing.latency, end - timing.latency)
-    cmd_vel = spec.to_cmd_vel(command)
-    expected = _expected(recording, spec, twists, timing)
-    if any(c.cmd_vel == "linear.y" for c in spec.command):
-        response = command
-        if spec.state:
-            response = _as_commands(expected, recording, spec, timing.latency)
-        return mounting_by_commands(twists, spec.to_cmd_vel(response))
-    found = mounting_without_lateral_motion(twists, cmd_vel[:, 0])
+    found = mounting_without_lateral_motion(twists, spec.to_cmd_vel(command)[:, 0])
     speed = _speed_index(spec)
     if found is None or speed is None or np.isnan(found.lever_sigma[0]):
         return found
+    expected = _expected(recording, spec, twists, timing)
     lever_y, sigma = lateral_lever(twists, found.rotation, expected[:, speed])
     return replace(
         found,
         lever=np.array([found.lever[0], lever_y]),
         lever_sigma=np.array([found.lever_sigma[0], sigma]),
     )
+
+
+def _by_commands(
+    recording: Recording, spec: RobotSpec, twists: Motion, timing: Timing
+) -> Mounting | None:
+    """Mounting on a robot that moves in every direction."""
+    if spec.state:
+        expected = _expected(recording, spec, twists, timing)
+        command = _as_commands(expected, recording, spec, timing.latency)
+    else:
+        begin = twists.start + timing.offset - timing.latency
+        command = held(recording.command, spec, begin, begin + twists.end - twists.start)
+    return mounting_by_commands(twists, spec.to_cmd_vel(command))
 
 
 def _as_commands(states: Array, recording: Recording, spec: RobotSpec, latency: float) -> Array:
@@ -212,17 +234,3 @@ def _responses(
         Response(v.name, str(v.follows), float(lag), float(gain))
         for v, lag, gain in zip(spec.state, timing.lags, gains, strict=True)
     )
-
-
-def _wheels_swapped(recording: Recording, twists: Motion, offset: float) -> bool | None:
-    """Whether the left wheel is faster in left turns; None if the wheels don't tell."""
-    if recording.wheels is None:
-        return None
-    start, end = twists.start + offset, twists.end + offset
-    wheels = interval_means(recording.wheels.t, recording.wheels.values, start, end)
-    difference, turn = wheels[:, 1] - wheels[:, 0], twists.twist[:, 2]
-    size = float(np.sqrt((difference**2).mean() * (turn**2).mean()))
-    if size <= 0.0:
-        return None
-    agreement = float((difference * turn).mean()) / size
-    return agreement < 0.0 if abs(agreement) > 0.5 else None

@@ -43,6 +43,8 @@ class Calibration:
         burst_period_s: between the bursts in which poses arrived [s]; 0 without bursts.
         position_noise_m: standard deviation of x and y of the pose [m].
         heading_noise_rad: standard deviation of its heading [rad].
+        wheel_scale: speed per unit of the mean of both wheels [m/s]; None if not known.
+        turn_scale: yaw rate per unit of right wheel less left [rad/s]; None if not known.
         wheels_swapped: whether left and right wheel are interchanged; None if not known.
         uncertainty: standard uncertainty by the names above, for what was estimated.
         notes: what was found and what could not be learnt, one sentence each.
@@ -56,6 +58,8 @@ class Calibration:
     burst_period_s: float = 0.0
     position_noise_m: float = 0.0
     heading_noise_rad: float = 0.0
+    wheel_scale: float | None = None
+    turn_scale: float | None = None
     wheels_swapped: bool | None = None
     uncertainty: dict[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
@@ -99,6 +103,8 @@ class Calibration:
             "burst_period_s": self.burst_period_s,
             "position_noise_m": self.position_noise_m,
             "heading_noise_rad": self.heading_noise_rad,
+            "wheel_scale": self.wheel_scale,
+            "turn_scale": self.turn_scale,
             "wheels_swapped": self.wheels_swapped,
             "uncertainty": dict(self.uncertainty),
             "notes": list(self.notes),
@@ -112,6 +118,8 @@ class Calibration:
             swapped = data["wheels_swapped"]
             return cls(
                 **{name: float(data[name]) for name in _NUMBERS},
+                wheel_scale=_optional(data["wheel_scale"]),
+                turn_scale=_optional(data["turn_scale"]),
                 lever_arm_m=(float(x), float(y)),
                 responses=tuple(Response(**response) for response in data["responses"]),
                 wheels_swapped=None if swapped is None else bool(swapped),
@@ -132,3 +140,7 @@ _NUMBERS = (
     "position_noise_m",
     "heading_noise_rad",
 )
+
+
+def _optional(value: Any) -> float | None:
+    return None if value is None else float(value)

@@ -7,6 +7,7 @@ from textwrap import fill
 
 import numpy as np
 
+from nics_drl_bridge.calibration.estimates import estimates
 from nics_drl_bridge.calibration.identify import Identified
 from nics_drl_bridge.calibration.open_loop import OpenLoop
 from nics_drl_bridge.kinematics.accuracy import Curve
@@ -48,6 +49,12 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
         "",
         "Valid where the drive was:",
         *_box(model, spec),
+        "",
+        "Calibration (standard uncertainties):",
+        *_calibration(identified),
+        "",
+        "Noise that the simulator and the estimator use (standard deviations):",
+        *(f"  {line}" for line in identified.noise.sentences()),
         "",
         "Found, and not learnt:",
         *(_item(note) for note in identified.notes or ("Nothing had to be corrected.",)),
@@ -107,6 +114,11 @@ def _curve(curve: Curve) -> list[str]:
     more = f" ({len(curve.error) - 1} in all)" if shown < len(curve.error) else ""
     text = f"{curve.dof:<14} " + ", ".join(points) + more
     return fill(text, WIDTH, subsequent_indent=" " * 15).splitlines()
+
+
+def _calibration(identified: Identified) -> list[str]:
+    found = estimates(identified.recording, identified.calibration, identified.findings)
+    return [f"  {estimate.text}" for estimate in found.values()]
 
 
 def _item(note: str) -> str:

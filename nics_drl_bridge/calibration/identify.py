@@ -11,13 +11,15 @@ from nics_drl_bridge.calibration.assess import merged, unseen_samples, with_qual
 from nics_drl_bridge.calibration.assume import assume_textbook
 from nics_drl_bridge.calibration.calibrate import examine
 from nics_drl_bridge.calibration.calibration import Calibration
+from nics_drl_bridge.calibration.noise_model import Noise
 from nics_drl_bridge.calibration.open_loop import HORIZON_S, OpenLoop, open_loop_error, windows
 from nics_drl_bridge.calibration.plausibility import check_axes, check_units, mirror_note
-from nics_drl_bridge.calibration.refine import refine
+from nics_drl_bridge.calibration.refine import problem_of, refine
 from nics_drl_bridge.calibration.repair import repair
-from nics_drl_bridge.calibration.report import sentences
+from nics_drl_bridge.calibration.report import Findings, sentences
 from nics_drl_bridge.calibration.simplify import simplify
 from nics_drl_bridge.calibration.timing import SEARCH_S
+from nics_drl_bridge.calibration.unexplained import measure_noise
 from nics_drl_bridge.calibration.verdict import doubts, refuse_unexcited, unlearnt
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.kinematics.fit import ALPHA, ORDER, Alpha, Fit, fit
@@ -43,6 +45,8 @@ class Identified:
         train_until_s: where the training part ended, from the drive's first pose [s].
         held_out: open-loop errors on the rest; None if it was too short for them.
         alpha: of the pruning; `auto` for the knee of the accuracy curve.
+        noise: of sensors and motion, each level measured or assumed.
+        findings: of the calibration, for pictures.
         notes: sentences on what was found, what could not be learnt, what was assumed.
     """
 
@@ -55,6 +59,8 @@ class Identified:
     train_until_s: float
     held_out: OpenLoop | None
     alpha: Alpha
+    noise: Noise
+    findings: Findings
     notes: tuple[str, ...]
 
 
@@ -118,12 +124,14 @@ def identify(
         model, assumed = assume_textbook(model, spec, linear.unmoved)
         notes = (*notes, *assumed)
     unseen = unseen_samples(whole, calibration, spec, until)
+    noise = measure_noise(whole, calibration, model, align(whole, calibration, spec), spec)
     as_fitted = model is linear.model
     model = with_quality(model, linear, unseen, held_out, spec)
     linear = replace(linear, model=model) if as_fitted else linear
     return Identified(
-        model, calibration, linear, samples, unseen, whole, until, held_out, alpha, notes
-    )
+        model, calibration, linear, samples, unseen, whole, until, held_out, alpha, noise, findings,
+        notes,
+    )  # fmt: skip
 
 
 def cut(recording: Recording, until: float) -> Recording:
@@ -161,13 +169,13 @@ def _refined(
         return model, calibration, ()
     linear = model
     model, calibration = _by_definition(model.with_errors({}), calibration, spec)
-    refined = refine(model, calibration, training, spec, 0.0, until)
-    if refined is None:
+    problem = problem_of(model, calibration, training, spec, 0.0, until)
+    if problem is None:
         return merged(model, linear, {}), calibration, (
             "The training part is too short to refine the model by its errors over seconds; record "
             "a longer drive.",
         )  # fmt: skip
-    refined = simplify(refined, training, spec, 0.0, until)
+    refined = simplify(problem, refine(problem, model, calibration))
     note = (
         "Coefficients and calibration were refined by the open-loop errors over up to 5 s: "
         f"{refined.error:.4f} m (root mean square) is left on the training part."

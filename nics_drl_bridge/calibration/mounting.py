@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.calibration.noise import Motion
 from nics_drl_bridge.geometry import rotate, wrap_angle
+from nics_drl_bridge.kinematics.statistics import standard_errors
 
 Array = NDArray[np.float64]
 
@@ -108,9 +109,7 @@ def lateral_lever(motion: Motion, rotation: float, speed: Array) -> tuple[float,
     if size[1] < 2.0 * MIN_SECOND * size[0]:
         return 0.0, float("nan")
     beta = np.linalg.lstsq(chi, along, rcond=None)[0]
-    rest = along - chi @ beta
-    covariance = np.linalg.inv(chi.T @ chi) * float((rest**2).mean())
-    return -float(beta[1]), float(np.sqrt(covariance[1, 1]))
+    return -float(beta[1]), float(standard_errors(chi, along - chi @ beta)[1])
 
 
 def mounting_by_commands(motion: Motion, response: Array) -> Mounting | None:
@@ -129,7 +128,7 @@ def mounting_by_commands(motion: Motion, response: Array) -> Mounting | None:
         return None
     gain, *_ = np.linalg.lstsq(response, motion.twist, rcond=None)
     rest = motion.twist - response @ gain
-    spread = np.sqrt(np.diag(np.linalg.inv(response.T @ response)))[:, None] * rest.std(axis=0)
+    spread = np.stack([standard_errors(response, column) for column in rest.T], axis=1)
     rotation = float(np.arctan2(gain[0, 1] - gain[1, 0], gain[0, 0] + gain[1, 1]))
     across = rotate(gain[2, :2], -rotation) / gain[2, 2]  # (-lever_y, lever_x)
     scale = float(np.hypot(gain[0, 0], gain[0, 1]))

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.calibration.signals import unwrapped
-from nics_drl_bridge.calibration.stamps import Bursts
+from nics_drl_bridge.calibration.stamps import Bursts, find_bursts
+from nics_drl_bridge.kinematics.recording import Stream
 
 Array = NDArray[np.float64]
 
@@ -52,12 +53,7 @@ def pose_noise(
     """
     pose = unwrapped(pose)
     if bursts is None:
-        rest = np.diff(pose, DIFFERENCE, axis=0) / DIFFERENCE_GAIN
-        if t is not None and len(rest):
-            span = np.diff(t)
-            even = np.abs(span - np.median(span)) < UNEVEN * np.median(span)
-            whole = np.convolve(even, np.ones(DIFFERENCE), "valid") > DIFFERENCE - 0.5
-            rest = rest[whole] if whole.mean() > LEAST_WHOLE else rest
+        rest = _high_differences(pose, t)
         if len(rest) < DIFFERENCE:
             return None
         sigma = np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD
@@ -68,6 +64,32 @@ def pose_noise(
         sigma = found
     sigma = np.where(sigma < NEGLIGIBLE, 0.0, sigma)
     return float(np.hypot(sigma[0], sigma[1]) / np.sqrt(2.0)), float(sigma[2])
+
+
+def pose_residual(pose: Stream) -> Array | None:
+    """The noise (n, 3) of poses that are stamped one by one, scaled to its own size; else None."""
+    if find_bursts(pose.t) is not None or len(pose.t) <= 2 * DIFFERENCE:
+        return None
+    return _high_differences(unwrapped(pose.values), pose.t)
+
+
+def _high_differences(pose: Array, t: Array | None) -> Array:
+    """Differences (n, 3) so high that motion has none, over stretches without a gap."""
+    rest = np.diff(pose, DIFFERENCE, axis=0) / DIFFERENCE_GAIN
+    if t is None or not len(rest):
+        return np.asarray(rest)
+    span = np.diff(t)
+    even = np.abs(span - np.median(span)) < UNEVEN * np.median(span)
+    whole = np.convolve(even, np.ones(DIFFERENCE), "valid") > DIFFERENCE - 0.5
+    return np.asarray(rest[whole] if whole.mean() > LEAST_WHOLE else rest)
+
+
+def white_noise(values: Array) -> float:
+    """Standard deviation of white noise on an even series (T,) that is smooth besides."""
+    if len(values) <= 2 * DIFFERENCE:
+        return 0.0
+    rest = np.diff(values, DIFFERENCE) / DIFFERENCE_GAIN
+    return float(np.median(np.abs(rest)) / GAUSSIAN_MAD)
 
 
 def _spread_at_rest(pose: Array) -> Array | None:

@@ -126,13 +126,9 @@ def predict(
 
     The state at the start comes from what was measured or commanded before it.
     """
-    start = chosen.start_t + calibration.clock_offset_s
-    end = chosen.end_t + calibration.clock_offset_s
     base = calibration.to_base(chosen.start)
-    if recording.state is None:
-        relative = _by_one_rollout(model, calibration, recording, spec, start, end)
-    else:
-        relative = _by_windows(model, calibration, recording, spec, start, end)
+    by = _by_one_rollout if recording.state is None else _by_windows
+    relative = by(model, calibration, recording, spec, chosen)
     return calibration.to_tracked(geometry.compose(base, relative))
 
 
@@ -141,18 +137,41 @@ def _by_one_rollout(
     calibration: Calibration,
     recording: Recording,
     spec: RobotSpec,
-    start: Array,
-    end: Array,
+    chosen: Windows,
 ) -> Array:
     """Relative poses (W, 3); an inferred state needs commands only, so all windows share it."""
+    start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
     grid = np.arange(min(start.min(), recording.command.t[0]) - 1.0, end.max() + model.dt, model.dt)
     begin = grid - calibration.command_latency_s
     command = held(recording.command, spec, begin, begin + model.dt)
     gains = np.array([r.gain for r in calibration.responses])
     state = gains * command[0, followed(spec)]
-    path = _roll(model, state[None], command[None])[0, :-1]
+    path = _roll(model, state[None], command[None])[0][0, :-1]
     at = [np.stack([np.interp(t, grid, column) for column in path.T], axis=1) for t in (start, end)]
     return geometry.between(at[0], at[1])
+
+
+def from_measured_states(
+    model: TaylorModel,
+    calibration: Calibration,
+    recording: Recording,
+    spec: RobotSpec,
+    chosen: Windows,
+) -> tuple[Array, Array, Array, NDArray[np.intp], Array]:
+    """Rolls each window out from its own measured state.
+
+    Returns:
+        Poses (W, T + 1, 3) from the origin, states (W, T + 1, S), commands (W, T, C), whole steps
+        (W,) to the end and the share (W,) of one more.
+    """
+    start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
+    steps = int(np.ceil(float((end - start).max()) / model.dt - 1e-6)) + 1
+    begin = start[:, None] + model.dt * np.arange(steps) - calibration.command_latency_s
+    command = held(recording.command, spec, begin, begin + model.dt)
+    poses, states = _roll(model, states_at(recording, calibration, spec, start), command)
+    exact = (end - start) / model.dt
+    step = np.floor(exact + 1e-6).astype(np.intp)
+    return poses, states, command, step, np.clip(exact - step, 0.0, 1.0)
 
 
 def _by_windows(
@@ -160,28 +179,24 @@ def _by_windows(
     calibration: Calibration,
     recording: Recording,
     spec: RobotSpec,
-    start: Array,
-    end: Array,
+    chosen: Windows,
 ) -> Array:
     """Relative poses (W, 3), each window from its own measured state."""
-    steps = int(np.ceil(float((end - start).max()) / model.dt - 1e-6)) + 1
-    begin = start[:, None] + model.dt * np.arange(steps) - calibration.command_latency_s
-    command = held(recording.command, spec, begin, begin + model.dt)
-    state = states_at(recording, calibration, spec, start)
-    poses = _roll(model, state, command)
-    exact = (end - start) / model.dt
-    step = np.floor(exact + 1e-6).astype(np.intp)
-    share, row = np.clip(exact - step, 0.0, 1.0)[:, None], np.arange(len(start))
+    poses, _, _, step, share = from_measured_states(model, calibration, recording, spec, chosen)
+    row, share = np.arange(len(step)), share[:, None]
     return np.asarray((1.0 - share) * poses[row, step] + share * poses[row, step + 1])
 
 
-def _roll(model: TaylorModel, state: Array, command: Array) -> Array:
-    """Poses (W, T + 1, 3) from the origin, under commands (W, T, C); headings are unwrapped."""
+def _roll(model: TaylorModel, state: Array, command: Array) -> tuple[Array, Array]:
+    """Poses (W, T + 1, 3) from the origin and states (W, T + 1, S), under commands (W, T, C).
+
+    Headings are unwrapped.
+    """
     count, steps = command.shape[:2]
     poses, states = np.zeros((count, steps + 1, 3)), np.empty((count, steps + 1, state.shape[1]))
     states[:, 0] = state
     rollout(poses, states, np.ascontiguousarray(command), term_arrays(model), SERIES, model.dt)
-    return poses
+    return poses, states
 
 
 def open_loop_error(

@@ -13,6 +13,20 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.calibration.calibration import Calibration, Response
+from nics_drl_bridge.calibration.course import (
+    Course,
+    course_of,
+    relative_ends,
+    tracked_ends,
+    tracked_slopes,
+)
+from nics_drl_bridge.calibration.free import (
+    free_coefficients,
+    free_time,
+    lag_is_measured,
+    linear_term,
+    may_turn,
+)
 from nics_drl_bridge.calibration.open_loop import Windows, predict, windows
 from nics_drl_bridge.calibration.timing import minimise, uncertainty
 from nics_drl_bridge.kinematics.model import TaylorModel
@@ -34,6 +48,8 @@ OUTLYING_SHARE = 0.25
 """if that is also more than this share of the longest path."""
 MOST_OUTLIERS = 0.3
 LEAST_SCALE = 0.05
+TURN_RAD = 1e-5
+"""By so much the rotation is turned to see what that does."""
 
 
 @dataclass(frozen=True)
@@ -54,27 +70,47 @@ class Refined:
 
 
 @dataclass(frozen=True)
-class _Problem:
+class Problem:
+    """What a refinement predicts: windows of one drive, the same for every model tried on them.
+
+    Attributes:
+        recording, spec: the drive and the robot.
+        chosen: windows of each horizon, without those that hold a jump of the pose.
+        courses: of X over them where the state was measured, else empty.
+    """
+
     recording: Recording
     spec: RobotSpec
     chosen: tuple[Windows, ...]
-    free: NDArray[np.bool_]
+    courses: tuple[Course, ...]
+
+
+@dataclass(frozen=True)
+class _Free:
+    """What may move: coefficients (D, K), a time of the calibration, its rotation."""
+
+    coefficients: NDArray[np.bool_]
     time: str | None
     turn: bool
 
+    @property
+    def count(self) -> int:
+        """How many coefficients."""
+        return int(self.coefficients.sum())
 
-def refine(
+
+def problem_of(
     model: TaylorModel,
     calibration: Calibration,
     recording: Recording,
     spec: RobotSpec,
     start: float,
     stop: float,
-) -> Refined | None:
-    """Moves coefficients and calibration to the least open-loop error.
+) -> Problem | None:
+    """Chooses the windows that a refinement predicts.
 
     Args:
-        model: the fitted model; its pruned terms stay pruned.
+        model: the fitted model.
         calibration: of the drive.
         recording: the drive.
         spec: the robot.
@@ -82,7 +118,7 @@ def refine(
         stop: its end [s].
 
     Returns:
-        The refined model, or None if the part is too short.
+        The problem, or None if the part is too short.
     """
     chosen = tuple(
         windows(recording, calibration, start, stop, horizon, SPACING_S) for horizon in HORIZONS_S
@@ -94,39 +130,56 @@ def refine(
     )
     if not chosen:
         return None
-    problem = _Problem(
-        recording,
-        spec,
-        chosen,
-        free_coefficients(model, calibration, spec),
-        _free_time(calibration),
-        _may_turn(calibration, spec),
+    courses: tuple[Course, ...] = ()
+    if recording.state is not None:
+        courses = tuple(course_of(model, calibration, recording, spec, w) for w in chosen)
+    return Problem(recording, spec, chosen, courses)
+
+
+def refine(problem: Problem, model: TaylorModel, calibration: Calibration) -> Refined:
+    """Moves coefficients and calibration to the least open-loop error.
+
+    Args:
+        problem: the windows to predict.
+        model: the fitted model; its pruned terms stay pruned.
+        calibration: of the drive.
+    """
+    free = _Free(
+        free_coefficients(model, calibration, problem.spec),
+        free_time(calibration),
+        may_turn(calibration, problem.spec),
     )
-    theta = _pack(problem, model, calibration)
+    theta = _pack(free, model, calibration)
     scale = np.maximum(np.abs(theta), LEAST_SCALE)
-    scale[int(problem.free.sum()) :] = LEAST_SCALE  # s, rad
-    theta, jacobian, rest = minimise(
-        lambda value: _residual(problem, model, calibration, value), theta, scale
+    scale[free.count :] = LEAST_SCALE  # s, rad
+
+    def residual(value: Array) -> Array:
+        return _bounded(_errors(problem, *_unpack(problem, free, model, calibration, value)))
+
+    def jacobian(value: Array) -> Array:
+        return _derivatives(problem, free, *_unpack(problem, free, model, calibration, value))
+
+    theta, slope, rest = minimise(
+        residual, theta, scale, jacobian=jacobian if problem.courses else None
     )
-    sigma = uncertainty(jacobian, rest)
-    refined = _unpack(problem, model, calibration, theta, sigma)
+    sigma = uncertainty(slope, rest)
+    refined = _unpack(problem, free, model, calibration, theta, sigma)
     error = float(np.sqrt(np.mean(rest**2)))
-    return Refined(*refined, error, _coefficient_errors(problem, jacobian, rest, refined[0]))
+    return Refined(*refined, error, _coefficient_errors(problem, free, slope, rest, refined[0]))
 
 
 def _coefficient_errors(
-    problem: _Problem, jacobian: Array, rest: Array, model: TaylorModel
+    problem: Problem, free: _Free, jacobian: Array, rest: Array, model: TaylorModel
 ) -> Array:
     """Standard errors (D, K); windows that share a stretch of the drive are one cluster."""
     starts = np.concatenate([np.repeat(w.start_t, 3) for w in problem.chosen])
     cluster = np.floor((starts - starts.min()) / max(HORIZONS_S)).astype(np.intp)
     errors = np.full(model.coefficients.shape, np.nan)
-    count = int(problem.free.sum())
-    errors[problem.free] = clustered_errors(jacobian, rest, cluster)[:count]
+    errors[free.coefficients] = clustered_errors(jacobian, rest, cluster)[: free.count]
     for state in problem.spec.state:
-        tied = [_linear_term(model, problem.spec, n) for n in (state.name, str(state.follows))]
+        tied = [linear_term(model, problem.spec, n) for n in (state.name, str(state.follows))]
         d = model.dofs.index(f"d_{state.name}")
-        if None in tied or not problem.free[d, tied[0]] or problem.free[d, tied[1]]:
+        if None in tied or not free.coefficients[d, tied[0]] or free.coefficients[d, tied[1]]:
             continue
         gain = abs(model.coefficients[d, tied[1]] / model.coefficients[d, tied[0]])
         errors[d, tied[1]] = gain * errors[d, tied[0]]
@@ -150,95 +203,37 @@ def _without_outliers(
     return Windows(*(values[inside] for values in vars(chosen).values()))
 
 
-def free_coefficients(
-    model: TaylorModel, calibration: Calibration, spec: RobotSpec
-) -> NDArray[np.bool_]:
-    """Which coefficients (D, K) may move: kept, and not fixed by what a state is.
-
-    An inferred speed is by definition the speed along the travel, so that vx = 1 speed; its
-    lag stays where the wheels showed it.
-    """
-    free = model.coefficients != 0.0
-    if not calibration.responses:
-        free[3:] = False  # the rates of a measured state were fitted to that state itself
-    for i, response in enumerate(calibration.responses):
-        alone = _linear_term(model, spec, response.state)
-        if alone is None:
-            continue
-        if model.coefficients[0, alone] == 1.0:
-            free[0, alone] = False
-        else:  # another scale of this state would serve as well: its gain stays
-            free[3 + i, _linear_term(model, spec, response.command)] = False
-        if _lag_is_measured(calibration):
-            free[3 + i, alone] = False
-    return np.asarray(free)
-
-
-def _lag_is_measured(calibration: Calibration) -> bool:
-    """Offset and latency are both known only where the wheels showed the response."""
-    return {"clock_offset_s", "command_latency_s"} <= set(calibration.uncertainty)
-
-
-def _linear_term(model: TaylorModel, spec: RobotSpec, name: str) -> int | None:
-    """Column of the term that is one variable alone."""
-    wanted = np.array([v == name for v in spec.variable_names], dtype=np.int64)
-    hits = np.flatnonzero((model.powers == wanted).all(axis=1))
-    return int(hits[0]) if len(hits) else None
-
-
-def _may_turn(calibration: Calibration, spec: RobotSpec) -> bool:
-    """Whether the rotation may move.
-
-    It is known by the direction in which a robot can't move. One that moves in every direction
-    would be described as well in any other frame, with other coefficients.
-    """
-    everywhere = any(command.cmd_vel == "linear.y" for command in spec.command)
-    return "rotation_rad" in calibration.uncertainty and not calibration.is_exact and not everywhere
-
-
-def _free_time(calibration: Calibration) -> str | None:
-    """The time that may move: the clock offset, else the latency; none that the state showed."""
-    if not calibration.responses:
-        return None
-    if "clock_offset_s" in calibration.uncertainty:
-        return "clock_offset_s"
-    if calibration.command_latency_s > 0.0:
-        return "command_latency_s"
-    return None
-
-
-def _pack(problem: _Problem, model: TaylorModel, calibration: Calibration) -> Array:
-    tail = [] if problem.time is None else [float(getattr(calibration, problem.time))]
-    tail += [calibration.rotation_rad] if problem.turn else []
-    return np.append(model.coefficients[problem.free], tail)
+def _pack(free: _Free, model: TaylorModel, calibration: Calibration) -> Array:
+    tail = [] if free.time is None else [float(getattr(calibration, free.time))]
+    tail += [calibration.rotation_rad] if free.turn else []
+    return np.append(model.coefficients[free.coefficients], tail)
 
 
 def _unpack(
-    problem: _Problem,
+    problem: Problem,
+    free: _Free,
     model: TaylorModel,
     calibration: Calibration,
     theta: Array,
     sigma: Array | None = None,
 ) -> tuple[TaylorModel, Calibration]:
-    count = int(problem.free.sum())
     coefficients = model.coefficients.copy()
-    coefficients[problem.free] = theta[:count]
+    coefficients[free.coefficients] = theta[: free.count]
     for i, response in enumerate(calibration.responses):
         own, command = (
-            _linear_term(model, problem.spec, n) for n in (response.state, response.command)
+            linear_term(model, problem.spec, n) for n in (response.state, response.command)
         )
-        if own is not None and command is not None and not problem.free[3 + i, command]:
+        if own is not None and command is not None and not free.coefficients[3 + i, command]:
             coefficients[3 + i, command] = -response.gain * coefficients[3 + i, own]
     model = replace(model, coefficients=coefficients)
-    tail = list(theta[count:])
-    names = ([problem.time] if problem.time else []) + (["rotation_rad"] if problem.turn else [])
-    values = dict(zip(names, map(float, tail), strict=True))
+    names = ([free.time] if free.time else []) + (["rotation_rad"] if free.turn else [])
+    values = dict(zip(names, map(float, theta[free.count :]), strict=True))
     if sigma is None:
         return model, replace(calibration, **values)  # type: ignore[arg-type]
     if "rotation_rad" in values:
         values["rotation_rad"] = float(geometry.wrap_angle(values["rotation_rad"]))
-    spread = dict(zip(names, map(float, sigma[count:]), strict=True))
-    if _lag_is_measured(calibration) and "clock_offset_s" in spread:
+    spread = dict(zip(names, map(float, sigma[free.count :]), strict=True))
+    if lag_is_measured(calibration) and "clock_offset_s" in spread:
         spread["clock_offset_s"] = float(
             np.hypot(spread["clock_offset_s"], calibration.uncertainty["command_latency_s"])
         )
@@ -253,7 +248,7 @@ def _unpack(
 def _response(model: TaylorModel, spec: RobotSpec, response: Response) -> Response:
     """The lag and the gain that the coefficients of the state's rate amount to."""
     d = model.dofs.index(f"d_{response.state}")
-    own, command = (_linear_term(model, spec, n) for n in (response.state, response.command))
+    own, command = (linear_term(model, spec, n) for n in (response.state, response.command))
     if own is None or command is None or not 0.0 < -model.coefficients[d, own] * model.dt < 1.0:
         return response
     rate = -float(model.coefficients[d, own])
@@ -261,17 +256,43 @@ def _response(model: TaylorModel, spec: RobotSpec, response: Response) -> Respon
     return replace(response, lag_s=lag, gain=float(model.coefficients[d, command]) / rate)
 
 
-def _residual(
-    problem: _Problem, model: TaylorModel, calibration: Calibration, theta: Array
-) -> Array:
-    model, calibration = _unpack(problem, model, calibration, theta)
+def _errors(problem: Problem, model: TaylorModel, calibration: Calibration) -> Array:
+    """Errors (n,) of all predictions: x, y and heading of each window [m]."""
     parts = []
     with np.errstate(all="ignore"):  # a step of the search may diverge; it is then taken back
-        for chosen in problem.chosen:
-            error = (
-                predict(model, calibration, problem.recording, problem.spec, chosen) - chosen.end
-            )
+        for k, chosen in enumerate(problem.chosen):
+            if problem.courses:
+                ends = relative_ends(problem.courses[k], model)[0]
+                predicted = tracked_ends(problem.courses[k], calibration, ends)
+            else:
+                predicted = predict(model, calibration, problem.recording, problem.spec, chosen)
+            error = predicted - chosen.end
             error[:, 2] = HEADING_ARM_M * geometry.wrap_angle(error[:, 2])
             parts.append(error.ravel())
-    finite = np.nan_to_num(np.concatenate(parts), nan=DIVERGED)
+    return np.concatenate(parts)
+
+
+def _bounded(error: Array) -> Array:
+    finite = np.nan_to_num(error, nan=DIVERGED)
     return np.asarray(np.clip(finite, -DIVERGED, DIVERGED))
+
+
+def _derivatives(
+    problem: Problem, free: _Free, model: TaylorModel, calibration: Calibration
+) -> Array:
+    """Derivatives (n, P) of `_errors` by the free coefficients and the rotation."""
+    parts = []
+    for course in problem.courses:
+        ends, moved = relative_ends(course, model, free.coefficients)
+        slope = tracked_slopes(course, calibration, ends, moved)
+        if free.turn:
+            turned = [
+                tracked_ends(course, replace(calibration, rotation_rad=angle), ends)
+                for angle in calibration.rotation_rad + np.array([-TURN_RAD, TURN_RAD])
+            ]
+            aside = (turned[1] - turned[0])[:, :, None]
+            aside[:, 2] = geometry.wrap_angle(aside[:, 2])
+            slope = np.concatenate([slope, aside / (2.0 * TURN_RAD)], axis=2)
+        slope[:, 2] *= HEADING_ARM_M
+        parts.append(slope.reshape(-1, slope.shape[2]))
+    return np.nan_to_num(np.concatenate(parts), nan=0.0)

@@ -96,9 +96,10 @@ def _about_mounting(calibration: Calibration, found: Findings, spec: RobotSpec) 
             "exactly at base_link; drive in every direction and turn."
         ]
     if c.rotation_rad != 0.0:
+        sigma = c.uncertainty.get("rotation_rad", mounting.rotation_sigma)
         notes.append(
             f"The direction of travel lies {c.rotation_rad:.4f} rad (+- "
-            f"{mounting.rotation_sigma:.4f} rad) from the tracked body's heading."
+            f"{sigma:.4f} rad) from the tracked body's heading."
         )
     if np.isnan(mounting.lever_sigma[0]):
         why = "all of the path had one curvature" if mounting.turns else "the robot never turned"
@@ -137,9 +138,16 @@ def _about_responses(calibration: Calibration, found: Findings) -> list[str]:
 
 
 def _about_wheels(calibration: Calibration) -> list[str]:
+    notes = []
+    if calibration.wheel_scale is not None:
+        sigma = calibration.uncertainty["wheel_scale"]
+        notes.append(
+            f"A unit of the wheels' speed is {calibration.wheel_scale:.4g} m/s (+- {sigma:.2g} "
+            "m/s)."
+        )
     if calibration.wheels_swapped:
-        return [
+        notes += [
             "Left and right wheel look interchanged: the wheel recorded as the left one is the "
             "faster one when the robot turns left, and the slower one when it turns right."
         ]
-    return []
+    return notes

@@ -6,30 +6,28 @@ from dataclasses import replace
 
 import numpy as np
 
-from nics_drl_bridge.calibration.refine import Refined, free_coefficients, refine
-from nics_drl_bridge.kinematics.recording import Recording
+from nics_drl_bridge.calibration.free import free_coefficients
+from nics_drl_bridge.calibration.refine import Problem, Refined, refine
 from nics_drl_bridge.kinematics.spec import RobotSpec
 
 WORTH = 0.1
 """A term whose loss raises the error by less than this share is left out."""
 
 
-def simplify(
-    refined: Refined, recording: Recording, spec: RobotSpec, start: float, stop: float
-) -> Refined:
+def simplify(problem: Problem, refined: Refined) -> Refined:
     """Leaves out terms of the body twist that hardly help to predict the training part.
 
     The one that is least certain goes first; the rest is refined anew.
     """
     best, tried = refined, set[tuple[int, int]]()
     limit = refined.error * (1.0 + WORTH)
-    while (weakest := _weakest(best, spec, tried)) is not None:
+    while (weakest := _weakest(best, problem.spec, tried)) is not None:
         tried.add(weakest)
         coefficients = best.model.coefficients.copy()
         coefficients[weakest] = 0.0
         shorter = replace(best.model, coefficients=coefficients)
-        again = refine(shorter, best.calibration, recording, spec, start, stop)
-        if again is not None and again.error < limit:
+        again = refine(problem, shorter, best.calibration)
+        if again.error < limit:
             best = again
     used = np.abs(best.model.coefficients).sum(axis=0) > 0.0
     model = replace(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,30 +103,42 @@ def delay_of_response(
         centers: around which to search for the delay [s].
         lags: (S,) known time constants; None to estimate those that the drive shows.
     """
-    start, end, signal = target
     moved = moved_commands(command)[followed(spec)] if spec.state else moved_commands(command)
-    powers = features.exponents(len(moved), 2)
-    powers = powers[(powers[:, ~moved] == 0).all(axis=1)]
-    grid = np.arange(start.min() - LEAD_S, end.max() + STEP_S, STEP_S)
     free = np.flatnonzero(moved[: len(spec.state)]) if lags is None else np.zeros(0, dtype=np.intp)
     base = nominal_lags(spec) if lags is None else lags
-
-    def signals(tau: Array, delay: float) -> Array:
-        if spec.state:
-            return inferred_states(command, spec, tau, delay, grid)
-        return held(command, spec, grid - delay, grid + STEP_S - delay)
+    left_over = response_residual(command, spec, target)
 
     def residual(theta: Array) -> Array:
         tau = base.copy()
         tau[free] = np.exp(theta[1:])
-        chi = features.evaluate(signals(tau, theta[0]), powers)
-        return unexplained(interval_means(grid, chi, start, end), signal)
+        return left_over(tau, theta[0])
 
     theta, sigma, explained = _search(residual, centers, np.log(base[free]))
     found, spread = base.copy(), np.full(len(base), np.nan)
     found[free] = np.exp(theta[1:])
     spread[free] = sigma[1:] * found[free]
     return Delay(float(theta[0]), float(sigma[0]), found, spread, explained)
+
+
+def response_residual(
+    command: Stream, spec: RobotSpec, target: tuple[Array, Array, Array]
+) -> Callable[[Array, float], Array]:
+    """What commands, by way of lags (S,) and a delay [s], leave unexplained of a signal."""
+    start, end, signal = target
+    moved = moved_commands(command)[followed(spec)] if spec.state else moved_commands(command)
+    powers = features.exponents(len(moved), 2)
+    powers = powers[(powers[:, ~moved] == 0).all(axis=1)]
+    grid = np.arange(start.min() - LEAD_S, end.max() + STEP_S, STEP_S)
+
+    def residual(lags: Array, delay: float) -> Array:
+        if spec.state:
+            response = inferred_states(command, spec, lags, delay, grid)
+        else:
+            response = held(command, spec, grid - delay, grid + STEP_S - delay)
+        chi = features.evaluate(response, powers)
+        return unexplained(interval_means(grid, chi, start, end), signal)
+
+    return residual
 
 
 def fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
@@ -148,6 +161,11 @@ def latency_of_state(command: Stream, state: Stream, spec: RobotSpec) -> Delay |
     """
     if not moved_commands(command).any():
         return None
+    return _search_or_zero(state_residual(command, state, spec))
+
+
+def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Callable[[Array], Array]:
+    """What commands of a delay (1,) [s] leave unexplained of the rates of a measured state."""
     span = np.diff(state.t)
     keep = np.flatnonzero((span > 0.0) & (span < LONG_STEP * np.median(span)))
     if len(keep) > MAX_ROWS:  # by the golden section: no stride that commands could share
@@ -160,13 +178,18 @@ def latency_of_state(command: Stream, state: Stream, spec: RobotSpec) -> Delay |
         u = held(command, spec, start - theta[0], end - theta[0])
         return unexplained(np.concatenate([np.ones((len(u), 1)), middle, u], axis=1), rates)
 
-    return _search_or_zero(residual)
+    return residual
 
 
 def delay_of_pose(
     state: Stream, target: tuple[Array, Array, Array], centers: tuple[float, ...]
 ) -> Delay:
     """The delay of the pose's clock behind that of a measured state."""
+    return _search_or_zero(pose_residual(state, target), centers)
+
+
+def pose_residual(state: Stream, target: tuple[Array, Array, Array]) -> Callable[[Array], Array]:
+    """What a measured state of a delay (1,) [s] leaves unexplained of the pose's rates."""
     start, end, signal = target
     chi = features.evaluate(state.values, features.exponents(state.values.shape[1], 2))
 
@@ -174,7 +197,7 @@ def delay_of_pose(
         means = interval_means(state.t, chi, start - theta[0], end - theta[0])
         return unexplained(means, signal)
 
-    return _search_or_zero(residual, centers)
+    return residual
 
 
 def unexplained(chi: Array, signal: Array) -> Array:
@@ -223,6 +246,7 @@ def minimise(
     start: Array,
     scale: Array,
     bounds: tuple[Array, Array] | None = None,
+    jacobian: Callable[[Array], Array] | None = None,
 ) -> tuple[Array, Array, Array]:
     """Least squares in steps of each parameter's own scale, however large its value is.
 
@@ -231,14 +255,19 @@ def minimise(
         start: (P,).
         scale: (P,) by which a parameter may be expected to move.
         bounds: least and greatest parameters (P,).
+        jacobian: of the residual (n, P); by finite differences when None.
 
     Returns:
         Parameters (P,), Jacobian (n, P) and residual (n,) there.
     """
     low, high = bounds or (np.full(len(start), -np.inf), np.full(len(start), np.inf))
+    slope: Any = "2-point"
+    if jacobian is not None:
+        slope = lambda z: jacobian(start + (z - 1.0) * scale) * scale  # noqa: E731
     found = least_squares(
         lambda z: residual(start + (z - 1.0) * scale),
         np.ones(len(start)),
+        jac=slope,
         bounds=((low - start) / scale + 1.0, (high - start) / scale + 1.0),
         diff_step=DIFFERENCE,
         xtol=TOLERANCE,

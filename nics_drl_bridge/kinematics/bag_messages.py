@@ -31,6 +31,11 @@ def typestore() -> Typestore:
     return store
 
 
+def frames(transform: Any) -> tuple[str, str]:
+    """Parent and child of a transform, without the leading slash of old publishers."""
+    return transform.header.frame_id.strip("/"), transform.child_frame_id.strip("/")
+
+
 def stamp(message: Any) -> int:
     """The stamp of a message's header [ns]."""
     time = message.header.stamp
@@ -65,6 +70,12 @@ def pose_row(message: Any) -> Row:
     position, q = _place(message)
     heading = np.arctan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y**2 + q.z**2))
     return position.x, position.y, float(heading)
+
+
+def twist_row(message: Any) -> Row:
+    """Body velocity x, y [m/s] and yaw rate [rad/s] of an Odometry."""
+    twist = message.twist.twist
+    return twist.linear.x, twist.linear.y, twist.angular.z
 
 
 def imu_row(message: Any) -> Row:

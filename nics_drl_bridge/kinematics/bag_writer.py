@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -61,15 +62,19 @@ def write_bag(
     store = get_typestore(Stores.ROS2_JAZZY)
     messages = _Messages(store)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
-    with Writer(path, version=VERSION, storage_plugin=plugin) as writer:
-        for topic, kind, stream, make in _topics(recording, spec, messages):
-            connection = writer.add_connection(topic, kind, typestore=store)
-            stamps = np.round(stream.t * NANO).astype(np.int64) + START_NS
-            receive = stamps + _to_commands_clock(recording, stream)
-            for k, values in enumerate(stream.values):
-                message = make(messages.header(int(stamps[k])), values)
-                raw = store.serialize_cdr(message, kind)
-                writer.write(connection, int(receive[k]), raw)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as beside:
+        unfinished = Path(beside) / path.name
+        with Writer(unfinished, version=VERSION, storage_plugin=plugin) as writer:
+            for topic, kind, stream, make in _topics(recording, spec, messages):
+                connection = writer.add_connection(topic, kind, typestore=store)
+                stamps = np.round(stream.t * NANO).astype(np.int64) + START_NS
+                receive = stamps + _to_commands_clock(recording, stream)
+                for k, values in enumerate(stream.values):
+                    message = make(messages.header(int(stamps[k])), values)
+                    raw = store.serialize_cdr(message, kind)
+                    writer.write(connection, int(receive[k]), raw)
+        unfinished.rename(path)
 
 
 def _topics(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.kinematics.recording import Recording, Stream
+from nics_drl_bridge.kinematics.recording import SLOWEST_SAMPLING_S, Recording, Stream
 
 Array = NDArray[np.float64]
 
@@ -54,11 +54,11 @@ def load_csv_folder(path: Path) -> Recording:
             )
     tables = {name: _read(path / name) for name in COLUMNS if (path / name).exists()}
     command, vrpn = tables["cmd.csv"], tables["vrpn.csv"]
-    _check_units(path, command, vrpn)
+    _check_units(path, tables)
     return Recording(
         command=Stream(command[:, 2], command[:, :2], ROBOT_CLOCK),
         pose=Stream(vrpn[:, 7] * 1e-9, _pose(path / "vrpn.csv", vrpn), POSE_CLOCK),
-        wheels=_wheels(path, tables),
+        wheels=_wheels(tables),
         source=str(path),
     )
 
@@ -119,26 +119,33 @@ def _pose(path: Path, vrpn: Array) -> Array:
     return np.stack([vrpn[:, 0], vrpn[:, 1], heading], axis=1)
 
 
-def _check_units(path: Path, command: Array, vrpn: Array) -> None:
-    """Motion capture in ns, commands in s: both must have lasted about as long."""
-    seconds, capture = np.ptp(command[:, -1]), np.ptp(vrpn[:, -1]) * 1e-9
-    if seconds > MAX_DURATION_S:
-        raise RecordingError(
-            f"{path / 'cmd.csv'}: lasts {seconds:.3g} s; its stamps must be in seconds."
-        )
-    if seconds > 0.0 and not 1 / MAX_DURATION_RATIO < capture / seconds < MAX_DURATION_RATIO:
-        raise RecordingError(
-            f"{path / 'vrpn.csv'}: lasts {capture:.3g} s where the commands last {seconds:.3g} s; "
-            "its stamps must be in nanoseconds."
-        )
+def _check_units(path: Path, tables: dict[str, Array]) -> None:
+    """Motion capture in ns, all else in s: all must have lasted about as long.
+
+    Two files that disagree don't tell which of them is wrong: commands that come seconds apart do.
+    """
+    times = tables["cmd.csv"][:, -1]
+    seconds, step = np.ptp(times), np.median(np.diff(times)) if len(times) > 1 else 0.0
+    for name, table in tables.items():
+        unit, factor = ("nanoseconds", 1e-9) if name == "vrpn.csv" else ("seconds", 1.0)
+        lasted = np.ptp(table[:, -1]) * factor
+        alike = seconds == 0.0 or 1 / MAX_DURATION_RATIO < lasted / seconds < MAX_DURATION_RATIO
+        if seconds > MAX_DURATION_S or (not alike and step > SLOWEST_SAMPLING_S):
+            raise RecordingError(
+                f"{path / 'cmd.csv'}: lasts {seconds:.3g} s, with {step:.3g} s from one command to "
+                "the next; its stamps must be in seconds."
+            )
+        if not alike:
+            raise RecordingError(
+                f"{path / name}: lasts {lasted:.3g} s where the commands last {seconds:.3g} s; "
+                f"its stamps must be in {unit}."
+            )
 
 
-def _wheels(path: Path, tables: dict[str, Array]) -> Stream | None:
+def _wheels(tables: dict[str, Array]) -> Stream | None:
     """Both wheels at the stamps of the left one."""
     if "L_wheel.csv" not in tables or "R_wheel.csv" not in tables:
         return None
     left, right = tables["L_wheel.csv"], tables["R_wheel.csv"]
-    if np.ptp(left[:, 1]) > MAX_DURATION_S:
-        raise RecordingError(f"{path / 'L_wheel.csv'}: its stamps must be in seconds.")
     at_left = np.interp(left[:, 1], right[:, 1], right[:, 0])
     return Stream(left[:, 1], np.stack([left[:, 0], at_left], axis=1), ROBOT_CLOCK)

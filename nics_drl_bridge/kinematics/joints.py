@@ -98,7 +98,7 @@ def state_of(joints: Joints, spec: RobotSpec, roles: TopicRoles, place: str) -> 
                 f"{place}: topics: robot {spec.name!r} has no state {name!r}; "
                 f"{nearest(name, known)}"
             )
-    sources = [_source(joints, variable, roles, f"{place}: {there}") for variable in spec.state]
+    sources = [_source(joints, variable, roles, place) for variable in spec.state]
     found = [source for source in sources if source is not None]
     if spec.state and len(found) == len(sources):
         columns = [_column(joints, v, s) for v, s in zip(spec.state, found, strict=True)]

@@ -62,6 +62,8 @@ class Recording:
         wheels: (T, 2) left and right wheel speed in the encoder's units, where there are any.
         imu: (T, 3) acceleration along x and y [m/s^2] and yaw rate [rad/s] of the sensor, where
             there is one.
+        odometry: (T, 3) body twist that the wheels report, vx, vy [m/s] and yaw rate [rad/s],
+            where it was recorded beside a pose of its own.
         source: where it came from, for reports and errors.
         variables: names of X = [state, command] of the robot that drove, where known.
     """
@@ -71,6 +73,7 @@ class Recording:
     state: Stream | None = None
     wheels: Stream | None = None
     imu: Stream | None = None
+    odometry: Stream | None = None
     source: str = "recording"
     variables: tuple[str, ...] = ()
 
@@ -84,6 +87,8 @@ class Recording:
             named["wheels"] = self.wheels
         if self.imu is not None:
             named["imu"] = self.imu
+        if self.odometry is not None:
+            named["odometry"] = self.odometry
         return named
 
 
@@ -158,7 +163,7 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
             "drove."
         )
     width = {"command": len(spec.command), "state": len(spec.state)}
-    width |= {"pose": 3, "wheels": 2, "imu": 3}
+    width |= {"pose": 3, "wheels": 2, "imu": 3, "odometry": 3}
     for name, stream in recording.streams.items():
         _check_stream(f"{recording.source}: {name}", stream, width[name])
     _check_units(recording, spec)

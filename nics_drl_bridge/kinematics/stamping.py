@@ -26,6 +26,14 @@ SAME_CLOCK_S = (-0.001, 0.05)
 """Headers this much before their receipt [s], in the median, are of the recorder's own clock."""
 MAX_WANDER_S = 1.0
 """Between headers of one clock and their receipt, the delay varies by less than this [s]."""
+STALLED = 2.0
+"""The share of messages [%] that a recorder which stalled may have received later still."""
+MAX_STALL_S = 30.0
+"""But no later than this [s]."""
+MAX_LATE = 0.01
+"""The share of messages that may come after one with a later stamp."""
+MAX_UNSTAMPED = 0.05
+"""The share of messages at the start that may lack a stamp: a simulation has no time yet."""
 ROBOT_STREAMS = ("command", "state", "wheels", "imu")
 """What a robot's own computer makes: these have to share a clock."""
 
@@ -46,8 +54,8 @@ class TopicData:
     header_ns: Nanoseconds | None
     values: Array
 
-    def rows(self, keep: NDArray[np.bool_]) -> TopicData:
-        """The messages for which `keep` (T,) is true."""
+    def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> TopicData:
+        """The messages for which `keep` (T,) is true, or those that it counts up."""
         header = None if self.header_ns is None else self.header_ns[keep]
         return TopicData(self.topic, self.receive_ns[keep], header, self.values[keep])
 
@@ -59,7 +67,9 @@ def streams(data: Mapping[str, TopicData], stamps: Stamps, place: str) -> dict[s
     than 50 ms before their receipt are of the recorder's clock, which is also that of streams
     without header (clock `receive`). Others are of a foreign clock (`header`): their stamps
     are moved by the median delay, so that the offset left for calibration to find is small.
-    Command, state, wheels and IMU are put on one clock, by receipt if need be.
+    Command, state, wheels and IMU are put on one clock, by receipt if need be. The few
+    messages that came after one with a later stamp are put in order, and those before a
+    simulation's first time are left out.
 
     Args:
         data: messages by stream name; empty ones are not allowed.
@@ -74,6 +84,7 @@ def streams(data: Mapping[str, TopicData], stamps: Stamps, place: str) -> dict[s
     """
     if stamps == "receive":
         return _by_receipt(data, _origin(data))
+    data = {name: _in_order(part, place) for name, part in data.items()}
     headers = {name: _header(part, stamps, place) for name, part in data.items()}
     if stamps == "header":
         origin = min(int(ns.min()) for ns in headers.values() if ns is not None)
@@ -113,12 +124,14 @@ def _clocks(
             continue
         delay = part.receive_ns - ns
         median = int(np.median(delay))
-        if np.ptp(delay) * NANO > MAX_WANDER_S:
+        usual = np.percentile(delay, 100.0 - STALLED)
+        wander = max(usual - median, median - delay.min()) * NANO
+        if wander > MAX_WANDER_S or (delay.max() - median) * NANO > MAX_STALL_S:
             raise RecordingError(
                 f"{place}: topic {part.topic!r}: its header stamps lie {delay.min() * NANO:.3f} to "
-                f"{delay.max() * NANO:.3f} s before their receipt: they are of several clocks, or "
-                "of a simulated time at another rate; set `stamps` to receive, or to header if "
-                "every topic has headers."
+                f"{delay.max() * NANO:.3f} s before their receipt, so they are of several clocks "
+                "or of a simulated time at another rate; write `stamps: receive` into the topics "
+                "file, and record a simulation with `ros2 bag record --use-sim-time`."
             )
         if SAME_CLOCK_S[0] <= median * NANO <= SAME_CLOCK_S[1]:
             clocks[name] = (RECEIVE, 0)
@@ -136,19 +149,37 @@ def _header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
     if ns is None or empty.all():
         if stamps == "header":
             raise RecordingError(
-                f"{topic}: its messages have no header stamps; set `stamps` to auto or receive."
+                f"{topic}: its messages have no header stamps; write `stamps: auto` into the "
+                "topics file."
             )
         return None
     if empty.any():
         raise RecordingError(
-            f"{topic}: {empty.sum()} of {len(ns)} headers have no stamp; set `stamps` to receive."
-        )
-    for k in np.flatnonzero(np.diff(ns) < 0)[:1]:
-        raise RecordingError(
-            f"{topic}: the header stamps run backwards at message {k + 1}, by "
-            f"{(ns[k] - ns[k + 1]) * NANO:.3f} s; set `stamps` to receive, or cut the bag there."
+            f"{topic}: {empty.sum()} of {len(ns)} headers have no stamp; write `stamps: "
+            "receive` into the topics file."
         )
     return ns
+
+
+def _in_order(part: TopicData, place: str) -> TopicData:
+    """Leaves out what came before there was a time, and sorts the few that came late."""
+    if part.header_ns is None or not part.header_ns.any():
+        return part
+    first = int(np.argmax(part.header_ns != 0))
+    if first <= MAX_UNSTAMPED * len(part.header_ns):
+        part = part.rows(np.arange(first, len(part.header_ns)))
+    ns = part.header_ns
+    if ns is None or not ns.all():
+        return part
+    late = np.maximum.accumulate(ns) - ns
+    if np.mean(late > 0) > MAX_LATE or late.max() * NANO > MAX_WANDER_S:
+        k = int(np.argmax(late > 0))
+        raise RecordingError(
+            f"{place}: topic {part.topic!r}: the header stamps run backwards at message {k}, by "
+            f"{late[k] * NANO:.3f} s; write `stamps: receive` into the topics file, or cut the "
+            "bag there."
+        )
+    return part.rows(np.argsort(ns, kind="stable"))
 
 
 def _origin(data: Mapping[str, TopicData]) -> int:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -16,6 +17,8 @@ Stamps = Literal["auto", "header", "receive"]
 NONE = "none"
 ROLES = ("cmd_vel", "pose", "odom", "joint_states", "imu")
 REQUIRED = "cmd_vel"
+MOST_LISTED = 20
+"""A sentence lists no more topics than this."""
 TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 ACKERMANN = "ackermann_msgs/msg/AckermannDrive"
 ACKERMANN_STAMPED = f"{ACKERMANN}Stamped"
@@ -23,20 +26,23 @@ POSE, POSE_COVARIANCE = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
 )
-TRANSFORM, ODOMETRY = "geometry_msgs/msg/TransformStamped", "nav_msgs/msg/Odometry"
+TRANSFORM, TRANSFORMS = "geometry_msgs/msg/TransformStamped", "tf2_msgs/msg/TFMessage"
+ODOMETRY = "nav_msgs/msg/Odometry"
 JOINTS, IMU = "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu"
 TYPES = {
     "cmd_vel": (TWIST, TWIST_STAMPED, ACKERMANN_STAMPED, ACKERMANN),
-    "pose": (POSE, POSE_COVARIANCE, TRANSFORM, ODOMETRY),
+    "pose": (POSE, POSE_COVARIANCE, TRANSFORM, TRANSFORMS, ODOMETRY),
     "odom": (ODOMETRY,),
     "joint_states": (JOINTS,),
     "imu": (IMU,),
 }
 """The message types that can play each role."""
+NEVER_GUESSED = {"pose": (ODOMETRY, TRANSFORMS)}
+"""Types that play a role only when the user says so."""
 
 USUAL = {
     "cmd_vel": (r"/cmd_vel$", r"/cmd_vel_stamped$", r"/(ackermann_cmd|drive)$"),
-    "pose": (r"(vrpn|mocap|optitrack|vicon|qualisys)", r"/pose$", r"/amcl_pose$"),
+    "pose": (r"(vrpn|mocap|optitrack|vicon|qualisys)", r"/pose$"),
     "odom": (r"/odom$", r"/(odom|odometry)[^/]*$", r"odom"),
     "joint_states": (r"/joint_states$", r"/joint_state[^/]*$"),
     "imu": (r"/imu(/data)?$", r"/imu[^/]*$", r"imu"),
@@ -64,11 +70,13 @@ class TopicRoles(Schema):
     Attributes:
         cmd_vel: the commands: Twist, TwistStamped, AckermannDrive or AckermannDriveStamped.
         pose: of motion capture or localisation: PoseStamped, PoseWithCovarianceStamped,
-            TransformStamped; or Odometry when named here. Goes before `odom`.
-        odom: Odometry; its pose is taken when there is no `pose`.
+            TransformStamped; or TFMessage and Odometry when named here. Goes before `odom`.
+        odom: Odometry; its pose is taken when there is no `pose`. Named beside a `pose`, its
+            twist shows the noise of the odometry.
         joint_states: JointState, for measured state and wheel speeds.
         imu: Imu. `none` leaves a role out.
-        child_frame: of a `pose` topic that holds the transforms of several bodies.
+        frame: parent of the transforms to take, of a `pose` topic that holds several.
+        child_frame: their child, the robot.
         state: joint of each state variable; guessed by the joints' names when left out.
         wheels: left and right joint whose velocities are the wheel speeds; likewise.
         stamps: `header` takes all times from the messages' headers, `receive` from when the
@@ -80,90 +88,143 @@ class TopicRoles(Schema):
     odom: str | None = None
     joint_states: str | None = None
     imu: str | None = None
+    frame: str | None = None
     child_frame: str | None = None
     state: dict[str, JointSource | str] = Field(default_factory=dict)
     wheels: tuple[str, str] | None = None
     stamps: Stamps = "auto"
 
 
-def topic_roles(
-    file: Path | None = None, options: Iterable[str] = (), stamps: str | None = None
-) -> TopicRoles:
+def topic_roles(file: Path | None = None, options: Iterable[str] = ()) -> TopicRoles:
     """The roles that a YAML file and the options `ROLE=TOPIC` of a command line give.
+
+    Args:
+        file: of the keys of `TopicRoles`.
+        options: go before the file.
 
     Raises:
         ConfigError: the file, a role or a value is wrong.
     """
     roles = load_yaml(file, TopicRoles) if file else TopicRoles()
-    given: dict[str, str] = {} if stamps is None else {"stamps": stamps}
+    given: dict[str, str] = {}
     for option in options:
-        role, equals, topic = option.partition("=")
+        role, equals, topic = (part.strip() for part in option.partition("="))
         if not equals or not topic:
             raise ConfigError(f"--topic {option!r}: must be ROLE=TOPIC, as in cmd_vel=/cmd_vel.")
         if role not in ROLES:
             raise ConfigError(f"--topic {option!r}: unknown role {role!r}; {nearest(role, ROLES)}")
+        if role in given:
+            raise ConfigError(f"--topic {option!r}: {role} was given before; give it once.")
         given[role] = topic
     return validate({**roles.model_dump(exclude_none=True), **given}, TopicRoles, "topics")
 
 
-def assign(roles: TopicRoles, types: Mapping[str, str], place: str) -> dict[str, str]:
+def assign(
+    roles: TopicRoles, types: Mapping[str, str], empty: Collection[str], place: str
+) -> dict[str, str]:
     """The topic of each role that is played.
 
     Args:
         roles: what the user said.
-        types: message type of each topic that holds messages.
+        types: message type of each topic.
+        empty: topics without messages, which play no role.
         place: the recording's name, for errors.
 
     Returns:
-        role -> topic. There is a `cmd_vel`, and one of `pose` and `odom` at least.
+        role -> topic. There is a `cmd_vel`, and either a `pose` or an `odom`.
 
     Raises:
-        RecordingError: a topic is missing, of a wrong type, or several could play a role.
+        RecordingError: a topic is missing, of a wrong type, or several could play a role; one
+            sentence with the topics that are there and what to write.
     """
-    chosen = {role: _topic(role, getattr(roles, role), types, place) for role in ROLES}
-    found = {role: topic for role, topic in chosen.items() if topic is not None}
-    there = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(types.items())) or "none"
-    if REQUIRED not in found:
-        raise RecordingError(
-            f"{place}: no topic is known to hold the commands; say which with --topic "
-            f"cmd_vel=TOPIC, or record one; topics with messages: {there}."
-        )
-    if "pose" not in found and "odom" not in found:
-        raise RecordingError(
-            f"{place}: no topic is known to hold poses; say which with --topic pose=TOPIC or "
-            f"--topic odom=TOPIC, or record one; topics with messages: {there}."
-        )
+    table = _Topics(types, empty, place)
+    found = {}
+    for role in ROLES:
+        if role == "odom" and "pose" in found and roles.odom is None:
+            continue
+        topic = table.choose(role, getattr(roles, role))
+        if topic is not None:
+            found[role] = topic
+    for needed, words in ((("cmd_vel",), "commands"), (("pose", "odom"), "poses")):
+        if not found.keys() & set(needed):
+            raise table.missing(needed, words)
     return found
 
 
-def _topic(role: str, wanted: str | None, types: Mapping[str, str], place: str) -> str | None:
-    if wanted == NONE:
-        return None
-    if wanted is None:
-        return _guess(role, types, place)
-    topic = wanted if wanted.startswith("/") else f"/{wanted}"
-    if topic not in types:
-        raise RecordingError(
-            f"{place}: holds no messages of the topic {topic!r} ({role}); {nearest(topic, types)}"
-        )
-    if types[topic] not in TYPES[role]:
-        raise RecordingError(
-            f"{place}: the topic {topic!r} is of type {types[topic]}; {role} must be one of "
-            f"{', '.join(TYPES[role])}."
-        )
-    return topic
+@dataclass(frozen=True)
+class _Topics:
+    """The topics of a bag."""
 
+    types: Mapping[str, str]
+    empty: Collection[str]
+    place: str
 
-def _guess(role: str, types: Mapping[str, str], place: str) -> str | None:
-    """The one topic with the surest usual name; None when no name is usual."""
-    allowed = set(TYPES[role]) - ({ODOMETRY} if role == "pose" else set())
-    for pattern in USUAL[role]:
-        found = sorted(t for t, kind in types.items() if kind in allowed and re.search(pattern, t))
-        if len(found) > 1:
+    def choose(self, role: str, wanted: str | None) -> str | None:
+        """The topic of a role: the wanted one, or the one that looks like it."""
+        if wanted == NONE:
+            return None
+        if wanted is None:
+            return self._guess(role)
+        topic = wanted if wanted.startswith("/") else f"/{wanted}"
+        if topic not in self.types:
             raise RecordingError(
-                f"{place}: {' and '.join(found)} could each be {role}; say which with --topic "
-                f"{role}={found[0]}" + ("." if role == REQUIRED else f", or {role}={NONE}.")
+                f"{self.place}: has no topic {topic!r} ({role}); {self._listed((role,))}"
             )
-        if found:
-            return found[0]
-    return None
+        if topic in self.empty:
+            raise RecordingError(
+                f"{self.place}: holds no messages of the topic {topic!r} ({role}); "
+                f"{self._listed((role,))}"
+            )
+        if self.types[topic] not in TYPES[role]:
+            raise RecordingError(
+                f"{self.place}: the topic {topic!r} is of type {self.types[topic]}; {role} must "
+                f"be one of {', '.join(TYPES[role])}."
+            )
+        return topic
+
+    def _guess(self, role: str) -> str | None:
+        """The one topic with the surest usual name; None when no name is usual."""
+        allowed = set(TYPES[role]) - set(NEVER_GUESSED.get(role, ()))
+        full = [t for t, kind in self.types.items() if kind in allowed and t not in self.empty]
+        for pattern in USUAL[role]:
+            found = sorted(t for t in full if re.search(pattern, t))
+            if len(found) > 1:
+                without = "" if role == REQUIRED else f", or {role}={NONE} for none"
+                several = ", ".join(f"{t} ({self.types[t]})" for t in found)
+                raise RecordingError(
+                    f"{self.place}: each of several topics could be {role}: {several}; say which "
+                    f"with --topic {role}={found[0]}{without}."
+                )
+            if found:
+                return found[0]
+        return None
+
+    def missing(self, roles: Sequence[str], words: str) -> RecordingError:
+        """That no topic plays any of the roles, and what to write."""
+        fitting = [(role, topic) for role in roles for topic in self._fitting(role)]
+        if fitting:
+            role, topic = fitting[0]
+            advice = f"say which does, as in --topic {role}={topic}"
+        else:
+            kinds = dict.fromkeys(kind for role in roles for kind in TYPES[role])
+            advice = f"record one of type {', '.join(kinds)}"
+        return RecordingError(
+            f"{self.place}: no topic is known to hold the {words}; {advice}; {self._listed(roles)}"
+        )
+
+    def _fitting(self, role: str) -> list[str]:
+        """Topics with messages of a type that can play the role."""
+        return sorted(
+            t for t, kind in self.types.items() if kind in TYPES[role] and t not in self.empty
+        )
+
+    def _listed(self, roles: Sequence[str]) -> str:
+        """The topics with their types, those that fit a role first."""
+        fitting = {topic for role in roles for topic in self._fitting(role)}
+        topics = sorted(self.types, key=lambda topic: (topic not in fitting, topic))
+        told = [
+            f"{topic} ({self.types[topic]}{', empty' if topic in self.empty else ''})"
+            for topic in topics[:MOST_LISTED]
+        ]
+        more = len(topics) - len(told)
+        return f"its topics are {', '.join(told)}{f' and {more} more' if more else ''}."

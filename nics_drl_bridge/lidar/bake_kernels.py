@@ -62,8 +62,8 @@ def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # 
     else:
         kernels.polygon(fine, directions, beams, distance, 0.0, cos, sin, corners)
     count = fine.shape[0]
-    first = min(max(int(math.ceil((edge[0] - beams[0]) / beams[1])), 0), count - 1)
-    last = max(min(int(math.floor((edge[1] - beams[0]) / beams[1])), count - 1), 0)
+    first = min(max(math.ceil((edge[0] - beams[0]) / beams[1]), 0), count - 1)
+    last = max(min(math.floor((edge[1] - beams[0]) / beams[1]), count - 1), 0)
     while first < last and not np.isfinite(fine[first]):
         first += 1
     while last > first and not np.isfinite(fine[last]):
@@ -84,15 +84,14 @@ def into_phases(rows, fine, width, phases):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def rows_of_turn(rows, starts, begins, widths, corners, radius, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
+def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
     """All rows of one rotation.
 
     Args:
         rows: (R,) float32 result: the table's ranges [m].
-        starts: (D,) where each row begins in `rows`.
-        begins: (D,) first beam of each row, from the bearing.
-        widths: (D,) beams of each row.
-        corners, radius: see `row`.
+        layout: (3, D) where each row begins in `rows`, its first beam from the bearing, and its
+            width in beams.
+        shape: corners and radius, see `row`.
         distances: (D,) [m].
         turn: rotation [rad].
         edges: (D, 2) [rad].
@@ -100,12 +99,14 @@ def rows_of_turn(rows, starts, begins, widths, corners, radius, distances, turn,
         phases: points per beam.
     """
     c, s = math.cos(turn), math.sin(turn)
+    corners, radius = shape
     for d in range(distances.shape[0]):
-        points = widths[d] * phases
-        angles = (begins[d] * phases + np.arange(points)) * (step / phases)
+        start, begin, width = layout[0, d], layout[1, d], layout[2, d]
+        points = width * phases
+        angles = (begin * phases + np.arange(points)) * (step / phases)
         directions = np.empty((points, 2))
         directions[:, 0], directions[:, 1] = np.cos(angles), np.sin(angles)
         fine = np.empty(points, np.float32)
         beams = (angles[0], step / phases, 0.0)
         row(fine, directions, beams, corners, radius, distances[d], c, s, edges[d])
-        into_phases(rows[starts[d] : starts[d] + points], fine, widths[d], phases)
+        into_phases(rows[start : start + points], fine, width, phases)

@@ -17,8 +17,6 @@ import math
 import numpy as np
 from numba import njit
 
-from nics_drl_bridge.lidar import kernels
-
 BLOCK = 16
 """So many beams are fused at once; rows and lines are that much longer than their content."""
 COLUMNS = 11
@@ -117,7 +115,7 @@ def directions(found, work):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy")
 def cells_of(found, bodies, n, shape_of, cell_of, hulls, work, cells):  # type: ignore[no-untyped-def]
-    """Third pass: which cell of the table each looks up, and its two silhouettes as (along, across).
+    """Third pass: which cell each looks up, and its two silhouettes as (along, across).
 
     The silhouette is exact: of two corners that it can be within the cell, the outer one.
     """
@@ -125,7 +123,12 @@ def cells_of(found, bodies, n, shape_of, cell_of, hulls, work, cells):  # type: 
         b = cells[0, k]
         dx, dy, distance = work[0, k], work[1, k], work[2, k]
         c, s, h = bodies[n, b, 3], bodies[n, b, 4], int(bodies[n, b, 6])
-        radius, distances, turns, parts = shape_of[h, 0], shape_of[h, 2], shape_of[h, 4], shape_of[h, 5]
+        radius, distances, turns, parts = (
+            shape_of[h, 0],
+            shape_of[h, 2],
+            shape_of[h, 4],
+            shape_of[h, 5],
+        )
         place = (distance - radius) * shape_of[h, 1]
         step = min(math.floor(place), distances - 2.0)
         turn = (bodies[n, b, 2] - work[3, k]) * shape_of[h, 3] + 0.5
@@ -162,7 +165,7 @@ def cells_of(found, bodies, n, shape_of, cell_of, hulls, work, cells):  # type: 
 
 @njit(cache=True, error_model="numpy")
 def spans(found, heading, beams, work):  # type: ignore[no-untyped-def]
-    """Fourth pass: bearing and both silhouettes in beams, the right one in the first turn: rows 3, 4, 5."""
+    """Fourth pass: bearing and both silhouettes in beams, the right one within the first turn."""
     per_beam = 1.0 / beams[1]
     turn = 2.0 * math.pi * per_beam
     rx, ry, lx, ly = work[4], work[5], work[6], work[7]
@@ -186,10 +189,10 @@ def fuse(line, found, beams, row_of, cell_of, rows, shift, work, cells):  # type
         middle, right, left, cell = work[3, k], work[9, k], work[10, k], cells[1, k]
         blend = np.float32(work[8, k])
         while True:
-            begin = max(int(math.ceil(right)), 0)
-            hits = min(int(math.floor(left)), last) - begin + 1
+            begin = max(math.ceil(right), 0)
+            hits = min(math.floor(left), last) - begin + 1
             if hits > 0:
-                point = int(math.floor((begin - middle) * phases + 0.5))
+                point = math.floor((begin - middle) * phases + 0.5)
                 beam, phase = point >> shift, point & (phases - 1)
                 width, width2 = cell_of[cell, 1], cell_of[cell + 1, 1]
                 skip = max(min(beam - cell_of[cell, 0], width - hits), 0)

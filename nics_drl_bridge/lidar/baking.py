@@ -99,6 +99,13 @@ def bake(
     )
 
 
+def with_shapes(spec: LidarSpec, table: LidarTable, shapes: Sequence[Shape]) -> LidarTable:
+    """The table itself if it holds all of these shapes, or one of the same density that does."""
+    if set(shapes) <= set(table.shapes):
+        return table
+    return bake(spec, (*table.shapes, *shapes), table.density)
+
+
 def _grid(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> _Grid:
     """Where the cells of a shape lie and how wide their rows are."""
     shape, radius, order = outlines.shapes[h], outlines.radii[h], outlines.orders[h]
@@ -124,15 +131,13 @@ def _grid(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> _Gri
     return _Grid(distances, np.arange(count) * unit, edges[1::2], cell)
 
 
-def _around(
-    edge: NDArray[np.float64], outer: np.ufunc
-) -> NDArray[np.float64]:
+def _around(edge: NDArray[np.float64], outer: np.ufunc) -> NDArray[np.float64]:
     """(T, D) the outermost edge until the next cells, from edges (2 T + 1, D) at half steps."""
     turned = outer(outer(edge[:-1:2], edge[1::2]), edge[2::2])
     result = turned.copy()
     result[:, 1:] = outer(result[:, 1:], turned[:, :-1])
     result[:, :-1] = outer(result[:, :-1], turned[:, 1:])
-    return result
+    return np.asarray(result)
 
 
 def _candidates(hints: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -155,11 +160,16 @@ def _rows_of_turn(
     phases: int,
 ) -> None:
     corners = outlines.corners[outlines.corner[h] : outlines.corner[h + 1]]
-    begins, widths = (np.ascontiguousarray(grid.cell[t, :, i]) for i in (0, 1))
     bake_kernels.rows_of_turn(
-        rows, starts, begins, widths, corners, outlines.radii[h], grid.distances, grid.turns[t],
-        grid.edges[t], spec.angle_increment, phases,
-    )  # fmt: skip
+        rows,
+        np.stack([starts, grid.cell[t, :, 0], grid.cell[t, :, 1]]),
+        (corners, outlines.radii[h]),
+        grid.distances,
+        grid.turns[t],
+        grid.edges[t],
+        spec.angle_increment,
+        phases,
+    )
 
 
 def _apply(

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import BLOCK, COLUMNS
+from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.shapes import BODY, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.table import LidarTable
 
 Renderer = Literal["auto", "baked", "exact"]
@@ -69,7 +69,7 @@ class Scanner:
             return np.zeros(len(corners), np.uint8)
         if self.renderer == "baked":
             return np.ones(len(corners), np.uint8)
-        return ((corners == 0) | (corners > FEW_CORNERS)).astype(np.uint8)
+        return np.asarray((corners == 0) | (corners > FEW_CORNERS), np.uint8)
 
     def room(self, bodies: int) -> Room:
         """Scratch that one thread needs to scan a world of so many bodies."""
@@ -117,8 +117,6 @@ class Scanner:
         return out
 
 
-def make_scanner(
-    spec: LidarSpec, shapes: Sequence[Shape], renderer: Renderer = "auto"
-) -> Scanner:
+def make_scanner(spec: LidarSpec, shapes: Sequence[Shape], renderer: Renderer = "auto") -> Scanner:
     """A scanner with a table for the given shapes, baked now."""
     return Scanner(spec, bake(spec, shapes), renderer)

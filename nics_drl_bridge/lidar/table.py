@@ -5,15 +5,16 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ModelError
-from nics_drl_bridge.files import npz_arrays, npz_bytes
+from nics_drl_bridge.files import npz_bytes, npz_mapped, sha256
 from nics_drl_bridge.lidar.shapes import SHAPES, Circle, Outlines, Shape
 
 
@@ -75,9 +76,9 @@ class LidarTable:
         """What the kernels take.
 
         Per shape (H, 11): radius [m], cells per metre, distances, rotations per radian, grid
-        rotations in a part of a turn, parts, 1 / (grid rotations x parts), first cell, first corner of the
-        hull, corners per part, 1 for a circle; then `start`, `cell`, `rows`, log2 of the phases,
-        the hulls.
+        rotations in a part of a turn, parts, 1 / (grid rotations x parts), first cell, first
+        corner of the hull, corners per part, 1 for a circle; then `start`, `cell`, `rows`, log2
+        of the phases, the hulls.
         """
         outlines, distances = self.outlines, self.density.distances
         of = np.zeros((len(self.shapes), 11))
@@ -99,30 +100,67 @@ class LidarTable:
         return sum(a.nbytes for a in (self.grid, self.start, self.cell, self.rows))
 
     def dump(self) -> bytes:
-        """The table as the content of an `.npz` file."""
-        return npz_bytes(
-            {
-                "about": np.frombuffer(self._about().encode(), np.uint8),
-                "grid": self.grid,
-                "start": self.start,
-                "cell": self.cell,
-                "rows": self.rows,
-            }
-        )
+        """The table as the content of an `.npz` file that can be mapped."""
+        arrays: dict[str, NDArray[Any]] = {
+            "about": np.frombuffer(self._about().encode(), np.uint8),
+            "grid": self.grid,
+            "start": self.start,
+            "cell": self.cell,
+            "rows": self.rows,
+        }
+        return npz_bytes(arrays, packed=False)
 
     def _about(self) -> str:
         shapes = SHAPES.dump_python(self.shapes, mode="json")
         return json.dumps({"shapes": shapes, "density": self.density.model_dump()})
 
     @classmethod
-    def parse(cls, data: bytes, source: str) -> LidarTable:
-        """Reads what `dump` wrote. Raises ModelError with the file's name otherwise."""
+    def load(cls, path: Path, checksum: str | None = None) -> LidarTable:
+        """Maps a table that `dump` made into memory; processes that do so share it.
+
+        Args:
+            path: of the file.
+            checksum: SHA-256 that the file must have, in hexadecimal.
+
+        Raises:
+            ModelError: the file can't be read, is another one, damaged, or no table.
+        """
         try:
-            arrays = npz_arrays(data)
+            if checksum is not None and sha256(path.read_bytes()) != checksum:
+                raise ModelError(f"{path}: does not match its checksum; generate the model anew.")
+            arrays = npz_mapped(path)
             about = json.loads(arrays.pop("about").tobytes())
             shapes = SHAPES.validate_python(about["shapes"])
-            return cls(shapes, Density(**about["density"]), **arrays)
-        except (KeyError, TypeError, ValueError, ValidationError) as error:
+            table = cls(shapes, Density(**about["density"]), **arrays)
+            table._check()
+        except OSError as error:
             raise ModelError(
-                f"{source}: is no lidar table ({error}); generate the model anew."
+                f"{path}: can't be read ({error.strerror}); generate the model anew."
             ) from None
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise ModelError(
+                f"{path}: is no lidar table ({reason}); generate the model anew."
+            ) from None
+        return table
+
+    def _check(self) -> None:
+        """Raises ValueError when the kernels would read beyond an array."""
+        cells = int(self.grid[:, 1].sum()) * self.density.distances
+        arrays: tuple[NDArray[Any], ...] = (self.grid, self.start, self.cell, self.rows)
+        if [array.dtype for array in arrays] != [np.float64, np.int32, np.int16, np.float32]:
+            raise ValueError("an array has another type of number")
+        if self.grid.shape != (len(self.shapes), 3) or self.start.shape != (cells,):
+            raise ValueError("the number of cells does not fit the shapes")
+        if self.cell.shape != (cells, 6) or self.rows.ndim != 1:
+            raise ValueError("an array has another shape")
+        widths = self.cell[:, 1].astype(np.int64) * self.density.phases
+        ends = self.start + widths
+        if cells and (self.start.min() < 0 or widths.min() < 1 or ends.max() > len(self.rows)):
+            raise ValueError("a row lies outside of the table")
+        corners = np.diff(self.outlines.hull) // 2
+        first = self.grid[:, 2].astype(np.int64)
+        for h, count in enumerate(self.grid[:, 1].astype(np.int64) * self.density.distances):
+            part = self.cell[first[h] : first[h] + count, 2:]
+            if len(part) != count or part.min() < 0 or part.max() >= corners[h]:
+                raise ValueError("a cell names a corner that its shape has not")

@@ -15,14 +15,21 @@ from nics_drl_bridge.middleware import kernels
 
 Array = NDArray[np.float64]
 
-POSITION_DRIFT = 0.02
-"""How far the model's position is off after a second [m / sqrt(s)]."""
-HEADING_DRIFT = 0.02
-"""The same for the heading [rad / sqrt(s)]."""
-STATE_DRIFT = 0.1
-"""How far a state is off after a second, as a share of its range [1 / sqrt(s)]."""
+LEAST_POSE_DRIFT = 2e-3
+"""No model is trusted to be off by less than this after a second [m or rad / sqrt(s)],"""
+LEAST_STATE_DRIFT = 5e-3
+"""nor, of a state, by less than this share of its range [1 / sqrt(s)]."""
 LEAST_TWIST_STD = 1e-3
-"""A twist is never trusted more than this [m/s, rad/s]."""
+"""A twist is never trusted more than this [m/s, rad/s],"""
+LEAST_POSE_STD = 1e-3
+"""nor is a pose [m, rad]."""
+SURPRISE = 16.27
+"""A twist whose squared, normalised innovation exceeds this, once in a thousand, is news: the
+robot is stuck, slips or is pushed. (99.9 % of chi-squared with three degrees of freedom.)"""
+NEWS = 0.5
+"""The state is then taken to be off by this share of its range."""
+REACHABLE = 2.0
+"""No state is believed beyond this many times its range: the model means nothing there."""
 START_STD = 1e-3
 """How well the pose is known at a reset [m, rad]."""
 COMMANDS_KEPT = 64
@@ -38,8 +45,8 @@ class Estimator:
     an integer of nanoseconds, so that the same messages give the same numbers to the bit.
 
     Args:
-        model: its kinematics predict, its noise weighs the odometry, its latency delays the
-            commands.
+        model: its kinematics predict, its drift is the Q and its sensors' noise the R of the
+            filter, its latency delays the commands.
     """
 
     def __init__(self, model: SimulatorModel) -> None:
@@ -47,9 +54,13 @@ class Estimator:
         dt, _, delay = model.timing
         self._dt_ns, self._delay_ns = round(dt * NANO), round(dt * delay * NANO)
         size = len(model.robot.state)
-        spread = [STATE_DRIFT * (v.max - v.min) for v in model.robot.state]
-        drift = np.array([POSITION_DRIFT, POSITION_DRIFT, HEADING_DRIFT, *spread])
-        self._process = np.diag(drift**2)
+        reach = np.array([v.max - v.min for v in model.robot.state])
+        least = np.concatenate([np.full(3, LEAST_POSE_DRIFT), LEAST_STATE_DRIFT * reach])
+        self._process = np.diag(np.maximum(model.noise.drift(model.robot), least) ** 2)
+        self._news = np.concatenate([np.zeros(3), NEWS * reach]) ** 2
+        center = np.array([v.max + v.min for v in model.robot.state]) / 2.0
+        self._limits = center - REACHABLE / 2.0 * reach, center + REACHABLE / 2.0 * reach
+        self._pose_std = np.maximum(model.noise.pose, LEAST_POSE_STD)
         linear, angular = (max(std, LEAST_TWIST_STD) for std in model.noise.odometry)
         self._twist_noise = np.diag([linear, linear, angular]) ** 2
         self._width = len(model.robot.command)
@@ -124,16 +135,28 @@ class Estimator:
         """Corrects by a measured body twist (3,) at the time of the estimate."""
         command = self._command_at(self.time_ns - 1)
         expected, derivative = kernels.twist_of(self._filter.x, command, self._terms)
+        measured = np.asarray(twist, dtype=np.float64)
+        innovation = measured - expected
+        covariance = derivative @ self._filter.P @ derivative.T + self._twist_noise
+        if innovation @ np.linalg.solve(covariance, innovation) > SURPRISE:
+            variance = np.diag(self._filter.P)
+            self._filter.P = self._filter.P + np.diag(np.maximum(self._news - variance, 0.0))
         self._filter.update(
-            np.asarray(twist, dtype=np.float64),
+            measured,
             HJacobian=lambda _: derivative,
             Hx=lambda _: expected,
             R=self._twist_noise,
         )
-        self._wrap()
+        self._settle()
 
-    def update_pose(self, pose: ArrayLike, std: ArrayLike) -> None:
-        """Corrects by a measured pose (3,) with standard deviations (3,) [m, m, rad]."""
+    def update_pose(self, pose: ArrayLike, std: ArrayLike | None = None) -> None:
+        """Corrects by a measured pose (3,).
+
+        Args:
+            pose: x [m], y [m], heading [rad] in `map`.
+            std: (3,) its standard deviations; those of the model's pose sensor when None.
+        """
+        std = self._pose_std if std is None else std
         observe = np.eye(3, self._filter.dim_x)
         self._filter.update(
             np.asarray(pose, dtype=np.float64),
@@ -142,10 +165,12 @@ class Estimator:
             R=np.diag(np.asarray(std, dtype=np.float64) ** 2),
             residual=_pose_residual,
         )
-        self._wrap()
+        self._settle()
 
-    def _wrap(self) -> None:
+    def _settle(self) -> None:
+        """Brings the heading into [-pi, pi) and the state to where it can be."""
         self._filter.x[2] = wrap_angle(self._filter.x[2])
+        self._filter.x[3:] = np.clip(self._filter.x[3:], *self._limits)
 
 
 def _pose_residual(measured: Array, expected: Array) -> Array:

@@ -10,8 +10,10 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion, Twist
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
-from sensor_msgs.msg import LaserScan
+from sensor_msgs.msg import JointState, LaserScan
 
+from nics_drl_bridge.kinematics.joints import POSITION_UNITS
+from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.lidar.rep117 import from_device, to_device
 from nics_drl_bridge.lidar.spec import LidarSpec
 
@@ -104,6 +106,18 @@ def odometry_from_ros(message: Odometry) -> tuple[Array, Array]:
     return np.array([pose.position.x, pose.position.y, heading]), twist_from_ros(
         message.twist.twist
     )
+
+
+def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState:
+    """A state (S,) as a JointState: angles and lengths as positions, all else as velocities."""
+    message = JointState()
+    message.header.stamp = stamp_to_ros(time_ns)
+    for variable, value in zip(spec.state, np.asarray(state, dtype=np.float64), strict=True):
+        still = variable.unit in POSITION_UNITS
+        message.name.append(variable.name)
+        message.position.append(float(value) if still else 0.0)
+        message.velocity.append(0.0 if still else float(value))
+    return message
 
 
 UNUSED_VARIANCE = 1e6

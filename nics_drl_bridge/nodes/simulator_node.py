@@ -17,7 +17,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import LaserScan
+from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool, Trigger
 
 from nics_drl_bridge import geometry
@@ -35,7 +35,7 @@ COVARIANCE_GROWTH_S = 1.0
 
 
 class SimulatorNode(Node):
-    """Takes `cmd_vel`, publishes `scan`, `odom`, `ground_truth` and `/clock`.
+    """Takes `cmd_vel`, publishes `scan`, `odom`, `joint_states`, `ground_truth` and `/clock`.
 
     Stamps are simulated time, as on `/clock`: it begins at the system's time and never runs
     backwards, also not at a reset. `~/reset` begins the episode of the parameters
@@ -117,6 +117,7 @@ class SimulatorNode(Node):
         self._scan_topic = self.create_publisher(LaserScan, "scan", qos.SENSOR_RELIABLE)
         self._odom_topic = self.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
         self._truth_topic = self.create_publisher(Odometry, "ground_truth", qos.SENSOR_RELIABLE)
+        self._joint_topic = self.create_publisher(JointState, "joint_states", qos.SENSOR_RELIABLE)
         self._clock_topic = self.create_publisher(Clock, "/clock", qos.SENSOR_RELIABLE)
         commands = qos.EVERY_COMMAND if self._mode == "lockstep" else qos.COMMAND
         self.create_subscription(Twist, "cmd_vel", self._on_command, commands)
@@ -195,6 +196,9 @@ class SimulatorNode(Node):
         self._clock_topic.publish(Clock(clock=conversions.stamp_to_ros(now)))
         self._odom_topic.publish(
             conversions.odometry_to_ros(pose, twist, now, (odom_frame, base), variance)
+        )
+        self._joint_topic.publish(
+            conversions.joints_to_ros(self._model.robot, data.state[0, 0], now)
         )
         self._scan_topic.publish(
             conversions.scan_to_ros(self._model.lidar, data.ranges[0, 0], now, laser)

@@ -39,3 +39,8 @@ def policy_node() -> None:
 def command_gate() -> None:
     """Runs `command_gate`."""
     _start("command_gate")
+
+
+def record_node() -> None:
+    """Runs `record_node`."""
+    _start("record_node")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,10 +18,11 @@ from nics_drl_bridge.calibration.signals import held
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.kinematics.recording import Samples
 from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.report.calibration_pictures import calibration_pictures
+from nics_drl_bridge.report.drawing import MEASURED, MODEL, OTHER, png
 
 Array = NDArray[np.float64]
 
-MEASURED, MODEL, OTHER = "#1f6fb2", "#d1495b", "#8d99ae"
 SHOWN_S = 8.0
 PATHS, POINTS = 6, 40
 SETTLED_S = 1.0
@@ -31,7 +31,7 @@ LEAST_RATE = 1e-6
 
 
 def write_pictures(spec: RobotSpec, identified: Identified, folder: Path) -> tuple[Path, ...]:
-    """Writes the pictures of a fit as PNG files.
+    """Writes the pictures of a fit and of its calibration as PNG files.
 
     Args:
         spec: the robot.
@@ -43,8 +43,9 @@ def write_pictures(spec: RobotSpec, identified: Identified, folder: Path) -> tup
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = []
-    for name, png in fit_pictures(spec, identified).items():
-        write_bytes(folder / f"{name}.png", png)
+    drawn = {**fit_pictures(spec, identified), **calibration_pictures(spec, identified)}
+    for name, picture in drawn.items():
+        write_bytes(folder / f"{name}.png", picture)
         files.append(folder / f"{name}.png")
     return tuple(files)
 
@@ -89,7 +90,7 @@ def accuracy(identified: Identified) -> bytes:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, fontsize=9)
-    return _png(figure)
+    return png(figure)
 
 
 def held_out_paths(spec: RobotSpec, identified: Identified) -> bytes:
@@ -119,7 +120,7 @@ def held_out_paths(spec: RobotSpec, identified: Identified) -> bytes:
         axes.set_axis_off()
     handles, labels = grid[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
-    return _png(figure)
+    return png(figure)
 
 
 def residuals(identified: Identified, unseen: Samples) -> bytes:
@@ -142,7 +143,7 @@ def residuals(identified: Identified, unseen: Samples) -> bytes:
         grid[0].plot([], [], color=color, label=label)
     figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper center", ncols=3,
                   frameon=False)  # fmt: skip
-    return _png(figure)
+    return png(figure)
 
 
 def alignment(spec: RobotSpec, identified: Identified) -> bytes:
@@ -172,7 +173,7 @@ def alignment(spec: RobotSpec, identified: Identified) -> bytes:
         f"clock offset {calibration.clock_offset_s:.4g} s, command latency "
         f"{calibration.command_latency_s:.4g} s", fontsize=10,
     )  # fmt: skip
-    return _png(figure)
+    return png(figure)
 
 
 def _response(
@@ -207,9 +208,3 @@ def _predicted(spec: RobotSpec, identified: Identified, chosen: Windows) -> Arra
         for end in ends
     ]
     return np.stack([chosen.start, *poses], axis=1)
-
-
-def _png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""Compiled inner loops of the simulator: motion, collision, odometry and scans.
+"""Compiled inner loops of the simulator: motion, collision, and the step of all worlds.
 
 What one robot does is a scalar function; the batched loops call it. Shapes: N worlds, M
 robots, S state, C command, H periods of command history, K obstacles, W walls, B beams.
@@ -11,10 +11,8 @@ import math
 import numpy as np
 from numba import njit
 
-from nics_drl_bridge import random_kernels as random
-from nics_drl_bridge.kinematics.kernels import advance, delayed, move, rates, run, wrap
-from nics_drl_bridge.lidar import fault_kernels
-from nics_drl_bridge.lidar import kernels as lidar
+from nics_drl_bridge.kinematics.kernels import delayed, move, rates, run, wrap
+from nics_drl_bridge.sim import sensing_kernels as sensing
 from nics_drl_bridge.sim.world import wall_distance
 
 
@@ -23,8 +21,8 @@ def clearance(pose, me, footprint, bodies, walls):  # type: ignore[no-untyped-de
     """Free space [m] between the round footprint at a pose (3,) and the nearest wall or body."""
     least = wall_distance(pose[0], pose[1], walls)
     for k in range(bodies.shape[0]):
-        if k != me and bodies[k, 2] > 0.0:
-            away = np.hypot(pose[0] - bodies[k, 0], pose[1] - bodies[k, 1]) - bodies[k, 2]
+        if k != me and bodies[k, 5] > 0.0:
+            away = np.hypot(pose[0] - bodies[k, 0], pose[1] - bodies[k, 1]) - bodies[k, 5]
             least = min(least, away)
     return least - footprint
 
@@ -72,7 +70,7 @@ def move_carefully(pose, state, history, bodies, walls, collided, footprint, mot
         pose: (M, 3), in place.
         state: (M, S), in place.
         history: (M, H, C) commands, newest first.
-        bodies: (K + M, 4) obstacles and robots: x, y, radius, shape; robots in place.
+        bodies: (K + M, 7) obstacles, then robots, see `lidar.shapes.BODY`; robots in place.
         walls: (W, 4).
         collided: (M,) set to 1 by a touch.
         footprint: radius [m].
@@ -157,54 +155,14 @@ def move_block(pose, state, history, bodies, walls, collided, footprint, lanes, 
 
 
 @njit(cache=True)
-def measure(odom, twist, before, after, now, seed, counter, std, period, series):  # type: ignore[no-untyped-def]
-    """What the wheels' odometry says of one period: a drifting pose and a noisy twist.
-
-    Args:
-        odom: (3,) odometry pose, in place.
-        twist: (3,) measured twist, result.
-        before, after: (3,) true poses around the period.
-        now: (3,) true twist at its end.
-        seed, counter: of the random draws.
-        std: (2,) standard deviation of the linear [m/s] and the angular twist [rad/s].
-        period: [s].
-        series: see `kinematics.kernels`.
-    """
-    noise = np.zeros(3)
-    for i in range(3):
-        if std[i // 2] > 0.0:
-            noise[i] = std[i // 2] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter + i)
-        twist[i] = now[i] + noise[i]
-    c, s = math.cos(before[2]), math.sin(before[2])
-    dx, dy = after[0] - before[0], after[1] - before[1]
-    x, y = c * dx + s * dy, c * dy - s * dx
-    turned = after[2] - before[2]
-    c, s = math.cos(odom[2]), math.sin(odom[2])
-    odom[0] += c * x - s * y
-    odom[1] += s * x + c * y
-    odom[2] += turned
-    advance(odom, noise, period, series)
+def place_robot(bodies, n, k, pose):  # type: ignore[no-untyped-def]
+    """Puts body k of world n to a robot's pose (3,)."""
+    bodies[n, k, 0], bodies[n, k, 1], bodies[n, k, 2] = pose
+    bodies[n, k, 3], bodies[n, k, 4] = math.cos(pose[2]), math.sin(pose[2])
 
 
 @njit(cache=True)
-def scan_robot(ranges, pose, me, bodies, walls, sensor, faults, seed, counter):  # type: ignore[no-untyped-def]
-    """One scan (B,) of everything but the robot itself, with the faults of its device.
-
-    Args:
-        me: row of the robot in `bodies`.
-        sensor: see `lidar.scanner.Scanner.arguments`.
-        faults: (P,) of this robot, see `lidar.fault_kernels`.
-        seed, counter: of the random draws.
-    """
-    own = bodies[me, 2]
-    bodies[me, 2] = 0.0
-    lidar.scan(ranges, pose, bodies, walls, sensor)
-    bodies[me, 2] = own
-    fault_kernels.distort(ranges, sensor[3], faults, seed, counter)
-
-
-@njit(cache=True)
-def step_worlds(arrays, commands, walls, footprint, noise, sensor, lanes, motion, room):  # type: ignore[no-untyped-def]
+def step_worlds(arrays, commands, walls, footprint, noise, sensor, lanes, motion, rooms):  # type: ignore[no-untyped-def]
     """One control period of every world.
 
     Args:
@@ -212,11 +170,15 @@ def step_worlds(arrays, commands, walls, footprint, noise, sensor, lanes, motion
         commands: (N, M, C).
         walls: (W, 4).
         footprint: radius [m].
-        noise: standard deviation of the odometry, linear [m/s] and angular [rad/s].
+        noise: standard deviations of the odometry, linear [m/s] and angular [rad/s], and (3 + S)
+            of the drift after a second.
         sensor: see `lidar.scanner.Scanner.arguments`.
-        lanes, motion, room: see the functions above.
+        lanes, motion: see the functions above.
+        rooms: scratch of the motion, see `move_carefully`, of the scans, see
+            `lidar.scanner.Scanner.room`, and of skewed ones, see `sensing_kernels.sense`.
     """
-    pose, state, history, bodies, odom, twist, ranges, collided, steps, seeds, faults = arrays
+    pose, state, history, bodies, odom, twist, _, collided, steps, seeds, _ = arrays
+    room, scan_room, sweep = rooms
     worlds, robots = pose.shape[0], pose.shape[1]
     before = pose.copy()
     for h in range(history.shape[2] - 1, 0, -1):
@@ -230,21 +192,25 @@ def step_worlds(arrays, commands, walls, footprint, noise, sensor, lanes, motion
             footprint, lanes, motion, room,
         )  # fmt: skip
     x, dq, _ = room
-    terms, _, timing = motion
+    terms, series, timing = motion
     period = timing[0] * timing[1]
+    first, drifts, now = bodies.shape[1] - robots, noise[2:].any(), sweep[1]
     for n in range(worlds):
         steps[n] += 1
         for m in range(robots):
             counter = steps[n] * robots + m
+            if drifts and collided[n, m] == 0:
+                sensing.disturb(
+                    pose[n, m], state[n, m], noise[2:], seeds[n], counter, period, series
+                )
+            place_robot(bodies, n, first + m, pose[n, m])
             _rates_now(dq, x, state[n, m], history[n, m], terms, timing)
-            measure(
+            now[n, m] = dq[:3]
+            sensing.measure(
                 odom[n, m], twist[n, m], before[n, m], pose[n, m], dq,
-                seeds[n], counter, noise, period, motion[1],
+                seeds[n], counter, noise[:2], period, series,
             )  # fmt: skip
-            scan_robot(
-                ranges[n, m], pose[n, m], bodies.shape[1] - robots + m, bodies[n], walls, sensor,
-                faults[n, m], seeds[n], counter,
-            )  # fmt: skip
+    sensing.sense(arrays, np.arange(worlds), walls, sensor, scan_room, sweep)
 
 
 @njit(cache=True)
@@ -254,16 +220,3 @@ def _rates_now(dq, x, state, history, terms, timing):  # type: ignore[no-untyped
     size = state.shape[0]
     x[:size], x[size:-1] = state, history[row]
     rates(dq, x, terms)
-
-
-@njit(cache=True)
-def scan_worlds(arrays, chosen, walls, sensor):  # type: ignore[no-untyped-def]
-    """Scans of the worlds `chosen` (n,) as they stand, after a reset."""
-    pose, _, _, bodies, _, _, ranges, _, steps, seeds, faults = arrays
-    for n in chosen:
-        robots = pose.shape[1]
-        for m in range(robots):
-            scan_robot(
-                ranges[n, m], pose[n, m], bodies.shape[1] - robots + m, bodies[n], walls, sensor,
-                faults[n, m], seeds[n], steps[n] * robots + m,
-            )  # fmt: skip

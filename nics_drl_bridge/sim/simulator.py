@@ -12,14 +12,18 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.kinematics.kernels import SERIES, scratch, term_arrays
-from nics_drl_bridge.lidar.scanner import Renderer, make_scanner
-from nics_drl_bridge.sim import kernels
+from nics_drl_bridge.lidar.baking import with_shapes
+from nics_drl_bridge.lidar.scanner import Renderer, Scanner
+from nics_drl_bridge.lidar.shapes import BODY, Circle
+from nics_drl_bridge.sim import kernels, sensing_kernels
 from nics_drl_bridge.sim.validity import CommandBox, OutsideValidityWarning
 from nics_drl_bridge.sim.world import Scene, World, sample_scene
 
 __all__ = ["FastSimulator", "OutsideValidityWarning", "Worlds"]
 
 Array = NDArray[np.float64]
+SLICES = 16
+"""A skewed scan is rendered in so many groups of beams."""
 LANES = 256
 """So many robots move side by side: their arrays stay in the fastest cache."""
 
@@ -32,7 +36,7 @@ class Worlds:
         pose: (N, M, 3) true pose of `base_link` in `map`.
         state: (N, M, S) true state.
         history: (N, M, H, C) commands, newest first.
-        bodies: (N, K + M, 4) obstacles, then robots: x, y, radius [m], shape in the table.
+        bodies: (N, K + M, 7) obstacles, then robots, see `lidar.shapes.BODY`.
         odom: (N, M, 3) pose by odometry, which drifts; it begins at the start pose.
         twist: (N, M, 3) measured body twist.
         ranges: (N, M, B) scan, float32, REP-117.
@@ -64,7 +68,7 @@ class FastSimulator:
         world: the field and its obstacles.
         worlds: N.
         robots: M in each world. They see and touch each other.
-        renderer: `baked` or `exact`.
+        renderer: `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`.
     """
 
     def __init__(
@@ -73,7 +77,7 @@ class FastSimulator:
         world: World,
         worlds: int = 1,
         robots: int = 1,
-        renderer: Renderer = "baked",
+        renderer: Renderer = "auto",
     ) -> None:
         if worlds < 1 or robots < 1:
             raise ConfigError(
@@ -81,18 +85,32 @@ class FastSimulator:
             )
         self.model, self.world = model, world
         self.goals: Array = np.zeros((worlds, robots, 2))
-        footprint = model.robot.footprint_radius
-        self._scanner = make_scanner(model.lidar, (*world.obstacles.radii, footprint), renderer)
-        self._footprint_shape = self._scanner.table.shape_of(footprint)
+        self._footprint = Circle(radius=model.robot.footprint_radius)
+        table = with_shapes(model.lidar, model.table, (*world.shapes, self._footprint))
+        self._scanner = Scanner(model.lidar, table, renderer)
         self._walls = world.all_walls()
-        self._noise = np.array(model.noise.odometry)
+        drift = model.noise.simulated_drift(model.robot)
+        self._noise = np.array([*model.noise.odometry, *drift])
         self._sensor = self._scanner.arguments
         self._motion = (term_arrays(model.kinematics), SERIES, model.timing)
-        self._room = (*scratch(model.kinematics), np.zeros((robots, 2)))
+        bodies = world.obstacles.count + robots
+        self._rooms = (
+            (*scratch(model.kinematics), np.zeros((robots, 2))),
+            self._scanner.room(bodies),
+            self._make_sweep(worlds, robots),
+        )
         self._lanes = self._make_lanes(worlds, robots)
         self._box = CommandBox(model.kinematics, model.robot)
         self.data = self._allocate(worlds, robots)
         self._fields: tuple[Any, ...] = tuple(vars(self.data).values())
+
+    def _make_sweep(self, worlds: int, robots: int) -> tuple[Any, ...]:
+        """What skewed scans need, see `sensing_kernels.sense`."""
+        lidar, shape = self.model.lidar, (worlds, robots, 3)
+        slices = 0 if lidar.faults.skew == "none" else SLICES
+        part = (worlds, robots, lidar.beams if slices else 0)
+        twists, poses = np.zeros(shape), np.zeros(shape)
+        return lidar.sweep_time, twists, poses, np.zeros((slices, 3)), np.zeros(part, np.float32)
 
     def _make_lanes(self, worlds: int, robots: int) -> tuple[Array, Array, Array]:
         """Room for the robots that move side by side: pose (6, L), x (V + 1, L), dq (D, L)."""
@@ -111,7 +129,7 @@ class FastSimulator:
             pose=np.zeros((*shape, 3)),
             state=np.zeros((*shape, size)),
             history=np.zeros((*shape, periods, width)),
-            bodies=np.zeros((worlds, bodies, 4)),
+            bodies=np.zeros((worlds, bodies, BODY)),
             odom=np.zeros((*shape, 3)),
             twist=np.zeros((*shape, 3)),
             ranges=np.full((*shape, self.model.lidar.beams), np.inf, np.float32),
@@ -147,7 +165,9 @@ class FastSimulator:
             self._place(int(n), int(seed), scene, start)
             scenes.append(scene)
         self._box.begin()
-        kernels.scan_worlds(self._fields, chosen, self._walls, self._sensor)
+        _, room, sweep = self._rooms
+        sweep[1][chosen] = 0.0
+        sensing_kernels.sense(self._fields, chosen, self._walls, self._sensor, room, sweep)
         return scenes
 
     def _place(self, n: int, seed: int, scene: Scene, start: Array) -> None:
@@ -156,10 +176,10 @@ class FastSimulator:
         for zeroed in (data.state, data.history, data.twist, data.collided, data.steps):
             zeroed[n] = 0
         data.seeds[n] = seed
-        data.bodies[n, :-robots] = self._scanner.with_shapes(scene.circles)
-        data.bodies[n, -robots:, :2] = start[:, :2]
-        data.bodies[n, -robots:, 2] = self.model.robot.footprint_radius
-        data.bodies[n, -robots:, 3] = self._footprint_shape
+        discs = [Circle(radius=float(radius)) for radius in scene.circles[:, 2]]
+        still = np.concatenate([scene.circles[:, :2], np.zeros((len(discs), 1))], axis=1)
+        data.bodies[n, :-robots] = self._scanner.place(discs, still)
+        data.bodies[n, -robots:] = self._scanner.place([self._footprint] * robots, start)
         self.goals[n] = scene.goals
 
     def step(self, commands: ArrayLike) -> None:
@@ -172,5 +192,5 @@ class FastSimulator:
         self._box.check(commands)
         kernels.step_worlds(
             self._fields, commands, self._walls, self.model.robot.footprint_radius,
-            self._noise, self._sensor, self._lanes, self._motion, self._room,
+            self._noise, self._sensor, self._lanes, self._motion, self._rooms,
         )  # fmt: skip

@@ -13,6 +13,7 @@ from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
+from nics_drl_bridge.lidar.shapes import Circle, Shape
 
 Array = NDArray[np.float64]
 TRIES = 2000
@@ -71,6 +72,11 @@ class World(Schema):
     def fingerprint(self) -> str:
         """Tells two worlds apart: the name, and the first 8 digits of a SHA-256 over all of it."""
         return f"{self.name}-{sha256(self.model_dump_json().encode())[:8]}"
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        """Every shape that an obstacle may have."""
+        return tuple(Circle(radius=radius) for radius in self.obstacles.radii)
 
     def all_walls(self) -> Array:
         """(W, 4) the four sides of the field, then the further walls [m]."""

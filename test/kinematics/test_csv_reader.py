@@ -102,6 +102,29 @@ def test_command_stamps_in_nanoseconds_are_refused(folder):
         load_csv_folder(folder)
 
 
+@pytest.mark.parametrize("name", ["cmd.csv", "L_wheel.csv", "acceleration.csv"])
+@pytest.mark.parametrize("factor", [1e3, 1e6])
+def test_of_stamps_in_mixed_units_the_right_file_is_named(folder, name, factor):
+    if not (folder / name).exists():
+        write(folder / name, np.column_stack([np.zeros((300, 3)), np.arange(300) * 0.1]))
+    table = np.loadtxt(folder / name, delimiter=",")
+    table[:, -1] *= factor
+    write(folder / name, table)
+    with pytest.raises(RecordingError, match="must be in seconds") as caught:
+        load_csv_folder(folder)
+    assert str(caught.value).startswith(str(folder / name))
+
+
+@pytest.mark.parametrize("factor", [1e-9, 1e-6, 1e-3])
+def test_of_pose_stamps_in_another_unit_the_pose_is_named(folder, factor):
+    table = np.loadtxt(folder / "vrpn.csv", delimiter=",")
+    table[:, 7] *= factor
+    write(folder / "vrpn.csv", table)
+    with pytest.raises(RecordingError, match="must be in nanoseconds") as caught:
+        load_csv_folder(folder)
+    assert str(caught.value).startswith(str(folder / "vrpn.csv"))
+
+
 def test_the_reader_is_chosen_by_what_lies_there(folder, tmp_path):
     assert read_recording(folder).wheels is not None
     t = np.arange(30) * 0.1

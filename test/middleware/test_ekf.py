@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from robots import direct_model, field
+from scipy.stats import chi2
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.calibration.noise_model import Level, Noise
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.kinematics.kernels import SERIES, rates, scratch, term_arrays
 from nics_drl_bridge.middleware import kernels
@@ -147,7 +151,7 @@ def test_a_heading_is_corrected_the_short_way_round(believed, measured):
 
 
 def simulated_drive(model, seconds, seed, pose_std=None):
-    """Errors (T, 3) of the estimate, of the odometry, and the covariances on the way."""
+    """Errors (T, 3) of the estimate, of the odometry, and covariances, all in the robot's frame."""
     simulator, estimator = FastSimulator(model, field(60.0)), Estimator(model)
     rng = np.random.default_rng(seed)
     start = np.array([0.0, 0.0, 3.0])
@@ -168,7 +172,9 @@ def simulated_drive(model, seconds, seed, pose_std=None):
             estimator.update_pose(true + rng.normal(size=3) * pose_std, np.full(3, pose_std))
         errors.append(geometry.between(true, estimator.at(now)[0]))
         drifts.append(geometry.between(true, simulator.data.odom[0, 0]))
-        covariances.append(estimator.covariance[:3, :3])
+        turn = np.eye(3)
+        turn[:2, :2] = geometry.rotate(np.eye(2), true[2]).T
+        covariances.append(turn.T @ estimator.covariance[:3, :3] @ turn)
     return np.array(errors), np.array(drifts), np.array(covariances)
 
 
@@ -227,6 +233,64 @@ def test_the_covariance_stays_positive_definite_over_ten_thousand_random_steps(r
             assert covariance == pytest.approx(covariance.T, abs=1e-9)
             scale = np.sqrt(np.diag(covariance))
             assert np.linalg.eigvalsh(covariance / np.outer(scale, scale)).min() > 0.0
+
+
+NOISY = Noise(
+    odom_linear=Level(std=0.05, unit="m/s", source="measured"),
+    odom_angular=Level(std=0.05, unit="rad/s", source="measured"),
+    position_drift=Level(std=0.03, unit="m/sqrt(s)", source="measured"),
+    heading_drift=Level(std=0.03, unit="rad/sqrt(s)", source="measured"),
+)
+RUNS = 60
+
+
+def noisy_model(robot):
+    """The built-in robot; its state drifts by two per cent of its range within a second."""
+    model = builtin_model(robot)
+    states = {
+        v.name: Level(std=0.02 * (v.max - v.min), unit=f"{v.unit}/sqrt(s)", source="measured")
+        for v in model.robot.state
+    }
+    return replace(model, noise=NOISY.model_copy(update={"state_drift": states}))
+
+
+@pytest.mark.parametrize("pose_std", [None, 0.02])
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_estimate_is_as_uncertain_as_it_claims(robot, pose_std):
+    """The mean NEES of many drives lies within the 95 % band of chi-squared."""
+    model, nees = noisy_model(robot), []
+    for seed in range(RUNS):
+        errors, _, covariances = simulated_drive(model, 8, seed, pose_std)
+        nees.append(errors[-1] @ np.linalg.solve(covariances[-1], errors[-1]))
+    low, high = chi2.ppf([0.025, 0.975], 3 * RUNS) / RUNS
+    assert low < np.mean(nees) < high
+
+
+def test_a_robot_that_is_stuck_is_noticed_at_once():
+    estimator = Estimator(builtin_model("ackermann"))
+    estimator.reset(0, np.zeros(3))
+    estimator.command(0, [0.8, 0.0])
+    for step in range(1, 21):
+        estimator.predict(step * PERIOD)
+        estimator.update_twist(np.zeros(3))
+    pose, twist = estimator.at(20 * PERIOD)
+    assert abs(twist[0]) < 0.1
+    assert abs(pose[0]) < 0.8  # the command alone leads to 1.5 m
+
+
+def test_the_noise_of_the_pose_is_that_of_the_model():
+    model = noisy_model("differential")
+    spread = []
+    for std in (0.01, 0.1):
+        level = Level(std=std, unit="m", source="measured")
+        noise = model.noise.model_copy(update={"pose_position": level})
+        estimator = Estimator(replace(model, noise=noise))
+        estimator.reset(0, np.zeros(3))
+        estimator.predict(10 * SECOND)
+        estimator.update_pose(np.zeros(3))
+        spread.append(np.sqrt(estimator.covariance[0, 0]))
+    assert spread[0] == pytest.approx(0.01, rel=0.2)
+    assert spread[1] > 3.0 * spread[0]
 
 
 def test_the_same_data_give_the_same_bits():

@@ -11,6 +11,7 @@ from geometry_msgs.msg import Quaternion
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import LaserScan
 
+from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.nodes import conversions
 
@@ -133,3 +134,12 @@ def test_a_device_that_turns_while_it_measures_says_so_in_the_header():
     message = conversions.scan_to_ros(spec, np.ones(spec.beams, np.float32), 0, "laser")
     # 3 rad of a turn that takes 50 ms, in 180 steps.
     assert message.time_increment == pytest.approx(0.05 * 3.0 / (2.0 * math.pi) / 180)
+
+
+def test_a_state_is_told_by_joints_of_its_names():
+    car = load_robot("ackermann")
+    message = over_the_wire(conversions.joints_to_ros(car, [0.7, -0.3], 5_000_000_007))
+    assert conversions.stamp_from_ros(message.header.stamp) == 5_000_000_007
+    assert message.name == ["speed", "steering"]
+    assert list(message.velocity) == [0.7, 0.0]
+    assert list(message.position) == [0.0, -0.3]

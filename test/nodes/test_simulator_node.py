@@ -17,7 +17,7 @@ from domains import claimed_domain
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import LaserScan
+from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool, Trigger
 
 from nics_drl_bridge.nodes import conversions, qos
@@ -322,6 +322,20 @@ def test_as_fast_as_possible_it_outruns_the_clock(launch, meet, domain_id):
     print(f"{factor:.0f} times faster than the clock")
     assert factor > 2.0
     process.close()
+
+
+def test_its_joints_tell_the_state_at_the_stamps_of_its_odometry(launch, meet, domain_id):
+    launch("simulator_node", domain_id)
+    peer = meet(domain_id)
+    joints, odom = peer.listen(JointState, "joint_states"), peer.listen(Odometry, "odom")
+    command = peer.speak(Twist, "cmd_vel")
+    ahead = conversions.twist_to_ros([0.5, 0.0, 0.2])
+    peer.until(
+        lambda: command.publish(ahead) or (joints and joints[-1].velocity[0] > 0.4), "driving"
+    )
+    assert joints[-1].name == ["speed", "steering"]
+    assert joints[-1].position[1] > 0.1
+    peer.until(lambda: stamp_ns(joints[-1]) in {stamp_ns(each) for each in odom}, "its odometry")
 
 
 REFUSED = {

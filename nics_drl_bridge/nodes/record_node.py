@@ -1,0 +1,261 @@
+"""record_node: drives a robot so that it shows its whole motion, and records it."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import Imu, JointState
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import BackendError, BridgeError
+from nics_drl_bridge.kinematics.drive_file import write_drive
+from nics_drl_bridge.kinematics.exploration import PERIOD_S, STILL_S
+from nics_drl_bridge.kinematics.recording import Recording
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.drive_log import DriveLog
+from nics_drl_bridge.nodes.drive_parameters import declare_drive
+from nics_drl_bridge.nodes.runner import EXIT_BAD_INPUT, last_word, run_node
+
+Array = NDArray[np.float64]
+PATIENCE_S = 10.0
+POLL_S = 0.01
+HALT_S = 0.5
+"""Zero is repeated for so long: a robot that listens best effort may miss one."""
+PERIOD_NS = round(PERIOD_S * conversions.NANO)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a drive ended.
+
+    Attributes:
+        complete: whether it went to its end.
+        failure: why it did not; None if it did, or if somebody interrupted it.
+        recording: what was saved; None if nothing was.
+        line: one sentence about it.
+    """
+
+    complete: bool
+    failure: BridgeError | None
+    recording: Recording | None
+    line: str
+
+
+class RecordNode(Node):
+    """Sends `cmd_vel` at 20 Hz, hears `odom`, `joint_states`, `imu`, `pose`, writes a recording.
+
+    The circle lies around the place where the robot stands at the start; each segment of the
+    drive is chosen from where odometry says that the robot is. The drive ends with zero
+    commands, and also at a signal, at an error, when odometry is silent, and when the robot
+    leaves the circle; what was recorded until then is saved. Should this process be killed, only
+    the robot's own timeout on `cmd_vel` stops it.
+
+    Args:
+        context: to live in.
+        given: parameters, before those of the command line.
+    """
+
+    def __init__(self, context: Context, given: Mapping[str, Any] | None = None) -> None:
+        overrides = [Parameter(name, value=value) for name, value in (given or {}).items()]
+        super().__init__("record_node", context=context, parameter_overrides=overrides)
+        self.outcome: Outcome | None = None
+        self._order = declare_drive(self)
+        self._drive = self._order.plan.begin()
+        self._sim_time = bool(self.get_parameter("use_sim_time").value)
+        self._steady_origin_ns = time.time_ns() - time.monotonic_ns()
+        self._log = DriveLog(self._order.plan.robot, self._order.roles, self._now_ns)
+        kind = TwistStamped if self._order.stamped else Twist
+        self._topic = self.create_publisher(kind, "cmd_vel", qos.COMMAND)
+        self.create_subscription(Odometry, "odom", self._on_odometry, qos.SENSOR)
+        self.create_subscription(PoseStamped, "pose", self._log.pose, qos.SENSOR)
+        self.create_subscription(JointState, "joint_states", self._log.joints, qos.SENSOR)
+        self.create_subscription(Imu, "imu", self._log.imu, qos.SENSOR)
+        self._began, self._heard = time.monotonic(), -np.inf
+        self._ticks, self._origin_ns = 0, 0
+        self._stamp_ns = 0
+        self._pose: Array | None = None
+        self._start: Array = np.zeros(3)
+        # Steady: what guards the robot must not depend on whose time the node follows.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(POLL_S, self._on_time, clock=steady)
+
+    def _now_ns(self) -> int:
+        """Simulated time, or the system's when this began, continued by the steady clock [ns]."""
+        if self._sim_time:
+            # Odometry may come in before the tick of /clock that it belongs to.
+            return max(int(self.get_clock().now().nanoseconds), self._stamp_ns)
+        return self._steady_origin_ns + time.monotonic_ns()
+
+    def _on_odometry(self, message: Odometry) -> None:
+        self._stamp_ns = max(self._stamp_ns, conversions.stamp_from_ros(message.header.stamp))
+        pose = self._log.odometry(message)
+        if pose is None:
+            return
+        self._pose, self._heard = pose, time.monotonic()
+        if self._ticks:
+            self._drive.see(geometry.between(self._start, pose))
+            self._on_time()  # at once: with a fast simulated time a poll may be a tick late
+
+    def _on_time(self) -> None:
+        if self.outcome is not None:
+            return
+        try:
+            if self._ticks or self._ready():
+                self._go_on()
+        except BridgeError as error:
+            self._end(error)
+            return
+        if self._drive.done:
+            self._end(None, complete=True)
+
+    def _ready(self) -> bool:
+        """Whether the robot listens and tells where it is; it is waited for 10 s."""
+        listeners = self._topic.get_subscription_count()
+        if self._pose is not None and listeners > 0 and self._now_ns() > 0:
+            others = self.count_publishers(self._topic.topic_name) - 1
+            if others > 0:
+                raise BackendError(
+                    f"topic {self._topic.topic_name!r}: {others} other publisher(s) would drive "
+                    "the robot too; end them, or remap the topic."
+                )
+            self._start, self._origin_ns = self._pose, self._now_ns()
+            return True
+        if time.monotonic() - self._began > PATIENCE_S:
+            name, missing = (
+                ("odom", "nothing arrived")
+                if self._pose is None
+                else ("cmd_vel", "nobody listened")
+            )
+            raise BackendError(
+                f"topic {self._place(name)}: {missing} within {PATIENCE_S:g} s; start the robot, "
+                "or correct namespace, ROS_DOMAIN_ID or remapping."
+            )
+        return False
+
+    def _place(self, topic: str) -> str:
+        """Where a topic was looked for."""
+        return (
+            f"{self.resolve_topic_name(topic)!r} (namespace {self.get_namespace()!r}, ROS domain "
+            f"{self.context.get_domain_id()})"
+        )
+
+    def _go_on(self) -> None:
+        """Sends the command that is due, if one is."""
+        self._guard()
+        due = (self._now_ns() - self._origin_ns) // PERIOD_NS + 1 - self._ticks
+        if due <= 0:
+            return
+        if self._ticks < STILL_S / PERIOD_S <= self._ticks + due:
+            self._log.check()
+        for _ in range(due):  # more than one where time goes on in greater steps
+            command = self._drive.next()
+            self._ticks += 1
+        self._send(command)
+
+    def _guard(self) -> None:
+        """Raises BackendError when the robot must not go on."""
+        age = time.monotonic() - self._heard
+        if age > self._order.odom_timeout:
+            raise BackendError(
+                f"topic {self._place('odom')}: nothing new for {age:.2f} s, which may be "
+                f"{self._order.odom_timeout:g} s; find out why odometry stopped."
+            )
+        bound, radius = self._order.plan.bound, self._order.plan.robot.footprint_radius
+        x, y, _ = geometry.between(self._start, self._start if self._pose is None else self._pose)
+        if np.hypot(x, y) + radius > bound:
+            raise BackendError(
+                f"the robot left its circle of {bound:g} m, at x {x:.2f}, y {y:.2f} m "
+                f"from the start with a radius of {radius:g} m; give it a larger bound, less "
+                "speed, or the parameters that it really has."
+            )
+
+    def _send(self, command: Array) -> None:
+        self._topic.publish(self._message(self._order.plan.robot.to_cmd_vel(command)))
+        self._log.command(command)
+
+    def _message(self, twist: Array) -> Twist | TwistStamped:
+        message = conversions.twist_to_ros(twist)
+        if not self._order.stamped:
+            return message
+        stamped = TwistStamped(twist=message)
+        stamped.header.stamp = conversions.stamp_to_ros(self._now_ns())
+        return stamped
+
+    def stop(self) -> None:
+        """Leaves the robot standing still, and saves what was recorded."""
+        if self.outcome is None:
+            self._end(None)
+
+    def _end(self, failure: BridgeError | None, complete: bool = False) -> None:
+        """Stops the robot, saves, and ends the node; for every way in which a drive ends."""
+        self.outcome = Outcome(complete, failure, None, "")
+        recording, told = None, "the robot was not moved, nothing is recorded"
+        if self._ticks:
+            self._halt()
+            recording, told = self._save()
+        if not complete:
+            stopped = "the robot was told to stop; " if self._ticks else ""
+            told = f"{failure or 'interrupted:'} {stopped}{told}"
+        self.outcome = Outcome(complete, failure, recording, told)
+        self.context.try_shutdown()
+
+    def _halt(self) -> None:
+        until = time.monotonic() + HALT_S
+        zero = np.zeros(len(self._order.plan.robot.command))
+        while time.monotonic() < until:
+            self._send(zero)
+            time.sleep(PERIOD_S)
+        last_word(self._topic, self._message(np.zeros(3)))
+
+    def _save(self) -> tuple[Recording | None, str]:
+        """What was saved, and a clause about it."""
+        try:
+            recording = self._log.recording()
+            write_drive(recording, self._order.out, self._order.plan.robot)
+        except (BridgeError, OSError) as error:
+            return None, f"nothing was saved ({error})"
+        return recording, f"{self._log.seconds:.1f} s are recorded in {self._order.out}"
+
+
+def record(given: Mapping[str, Any] | None = None, args: Sequence[str] | None = None) -> Outcome:
+    """Drives and records until the end, an error, SIGINT or SIGTERM.
+
+    Args:
+        given: parameters, before those of the command line.
+        args: the command line, `sys.argv` by default.
+
+    Returns:
+        How it ended.
+    """
+    nodes: list[RecordNode] = []
+
+    def make(context: Context) -> RecordNode:
+        nodes.append(RecordNode(context, given))
+        return nodes[-1]
+
+    run_node(make, args)
+    return nodes[-1].outcome or Outcome(False, None, None, "interrupted: nothing was saved")
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point of the executable."""
+    outcome = record(args=args)
+    sys.stderr.write(f"record_node: {outcome.line}\n")
+    if outcome.failure is not None:
+        raise SystemExit(EXIT_BAD_INPUT)
+
+
+if __name__ == "__main__":
+    main()

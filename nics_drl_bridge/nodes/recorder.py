@@ -1,0 +1,148 @@
+"""What `nics record` does around `record_node`: preview, drive, and what to do next.
+
+It imports ROS 2 only when asked to drive, so that a drive can be previewed without.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError
+from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.kinematics.coverage import coverage
+from nics_drl_bridge.kinematics.drive_file import check_out
+from nics_drl_bridge.kinematics.drive_plan import DrivePlan
+from nics_drl_bridge.kinematics.recording import Recording
+from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
+from nics_drl_bridge.report.drive_picture import drive_picture
+
+NODE = "nics_drl_bridge.nodes.record_node"
+
+
+@dataclass(frozen=True)
+class Order:
+    """What to record, as `nics record` takes it.
+
+    Attributes:
+        robot: name or YAML file of the robot.
+        out: `.npz` file, or folder of a rosbag2, to write.
+        bound: radius of the circle around the start to keep within [m].
+        duration: of the drive [s].
+        speed: share of the greatest speeds and rates to use.
+        seed: of the pattern.
+        namespace: of the robot's topics.
+        remap: rules `NAME:=OTHER` for topics.
+        topics: YAML file that names joints.
+        stamped: whether `cmd_vel` is a TwistStamped.
+        use_sim_time: whether time comes from `/clock`.
+    """
+
+    robot: str
+    out: Path
+    bound: float = 2.0
+    duration: float = 60.0
+    speed: float = 1.0
+    seed: int = 0
+    namespace: str = ""
+    remap: tuple[str, ...] = ()
+    topics: Path | None = None
+    stamped: bool = False
+    use_sim_time: bool = False
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Of `record_node`."""
+        return {
+            "robot": self.robot,
+            "out": str(self.out),
+            "bound": self.bound,
+            "duration": self.duration,
+            "speed": self.speed,
+            "seed": self.seed,
+            "topics": str(self.topics or ""),
+            "stamped": self.stamped,
+            "use_sim_time": self.use_sim_time,
+        }
+
+    @property
+    def arguments(self) -> list[str]:
+        """The command line of `record_node`.
+
+        Raises:
+            ConfigError: a remapping is none.
+        """
+        rules = [f"__ns:=/{self.namespace.strip('/')}"] if self.namespace.strip("/") else []
+        for rule in self.remap:
+            if not all(rule.partition(":=")):
+                raise ConfigError(
+                    f"--remap {rule!r}: must be NAME:=OTHER, as in odom:=/wheel_odom."
+                )
+            rules.append(rule)
+        flags = [word for rule in rules for word in ("-r", rule)]
+        return ["nics", "--ros-args", *flags] if flags else ["nics"]
+
+
+def require_ros() -> None:
+    """Imports ROS 2.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    try:
+        import_module(NODE)
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("nics_drl_bridge"):
+            raise
+        raise ConfigError(f"nics record {MISSING_ROS.format(module=error.name)}") from None
+
+
+def preview(order: Order) -> tuple[str, ...]:
+    """Draws the expected drive beside the recording.
+
+    Returns:
+        Lines for people.
+
+    Raises:
+        ConfigError: the order can't be carried out.
+    """
+    robot, out = load_robot(order.robot), check_out(order.out)
+    plan = DrivePlan(robot, order.bound, order.duration, order.speed, order.seed)
+    pattern = plan.preview()
+    picture = out.parent / f"{out.stem}_preview.png"
+    write_bytes(picture, drive_picture(pattern, robot))
+    return (*pattern.lines(), f"its path is drawn in {picture}")
+
+
+def drive(order: Order) -> tuple[tuple[str, ...], bool]:
+    """Drives the robot and records it.
+
+    Returns:
+        Lines for people, and whether the drive went to its end; otherwise it was interrupted.
+
+    Raises:
+        BridgeError: why it ended before, and what was saved.
+    """
+    outcome = import_module(NODE).record(order.parameters, order.arguments)
+    if outcome.failure is not None:
+        raise BackendError(outcome.line)
+    lines: tuple[str, ...] = (outcome.line,)
+    if outcome.recording is not None:
+        lines += summary(outcome.recording, load_robot(order.robot), order)
+    return lines, outcome.complete
+
+
+def summary(recording: Recording, robot: RobotSpec, order: Order) -> tuple[str, ...]:
+    """How far the robot went, how well each command was moved, and what to do next."""
+    place = recording.pose.values[:, :2] - recording.pose.values[0, :2]
+    path = float(np.hypot(*np.diff(place, axis=0).T).sum())
+    reach = float(np.hypot(*place.T).max())
+    return (
+        f"measured: a path of {path:.1f} m, up to {reach:.2f} m from the start",
+        *(each.line() for each in coverage(recording, robot)),
+        f"next: nics generate {order.out} --robot {order.robot} --out {order.out.stem}_model",
+    )

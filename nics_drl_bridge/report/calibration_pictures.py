@@ -1,0 +1,175 @@
+"""Pictures of a calibration: one per estimate that the recording allowed, titled with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.calibration import stamps
+from nics_drl_bridge.calibration.calibrate import tracked_twists
+from nics_drl_bridge.calibration.curves import timing_curves
+from nics_drl_bridge.calibration.estimates import Estimate, estimates
+from nics_drl_bridge.calibration.identify import Identified
+from nics_drl_bridge.calibration.signals import interval_means
+from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.report.drawing import DARK, MEASURED, MODEL, OTHER, png
+from nics_drl_bridge.report.noise_picture import noise
+
+Array = NDArray[np.float64]
+
+BURSTS_SHOWN = 12
+MOST_POINTS = 3000
+CAPTIONS = {
+    "timing": "What each shift in time leaves unexplained; the estimate lies at the least.",
+    "bursts": "Poses that arrive in bursts, and the times that they were taken to be of.",
+    "mounting": "Velocities before and after correction: base_link of a robot that can't move "
+    "sideways has no lateral velocity.",
+    "wheels": "Wheel speeds against the motion: the scale, and which wheel is the left one.",
+    "noise": "Noise of the sensors, and how the error of predictions grows beside the drift that "
+    "simulator and estimator use.",
+}
+
+
+def calibration_pictures(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
+    """The pictures of a calibration by name, each a PNG.
+
+    `timing`, `bursts`, `mounting`, `wheels` and `noise`, each if the recording showed it; the
+    report in text says why the others are missing.
+    """
+    found = estimates(identified.recording, identified.calibration, identified.findings)
+    drawn = {
+        "timing": timing(spec, identified, found),
+        "bursts": bursts(identified, found),
+        "mounting": mounting(identified, found),
+        "wheels": wheels(identified, found),
+        "noise": noise(spec, identified),
+    }
+    return {name: picture for name, picture in drawn.items() if picture is not None}
+
+
+def timing(spec: RobotSpec, identified: Identified, found: dict[str, Estimate]) -> bytes | None:
+    """What each shift in time leaves unexplained, with the estimate and its uncertainty."""
+    curves = timing_curves(identified.recording, spec, identified.calibration)
+    if not curves:
+        return None
+    figure = Figure(figsize=(5.2 * len(curves), 3.8), layout="constrained")
+    for axes, curve in zip(figure.subplots(1, len(curves), squeeze=False)[0], curves, strict=True):
+        estimate = found[curve.name]
+        value, sigma = estimate.value or 0.0, estimate.sigma or 0.0
+        axes.plot(curve.value, curve.unexplained, color=MEASURED)
+        axes.axvspan(
+            value - 2.0 * sigma,
+            value + 2.0 * sigma,
+            color=MODEL,
+            alpha=0.25,
+            label="two standard uncertainties",
+        )
+        axes.axvline(value, color=MODEL, linestyle="--", label="estimate")
+        axes.set_xlabel(f"{estimate.name} [s]")
+        axes.set_ylabel("unexplained / spread of the signal")
+        _finish(axes, _plus_minus(estimate))
+    return png(figure)
+
+
+def bursts(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
+    """Stamps of the poses as they arrived, and as they were spread."""
+    t = identified.recording.pose.t
+    groups = stamps.find_bursts(t)
+    if groups is None:
+        return None
+    shown = slice(0, int(BURSTS_SHOWN * groups.size))
+    spread = stamps.spread(t, groups)
+    figure = Figure(figsize=(9.0, 3.8), layout="constrained")
+    axes, intervals = figure.subplots(1, 2)
+    number = np.arange(len(t))[shown]
+    axes.plot(t[shown] - t[0], number, ".", color=OTHER, label="as they arrived")
+    axes.plot(spread[shown] - t[0], number, "-", color=MODEL, label="spread over the period")
+    axes.set_xlabel("stamp [s]")
+    axes.set_ylabel("pose number")
+    _finish(axes, f"{_plus_minus(found['burst_period_s'])}, {groups.size:.0f} poses in each")
+    edges = np.linspace(0.0, 1.5 * groups.period_s, 60)
+    intervals.hist(np.diff(t), edges, color=OTHER, label="as they arrived")
+    intervals.hist(np.diff(spread), edges, color=MODEL, alpha=0.7, label="spread over the period")
+    intervals.set_xlabel("time between two poses [s]")
+    intervals.set_ylabel("number")
+    _finish(intervals, "intervals")
+    return png(figure)
+
+
+def mounting(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
+    """Velocities of the tracked body and of `base_link`: rotation and lever arm as slopes."""
+    rotation, lever_x, lever_y = (
+        found[name] for name in ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
+    )
+    if rotation.value is None:
+        return None
+    tracked = tracked_twists(identified.recording).twist
+    tracked = tracked[:: max(1, len(tracked) // MOST_POINTS)]
+    calibration = identified.calibration
+    turned = geometry.rotate(tracked[:, :2], -calibration.rotation_rad)
+    x, y = calibration.lever_arm_m
+    base = turned + tracked[:, 2:] * np.array([y, -x])
+    count = 1 if lever_x.value is None else 2
+    figure = Figure(figsize=(5.2 * count, 4.4), layout="constrained")
+    grid = figure.subplots(1, count, squeeze=False)[0]
+    _points(grid[0], (tracked[:, 0], tracked[:, 1]), (base[:, 0], base[:, 1]))
+    grid[0].set_aspect("equal", adjustable="datalim")
+    grid[0].set_xlabel("velocity along x of its own frame [m/s]")
+    grid[0].set_ylabel("velocity along y [m/s]")
+    _finish(grid[0], _plus_minus(rotation))
+    for axes in grid[1:]:
+        _points(axes, (tracked[:, 2], turned[:, 1]), (tracked[:, 2], base[:, 1]))
+        axes.set_xlabel("yaw rate [rad/s]")
+        axes.set_ylabel("lateral velocity [m/s]")
+        _finish(axes, f"{_plus_minus(lever_x)}\n{_plus_minus(lever_y)}")
+    return png(figure)
+
+
+def _points(axes: Axes, tracked: Sequence[Array], base: Sequence[Array]) -> None:
+    axes.plot(*tracked, ".", markersize=3, color=OTHER, label="tracked body")
+    axes.plot(*base, ".", markersize=3, color=MODEL, label="base_link")
+
+
+def wheels(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
+    """Wheel speeds against the motion: their scale, and which one is the left one."""
+    stream, calibration = identified.recording.wheels, identified.calibration
+    if stream is None or calibration.wheel_scale is None:
+        return None
+    twists = tracked_twists(identified.recording)
+    start, end = (t + calibration.clock_offset_s for t in (twists.start, twists.end))
+    units = interval_means(stream.t, stream.values, start, end)
+    turn = twists.twist[:, 2]
+    along = geometry.rotate(twists.twist[:, :2], -calibration.rotation_rad)[:, 0]
+    along = along + calibration.lever_arm_m[1] * turn
+    rows: tuple[tuple[str, str, str, Array, Array], ...] = (
+        ("wheel_scale", "mean of both wheels [unit]", "speed [m/s]", units.mean(axis=1), along),
+        ("turn_scale", "right less left wheel [unit]", "yaw rate [rad/s]",
+         units[:, 1] - units[:, 0], turn),
+    )  # fmt: skip
+    figure = Figure(figsize=(10.0, 4.0), layout="constrained")
+    for axes, (name, x_label, y_label, x, y) in zip(figure.subplots(1, 2), rows, strict=True):
+        axes.plot(x, y, ".", markersize=4, color=MEASURED, label="measured")
+        estimate = found[name]
+        if estimate.value is not None:
+            ends = np.array([x.min(), x.max()])
+            axes.plot(ends, estimate.value * ends, "--", color=MODEL, label="scale")
+        axes.set_xlabel(x_label)
+        axes.set_ylabel(y_label)
+        swapped = "" if name == "wheel_scale" else f"\n{found['wheels_swapped'].text}"
+        _finish(axes, _plus_minus(estimate) + swapped)
+    return png(figure)
+
+
+def _plus_minus(estimate: Estimate) -> str:
+    return estimate.text.replace("+-", "±")
+
+
+def _finish(axes: Axes, title: str) -> None:
+    axes.set_title(title, fontsize=10, color=DARK)
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False, fontsize=9)

@@ -1,0 +1,159 @@
+"""Bags for tests: messages of any kind, as a robot's own recorder would write them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+from nics_drl_bridge.kinematics import topic_roles as kinds
+from nics_drl_bridge.kinematics.bag_messages import typestore
+
+STORE = typestore()
+NANO = 1_000_000_000
+START_S = 1_700_000_000.0
+STEP_S = 0.02
+DURATION_S = 30.0
+
+Row = tuple[float, Any]
+"""Time of receipt [s after START_S], and message."""
+
+
+def new(kind: str, *values: Any) -> Any:
+    """A message, or a part of one."""
+    package, name = kind.replace("/msg/", "/").split("/")
+    return STORE.types[f"{package}/msg/{name}"](*values)
+
+
+def ns(seconds: float) -> int:
+    """Seconds after START_S as nanoseconds of the recorder's clock."""
+    return round(START_S) * NANO + round(seconds * NANO)
+
+
+def header(seconds: float | None, frame: str = "world") -> Any:
+    """A header stamped some seconds after START_S, or not at all."""
+    stamp = 0 if seconds is None else ns(seconds)
+    return new(
+        "std_msgs/Header", new("builtin_interfaces/Time", stamp // NANO, stamp % NANO), frame
+    )
+
+
+def vector(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Any:
+    return new("geometry_msgs/Vector3", x, y, z)
+
+
+def twist(x: float, y: float, turn: float) -> Any:
+    return new(kinds.TWIST, vector(x, y), vector(z=turn))
+
+
+def twist_stamped(t: float | None, *velocity: float) -> Any:
+    return new(kinds.TWIST_STAMPED, header(t), twist(*velocity))
+
+
+def ackermann(speed: float, steering: float) -> Any:
+    return new(kinds.ACKERMANN, steering, 0.0, speed, 0.0, 0.0)
+
+
+def ackermann_stamped(t: float | None, speed: float, steering: float) -> Any:
+    return new(kinds.ACKERMANN_STAMPED, header(t), ackermann(speed, steering))
+
+
+def turned(heading: float) -> Any:
+    half = heading / 2.0
+    return new("geometry_msgs/Quaternion", 0.0, 0.0, float(np.sin(half)), float(np.cos(half)))
+
+
+def pose(x: float, y: float, heading: float) -> Any:
+    return new("geometry_msgs/Pose", new("geometry_msgs/Point", x, y, 0.0), turned(heading))
+
+
+def pose_stamped(t: float | None, *place: float) -> Any:
+    return new(kinds.POSE, header(t), pose(*place))
+
+
+def pose_with_covariance(t: float | None, *place: float) -> Any:
+    inner = new("geometry_msgs/PoseWithCovariance", pose(*place), np.zeros(36))
+    return new(kinds.POSE_COVARIANCE, header(t), inner)
+
+
+def odometry(t: float | None, *place: float) -> Any:
+    inner = new("geometry_msgs/PoseWithCovariance", pose(*place), np.zeros(36))
+    speed = new("geometry_msgs/TwistWithCovariance", twist(0.0, 0.0, 0.0), np.zeros(36))
+    return new(kinds.ODOMETRY, header(t, "odom"), "base_link", inner, speed)
+
+
+def transform(
+    t: float | None, place: Iterable[float], frame: str = "world", child: str = "car"
+) -> Any:
+    x, y, heading = place
+    moved = new("geometry_msgs/Transform", vector(x, y), turned(heading))
+    return new(kinds.TRANSFORM, header(t, frame), child, moved)
+
+
+def transforms(*some: Any) -> Any:
+    return new(kinds.TRANSFORMS, list(some))
+
+
+def joints(
+    t: float | None, names: list[str], position: Iterable[float], velocity: Iterable[float]
+) -> Any:
+    return new(
+        kinds.JOINTS, header(t, ""), names, np.array(position), np.array(velocity), np.zeros(0)
+    )
+
+
+def imu(t: float | None, ax: float, ay: float, turn: float) -> Any:
+    return new(
+        kinds.IMU, header(t), turned(0.0), np.zeros(9), vector(z=turn), np.zeros(9),
+        vector(ax, ay, 9.81), np.zeros(9),
+    )  # fmt: skip
+
+
+def place_at(t: float) -> tuple[float, float, float]:
+    """Where a car on a circle is: 0.5 m/s, 0.25 rad/s."""
+    return 2.0 * float(np.sin(0.25 * t)), 2.0 - 2.0 * float(np.cos(0.25 * t)), 0.25 * t
+
+
+def times(step: float = STEP_S, duration: float = DURATION_S) -> list[float]:
+    return [float(t) for t in np.arange(0.0, duration, step)]
+
+
+def commands(delay: float = 0.0) -> list[Row]:
+    """Twists at 10 Hz."""
+    return [(delay + t, twist(0.5, 0.0, 0.1)) for t in times(0.1)]
+
+
+def poses(delay: float = 0.0, offset: float = 0.0) -> list[Row]:
+    """Poses whose headers are of a clock that is `offset` ahead, 2 ms before their receipt."""
+    return [
+        (delay + t, pose_stamped(delay + t + offset - 0.002, *place_at(delay + t))) for t in times()
+    ]
+
+
+def drive(delay: float = 0.0) -> dict[str, list[Row]]:
+    """A drive of few topics, half a minute long."""
+    return {"/cmd_vel": commands(delay), "/pose": poses(delay)}
+
+
+def write(
+    path: Path,
+    topics: dict[str, list[Row]],
+    storage: str = "mcap",
+    compression: str = "none",
+    version: int = 9,
+    kinds_of: dict[str, str] | None = None,
+) -> Path:
+    """Writes a bag; an empty topic needs its type in `kinds_of`."""
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    writer = Writer(path, version=version, storage_plugin=plugin)
+    writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
+    with writer:
+        for topic, rows in topics.items():
+            kind = rows[0][1].__msgtype__ if rows else (kinds_of or {})[topic]
+            connection = writer.add_connection(topic, kind, typestore=STORE)
+            for t, message in rows:
+                writer.write(connection, ns(t), STORE.serialize_cdr(message, kind))
+    return path

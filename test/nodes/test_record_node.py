@@ -1,0 +1,269 @@
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+
+from nics_drl_bridge.calibration.identify import identify
+from nics_drl_bridge.generator import builtin_model, save_model
+from nics_drl_bridge.kinematics.coverage import coverage
+from nics_drl_bridge.kinematics.readers import read_recording
+from nics_drl_bridge.kinematics.recording import check
+from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.nodes import conversions, qos
+from nodes.peer import DEADLINE_S
+
+pytestmark = pytest.mark.ros
+
+CAR = load_robot("ackermann")
+FRAMES, VARIANCE = ("odom", "base_link"), (0.0,) * 4
+LONG_S = 90.0
+SHARE_OF_PATH = 0.1
+
+
+class FakeRobot:
+    """A robot that goes its own way: what it hears, and odometry of a pose that the test gives."""
+
+    def __init__(self, peer, kind=Twist):
+        self.peer = peer
+        self.heard = peer.listen(kind, "cmd_vel", qos.COMMAND)
+        self.odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
+        self.pose, self.sent = [3.0, -2.0, 0.0], 0.0
+
+    def until(self, condition, what, deadline_s=DEADLINE_S):
+        """Publishes its pose 50 times a second until something is the case."""
+
+        def met():
+            if time.monotonic() - self.sent > 0.02:
+                self.sent = time.monotonic()
+                stamp = self.peer.node.get_clock().now().nanoseconds
+                self.odom.publish(
+                    conversions.odometry_to_ros(self.pose, np.zeros(3), stamp, FRAMES, VARIANCE)
+                )
+            return condition()
+
+        self.peer.until(met, what, deadline_s)
+
+    @property
+    def driven(self):
+        """Whether it was told to drive."""
+        return bool(self.heard) and self.heard[-1] != type(self.heard[-1])()
+
+
+def said(node):
+    return node.log.read_text(encoding="utf-8")
+
+
+def code_of(node):
+    return node._process.poll()
+
+
+def recorded(path, spec=CAR):
+    return check(read_recording(path, spec), spec)
+
+
+def seconds(path):
+    return float(np.ptp(recorded(path).command.t))
+
+
+def test_ctrl_c_leaves_a_zero_command_and_a_whole_recording(launch, meet, domain_id, tmp_path):
+    robot, out = FakeRobot(meet(domain_id)), tmp_path / "drive.npz"
+    node = launch("record_node", domain_id, out=str(out))
+    robot.until(lambda: robot.driven, "it drives")
+    node._process.send_signal(signal.SIGINT)
+    robot.until(lambda: code_of(node) is not None, "it ends")
+    assert code_of(node) == 0
+    robot.peer.until(lambda: robot.heard[-1] == Twist(), "zero")
+    assert robot.heard[-5:] == [Twist()] * 5
+    assert seconds(out) > 0.5
+    assert "interrupted: the robot was told to stop" in said(node)
+    assert f"are recorded in {out}" in said(node)
+    assert os.listdir(tmp_path) == ["drive.npz"]
+
+
+def test_sigterm_and_stamped_commands_in_a_namespace(launch, meet, domain_id, tmp_path):
+    robot, out = FakeRobot(meet(domain_id, "bot"), TwistStamped), tmp_path / "drive.npz"
+    node = launch("record_node", domain_id, "bot", out=str(out), stamped=True)
+    robot.until(lambda: robot.heard and robot.heard[-1].twist != Twist(), "it drives")
+    assert conversions.stamp_from_ros(robot.heard[-1].header.stamp) > 0
+    node._process.send_signal(signal.SIGTERM)
+    robot.until(lambda: code_of(node) is not None, "it ends")
+    robot.peer.until(lambda: robot.heard[-1].twist == Twist(), "zero")
+    assert seconds(out) > 0.5
+
+
+def test_silence_of_odometry_stops_the_robot(launch, meet, domain_id, tmp_path):
+    robot, out = FakeRobot(meet(domain_id)), tmp_path / "drive.npz"
+    node = launch("record_node", domain_id, out=str(out))
+    robot.until(lambda: robot.driven, "it drives")
+    robot.peer.until(lambda: code_of(node) is not None, "it ends without odometry")
+    assert code_of(node) == 2
+    robot.peer.until(lambda: robot.heard[-1] == Twist(), "zero")
+    sentence = f"topic '/odom' (namespace '/', ROS domain {domain_id}): nothing new for 0."
+    assert sentence in said(node)
+    assert seconds(out) > 0.5
+
+
+def test_odometry_that_only_repeats_itself_is_silence(launch, meet, domain_id, tmp_path):
+    robot, out = FakeRobot(meet(domain_id)), tmp_path / "drive.npz"
+    node = launch("record_node", domain_id, out=str(out))
+    robot.until(lambda: robot.driven, "it drives")
+    frozen = conversions.odometry_to_ros(robot.pose, np.zeros(3), 1, FRAMES, VARIANCE)
+    robot.peer.until(
+        lambda: robot.odom.publish(frozen) or code_of(node) is not None, "it ends all the same"
+    )
+    assert "nothing new for 0." in said(node)
+
+
+def test_leaving_the_bound_stops_the_robot(launch, meet, domain_id, tmp_path):
+    robot, out = FakeRobot(meet(domain_id)), tmp_path / "drive.npz"
+    node = launch("record_node", domain_id, out=str(out), bound=1.5)
+    robot.until(lambda: robot.driven, "it drives")
+    robot.pose = [3.0, -2.0 + 1.3, 0.0]  # still inside with its radius of 0.15 m
+    known = len(robot.heard)
+    robot.until(lambda: len(robot.heard) > known + 10, "it goes on")
+    assert code_of(node) is None
+    robot.pose = [3.0, -2.0 + 1.36, 0.0]
+    robot.until(lambda: code_of(node) is not None, "it ends")
+    robot.peer.until(lambda: robot.heard[-1] == Twist(), "zero")
+    assert code_of(node) == 2
+    assert "left its circle of 1.5 m, at x 0.00, y 1.36 m from the start" in said(node)
+    assert seconds(out) > 0.5
+
+
+def test_without_odometry_or_a_listener_it_says_where_it_looked(launch, meet, domain_id, tmp_path):
+    out = str(tmp_path / "drive.npz")
+    silent = launch("record_node", domain_id, "bot", {"odom": "wheel_odom"}, out=out)
+    peer = meet(domain_id)
+    unheard = FakeRobot(peer)
+    peer.node.destroy_subscription(next(iter(peer.node.subscriptions)))
+    deaf = launch("record_node", domain_id, out=out)
+    unheard.until(lambda: None not in (code_of(silent), code_of(deaf)), "both end")
+    assert (code_of(silent), code_of(deaf)) == (2, 2)
+    where = f"(namespace '/bot', ROS domain {domain_id}): nothing arrived within 10 s"
+    assert f"topic '/bot/wheel_odom' {where}" in said(silent)
+    where = f"(namespace '/', ROS domain {domain_id}): nobody listened within 10 s"
+    assert f"topic '/cmd_vel' {where}" in said(deaf)
+    assert os.listdir(tmp_path) == []
+
+
+def test_it_does_not_drive_a_robot_that_somebody_else_drives(launch, meet, domain_id, tmp_path):
+    robot = FakeRobot(meet(domain_id))
+    robot.peer.speak(Twist, "cmd_vel", 1)
+    node = launch("record_node", domain_id, out=str(tmp_path / "drive.npz"))
+    robot.until(lambda: code_of(node) is not None, "it ends")
+    assert "topic '/cmd_vel': 1 other publisher(s)" in said(node)
+    assert robot.heard == []
+
+
+def test_a_simulator_that_is_faster_than_the_clock_is_noticed(launch, meet, domain_id, tmp_path):
+    launch("simulator_node", domain_id, world="empty", rate=4.0)
+    peer = meet(domain_id)
+    odom = peer.listen(Odometry, "odom")
+    peer.until(lambda: odom, "the simulator runs")
+    node = launch("record_node", domain_id, out=str(tmp_path / "drive.npz"))
+    peer.until(lambda: code_of(node) is not None, "it ends")
+    assert re.search(r"stamps went on by .* s within .*use_sim_time", said(node))
+
+
+class Nics:
+    """`nics record` in a process of its own, in a folder."""
+
+    def __init__(self, folder, domain_id, *options):
+        self._said = folder / "said"
+        environment = {
+            "ROS_DOMAIN_ID": str(domain_id),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        }
+        command = [sys.executable, "-m", "nics_drl_bridge.cli", "record", "--yes"]
+        with self._said.open("wb") as log:
+            self.process = subprocess.Popen(
+                [*command, *map(str, options)],
+                cwd=folder,
+                env=os.environ | environment,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
+
+    @property
+    def ended(self):
+        return self.process.poll() is not None
+
+    @property
+    def said(self):
+        return self._said.read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def nics(tmp_path, domain_id):
+    """Starts `nics record`; it has ended after the test."""
+    started = []
+    yield lambda *options: started.append(Nics(tmp_path, domain_id, *options)) or started[-1]
+    for each in started:
+        each.process.kill()
+        each.process.wait()
+
+
+def test_ctrl_c_on_the_command_line_saves_a_bag_and_tells_what_it_holds(
+    nics, meet, domain_id, tmp_path
+):
+    pytest.importorskip("rosbags")
+    robot = FakeRobot(meet(domain_id))
+    command = nics("--out", "drive")
+    robot.until(lambda: robot.driven, "it drives")
+    command.process.send_signal(signal.SIGINT)
+    robot.until(lambda: command.ended, "it ends")
+    assert command.process.returncode == 130, command.said
+    robot.peer.until(lambda: robot.heard[-1] == Twist(), "zero")
+    assert "interrupted: the robot was told to stop; " in command.said
+    assert "s are recorded in drive\n" in command.said
+    assert "steering_command: " in command.said
+    assert set(os.listdir(tmp_path)) == {"said", "drive", "drive_preview.png"}
+    assert seconds(tmp_path / "drive") > 0.5
+
+
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize(
+    ("name", "rate", "options"),
+    [
+        ("ackermann", 1.0, ("--duration", 20)),
+        ("differential", 3.0, ("--duration", 40, "--use-sim-time", "--namespace", "bot")),
+    ],
+)
+def test_a_recorded_drive_of_a_simulator_generates_it_again(
+    nics, launch, meet, domain_id, tmp_path, name, rate, options
+):
+    save_model(builtin_model(name), tmp_path / "model")
+    namespace = "bot" if "bot" in options else ""
+    parameters = {"model": str(tmp_path / "model"), "world": "empty", "rate": rate}
+    launch("simulator_node", domain_id, namespace, **parameters)
+    peer = meet(domain_id, namespace)
+    odom, heard = peer.listen(Odometry, "odom"), peer.listen(Twist, "cmd_vel", qos.COMMAND)
+    peer.until(lambda: odom, "the simulator runs")
+    command = nics("--robot", name, "--out", "drive.npz", *options)
+    peer.until(lambda: command.ended, "the drive ends", LONG_S)
+    assert command.process.returncode == 0, command.said
+    assert command.said.startswith("preview of ")
+    after = f"next: nics generate drive.npz --robot {name} --out drive_model\n"
+    assert command.said.endswith(after)
+    assert heard[-1] == Twist()
+    spec = load_robot(name)
+    poses = np.array([conversions.odometry_from_ros(message)[0] for message in odom])
+    away = np.hypot(*(poses - poses[0])[:, :2].T) + spec.footprint_radius
+    assert 0.5 < away.max() < 2.0
+    drive = recorded(tmp_path / "drive.npz", spec)
+    assert all(each.share > 0.6 and not each.fault for each in coverage(drive, spec))
+    held_out = identify(drive, spec).held_out
+    print(f"{name}: {held_out.mean_position_error_m:.4f} m of {held_out.mean_path_m:.2f} m")
+    assert held_out.mean_position_error_m < SHARE_OF_PATH * held_out.mean_path_m

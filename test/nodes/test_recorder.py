@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.kinematics.textbook import record
+from nics_drl_bridge.nodes import recorder
+
+CAR = load_robot("ackermann")
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def nics(*words, cwd, **environment):
+    command = [sys.executable, "-m", "nics_drl_bridge.cli", "record", *map(str, words)]
+    return subprocess.run(
+        command, cwd=cwd, env=os.environ | environment, capture_output=True, text=True,
+        timeout=100, input="n\n",
+    )  # fmt: skip
+
+
+def test_a_preview_tells_and_draws_the_drive_and_does_no_more(tmp_path):
+    # A module path without ROS 2: a preview needs none.
+    (tmp_path / "rclpy.py").write_text("raise ModuleNotFoundError('no', name='rclpy')")
+    done = nics("--preview", "--out", "new/drive.npz", cwd=tmp_path, PYTHONPATH=str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    told = done.stdout.splitlines()
+    assert told[0].startswith("preview of 60 s: a path of ")
+    assert told[-1] == "its path is drawn in new/drive_preview.png"
+    assert (tmp_path / "new" / "drive_preview.png").read_bytes().startswith(PNG)
+    assert os.listdir(tmp_path / "new") == ["drive_preview.png"]
+
+
+@pytest.mark.ros
+def test_it_asks_before_the_robot_moves(tmp_path):
+    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+    done = nics("--out", "drive.npz", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("preview of ") == 1
+    assert done.stdout.endswith("Drive the robot now? [y/N]: nothing was driven or recorded.\n")
+
+
+def test_without_ros_it_is_one_sentence(tmp_path):
+    (tmp_path / "rclpy").mkdir()
+    for module in ("rclpy", "nav_msgs", "geometry_msgs"):
+        (tmp_path / module).mkdir(exist_ok=True)
+        text = f"raise ModuleNotFoundError('no', name='{module}')"
+        (tmp_path / module / "__init__.py").write_text(text)
+    done = nics("--out", "drive.npz", "--yes", cwd=tmp_path, PYTHONPATH=str(tmp_path))
+    assert done.returncode == 2
+    (sentence,) = done.stderr.splitlines()
+    assert sentence.startswith("nics: nics record needs the module ")
+    assert "source your ROS 2" in sentence
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (("--out", "drive.csv"), "unknown kind of recording '.csv'"),
+        (("--out", "taken.npz"), "taken.npz: is there already"),
+        (("--out", "drive.npz", "--robot", "ackerman"), "did you mean 'ackermann'?"),
+        (("--out", "drive.npz", "--bound", "0.5"), "too small for robot 'ackermann'"),
+        (("--out", "drive.npz", "--speed", "2"), "speed 2: must be from 0.05 to 1"),
+    ],
+)
+def test_what_can_not_be_done_is_one_sentence(tmp_path, words, hint):
+    (tmp_path / "taken.npz").write_text("mine")
+    done = nics("--preview", *words, cwd=tmp_path)
+    assert done.returncode == 2
+    (sentence,) = done.stderr.splitlines()
+    assert sentence.startswith("nics: ")
+    assert hint in sentence
+    assert os.listdir(tmp_path) == ["taken.npz"]
+
+
+def test_an_order_becomes_parameters_and_arguments_of_the_node():
+    order = recorder.Order("mecanum", Path("drive.npz"), bound=3.0, use_sim_time=True)
+    assert order.parameters["use_sim_time"] is True
+    assert (order.parameters["robot"], order.parameters["bound"]) == ("mecanum", 3.0)
+    assert order.arguments == ["nics"]
+    named = replace(order, namespace="/bot/", remap=("odom:=/wheels",))
+    assert named.arguments == ["nics", "--ros-args", "-r", "__ns:=/bot", "-r", "odom:=/wheels"]
+    with pytest.raises(ConfigError, match="--remap 'odom=wheels': must be NAME:=OTHER"):
+        _ = replace(order, remap=("odom=wheels",)).arguments
+
+
+def test_the_summary_tells_each_command_and_the_next_step():
+    order = recorder.Order("ackermann", Path("runs/drive.npz"))
+    drive = record(CAR, np.random.default_rng(0), duration=30.0)
+    measured, speed, steering, after = recorder.summary(drive, CAR, order)
+    assert measured.startswith("measured: a path of ")
+    assert speed.startswith("speed_command: moved from 0.0")
+    assert "on its own" in steering
+    assert after == "next: nics generate runs/drive.npz --robot ackermann --out drive_model"
+
+
+@pytest.mark.parametrize("complete", [True, False])
+def test_an_outcome_becomes_lines_or_an_error(monkeypatch, complete):
+    class Node:
+        failure = None
+
+        @classmethod
+        def record(cls, *_):
+            return type(
+                "Outcome", (),
+                {"complete": complete, "failure": cls.failure, "recording": None, "line": "over"},
+            )  # fmt: skip
+
+    monkeypatch.setattr(recorder, "import_module", lambda _: Node)
+    order = recorder.Order("ackermann", Path("drive.npz"))
+    assert recorder.drive(order) == (("over",), complete)
+    Node.failure = BackendError("odom")
+    with pytest.raises(BackendError, match=r"^over$"):
+        recorder.drive(order)

@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "calibration"))
+
+from drives import drive, with_wheels
+
+from nics_drl_bridge.calibration.curves import timing_curves
+from nics_drl_bridge.calibration.estimates import estimates
+from nics_drl_bridge.calibration.fit_report import fit_report
+from nics_drl_bridge.calibration.identify import Identified, identify
+from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
+from nics_drl_bridge.kinematics.textbook import record
+from nics_drl_bridge.report.calibration_pictures import CAPTIONS, calibration_pictures
+
+Found = tuple[RobotSpec, Identified]
+PNG = b"\x89PNG"
+WHEEL_TICK_S = 0.01
+"""Whether a wheel speed is of its stamp or of the tick before, a recording does not say."""
+
+
+@pytest.fixture(scope="module")
+def disturbed() -> Found:
+    """A drive that shows everything there is to estimate."""
+    car = load_robot("ackermann")
+    spoilt = drive(
+        car,
+        duration=60.0,
+        latency=0.12,
+        pose_clock_ahead=3.0,
+        rotation=0.3,
+        lever=(0.1, 0.05),
+        noise=(0.001, 0.002),
+        burst=0.1,
+        measured_state=False,
+    )
+    spoilt = with_wheels(spoilt, drive(car, duration=60.0, latency=0.12), swapped=True)
+    return car, identify(spoilt, car)
+
+
+@pytest.fixture(scope="module")
+def exact() -> Found:
+    spec = load_robot("differential")
+    return spec, identify(record(spec, np.random.default_rng(0), 30.0), spec)
+
+
+def listed(found: Found):
+    identified = found[1]
+    return estimates(identified.recording, identified.calibration, identified.findings)
+
+
+def test_every_estimate_of_a_disturbed_drive_has_its_picture(disturbed):
+    pictures = calibration_pictures(*disturbed)
+    assert set(pictures) == {"timing", "bursts", "mounting", "wheels", "noise"} == set(CAPTIONS)
+    assert all(picture.startswith(PNG) for picture in pictures.values())
+
+
+def test_the_estimates_are_right_within_their_uncertainty(disturbed):
+    found = listed(disturbed)
+    truth = {
+        "clock_offset_s": -3.0,
+        "command_latency_s": 0.12,
+        "rotation_rad": 0.3,
+        "lever_arm_x_m": 0.1,
+        "wheel_scale": 1.0 / 70.0,
+        "turn_scale": -1.0 / (70.0 * 0.16),
+    }
+    for name, value in truth.items():
+        estimate = found[name]
+        tolerance = 4.0 * estimate.sigma + (WHEEL_TICK_S if estimate.unit == "s" else 0.0)
+        assert estimate.value == pytest.approx(value, abs=tolerance, rel=0.02), name
+    assert found["wheels_swapped"].remark == "left and right are interchanged"
+
+
+def test_a_shift_explains_most_at_the_estimate(disturbed):
+    spec, identified = disturbed
+    curves = timing_curves(identified.recording, spec, identified.calibration)
+    assert [c.name for c in curves] == ["clock_offset_s", "command_latency_s"]
+    for curve in curves:
+        best = curve.value[np.argmin(curve.unexplained)]
+        assert best == pytest.approx(getattr(identified.calibration, curve.name), abs=0.03)
+
+
+def test_what_was_not_possible_has_no_picture_and_the_report_says_why(exact):
+    spec, identified = exact
+    pictures = calibration_pictures(spec, identified)
+    assert not {"bursts", "wheels"} & set(pictures)
+    text = fit_report("here", spec, identified)
+    for part in (
+        "clock offset: not estimated, pose and commands are on one clock",
+        "period of bursts: not estimated, the poses are stamped one by one",
+        "wheel scale: not estimated, no wheel speeds were recorded",
+    ):
+        assert part in text
+
+
+def test_the_text_has_value_uncertainty_and_unit(disturbed):
+    found = listed(disturbed)
+    offset = replace(found["clock_offset_s"], value=-3.0012, sigma=0.0104)
+    assert offset.text == "clock offset -3.001 +- 0.01 s"
