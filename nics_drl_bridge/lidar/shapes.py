@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Annotated, Literal
 
 import numpy as np
@@ -30,7 +29,7 @@ class Circle(Schema):
     kind: Literal["circle"] = "circle"
     radius: float = Field(gt=0.0)
 
-    @cached_property
+    @property
     def outline(self) -> Array:
         """(0, 2): a circle has no corners."""
         return np.zeros((0, 2))
@@ -52,7 +51,7 @@ class Rectangle(Schema):
             raise ValueError("size must be greater than 0; a wall without thickness is a segment")
         return self
 
-    @cached_property
+    @property
     def outline(self) -> Array:
         """(4, 2) corners, counter-clockwise [m]."""
         x, y = self.size[0] / 2.0, self.size[1] / 2.0
@@ -81,7 +80,7 @@ class Polygon(Schema):
             raise ValueError("a polygon needs at least 3 different corners")
         return points
 
-    @cached_property
+    @property
     def outline(self) -> Array:
         """(V, 2) corners, counter-clockwise [m]."""
         corners = np.array(self.points, dtype=np.float64)
@@ -111,7 +110,7 @@ class Segment(Schema):
             raise ValueError("ends must be two different points")
         return self
 
-    @cached_property
+    @property
     def outline(self) -> Array:
         """(2, 2) ends [m]."""
         return np.array(self.ends, dtype=np.float64)
