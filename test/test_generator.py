@@ -67,7 +67,7 @@ def test_a_saved_model_is_the_same_to_the_bit(robot, tmp_path):
 
 
 def one_radius(model):
-    return {"count": 2, "radii": [float(model.table.radii[0])], "gap": 0.3}
+    return {"count": 2, "radii": [model.table.shapes[0].radius], "gap": 0.3}
 
 
 def test_saving_twice_gives_the_same_bytes(saved, tmp_path):

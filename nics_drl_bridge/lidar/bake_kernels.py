@@ -44,6 +44,24 @@ def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[n
 
 
 @njit(cache=True)
+def between(corners, radius, distance, cos, sin, edge):  # type: ignore[no-untyped-def]
+    """Range to a shape straight ahead, half-way between its edges; see `row`."""
+    middle = (edge[0] + edge[1]) / 2.0
+    ray, out = np.empty((1, 2)), np.full(1, np.inf, np.float32)
+    ray[0, 0], ray[0, 1] = math.cos(middle), math.sin(middle)
+    beams = (middle, 1.0, 0.0)
+    if corners.shape[0] == 0:
+        kernels.circle(out, ray, beams, distance, 0.0, radius, np.inf)
+    else:
+        kernels.polygon(out, ray, beams, distance, 0.0, cos, sin, corners)
+        if not np.isfinite(out[0]):  # a wall seen edge-on
+            for v in range(corners.shape[0]):
+                x, y = kernels.turned(distance, 0.0, cos, sin, corners[v])
+                out[0] = min(out[0], math.hypot(x, y))
+    return out[0]
+
+
+@njit(cache=True)
 def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # type: ignore[no-untyped-def]
     """Ranges (P,) of a shape straight ahead, continued beyond its edges.
 
@@ -56,7 +74,7 @@ def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # 
         cos, sin: of its rotation.
         edge: (2,) its right and left edge [rad].
     """
-    kernels.clear(fine)
+    fine[:] = np.inf
     if corners.shape[0] == 0:
         kernels.circle(fine, directions, beams, distance, 0.0, radius, np.inf)
     else:
@@ -69,7 +87,7 @@ def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # 
     while last > first and not np.isfinite(fine[last]):
         last -= 1
     if not np.isfinite(fine[first]):  # thinner than the points: seen by none
-        fine[:] = distance
+        fine[:] = between(corners, radius, distance, cos, sin, edge)
         return
     fine[:first] = fine[first]
     fine[last + 1 :] = fine[last]

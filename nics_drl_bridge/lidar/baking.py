@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import bake_kernels
-from nics_drl_bridge.lidar.baked_kernels import BLOCK
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape, describe
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.lidar.table import Density, LidarTable
+from nics_drl_bridge.lidar.table import Density, LidarTable, padding
 
 TOUCHING = 1e-6
 """The nearest grid distance is this much more than the radius, as a part of it."""
+COARSE = np.radians(2.0)
+"""What a shape does between grid rotations is looked at in steps of at most half of this [rad]."""
+MOST_NUMBERS = 2**31 - 2**20
+MISS = 0.02
+"""An edge that two corners would miss by so many beams is looked for along the hull."""
 DENSITY = Density()
 SensorModel = Callable[[NDArray[np.float32], NDArray[np.float64]], NDArray[np.float32]]
 """Ranges (P,) [m] and angles of incidence (P,) [rad] to the ranges that the device reports."""
@@ -69,13 +76,15 @@ def bake(
     grids = [_grid(spec, outlines, h, density) for h in range(len(shapes))]
     cells = np.concatenate([np.zeros((0, 6), np.int64), *(g.cell.reshape(-1, 6) for g in grids)])
     ends = np.cumsum(cells[:, 1]) * density.phases
-    if len(cells) and (ends[-1] + BLOCK > np.iinfo(np.int32).max or np.abs(cells).max() > 32_767):
+    if len(cells) and (ends[-1] > MOST_NUMBERS or np.abs(cells).max() > 32_767):
         raise ConfigError(
             f"a lidar table of {len(cells)} cells with {spec.beams} beams is too large; lower "
             "`distances`, `rotations` or `phases`."
         )
     start = ends - cells[:, 1] * density.phases
-    rows = np.zeros((int(ends[-1]) if len(cells) else 0) + BLOCK, np.float32)
+    rows = np.zeros(
+        (int(ends[-1]) if len(cells) else 0) + padding(spec.angle_increment), np.float32
+    )
     total, done, first = sum(len(grid.turns) for grid in grids), 0, []
     for h, grid in enumerate(grids):
         first.append(sum(g.cell.shape[0] * g.cell.shape[1] for g in grids[:h]))
@@ -92,6 +101,7 @@ def bake(
     return LidarTable(
         shapes,
         density,
+        spec.angle_increment,
         np.array(about, dtype=np.float64).reshape(-1, 3),
         start.astype(np.int32),
         cells.astype(np.int16),
@@ -115,38 +125,109 @@ def _grid(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> _Gri
     count = 1 if round_ else max(1, -(-density.rotations // order))
     unit = 2.0 * np.pi / (count * order)
     hull = outlines.hulls[outlines.hull[h] : (outlines.hull[h] + outlines.hull[h + 1]) // 2]
-    halves = np.arange(-1, 2 * count) * unit / 2.0  # also between the grid's rotations
-    edges = np.zeros((len(halves), density.distances, 2))
+    parts = 2 * max(1, math.ceil(unit / COARSE))
+    turns = np.arange(-parts // 2, parts * count - parts // 2 + 1) * unit / parts
+    edges = np.zeros((len(turns), density.distances, 2))
     hints = np.zeros(edges.shape, np.int64)
-    bake_kernels.silhouettes(hull, radius if round_ else 0.0, distances, halves, edges, hints)
+    bake_kernels.silhouettes(hull, radius if round_ else 0.0, distances, turns, edges, hints)
     cell = np.zeros((count, density.distances, 6), np.int64)
-    low = _around(edges[..., 0], np.minimum) / spec.angle_increment
-    high = _around(edges[..., 1], np.maximum) / spec.angle_increment
+    low = _reach_of(edges[..., 0], parts, np.minimum) / spec.angle_increment
+    high = _reach_of(edges[..., 1], parts, np.maximum) / spec.angle_increment
     cell[..., 0] = np.floor(low - 0.5)
     cell[..., 1] = np.ceil(high + 0.5) - cell[..., 0] + 1
-    for side in (0, 1):
-        cell[..., 2 + 2 * side], cell[..., 3 + 2 * side] = _candidates(hints[..., side])
+    if not round_:
+        for side in (0, 1):
+            wound = _wound(hull, hints[..., side], edges[..., side] - turns[:, None] + side * np.pi)
+            two = _candidates(wound, parts, len(hull))
+            cell[..., 2 + 2 * side : 4 + 2 * side] = two
+            miss = _miss(hull, two, edges[..., side], turns, distances, parts)
+            far_off = miss > MISS * spec.angle_increment
+            climb = _climbs(wound, parts, len(hull))
+            cell[..., 2 + 2 * side : 4 + 2 * side][far_off] = climb[far_off]
     if cell[..., 1].max() > 32_767:
         raise ConfigError(f"{describe(shape)} with {spec.beams} beams: too many beams to bake.")
-    return _Grid(distances, np.arange(count) * unit, edges[1::2], cell)
+    return _Grid(distances, np.arange(count) * unit, edges[parts // 2 :: parts], cell)
 
 
-def _around(edge: NDArray[np.float64], outer: np.ufunc) -> NDArray[np.float64]:
-    """(T, D) the outermost edge until the next cells, from edges (2 T + 1, D) at half steps."""
-    turned = outer(outer(edge[:-1:2], edge[1::2]), edge[2::2])
+def _within(values: NDArray[Any], parts: int, outer: np.ufunc) -> NDArray[Any]:
+    """(T, D) the outermost value in each cell, of values (T * parts + 1, D) around and between.
+
+    The kernels blend two distances: a cell reaches to the next one.
+    """
+    count = len(values) // parts
+    turned = outer.reduce([values[k:][: count * parts : parts] for k in range(parts + 1)])
     result = turned.copy()
-    result[:, 1:] = outer(result[:, 1:], turned[:, :-1])
     result[:, :-1] = outer(result[:, :-1], turned[:, 1:])
     return np.asarray(result)
 
 
-def _candidates(hints: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(T, D) twice: two corners that can be an edge in a cell, from those at its four corners."""
-    later = np.concatenate([hints[:, 1:], hints[:, -1:]], axis=1)
-    before, after = hints[:-1:2], hints[2::2]
-    other = np.where(after != before, after, later[:-1:2])
-    other = np.where(other != before, other, later[2::2])
-    return before, other
+def _reach_of(edge: NDArray[np.float64], parts: int, outer: np.ufunc) -> NDArray[np.float64]:
+    """(T, D) the outermost edge of all cells that use the row of a cell."""
+    result = _within(edge, parts, outer)
+    result[:, 1:] = outer(result[:, 1:], result[:, :-1])
+    return result
+
+
+def _wound(
+    hull: NDArray[np.float64], hints: NDArray[np.int64], along: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Corners that make an edge, counted on around the hull where the shape turns on.
+
+    Args:
+        hull: (V, 2) counter-clockwise.
+        hints: (...) indices of the corners.
+        along: (...) direction of the edge in the shape's frame, so that the hull lies to its left
+            [rad]; it is between those of the hull's sides before and after the corner.
+    """
+    x, y = (np.roll(hull, -1, axis=0) - hull).T
+    after = np.arctan2(y, x)
+    middle = after - np.mod(after - np.roll(after, 1), 2.0 * np.pi) / 2.0
+    rounds = np.round((along - middle[hints]) / (2.0 * np.pi)).astype(np.int64)
+    return np.asarray(hints + len(hull) * rounds)
+
+
+def _candidates(wound: NDArray[np.int64], parts: int, corners: int) -> NDArray[np.int64]:
+    """(T, D, 2) two corners that can be an edge within each cell.
+
+    Along a line and around a circle outside of the shape the corner moves one way only, so those
+    at the rim of a cell hold all between them. Where there are more than two, those at a quarter
+    and three quarters stand for all.
+    """
+    low, high = _within(wound, parts, np.minimum), _within(wound, parts, np.maximum)
+    quarter = (high - low) // 4
+    return np.stack([(low + quarter) % corners, (high - quarter) % corners], axis=-1)
+
+
+def _climbs(wound: NDArray[np.int64], parts: int, corners: int) -> NDArray[np.int64]:
+    """(T, D, 2) the corner in the middle of each cell, and minus the stride to climb with."""
+    low, high = _within(wound, parts, np.minimum), _within(wound, parts, np.maximum)
+    first = wound[parts // 2 :: parts]
+    away = np.clip(np.maximum(high - first, first - low), 1, corners - 1)
+    stride = np.exp2(np.floor(np.log2(away))).astype(np.int64)
+    return np.stack([first % corners, -stride], axis=-1)
+
+
+def _miss(
+    hull: NDArray[np.float64],
+    two: NDArray[np.int64],
+    edge: NDArray[np.float64],
+    turns: NDArray[np.float64],
+    distances: NDArray[np.float64],
+    parts: int,
+) -> NDArray[np.float64]:
+    """(T, D) by how much the nearer of two corners misses the edge at the rim of a cell [rad]."""
+    count = len(two)
+    worst = np.zeros(two.shape[:2])
+    for k in range(parts + 1):
+        turn, true = turns[k:][: count * parts : parts], edge[k:][: count * parts : parts]
+        corner = rotate(hull[two], turn[:, None, None])
+        for later in (0, 1):
+            last = distances.shape[0] - later
+            x = corner[:, :last, :, 0] + distances[later:, None]
+            bearing = np.arctan2(corner[:, :last, :, 1], x)
+            off = np.abs(bearing - true[:, later:, None]).min(axis=-1)
+            worst[:, :last] = np.maximum(worst[:, :last], off)
+    return worst
 
 
 def _rows_of_turn(
@@ -180,10 +261,23 @@ def _apply(
     spec: LidarSpec,
     phases: int,
 ) -> None:
-    """Changes every row by the sensor model; incidence follows from r' / r along the row."""
+    """Changes every row by the sensor model."""
     for begin, width in zip(start, cells[:, 1], strict=True):
         part = rows[begin : begin + width * phases]
         fine = part.reshape(phases, width).T.ravel()
-        slope = np.gradient(fine.astype(np.float64), spec.angle_increment / phases)
-        changed = sensor_model(fine, np.arctan2(np.abs(slope), fine))
+        changed = sensor_model(fine, _incidence(fine, spec.angle_increment / phases))
         part[:] = np.asarray(changed, np.float32).reshape(width, phases).T.ravel()
+
+
+def _incidence(fine: NDArray[np.float32], step: float) -> NDArray[np.float64]:
+    """(P,) angle between each ray and the normal of what it hits [rad], from r' / r.
+
+    Of the slopes to both neighbours the smaller counts, so that a jump to another side is none.
+    Beyond the edges, where a row goes on with its outermost range, it is that at the edge.
+    """
+    slope = np.abs(np.diff(fine.astype(np.float64))) / step
+    moves = np.flatnonzero(slope)
+    if len(moves):
+        slope[: moves[0]], slope[moves[-1] + 1 :] = slope[moves[0]], slope[moves[-1]]
+    both = np.minimum(np.append(slope, np.inf), np.append(np.inf, slope))
+    return np.asarray(np.arctan2(both, fine))

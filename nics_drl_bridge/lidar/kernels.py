@@ -18,14 +18,14 @@ ROUNDING = 1e-6
 """A beam this near to an edge, in beams, is tried; the exact test decides."""
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _lower(out, i, value):  # type: ignore[no-untyped-def]
     """Fuses one return into beam i of a full or partial circle."""
     if value < out[i]:
         out[i] = value
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def beam_span(low, high, beams, count):  # type: ignore[no-untyped-def]
     """First beam index and number of beams in the angles [low, high].
 
@@ -40,7 +40,7 @@ def beam_span(low, high, beams, count):  # type: ignore[no-untyped-def]
     return first, max(last - first + 1, 0)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def circle(out, directions, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
     """Exact ranges to a circle at (x, y)."""
     d2 = x * x + y * y
@@ -72,7 +72,7 @@ def circle(out, directions, beams, x, y, radius, range_max):  # type: ignore[no-
                 _lower(out, i, c * x + s * y - math.sqrt(rest))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def segment(out, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
     """Exact ranges to the straight wall from (x1, y1) to (x2, y2)."""
     count = out.shape[0]
@@ -100,7 +100,7 @@ def segment(out, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-
                     _lower(out, i, distance)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def polygon(out, directions, beams, x, y, c, s, corners):  # type: ignore[no-untyped-def]
     """Exact ranges to the outline `corners` (V, 2), turned by (c, s), with its origin at (x, y)."""
     last = corners.shape[0] - 1
@@ -111,30 +111,31 @@ def polygon(out, directions, beams, x, y, c, s, corners):  # type: ignore[no-unt
         ax, ay = bx, by
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def turned(x, y, c, s, corner):  # type: ignore[no-untyped-def]
     """Where a corner (2,) lies when its shape is turned by (c, s) and put at (x, y)."""
     return x + c * corner[0] - s * corner[1], y + s * corner[0] + c * corner[1]
 
 
-@njit(cache=True, error_model="numpy")
-def clear(out):  # type: ignore[no-untyped-def]
-    """Begins a scan: no return anywhere."""
-    for i in range(out.shape[0]):
-        out[i] = np.inf
-
-
-@njit(cache=True, error_model="numpy")
-def finish(ranges, n, m, line, range_min, range_max):  # type: ignore[no-untyped-def]
-    """Ends a scan: `line` into `ranges` (N, M, B); too far `inf`, too close `-inf` (REP-117)."""
-    low, high = np.float32(range_min), np.float32(range_max)
+@njit(cache=True, error_model="numpy", _nrt=False)
+def clear(ranges, n, m):  # type: ignore[no-untyped-def]
+    """Begins the scan of robot m in world n of `ranges` (N, M, B): no return anywhere."""
+    nothing = np.float32(np.inf)
     for i in range(ranges.shape[2]):
-        value = line[i]
+        ranges[n, m, i] = nothing
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
+    """Ends a scan (B,) of exact ranges: too far is `inf`, too close is `-inf` (REP-117)."""
+    low, high = np.float32(range_min), np.float32(range_max)
+    for i in range(out.shape[0]):
+        value = out[i]
         value = value if value <= high else np.float32(np.inf)
-        ranges[n, m, i] = value if value >= low else np.float32(-np.inf)
+        out[i] = value if value >= low else np.float32(-np.inf)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def to_sensor(poses, n, m, mount):  # type: ignore[no-untyped-def]
     """x, y, heading, cos, sin of a lidar in its world, from poses (N, M, 3) and the mount (3,)."""
     c, s = math.cos(poses[n, m, 2]), math.sin(poses[n, m, 2])
@@ -144,7 +145,7 @@ def to_sensor(poses, n, m, mount):  # type: ignore[no-untyped-def]
     return x, y, heading, math.cos(heading), math.sin(heading)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def walls_into(out, directions, beams, sx, sy, c, s, walls):  # type: ignore[no-untyped-def]
     """Fuses straight walls (W, 4), given in the world, into a scan from (sx, sy, c, s)."""
     for w in range(walls.shape[0]):
@@ -155,7 +156,7 @@ def walls_into(out, directions, beams, sx, sy, c, s, walls):  # type: ignore[no-
         segment(out, directions, beams, ax, ay, bx, by)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def body_into(out, directions, beams, sx, sy, c, s, body, corners, corner, range_max):  # type: ignore[no-untyped-def]
     """Fuses one body (7,), see `shapes.BODY`, into a scan from (sx, sy, c, s)."""
     dx, dy = body[0] - sx, body[1] - sy

@@ -8,7 +8,7 @@ from nics_drl_bridge.lidar import baked_kernels as baking
 from nics_drl_bridge.lidar import kernels
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # type: ignore[no-untyped-def]
     """Scans of the robots of some worlds.
 
@@ -27,28 +27,37 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
     """
     mount, directions, beams, limits, baked, outlines, lookup = sensor
     corners, corner = outlines
-    shape_of, row_of, cell_of, rows, shift, hulls = lookup
-    line, work, cells = room
-    count = ranges.shape[2]
-    seen = line[:count]
+    shape_of, grid_of, row_of, cell_of, rows, shift, hulls = lookup
+    doubles, singles, wholes = room
+    x, y, distance, bearing, right, left = doubles
+    rx, ry, lx, ly, blend = singles
+    which, cell_at = wholes
     low, high = limits[0], limits[1]
     for n in chosen:
         for m in range(poses.shape[1]):
             me = first + m if first >= 0 else -1
             sx, sy, heading, c, s = kernels.to_sensor(poses, n, m, mount)
-            found, left = baking.in_sight(bodies, n, me, sx, sy, high, baked, work, cells)
-            baking.directions(found, work)
-            baking.cells_of(found, bodies, n, shape_of, cell_of, hulls, work, cells)
-            kernels.clear(line)
-            baking.spans(found, heading, beams, work)
-            baking.fuse(line, found, beams, row_of, cell_of, rows, shift, work, cells)
-            if left > 0:
-                for k in range(bodies.shape[1]):
+            found, missed = baking.in_sight(
+                bodies, n, me, sx, sy, high, baked, which, x, y, distance
+            )
+            baking.directions(found, x, y, distance, bearing)
+            baking.cells_of(
+                found, bodies, n, limits, shape_of, grid_of, cell_of, hulls, which, x, y, distance, bearing,
+                rx, ry, lx, ly, blend, cell_at,
+            )  # fmt: skip
+            kernels.clear(ranges, n, m)
+            baking.spans(found, heading, beams, rx, ry, lx, ly, bearing, right, left)
+            baking.fuse(
+                ranges, n, m, found, beams, limits, row_of, cell_of, rows, shift, bearing, right,
+                left, blend, which, cell_at,
+            )  # fmt: skip
+            if missed > 0 or walls.shape[0] > 0:
+                out = ranges[n, m]
+                for k in range(bodies.shape[1] if missed > 0 else 0):
                     if baking.left_out(bodies, n, k, me, sx, sy, high, baked):
                         kernels.body_into(
-                            seen, directions, beams, sx, sy, c, s, bodies[n, k], corners, corner,
+                            out, directions, beams, sx, sy, c, s, bodies[n, k], corners, corner,
                             high,
                         )  # fmt: skip
-            if walls.shape[0] > 0:
-                kernels.walls_into(seen, directions, beams, sx, sy, c, s, walls)
-            kernels.finish(ranges, n, m, line, low, high)
+                kernels.walls_into(out, directions, beams, sx, sy, c, s, walls)
+                kernels.finish(out, low, high)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,8 +11,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nics_drl_bridge.errors import ConfigError, ModelError
 from nics_drl_bridge.lidar import scan_kernels
-from nics_drl_bridge.lidar.baked_kernels import BLOCK, COLUMNS
+from nics_drl_bridge.lidar.baked_kernels import BLOCK, DOUBLES, SINGLES, WHOLES
 from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.shapes import BODY, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
@@ -19,7 +21,11 @@ from nics_drl_bridge.lidar.table import LidarTable
 
 Renderer = Literal["auto", "baked", "exact"]
 RENDERERS: tuple[Renderer, ...] = ("auto", "baked", "exact")
-Room = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]]
+Room = tuple[
+    tuple[NDArray[np.float64], ...],
+    tuple[NDArray[np.float32], ...],
+    tuple[NDArray[np.int64], ...],
+]
 NO_WALLS = np.zeros((0, 4))
 FEW_CORNERS = 2
 """A shape of so few corners is scanned exactly by `auto`: that is as fast as a look-up."""
@@ -40,6 +46,23 @@ class Scanner:
     spec: LidarSpec
     table: LidarTable
     renderer: Renderer = "auto"
+
+    def __post_init__(self) -> None:
+        """Raises ModelError when the table was baked for another lidar."""
+        table, spec = self.table, self.spec
+        if self.renderer == "exact" or not table.shapes:
+            return
+        if not math.isclose(table.beam_angle, spec.angle_increment, rel_tol=1e-9):
+            raise ModelError(
+                f"the lidar table is for beams that are {table.beam_angle:.6g} rad apart, those of "
+                f"the lidar {spec.name!r} are {spec.angle_increment:.6g} rad; bake one for it."
+            )
+        reach = float((table.grid[:, 0] - table.outlines.radii).min())
+        if reach < spec.range_max * (1.0 - 1e-9):
+            raise ModelError(
+                f"the lidar table reaches {reach:g} m, the lidar {spec.name!r} {spec.range_max:g} "
+                "m; bake one for it."
+            )
 
     @cached_property
     def arguments(self) -> tuple[Any, ...]:
@@ -73,9 +96,12 @@ class Scanner:
 
     def room(self, bodies: int) -> Room:
         """Scratch that one thread needs to scan a world of so many bodies."""
-        line = np.empty(self.spec.beams + BLOCK, np.float32)
         bodies = (bodies // BLOCK + 1) * BLOCK
-        return line, np.ones((COLUMNS, bodies)), np.zeros((2, bodies), np.int64)
+        return (
+            tuple(np.ones(bodies) for _ in range(DOUBLES)),
+            tuple(np.ones(bodies, np.float32) for _ in range(SINGLES)),
+            tuple(np.zeros(bodies, np.int64) for _ in range(WHOLES)),
+        )
 
     def place(self, shapes: Sequence[Shape], poses: ArrayLike) -> NDArray[np.float64]:
         """Bodies (..., K, 7) of K shapes at poses (..., K, 3): x, y [m], heading [rad].
@@ -104,11 +130,25 @@ class Scanner:
 
         Returns:
             (N, B) ranges [m]: `inf` no return, `-inf` too close (REP-117).
+
+        Raises:
+            ConfigError: an array has another shape.
         """
         poses = np.atleast_2d(np.asarray(poses, dtype=np.float64))
-        bodies = np.asarray(bodies, dtype=np.float64).reshape(len(poses), -1, BODY)
+        shape = (len(poses), self.spec.beams)
+        bodies = np.asarray(bodies, dtype=np.float64)
+        if bodies.size == 0:
+            bodies = np.zeros((len(poses), 0, BODY))
+        elif bodies.ndim == 2:
+            bodies = bodies[None]
         walls = np.asarray(walls, dtype=np.float64).reshape(-1, 4)
-        out = np.empty((len(poses), self.spec.beams), np.float32) if out is None else out
+        out = np.empty(shape, np.float32) if out is None else out
+        if poses.shape[1:] != (3,) or bodies.shape != (len(poses), bodies.shape[1], BODY):
+            raise ConfigError(
+                f"poses {poses.shape} and bodies {bodies.shape} must be (N, 3) and (N, K, {BODY})."
+            )
+        if out.shape != shape or out.dtype != np.float32:
+            raise ConfigError(f"out is {out.shape} {out.dtype}; it must be {shape} float32.")
         worlds = np.arange(len(poses))
         room = self.room(bodies.shape[1])
         scan_kernels.scan_worlds(

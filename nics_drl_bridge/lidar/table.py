@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import zlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +17,10 @@ from pydantic import Field, field_validator
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.files import npz_bytes, npz_mapped, sha256
+from nics_drl_bridge.lidar.baked_kernels import BLOCK
 from nics_drl_bridge.lidar.shapes import SHAPES, Circle, Outlines, Shape
+
+FORMAT = "nics_drl_bridge/lidar_table/2"
 
 
 class Density(Schema):
@@ -40,6 +45,14 @@ class Density(Schema):
         return phases
 
 
+def padding(beam_angle: float) -> int:
+    """How many numbers one look-up can read from where a row begins: half a turn, and a block.
+
+    A shape that the lidar is outside of covers less.
+    """
+    return math.ceil(math.pi / beam_angle) + 1 + BLOCK
+
+
 @dataclass(frozen=True)
 class LidarTable:
     """The ranges that shapes give, as rows over angle, for a grid of distance and rotation.
@@ -51,16 +64,20 @@ class LidarTable:
     Attributes:
         shapes: H of them.
         density: of the grid.
+        beam_angle: angle between the beams that it was baked for [rad].
         grid: (H, 3) greatest grid distance [m], grid rotations in the part of a turn after which
             the shape looks the same, first cell.
         start: (cells,) int32 where each row begins in `rows`.
-        cell: (cells, 6) int16 first beam of the row from the bearing, its width in beams, two
-            corners of the hull that can be the right edge, two that can be the left.
-        rows: (R,) float32 ranges [m].
+        cell: (cells, 6) int16 first beam of the row from the bearing, its width in beams; a corner
+            of the hull that can be the right edge within the cell, and the same corner, or the one
+            other that can be it, or minus the stride with which to look around when there are
+            more; the same two for the left edge.
+        rows: (R,) float32 ranges [m]; longer than its rows by what one look-up can read.
     """
 
     shapes: tuple[Shape, ...]
     density: Density
+    beam_angle: float
     grid: NDArray[np.float64]
     start: NDArray[np.int32]
     cell: NDArray[np.int16]
@@ -75,24 +92,24 @@ class LidarTable:
     def lookup(self) -> tuple[Any, ...]:
         """What the kernels take.
 
-        Per shape (H, 11): radius [m], cells per metre, distances, rotations per radian, grid
-        rotations in a part of a turn, parts, 1 / (grid rotations x parts), first cell, first
-        corner of the hull, corners per part, 1 for a circle; then `start`, `cell`, `rows`, log2
-        of the phases, the hulls.
+        Numbers of each shape (H, 4): radius [m], cells per metre, rotations in a full turn,
+        parts of a turn after which it looks the same per rotation. Counts (H, 6): distances,
+        rotations in a part, parts (0 for a circle), first cell, first corner of the hull,
+        corners per part. Then `start`, `cell`, `rows`, log2 of the phases, the hulls.
         """
         outlines, distances = self.outlines, self.density.distances
-        of = np.zeros((len(self.shapes), 11))
-        of[:, 0] = outlines.radii
-        of[:, 1] = (distances - 1) / (self.grid[:, 0] - outlines.radii)
-        of[:, 2] = distances
-        of[:, 4], of[:, 5] = self.grid[:, 1], outlines.orders
-        of[:, 3] = of[:, 4] * of[:, 5] / (2.0 * np.pi)
-        of[:, 6] = 1.0 / (of[:, 4] * of[:, 5])
-        of[:, 7], of[:, 8] = self.grid[:, 2], outlines.hull[:-1]
-        of[:, 9] = np.diff(outlines.hull) / 2 / outlines.orders
-        of[:, 10] = [isinstance(shape, Circle) for shape in self.shapes]
-        phases = self.density.phases
-        return of, self.start, self.cell, self.rows, phases.bit_length() - 1, outlines.hulls
+        rotations, parts = self.grid[:, 1], outlines.orders
+        numbers = np.zeros((len(self.shapes), 4))
+        numbers[:, 0] = outlines.radii
+        numbers[:, 1] = (distances - 1) / (self.grid[:, 0] - outlines.radii)
+        numbers[:, 2], numbers[:, 3] = rotations * parts, 1.0 / rotations
+        counts = np.zeros((len(self.shapes), 6), np.int64)
+        counts[:, 0], counts[:, 1] = distances, rotations
+        counts[:, 2] = [0 if isinstance(s, Circle) else n for s, n in zip(self.shapes, parts, strict=True)]
+        counts[:, 3], counts[:, 4] = self.grid[:, 2], outlines.hull[:-1]
+        counts[:, 5] = np.diff(outlines.hull) // 2 // parts
+        shift = self.density.phases.bit_length() - 1
+        return numbers, counts, self.start, self.cell, self.rows, shift, outlines.hulls
 
     @property
     def memory(self) -> int:
@@ -112,7 +129,23 @@ class LidarTable:
 
     def _about(self) -> str:
         shapes = SHAPES.dump_python(self.shapes, mode="json")
-        return json.dumps({"shapes": shapes, "density": self.density.model_dump()})
+        density = self.density.model_dump()
+        return json.dumps(
+            {
+                "format": FORMAT,
+                "shapes": shapes,
+                "density": density,
+                "beam_angle": self.beam_angle,
+                "crc32": self._crc32(),
+            }
+        )
+
+    def _crc32(self) -> int:
+        """Tells whether an array was damaged."""
+        crc = 0
+        for array in (self.grid, self.start, self.cell, self.rows):
+            crc = zlib.crc32(np.ascontiguousarray(array).data, crc)
+        return crc
 
     @classmethod
     def load(cls, path: Path, checksum: str | None = None) -> LidarTable:
@@ -130,14 +163,22 @@ class LidarTable:
                 raise ModelError(f"{path}: does not match its checksum; generate the model anew.")
             arrays = npz_mapped(path)
             about = json.loads(arrays.pop("about").tobytes())
+            if about["format"] != FORMAT:
+                raise ValueError(f"its format is {about['format']!r}, not {FORMAT!r}")
             shapes = SHAPES.validate_python(about["shapes"])
-            table = cls(shapes, Density(**about["density"]), **arrays)
+            density = Density.model_validate(about["density"])
+            table = cls(shapes, density, float(about["beam_angle"]), **arrays)
             table._check()
+            if table._crc32() != about["crc32"]:
+                raise ValueError("its numbers were damaged")
         except OSError as error:
             raise ModelError(
                 f"{path}: can't be read ({error.strerror}); generate the model anew."
             ) from None
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+        except (
+            ArithmeticError, AttributeError, IndexError, KeyError, RecursionError, TypeError,
+            ValueError,
+        ) as error:  # fmt: skip
             reason = " ".join(str(error).split())
             raise ModelError(
                 f"{path}: is no lidar table ({reason}); generate the model anew."
@@ -146,21 +187,28 @@ class LidarTable:
 
     def _check(self) -> None:
         """Raises ValueError when the kernels would read beyond an array."""
-        cells = int(self.grid[:, 1].sum()) * self.density.distances
         arrays: tuple[NDArray[Any], ...] = (self.grid, self.start, self.cell, self.rows)
         if [array.dtype for array in arrays] != [np.float64, np.int32, np.int16, np.float32]:
             raise ValueError("an array has another type of number")
-        if self.grid.shape != (len(self.shapes), 3) or self.start.shape != (cells,):
-            raise ValueError("the number of cells does not fit the shapes")
-        if self.cell.shape != (cells, 6) or self.rows.ndim != 1:
-            raise ValueError("an array has another shape")
+        if self.grid.shape != (len(self.shapes), 3) or not np.isfinite(self.grid).all():
+            raise ValueError("the grid does not fit the shapes")
+        counts = self.grid[:, 1] * self.density.distances
+        cells = int(counts.sum())
+        if (counts < 1).any() or not np.array_equal(self.grid[:, 2], np.cumsum(counts) - counts):
+            raise ValueError("the grid does not fit the density")
+        if (self.grid[:, 0] <= self.outlines.radii).any() or not 0.0 < self.beam_angle < 7.0:
+            raise ValueError("the grid has no extent")
+        if self.start.shape != (cells,) or self.cell.shape != (cells, 6) or self.rows.ndim != 1:
+            raise ValueError("the number of cells does not fit the grid")
         widths = self.cell[:, 1].astype(np.int64) * self.density.phases
         ends = self.start + widths
-        if cells and (self.start.min() < 0 or widths.min() < 1 or ends.max() > len(self.rows)):
+        last = len(self.rows) - padding(self.beam_angle)
+        if cells and (self.start.min() < 0 or widths.min() < 1 or ends.max() > last):
             raise ValueError("a row lies outside of the table")
-        corners = np.diff(self.outlines.hull) // 2
-        first = self.grid[:, 2].astype(np.int64)
-        for h, count in enumerate(self.grid[:, 1].astype(np.int64) * self.density.distances):
-            part = self.cell[first[h] : first[h] + count, 2:]
-            if len(part) != count or part.min() < 0 or part.max() >= corners[h]:
-                raise ValueError("a cell names a corner that its shape has not")
+        self._check_corners(counts.astype(np.int64))
+
+    def _check_corners(self, counts: NDArray[np.int64]) -> None:
+        corners = np.repeat(np.diff(self.outlines.hull) // 2, counts)[:, None]
+        hint, other = self.cell[:, 2::2], self.cell[:, 3::2]
+        if (hint < 0).any() or (hint >= corners).any() or (np.abs(other) >= corners).any():
+            raise ValueError("a cell names a corner that its shape has not")

@@ -1,0 +1,256 @@
+"""The paper's Fig. 4: what a robot sees on a fixed path among four obstacles.
+
+The point clouds of the exact scanner (the paper's scan mode), of the baked one and of MuJoCo's
+rays, laid over each other in the world, and a map that yag-slam makes of the baked scans and a
+drifting odometry. yag-slam is LGPL: it gets an environment of its own, made at first use.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from measuring import mujoco_rays
+from measuring.environments import NotInstalledError, python_with, run
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.lidar.scanner import Scanner, make_scanner
+from nics_drl_bridge.lidar.shapes import Circle, Polygon, Rectangle, Shape
+from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
+from nics_drl_bridge.report.drawing import DARK, MEASURED, MODEL, OTHER, png
+
+Array = NDArray[np.float64]
+HERE = Path(__file__).resolve().parent
+SLAM = ("yag-slam==0.3.0", "opencv-python-headless==5.0.0.93", "numpy==2.4.6", "numba==0.68.1")
+ROOM = np.array([(-4.0, -3.0), (4.0, -3.0), (4.0, 3.0), (-4.0, 3.0)])
+WALLS = np.concatenate([ROOM, np.roll(ROOM, -1, axis=0)], axis=1)
+CORNER = Polygon(
+    points=((-0.5, -0.4), (0.5, -0.4), (0.5, -0.1), (-0.2, -0.1), (-0.2, 0.5), (-0.5, 0.5))
+)
+OBSTACLES: tuple[Shape, ...] = (
+    Circle(radius=0.35), CORNER, Rectangle(size=(0.6, 0.6)), Rectangle(size=(1.4, 0.14)),
+)  # fmt: skip
+POSES = np.array([(-1.1, 0.3, 0.0), (1.0, -0.2, 0.3), (3.1, 2.2, 0.5), (-3.0, -2.1, -0.7)])
+LAPS, DRIFT = 1.15, np.array([1.02, 1.0, 1.04])
+ODOMETRY_NOISE = np.array([0.004, 0.002, 0.004])
+
+
+def path(scans: int) -> Array:
+    """(N, 3) poses on an ellipse around the middle of the room, a little more than once."""
+    t = np.linspace(-0.5 * np.pi, (2.0 * LAPS - 0.5) * np.pi, scans)
+    x, y = 2.7 * np.cos(t), 1.8 * np.sin(t)
+    return np.stack([x, y, np.arctan2(1.8 * np.cos(t), -2.7 * np.sin(t))], axis=1)
+
+
+def drifting(poses: Array, seed: int) -> Array:
+    """(N, 3) the path as an odometry that overrates speed and turning, and is noisy."""
+    moves = geometry.log(geometry.between(poses[:-1], poses[1:]))
+    noise = np.random.default_rng(seed).normal(size=moves.shape) * ODOMETRY_NOISE
+    odometry = [poses[0]]
+    for move in moves * DRIFT + noise:
+        odometry.append(geometry.compose(odometry[-1], geometry.exp(move)))
+    return np.array(odometry)
+
+
+def cloud(spec: LidarSpec, poses: Array, ranges: NDArray[np.float32]) -> Array:
+    """(P, 2) where the returns of all scans lie in the world [m]."""
+    angles = poses[:, 2:] + spec.angles
+    x = poses[:, :1] + ranges * np.cos(angles)
+    y = poses[:, 1:2] + ranges * np.sin(angles)
+    seen = np.isfinite(ranges)
+    return np.stack([x[seen], y[seen]], axis=1)
+
+
+def cloud_rmse(points: Array, reference: Array) -> float:
+    """Root mean square distance of points to their nearest neighbours in a reference [m]."""
+    return float(np.sqrt((cKDTree(reference).query(points)[0] ** 2).mean()))
+
+
+def slam(spec: LidarSpec, ranges: NDArray[np.float32], odometry: Array) -> dict[str, Array]:
+    """Poses and map of yag-slam. Raises NotInstalledError where it can't be had."""
+    python = python_with("yag_slam", SLAM)
+    with tempfile.TemporaryDirectory() as folder:
+        asked, answered = Path(folder) / "scans.npz", Path(folder) / "map.npz"
+        limits = np.array([spec.range_min, spec.range_max])
+        np.savez(asked, ranges=ranges, odometry=odometry, angles=spec.angles, limits=limits)
+        run(python, HERE / "measuring" / "yag_slam_map.py", str(asked), str(answered))
+        with np.load(answered) as found:
+            return dict(found)
+
+
+def path_error(poses: Array, truth: Array) -> float:
+    """Root mean square distance from the true path [m]."""
+    return float(np.sqrt(((poses[:, :2] - truth[:, :2]) ** 2).sum(axis=1).mean()))
+
+
+def outline(shape: Shape, pose: Array) -> Array:
+    """(V, 2) a closed line around an obstacle [m]."""
+    t = np.linspace(0.0, 2.0 * np.pi, 60)
+    corners = shape.outline
+    if isinstance(shape, Circle):
+        corners = shape.radius * np.stack([np.cos(t), np.sin(t)], axis=1)
+    return geometry.rotate(np.concatenate([corners, corners[:1]]), pose[2]) + pose[:2]
+
+
+def panel(axes: Axes, title: str, truth: Array) -> None:
+    """What all four have in common."""
+    axes.set_title(title, fontsize=10, loc="left")
+    axes.set_aspect("equal")
+    axes.set_xlim(-4.3, 4.3)
+    axes.set_ylim(-3.3, 3.3)
+    axes.plot(*truth[:, :2].T, color=MODEL, lw=1.2, label="path")
+    axes.plot(*truth[0, :2], "o", color=MODEL, ms=4)
+    axes.tick_params(labelsize=8)
+
+
+def draw_cloud(axes: Axes, points: Array) -> None:
+    """A point cloud."""
+    axes.plot(*points.T, ".", ms=1.2, mew=0.0, color=MEASURED, alpha=0.6, rasterized=True)
+
+
+def draw_map(axes: Axes, found: dict[str, Array], points: Array, odometry: Array) -> None:
+    """The map as yag-slam drew it, the cloud from its path, and the path of the odometry."""
+    image = found["image"]
+    cell = float(found["resolution"])
+    left, low = found["origin"] - 0.5 * cell  # the origin is the middle of a cell
+    height, width = (side * cell for side in image.shape[:2])
+    axes.imshow(
+        image,
+        cmap="gray",
+        alpha=0.4,
+        origin="lower",
+        extent=(left, left + width, low, low + height),
+        zorder=0,
+    )
+    draw_cloud(axes, points)
+    axes.plot(*odometry[:, :2].T, "--", color=OTHER, lw=1.2, label="odometry")
+    axes.plot(*found["poses"][:, :2].T, color=MEASURED, lw=1.2, label="path by SLAM")
+
+
+def picture(
+    truth: Array, clouds: dict[str, Array | None], titles: dict[str, str], mapped: Any
+) -> Figure:
+    """Four panels."""
+    figure = Figure(figsize=(11, 8.6), layout="constrained")
+    grid = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
+    for axes, (name, points) in zip(grid, clouds.items(), strict=False):
+        panel(axes, titles[name], truth)
+        if points is not None:
+            draw_cloud(axes, points)
+    panel(grid[3], titles["slam"], truth)
+    if mapped is not None:
+        draw_map(grid[3], *mapped)
+    for axes in grid:
+        for shape, pose in zip(OBSTACLES, POSES, strict=True):
+            axes.plot(*outline(shape, pose).T, color=DARK, lw=0.5, alpha=0.5, zorder=1)
+    grid[3].legend(loc="lower right", bbox_to_anchor=(0.95, 0.08), fontsize=8)
+    for axes in grid[2:]:
+        axes.set_xlabel("x [m]", fontsize=9)
+    for axes in grid[::2]:
+        axes.set_ylabel("y [m]", fontsize=9)
+    return figure
+
+
+def measure(scans: int, with_slam: bool, out: Path) -> dict[str, Any]:
+    """Scans the path, compares the clouds, makes the map and the picture."""
+    spec, truth = load_lidar("paper_12m"), path(scans)
+    exact = make_scanner(spec, OBSTACLES, "exact")
+    baked = Scanner(spec, exact.table, "baked")
+    bodies = np.broadcast_to(exact.place(OBSTACLES, POSES), (scans, len(OBSTACLES), 7))
+    ranges = {"exact": exact.scan(truth, bodies, WALLS), "baked": baked.scan(truth, bodies, WALLS)}
+    missing = {}
+    try:
+        ranges["mujoco"] = mujoco_rays.scan(spec, truth, OBSTACLES, POSES, WALLS)
+    except ConfigError as error:
+        missing["mujoco"] = str(error)
+    clouds = {name: cloud(spec, truth, each) for name, each in ranges.items()}
+    others = [name for name in ranges if name != "exact"]
+    result: dict[str, Any] = {
+        "scans": scans,
+        "points": {name: len(points) for name, points in clouds.items()},
+        "cloud_rmse_m": {name: cloud_rmse(clouds[name], clouds["exact"]) for name in others},
+        "range_rmse_m": {
+            name: float(np.sqrt(np.nanmean((ranges[name] - ranges["exact"]) ** 2.0)))
+            for name in others
+        },
+        "slam": None,
+    }
+    odometry, mapped = drifting(truth, 0), None
+    if with_slam:
+        try:
+            found = slam(spec, ranges["baked"], odometry)
+        except NotInstalledError as error:
+            missing["slam"] = str(error)
+        else:
+            rebuilt = cloud(spec, found["poses"], ranges["baked"])
+            mapped = (found, rebuilt, odometry)
+            result["slam"] = {
+                "odometry_error_m": path_error(odometry, truth),
+                "path_error_m": path_error(found["poses"], truth),
+                "cloud_rmse_m": cloud_rmse(rebuilt, clouds["exact"]),
+            }
+    titles = titles_of(result)
+    panels = {name: clouds.get(name) for name in ("exact", "baked", "mujoco")}
+    figure = picture(truth, panels, titles, mapped)
+    write_bytes(out, png(figure))
+    return {**result, "missing": missing, "picture": str(out)}
+
+
+def titles_of(result: dict[str, Any]) -> dict[str, str]:
+    """What stands above each panel."""
+    titles = {
+        "exact": f"a) scan mode: {result['points']['exact']:,} points of {result['scans']} scans"
+    }
+    for letter, name, word in (("b", "baked", "baked"), ("c", "mujoco", "MuJoCo")):
+        titles[name] = f"{letter}) {word}: not available"
+        if name in result["cloud_rmse_m"]:
+            apart = max(1e3 * result["cloud_rmse_m"][name], 0.01)
+            less = "less than " if apart == 0.01 else ""
+            titles[name] = f"{letter}) {word}: {less}{apart:.2f} mm RMSE from a)"
+    titles["slam"] = "d) map by yag-slam: not available"
+    if result["slam"] is not None:
+        before, after = (1e3 * result["slam"][key] for key in ("odometry_error_m", "path_error_m"))
+        titles["slam"] = (
+            f"d) yag-slam from b): path off by {after:.0f} mm, odometry {before:.0f} mm"
+        )
+    return titles
+
+
+def report(result: dict[str, Any]) -> str:
+    """The figures for people."""
+    text = f"{result['scans']} scans, {result['points']['exact']} points\n"
+    for name, apart in result["cloud_rmse_m"].items():
+        beams = result["range_rmse_m"][name]
+        text += f"{name:<8}cloud {apart:.2e} m RMSE from scan mode, beam by beam {beams:.2e} m\n"
+    if result["slam"] is not None:
+        before, after = result["slam"]["odometry_error_m"], result["slam"]["path_error_m"]
+        text += f"yag-slam: path off by {after:.3f} m RMSE, odometry by {before:.3f} m\n"
+    text += "".join(f"{name}: {reason}\n" for name, reason in result["missing"].items())
+    return text + f"picture: {result['picture']}\n"
+
+
+def main() -> None:
+    """Draws the picture; prints a few lines, or one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--scans", type=int, default=200, help="scans along the path")
+    parser.add_argument("--without-slam", action="store_true", help="install nothing, draw no map")
+    parser.add_argument("--out", type=Path, default=Path("runs/fig4_pointcloud.png"))
+    given = parser.parse_args()
+    result = measure(given.scans, not given.without_slam, given.out)
+    sys.stdout.write(json.dumps(result) + "\n" if given.json else report(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""What several benchmarks need: scenes, rates, and environments for other projects."""

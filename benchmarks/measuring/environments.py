@@ -1,0 +1,70 @@
+"""Environments of their own for other projects: they conflict with each other and with ours."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nics_drl_bridge"
+INSTALL_S = 600.0
+OF_OUR_OWN = ("LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE", "PYTHONPATH", "PYTHONHOME")
+"""Variables that would load our libraries into the other environment."""
+
+
+class NotInstalledError(Exception):
+    """A project can't be installed here; the text says why."""
+
+
+def clean() -> dict[str, str]:
+    """The environment variables for a program of another environment."""
+    kept = {name: value for name, value in os.environ.items() if name not in OF_OUR_OWN}
+    return {**kept, "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+
+def python_with(name: str, requirements: tuple[str, ...]) -> Path:
+    """The interpreter of a cached environment that holds the requirements.
+
+    It is made at first use and whenever the requirements change.
+
+    Raises:
+        NotInstalledError: pip could not install them.
+    """
+    folder = CACHE / f"{name}-py{sys.version_info[0]}.{sys.version_info[1]}"
+    python, ready = folder / "bin" / "python", folder / ".ready"
+    wanted = "\n".join(requirements)
+    if ready.is_file() and ready.read_text() == wanted:
+        return python
+    sys.stderr.write(f"Installing {', '.join(requirements)} into {folder}.\n")
+    shutil.rmtree(folder, ignore_errors=True)
+    command = [str(python), "-m", "pip", "install", "-q", "--disable-pip-version-check"]
+    try:
+        venv.create(folder, with_pip=True)
+        subprocess.run(
+            [*command, *requirements],
+            env=clean(), check=True, capture_output=True, text=True, timeout=INSTALL_S,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError) as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        said = getattr(error, "stderr", None) or str(error)
+        last = str(said).strip().splitlines()[-1:] or ["no message"]
+        raise NotInstalledError(f"{name} can't be installed: {last[0]}") from None
+    ready.write_text(wanted)
+    return python
+
+
+def run(python: Path, script: Path, *arguments: str, timeout: float = 600.0) -> str:
+    """Standard output of a script in such an environment. Raises NotInstalledError if it fails."""
+    try:
+        done = subprocess.run(
+            [str(python), str(script), *arguments],
+            env=clean(), check=True, capture_output=True, text=True, timeout=timeout,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError) as error:
+        said = getattr(error, "stderr", None) or str(error)
+        last = str(said).strip().splitlines()[-1:] or ["no message"]
+        raise NotInstalledError(f"{script.name} failed: {last[0]}") from None
+    return done.stdout

@@ -1,0 +1,38 @@
+"""How long calls take on a machine that does other things at the same time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Hashable, Mapping
+from typing import TypeVar
+
+import numpy as np
+
+WARM_UP = 3
+Name = TypeVar("Name", bound=Hashable)
+
+
+def interleaved(
+    calls: Mapping[Name, Callable[[], object]], repeats: int, warm: bool = False
+) -> dict[Name, list[float]]:
+    """Times of each call [s], all in turn, so that a slow moment slows all of them.
+
+    With `warm`, each is called once more just before, so that what it reads is in the caches.
+    """
+    for _ in range(WARM_UP):
+        for call in calls.values():
+            call()
+    times: dict[Name, list[float]] = {name: [] for name in calls}
+    for _ in range(repeats):
+        for name, call in calls.items():
+            if warm:
+                call()
+            begin = time.perf_counter()
+            call()
+            times[name].append(time.perf_counter() - begin)
+    return times
+
+
+def medians(times: Mapping[Name, list[float]]) -> dict[Name, float]:
+    """The median time of each call [s]."""
+    return {name: float(np.median(each)) for name, each in times.items()}

@@ -1,0 +1,145 @@
+"""The paper's Table II: how fast and how exact is the baked lidar among ten obstacles?
+
+720 beams, 3 m, batches of 1,024 scans in float32 on one thread, the table at the paper's density.
+Errors are against the exact scanner, with no return counted as the greatest range.
+`nearest row` is the paper's plain look-up on the same grid and scenes, `write limit` the rate
+at which the output array can merely be filled, measured in turn with the scanners.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from measuring.rates import interleaved, medians
+from measuring.scenes import SCENES, SPEC, Batch, batches, errors, nearest_row, scan
+
+from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.scanner import Scanner
+from nics_drl_bridge.lidar.table import Density, LidarTable
+
+DENSITY = Density(distances=100, rotations=240)
+PAPER = {  # scan mode [1/s], baked [1/s], RMSE [m], RMSE of the area [m^2]
+    "circle": (5.73e1, 3.30e2, 8.47e-2, 5.63e-3),
+    "square": (3.64, 3.32e2, 8.88e-2, 6.71e-3),
+    "strip": (4.16, 3.24e2, 1.05e-1, 9.86e-3),
+    "mixture": (5.70, 3.39e2, 9.06e-2, 7.20e-3),
+}
+SHARE, RMSE_M, PART = 0.1, 0.03, 1.0 / 3.0
+
+
+def timed(table: LidarTable, drawn: list[Batch], repeats: int) -> dict[str, list[float]]:
+    """Times of one batch [s]: exact, baked, and only filling the output."""
+    out = np.empty((len(drawn[0].lidar), SPEC.beams), np.float32)
+    exact, baked = Scanner(SPEC, table, "exact"), Scanner(SPEC, table, "baked")
+    full = [batch for batch in drawn if len(batch.lidar) == len(out)]
+    bodies = [batch.bodies(exact) for batch in full]
+    times: dict[str, list[float]] = {"exact": [], "baked": [], "write": []}
+    for batch, placed in zip(full, bodies, strict=True):
+        calls = {
+            "exact": lambda b=batch, p=placed: exact.scan(b.lidar, p, out=out),
+            "baked": lambda b=batch, p=placed: baked.scan(b.lidar, p, out=out),
+            "write": lambda: out.fill(1.0),
+        }
+        for name, some in interleaved(calls, max(1, repeats // len(full))).items():
+            times[name] += some
+    return times
+
+
+def measure(name: str, scans: int, repeats: int) -> tuple[dict[str, float], dict[str, Any]]:
+    """Figures of one scene; and what belongs to its table and the write limit."""
+    begin = time.perf_counter()
+    table = bake(SPEC, SCENES[name], DENSITY)
+    bake_s = time.perf_counter() - begin
+    drawn = batches(SCENES[name], scans)
+    exact = [scan(table, "exact", batch) for batch in drawn]
+    rmse, area = errors([scan(table, "baked", batch) for batch in drawn], exact)
+    plain = [scan(table, "exact", nearest_row(batch, table)) for batch in drawn]
+    plain_rmse, plain_area = errors(plain, exact)
+    times = timed(table, drawn, repeats)
+    seconds, batch = medians(times), len(drawn[0].lidar)
+    figures = {
+        "exact_scans_per_s": batch / seconds["exact"],
+        "baked_scans_per_s": batch / seconds["baked"],
+        "rmse_m": rmse,
+        "area_rmse_m2": area,
+        "nearest_row_rmse_m": plain_rmse,
+        "nearest_row_area_rmse_m2": plain_area,
+    }
+    writes = [batch / each for each in times["write"]]
+    return figures, {"bytes": table.memory, "bake_s": bake_s, "writes": writes}
+
+
+def judge(scene: dict[str, Any], write_limit: float) -> None:
+    """Adds what a scene is measured by: share of the write limit, and which bars it meets."""
+    scene["share_of_write_limit"] = scene["baked_scans_per_s"] / write_limit
+    scene["bars_met"] = {
+        "rate": scene["share_of_write_limit"] >= SHARE,
+        "rmse": scene["rmse_m"] <= RMSE_M,
+        "rmse_of_nearest_row": scene["rmse_m"] <= PART * scene["nearest_row_rmse_m"],
+        "area_of_nearest_row": scene["area_rmse_m2"] <= PART * scene["nearest_row_area_rmse_m2"],
+    }
+
+
+def run(scans: int, repeats: int) -> dict[str, Any]:
+    """All figures, see the head of this file."""
+    bake(SPEC, SCENES["mixture"], Density(distances=3, rotations=1))  # compiled before it is timed
+    found = {name: measure(name, scans, repeats) for name in SCENES}
+    write_limit = float(
+        np.median([rate for _, about in found.values() for rate in about["writes"]])
+    )
+    scenes: dict[str, dict[str, Any]] = {
+        name: dict(figures) for name, (figures, _) in found.items()
+    }
+    for scene in scenes.values():
+        judge(scene, write_limit)
+    return {
+        "scenes": scenes,
+        "write_limit_scans_per_s": write_limit,
+        "table_bytes": {name: about["bytes"] for name, (_, about) in found.items()},
+        "bake_s": {name: about["bake_s"] for name, (_, about) in found.items()},
+        "scans_per_scene": scans,
+    }
+
+
+def table_of(result: dict[str, Any]) -> str:
+    """The figures beside the paper's."""
+    row = "{:<9}{:<13}{:>10}{:>10}{:>8}{:>11}{:>12}{:>9}{:>8}\n"
+    text = row.format(
+        "scene", "", "exact/s", "baked/s", "of write", "RMSE [m]", "area [m2]", "table", "bake"
+    )
+    for name, s in result["scenes"].items():
+        text += row.format(
+            name, "ours", f"{s['exact_scans_per_s']:.2e}", f"{s['baked_scans_per_s']:.2e}",
+            f"{s['share_of_write_limit']:.0%}", f"{s['rmse_m']:.2e}", f"{s['area_rmse_m2']:.2e}",
+            f"{result['table_bytes'][name] / 1e6:.1f} MB", f"{result['bake_s'][name]:.1f} s",
+        )  # fmt: skip
+        plain = (f"{s['nearest_row_rmse_m']:.2e}", f"{s['nearest_row_area_rmse_m2']:.2e}")
+        text += row.format("", "nearest row", "", "", "", *plain, "", "")
+        theirs = [f"{value:.2e}" for value in PAPER[name]]
+        text += row.format("", "paper", *theirs[:2], "", *theirs[2:], "", "")
+        missed = [bar for bar, met in s["bars_met"].items() if not met]
+        text += f"{'':<9}bars {'all met' if not missed else 'missed: ' + ', '.join(missed)}\n"
+    return text + (
+        f"write limit: {result['write_limit_scans_per_s']:.2e} scans/s; errors over "
+        f"{result['scans_per_scene']} scans of each scene\n"
+    )
+
+
+def main() -> None:
+    """Prints a table, or one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--scans", type=int, default=4096, help="scans of each scene")
+    parser.add_argument("--repeats", type=int, default=200, help="timed batches of each scene")
+    given = parser.parse_args()
+    result = run(given.scans, given.repeats)
+    sys.stdout.write(json.dumps(result) + "\n" if given.json else table_of(result))
+
+
+if __name__ == "__main__":
+    main()

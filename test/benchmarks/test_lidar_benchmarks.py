@@ -1,0 +1,146 @@
+"""Every benchmark of the lidar in small: its JSON has all keys, its errors stay below the bars."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from nics_drl_bridge.lidar.baking import bake
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+SCENES = ["circle", "square", "strip", "mixture"]
+
+
+def result_of(script: str, *options: str, **variables: str) -> dict:
+    """The one JSON object that a benchmark prints."""
+    done = subprocess.run(
+        [sys.executable, str(BENCHMARKS / script), "--json", *options],
+        capture_output=True, text=True, check=True, timeout=110, env={**os.environ, **variables},
+    )  # fmt: skip
+    assert done.stdout.count("\n") == 1
+    return json.loads(done.stdout)
+
+
+@pytest.fixture(scope="module")
+def scenes(monkeypatch_module):
+    monkeypatch_module.syspath_prepend(str(BENCHMARKS))
+    from measuring import scenes
+
+    return scenes
+
+
+@pytest.fixture(scope="module")
+def monkeypatch_module():
+    with pytest.MonkeyPatch.context() as patch:
+        yield patch
+
+
+def test_table2_is_below_a_third_of_the_nearest_rows_errors_in_every_scene():
+    result = result_of("table2_lidar.py", "--scans", "512", "--repeats", "2")
+    assert list(result["scenes"]) == SCENES
+    for name, scene in result["scenes"].items():
+        assert scene["rmse_m"] <= 0.03, name
+        assert scene["rmse_m"] <= scene["nearest_row_rmse_m"] / 3.0, name
+        assert scene["area_rmse_m2"] <= scene["nearest_row_area_rmse_m2"] / 3.0, name
+        assert scene["exact_scans_per_s"] > 0.0
+        assert scene["baked_scans_per_s"] > 0.0
+        assert result["table_bytes"][name] > 0
+        assert result["bake_s"][name] > 0.0
+    assert result["write_limit_scans_per_s"] > 0.0
+
+
+def test_table3_shows_that_half_the_distances_cost_a_plain_look_up_more_than_half_the_rotations():
+    result = result_of("table3_density.py", "--scans", "256")
+    for density in ("100x240", "50x240", "100x120"):
+        assert list(result[density]) == SCENES
+        assert list(result["nearest_row"][density]) == SCENES
+        for name in SCENES:
+            assert result[density][name] <= result["nearest_row"][density][name] / 3.0
+    plain = result["times_worse"]["nearest_row"]
+    assert plain["50x240"] > 1.3 > plain["100x120"]
+
+
+def test_complexity_names_a_cost_for_every_number_of_vertices():
+    options = ("--most", "16", "--scans", "32", "--repeats", "2")
+    result = result_of("lidar_complexity.py", *options, "--distances", "10", "--rotations", "8")
+    assert result["vertices"] == [4, 8, 16]
+    for key in ("exact_us", "baked_us"):
+        assert len(result[key]) == 3
+        assert min(result[key]) > 0.0
+    assert set(result["few"]) >= {"circle", "segment", "3 corners"}
+
+
+def test_peers_are_null_with_a_reason_where_they_cant_be_installed(tmp_path):
+    options = ("--scans", "32", "--scenes", "1", "--repeats", "2")
+    nowhere = {"PIP_NO_INDEX": "1", "PIP_CONFIG_FILE": os.devnull}
+    cache = {"XDG_CACHE_HOME": str(tmp_path), "PIP_FIND_LINKS": str(tmp_path)}
+    result = result_of("lidar_peers.py", *options, **nowhere, **cache)
+    assert result["baked"] > 0.0
+    assert result["exact"] > 0.0
+    for peer in ("ir_sim", "irsim_x"):
+        assert result[peer] is None
+        assert "can't be installed" in result["missing"][peer]
+    assert not any(path.name == ".ready" for path in tmp_path.rglob("*"))
+
+
+def test_the_point_clouds_of_scan_mode_baked_and_mujoco_lie_on_each_other(tmp_path):
+    pytest.importorskip("mujoco")
+    out = tmp_path / "clouds.png"
+    result = result_of("fig4_pointcloud.py", "--scans", "12", "--without-slam", "--out", str(out))
+    assert result["points"] == {"exact": 8640, "baked": 8640, "mujoco": 8640}
+    assert result["range_rmse_m"]["mujoco"] < 1e-5
+    assert result["range_rmse_m"]["baked"] < 0.05
+    assert result["cloud_rmse_m"]["baked"] < 0.01
+    assert result["slam"] is None
+    assert matplotlib.image.imread(out).shape[0] > 500
+
+
+def test_random_scenes_keep_clear_of_the_lidar_and_differ_between_seeds(scenes):
+    for shapes in scenes.SCENES.values():
+        batch = scenes.random_batch(shapes, 300, 1)
+        for k, shape in enumerate(batch.shapes):
+            assert scenes.gap(shape, batch.poses[:, k]).min() > scenes.SPEC.range_min
+        assert np.hypot(*batch.poses[..., :2].reshape(-1, 2).T).max() <= scenes.SPEC.range_max
+        assert not np.allclose(batch.poses, scenes.random_batch(shapes, 300, 2).poses)
+
+
+def test_the_nearest_row_is_half_a_grid_step_away_at_most(scenes):
+    table = bake(scenes.SPEC, scenes.SCENES["strip"])
+    batch = scenes.random_batch(scenes.SCENES["strip"], 300, 1)
+    snapped = scenes.nearest_row(batch, table)
+    radius, step = scenes.STRIP.radius, scenes.SPEC.angle_increment
+    distance, _ = polar(batch.poses)
+    row, beam = polar(snapped.poses)
+    beyond = distance < radius
+    assert beyond.any()
+    assert np.array_equal(snapped.poses[beyond], batch.poses[beyond])
+    apart = (table.grid[0, 0] - radius) / (table.density.distances - 1)
+    on_grid = (row - radius)[~beyond] / apart
+    assert np.abs(on_grid - np.rint(on_grid)).max() < 1e-3
+    assert np.abs(row - distance)[~beyond].max() <= 0.5001 * apart
+    whole = beam[~beyond] / step
+    assert np.abs(whole - np.rint(whole)).max() < 1e-6
+    turn = 2.0 * np.pi / table.density.rotations
+    rotation = (snapped.poses[..., 2] - beam)[~beyond] / turn
+    assert np.abs(rotation - np.rint(rotation)).max() < 1e-6
+
+
+def test_errors_count_no_return_as_the_greatest_range(scenes):
+    beams = scenes.SPEC.beams
+    nothing = np.full((1, beams), np.inf, np.float32)
+    near = np.full((1, beams), 2.0, np.float32)
+    rmse, area = scenes.errors([nothing], [near])
+    assert rmse == pytest.approx(1.0)
+    assert area == pytest.approx(np.pi * (9.0 - 4.0))
+
+
+def polar(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance [m] and bearing [rad] of every obstacle."""
+    return np.hypot(poses[..., 0], poses[..., 1]), np.arctan2(poses[..., 1], poses[..., 0])

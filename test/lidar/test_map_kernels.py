@@ -1,0 +1,191 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import shapely
+
+from nics_drl_bridge.lidar import map_kernels
+from nics_drl_bridge.lidar.maps_grid import NO_MAP, GridMap
+
+BEAMS = 37
+EDGE = 1e-6  # beams that pass a corner this closely [m] may go either way
+KERNELS = {"exact": map_kernels.exact_map_into, "baked": map_kernels.map_into}
+
+
+def directions(beams=BEAMS):
+    angles = -np.pi + 2.0 * np.pi / beams * np.arange(beams)
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def scan(kernel, grid, pose, range_max=100.0, rays=None, before=np.inf):
+    """A scan (B,) from x, y, heading."""
+    rays = directions() if rays is None else np.asarray(rays, dtype=np.float64)
+    out = np.full(len(rays), before, np.float32)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    arrays = grid if isinstance(grid, tuple) else grid.arrays
+    beams = np.array([-np.pi, 2.0 * np.pi / len(rays), 1.0])
+    KERNELS[kernel](out, rays, beams, *pose[:2], c, s, range_max, arrays)
+    return out
+
+
+def random_map(seed):
+    rng = np.random.default_rng(seed)
+    shape = rng.integers(1, 30, 2)
+    cells = (rng.random(shape) < rng.choice([0.02, 0.1, 0.4])) * np.int8(100)
+    origin = (*rng.uniform(-2.0, 2.0, 2), rng.uniform(-np.pi, np.pi))
+    return GridMap(cells.astype(np.int8), float(rng.choice([0.05, 0.1, 0.3])), origin), rng
+
+
+def random_pose(grid, rng):
+    """Anywhere in the map, or up to half its size outside."""
+    size = np.array(grid.cells.shape)
+    place = rng.uniform(-0.5, 1.5, 2) if rng.random() < 0.3 else rng.random(2)
+    return np.array([*grid.cell_to_world(place * size - 0.5), rng.uniform(-np.pi, np.pi)])
+
+
+def by_shapely(grid, pose):
+    """Ranges to the boundary of the union of all solid squares, and which pass no corner closely.
+
+    Plane geometry in the frame of the map; this says nothing of the kernels' own arithmetic.
+    """
+    x, y, heading = grid.origin
+    c, s = np.cos(heading), np.sin(heading)
+    dx, dy = pose[0] - x, pose[1] - y
+    here = np.array([c * dx + s * dy, c * dy - s * dx])
+    turn = pose[2] - heading
+    angles = turn + np.arctan2(*directions().T[::-1])
+    ends = here + 100.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    low = np.argwhere(grid.blocked)[:, ::-1] * grid.resolution
+    # The union of the cells' own edges that only one solid cell has: exact, without snapping.
+    solid = np.pad(grid.blocked, 1)
+    lines = []
+    for row, column in np.argwhere(solid[:, 1:] != solid[:, :-1]):
+        lines.append([(column, row - 1), (column, row)])
+    for row, column in np.argwhere(solid[1:] != solid[:-1]):
+        lines.append([(column - 1, row), (column, row)])
+    ranges, clear = np.full(BEAMS, np.inf), np.ones(BEAMS, bool)
+    if not len(low):
+        return ranges, clear
+    rays = shapely.linestrings([[here, end] for end in ends])
+    lines = np.array(lines, dtype=float) * grid.resolution
+    hits = shapely.distance(
+        shapely.points(here),
+        shapely.intersection(rays[:, None], shapely.linestrings(lines)[None]),
+    )
+    corners = shapely.points(np.unique(lines.reshape(-1, 2), axis=0))
+    clear = (shapely.distance(rays[:, None], corners[None]) > EDGE).all(axis=1)
+    return np.nanmin(np.where(np.isnan(hits), np.inf, hits), axis=1), clear
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_scans_of_random_maps_agree_with_plane_geometry(kernel):
+    seen, solid, outside = 0, 0, 0
+    for seed in range(400):
+        grid, rng = random_map(seed)
+        pose = random_pose(grid, rng)
+        expected, clear = by_shapely(grid, pose)
+        found = scan(kernel, grid, pose)
+        assert found[clear] == pytest.approx(expected[clear], rel=1e-5, abs=1e-6), seed
+        seen += np.isfinite(found[clear]).sum()
+        row, column = grid.world_to_cell(pose[:2])
+        inside = 0 <= row < grid.cells.shape[0] and 0 <= column < grid.cells.shape[1]
+        outside += not inside
+        solid += inside and grid.blocked[row, column]
+    assert seen > 5000
+    assert min(solid, outside) > 20
+
+
+def test_the_baked_way_finds_what_the_exact_one_does_on_thousands_of_maps():
+    rays = directions(97)
+    different = beams = 0
+    for seed in range(3000):
+        grid, rng = random_map(seed)
+        pose = random_pose(grid, rng)
+        limit = rng.choice([0.5, 3.0, 100.0])
+        one, other = (scan(kernel, grid, pose, limit, rays) for kernel in KERNELS)
+        near = np.minimum(one, limit), np.minimum(other, limit)
+        different += (np.abs(near[0] - near[1]) > 1e-5).sum()
+        beams += len(rays)
+    assert different / beams < 3e-5  # corners, within rounding
+
+
+def test_both_ways_agree_from_the_corners_edges_and_centres_of_cells():
+    rays = directions(720)  # axes and diagonals among them: many beams run into corners
+    rng = np.random.default_rng(4)
+    grid = GridMap((rng.random((40, 50)) < 0.05).astype(np.int8) * np.int8(100), 0.125)
+    for shift in ((0.0, 0.0), (0.5, 0.0), (0.5, 0.5)):
+        same = []
+        for place in np.argwhere(~grid.blocked)[::7]:
+            at = np.array([*(place[::-1] + shift) * 0.125, 0.0])
+            one, other = (scan(kernel, grid, at, rays=rays) for kernel in KERNELS)
+            same.append(np.isclose(one, other, atol=1e-5) | (one == other))
+        assert np.mean(same) > 0.99
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_beams_exactly_along_the_axes_meet_the_faces_of_cells(kernel):
+    cells = np.zeros((9, 9), np.int8)
+    cells[4, 7] = cells[8, 4] = cells[4, 0] = 100
+    rays = [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]
+    found = scan(kernel, GridMap(cells, 0.1), (0.45, 0.45, 0.0), rays=rays)
+    assert found == pytest.approx([0.25, 0.35, 0.35, np.inf], abs=1e-6)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_lidar_in_a_solid_cell_sees_where_the_solid_ends(kernel):
+    cells = np.zeros((1, 6), np.int8)
+    cells[0, 2:5] = 100
+    found = scan(kernel, GridMap(cells, 1.0), (2.5, 0.5, 0.0), rays=[[1.0, 0.0], [-1.0, 0.0]])
+    assert found == pytest.approx([2.5, 0.5], abs=1e-6)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_return_at_range_max_is_kept_and_one_beyond_is_not(kernel):
+    cells = np.zeros((1, 100), np.int8)
+    cells[0, 80] = 100
+    grid = GridMap(cells, 0.05)
+    for limit, expected in ((3.0, 3.0), (2.99, np.inf)):
+        found = scan(kernel, grid, (1.0, 0.025, 0.0), limit, rays=[[1.0, 0.0]])
+        assert found[0] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_map_is_fused_by_the_minimum(kernel):
+    grid = GridMap(np.full((1, 1), 100, np.int8), 1.0, (1.0, -0.5, 0.0))
+    ahead = [[1.0, 0.0], [-1.0, 0.0]]
+    assert list(scan(kernel, grid, (0.0, 0.0, 0.0), rays=ahead, before=0.5)) == [0.5, 0.5]
+    assert list(scan(kernel, grid, (0.0, 0.0, 0.0), rays=ahead, before=2.0)) == [1.0, 2.0]
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_no_map_leaves_the_scan_alone(kernel):
+    assert (scan(kernel, NO_MAP, (0.0, 0.0, 0.0), before=1.5) == 1.5).all()
+
+
+def test_free_squares_are_free_and_as_large_as_can_be():
+    for seed in range(40):
+        grid, _ = random_map(seed)
+        squares = map_kernels.free_squares(grid.blocked)
+        solid = np.pad(grid.blocked, 1, constant_values=True)
+        for row, column in np.argwhere(~solid):
+            for quadrant in range(4):
+                side = int(squares[row, column] >> np.uint32(8 * quadrant)) & 255
+                right, up = 1 - 2 * (quadrant & 1), 1 - (quadrant & 2)
+
+                def square(n, row=row, column=column, right=right, up=up):
+                    rows = sorted((row, row + up * (n - 1)))
+                    columns = sorted((column, column + right * (n - 1)))
+                    return solid[rows[0] : rows[1] + 1, columns[0] : columns[1] + 1]
+
+                assert side >= 1
+                assert not square(side).any()
+                assert square(side + 1).any()
+        assert ((squares == 0) == solid).all()
+
+
+def test_squares_larger_than_a_byte_are_taken_in_several_jumps():
+    cells = np.zeros((3, 900), np.int8)
+    cells[1, 890] = 100
+    wide = GridMap(np.repeat(cells, 300, axis=0), 0.1)
+    found = scan("baked", wide, (0.05, 45.05, 0.0), rays=[[1.0, 0.0]])
+    assert found[0] == pytest.approx(88.95, abs=1e-4)
