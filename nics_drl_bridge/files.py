@@ -8,6 +8,7 @@ import os
 import shutil
 import struct
 import tempfile
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -134,6 +135,23 @@ def sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
+DAMAGE = (
+    AttributeError,  # a plain `.npy` file
+    EOFError,
+    KeyError,
+    MemoryError,
+    NotImplementedError,
+    OSError,
+    OverflowError,
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    struct.error,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What reading a damaged `.npz` file may raise besides ValueError."""
 ALIGNMENT = 64
 _PADDING = 0xD935
 """Id of a zip entry's field that only fills up, the one that Android's zipalign takes."""
@@ -188,7 +206,7 @@ def npz_mapped(path: Path) -> dict[str, NDArray[Any]]:
                     raise ValueError(f"the array {name!r} is of a wrong kind or cut off")
                 mapped = np.memmap(path, dtype, "c", file.tell(), shape) if size else None
                 arrays[name] = np.zeros(shape, dtype) if mapped is None else np.asarray(mapped)
-    except (OSError, struct.error, zipfile.BadZipFile, zlib.error, KeyError, EOFError) as error:
+    except DAMAGE as error:
         raise ValueError(str(error) or type(error).__name__) from None
     return arrays
 
@@ -204,18 +222,5 @@ def npz_arrays(data: bytes) -> dict[str, NDArray[Any]]:
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
-    except (
-        AttributeError,  # a plain `.npy` file
-        EOFError,
-        KeyError,
-        MemoryError,
-        NotImplementedError,
-        OSError,
-        OverflowError,
-        RuntimeError,
-        SyntaxError,
-        TypeError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
+    except DAMAGE as error:
         raise ValueError(str(error) or type(error).__name__) from None

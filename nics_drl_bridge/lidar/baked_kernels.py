@@ -17,28 +17,15 @@ import math
 import numpy as np
 from numba import njit
 
+from nics_drl_bridge.lidar import kernels
+
 BLOCK = 8
 """So many beams are fused at once; rows and lines are that much longer than their content."""
 DOUBLES, SINGLES, WHOLES = 6, 5, 2
 """Numbers per body that one pass hands to the next, by their kind."""
 ABOVE_ZERO = 2.0**24 + 0.5
 """Added before a number is cut to a whole one, so that it is rounded to the nearest."""
-HALF_PI, PER_TURN = 0.5 * math.pi, 0.5 / math.pi
-ATAN = (
-    0.9999999996145,
-    -0.3333332366563,
-    0.1999959585417,
-    -0.1427904841688,
-    0.1105378475317,
-    -0.0879611755717,
-    0.0671011398839,
-    -0.0442736682632,
-    0.0222034549106,
-    -0.0071661648959,
-    0.0010844927512,
-)
-
-
+PER_TURN = 0.5 / math.pi
 SINGLE = tuple(
     np.float32(factor)
     for factor in (
@@ -54,32 +41,7 @@ SINGLE = tuple(
 )
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
-def arctan2(y, x):  # type: ignore[no-untyped-def]
-    """The angle of (x, y) within 3e-10 rad, without a branch and so many at a time.
-
-    A polynomial in the square of the smaller over the larger, fitted at Chebyshev's nodes.
-    """
-    ax, ay = abs(x), abs(y)
-    ratio = min(ax, ay) / max(ax, ay)
-    s = ratio * ratio
-    r = ATAN[10]
-    r = r * s + ATAN[9]
-    r = r * s + ATAN[8]
-    r = r * s + ATAN[7]
-    r = r * s + ATAN[6]
-    r = r * s + ATAN[5]
-    r = r * s + ATAN[4]
-    r = r * s + ATAN[3]
-    r = r * s + ATAN[2]
-    r = r * s + ATAN[1]
-    r = (r * s + ATAN[0]) * ratio
-    r = HALF_PI - r if ay > ax else r
-    r = math.pi - r if x < 0.0 else r
-    return math.copysign(r, y)
-
-
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
 def in_sight(bodies, n, me, sx, sy, range_max, baked, which, x, y, distance):  # type: ignore[no-untyped-def]
     """First pass: packs the bodies in sight: which, offset, and the square of the distance.
 
@@ -110,7 +72,7 @@ def in_sight(bodies, n, me, sx, sy, range_max, baked, which, x, y, distance):  #
     return found, left
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
 def left_out(bodies, n, k, me, sx, sy, range_max, baked):  # type: ignore[no-untyped-def]
     """Whether body k is in sight, but can't be looked up; see `in_sight`."""
     dx, dy, radius = bodies[n, k, 0] - sx, bodies[n, k, 1] - sy, bodies[n, k, 5]
@@ -120,15 +82,15 @@ def left_out(bodies, n, k, me, sx, sy, range_max, baked):  # type: ignore[no-unt
     return seen and (baked[int(bodies[n, k, 6])] == 0 or d2 < radius * radius)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
 def directions(found, x, y, distance, bearing):  # type: ignore[no-untyped-def]
     """Second pass: distance and bearing in the world of each."""
     for k in range((found + BLOCK - 1) // BLOCK * BLOCK):
         distance[k] = math.sqrt(distance[k])
-        bearing[k] = arctan2(y[k], x[k])
+        bearing[k] = kernels.arctan2(y[k], x[k])
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
 def outermost(hulls, skip, corners, first, stride, d2, cos, sin, side):  # type: ignore[no-untyped-def]
     """Climbs along a hull to its right (side 1) or left (-1) silhouette, as (along, across).
 
@@ -163,7 +125,7 @@ def outermost(hulls, skip, corners, first, stride, d2, cos, sin, side):  # type:
     return x, y
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
 def cells_of(  # type: ignore[no-untyped-def]
     found, bodies, n, limits, shape_of, grid_of, cell_of, hulls, which, x, y, distance, bearing, rx, ry, lx, ly,
     blend, cell_at,
@@ -222,9 +184,9 @@ def cells_of(  # type: ignore[no-untyped-def]
         rx[k], ry[k], lx[k], ly[k] = right_x, right_y, left_x, left_y
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
 def arctan2_single(y, x):  # type: ignore[no-untyped-def]
-    """The same in single precision, within 2e-7 rad."""
+    """As `kernels.arctan2` in single precision, within 2e-7 rad."""
     ax, ay = abs(x), abs(y)
     ratio = min(ax, ay) / max(ax, ay)
     s = ratio * ratio
@@ -236,12 +198,12 @@ def arctan2_single(y, x):  # type: ignore[no-untyped-def]
     r = r * s + SINGLE[2]
     r = r * s + SINGLE[1]
     r = (r * s + SINGLE[0]) * ratio
-    r = np.float32(HALF_PI) - r if ay > ax else r
+    r = np.float32(kernels.HALF_PI) - r if ay > ax else r
     r = np.float32(math.pi) - r if x < np.float32(0.0) else r
     return math.copysign(r, y)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
 def spans(found, heading, beams, rx, ry, lx, ly, bearing, right, left):  # type: ignore[no-untyped-def]
     """Fourth pass: bearing and both silhouettes in beams, the right one within the first turn."""
     per_beam = 1.0 / beams[1]
@@ -259,7 +221,7 @@ def spans(found, heading, beams, rx, ry, lx, ly, bearing, right, left):  # type:
         bearing[k], right[k], left[k] = middle, middle + low, middle + high
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
 def fuse(  # type: ignore[no-untyped-def]
     ranges, n, m, found, beams, limits, row_of, cell_of, rows, shift, bearing, right, left, blend,
     which, cell_at,

@@ -142,6 +142,7 @@ def _grid(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> _Gri
             cell[..., 2 + 2 * side : 4 + 2 * side] = two
             miss = _miss(hull, two, edges[..., side], turns, distances, parts)
             far_off = miss > MISS * spec.angle_increment
+            far_off[:, 0] = True  # nearly touching, a rim says little of what lies within
             climb = _climbs(wound, parts, len(hull))
             cell[..., 2 + 2 * side : 4 + 2 * side][far_off] = climb[far_off]
     if cell[..., 1].max() > 32_767:

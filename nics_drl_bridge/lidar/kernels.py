@@ -18,6 +18,49 @@ ROUNDING = 1e-6
 """A beam this near to an edge, in beams, is tried; the exact test decides."""
 
 
+HALF_PI = 0.5 * math.pi
+TINY = 1e-300
+"""Keeps the angle of no vector at all from being none."""
+ATAN = (
+    0.9999999996145,
+    -0.3333332366563,
+    0.1999959585417,
+    -0.1427904841688,
+    0.1105378475317,
+    -0.0879611755717,
+    0.0671011398839,
+    -0.0442736682632,
+    0.0222034549106,
+    -0.0071661648959,
+    0.0010844927512,
+)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def arctan2(y, x):  # type: ignore[no-untyped-def]
+    """The angle of (x, y) within 3e-10 rad, without a branch and so many at a time.
+
+    A polynomial in the square of the smaller over the larger, fitted at Chebyshev's nodes.
+    """
+    ax, ay = abs(x), abs(y)
+    ratio = min(ax, ay) / (max(ax, ay) + TINY)
+    s = ratio * ratio
+    r = ATAN[10]
+    r = r * s + ATAN[9]
+    r = r * s + ATAN[8]
+    r = r * s + ATAN[7]
+    r = r * s + ATAN[6]
+    r = r * s + ATAN[5]
+    r = r * s + ATAN[4]
+    r = r * s + ATAN[3]
+    r = r * s + ATAN[2]
+    r = r * s + ATAN[1]
+    r = (r * s + ATAN[0]) * ratio
+    r = HALF_PI - r if ay > ax else r
+    r = math.pi - r if x < 0.0 else r
+    return math.copysign(r, y)
+
+
 @njit(cache=True, error_model="numpy", _nrt=False)
 def _lower(out, i, value):  # type: ignore[no-untyped-def]
     """Fuses one return into beam i of a full or partial circle."""
@@ -75,14 +118,18 @@ def circle(out, directions, beams, x, y, radius, range_max):  # type: ignore[no-
 @njit(cache=True, error_model="numpy", _nrt=False)
 def segment(out, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
     """Exact ranges to the straight wall from (x1, y1) to (x2, y2)."""
+    edge(out, directions, beams, x1, y1, arctan2(y1, x1), x2, y2, arctan2(y2, x2))
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def edge(out, directions, beams, x1, y1, angle1, x2, y2, angle2):  # type: ignore[no-untyped-def]
+    """The same, with the directions of its ends [rad]."""
     count = out.shape[0]
     ex, ey = x2 - x1, y2 - y1
     cross = x1 * ey - y1 * ex
     if cross == 0.0:  # seen edge-on
         return
-    low, high = math.atan2(y1, x1), math.atan2(y2, x2)
-    if cross < 0.0:
-        low, high = high, low
+    low, high = (angle1, angle2) if cross > 0.0 else (angle2, angle1)
     if high < low:
         high += TWO_PI
     turns = 1 if beams[2] > 0.0 else 3
@@ -105,10 +152,12 @@ def polygon(out, directions, beams, x, y, c, s, corners):  # type: ignore[no-unt
     """Exact ranges to the outline `corners` (V, 2), turned by (c, s), with its origin at (x, y)."""
     last = corners.shape[0] - 1
     ax, ay = turned(x, y, c, s, corners[last])
+    angle = arctan2(ay, ax)
     for v in range(last + 1):
         bx, by = turned(x, y, c, s, corners[v])
-        segment(out, directions, beams, ax, ay, bx, by)
-        ax, ay = bx, by
+        next_angle = arctan2(by, bx)
+        edge(out, directions, beams, ax, ay, angle, bx, by, next_angle)
+        ax, ay, angle = bx, by, next_angle
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)

@@ -128,21 +128,17 @@ class LidarTable:
         return npz_bytes(arrays, packed=False)
 
     def _about(self) -> str:
-        shapes = SHAPES.dump_python(self.shapes, mode="json")
-        density = self.density.model_dump()
-        return json.dumps(
-            {
-                "format": FORMAT,
-                "shapes": shapes,
-                "density": density,
-                "beam_angle": self.beam_angle,
-                "crc32": self._crc32(),
-            }
-        )
+        about = {
+            "format": FORMAT,
+            "shapes": SHAPES.dump_python(self.shapes, mode="json"),
+            "density": self.density.model_dump(),
+            "beam_angle": self.beam_angle,
+        }
+        return json.dumps(about | {"crc32": self._crc32(json.dumps(about))})
 
-    def _crc32(self) -> int:
-        """Tells whether an array was damaged."""
-        crc = 0
+    def _crc32(self, about: str) -> int:
+        """Tells whether anything of the table was damaged."""
+        crc = zlib.crc32(about.encode())
         for array in (self.grid, self.start, self.cell, self.rows):
             crc = zlib.crc32(np.ascontiguousarray(array).data, crc)
         return crc
@@ -159,6 +155,7 @@ class LidarTable:
             ModelError: the file can't be read, is another one, damaged, or no table.
         """
         try:
+            path.open("rb").close()
             if checksum is not None and sha256(path.read_bytes()) != checksum:
                 raise ModelError(f"{path}: does not match its checksum; generate the model anew.")
             arrays = npz_mapped(path)
@@ -169,7 +166,7 @@ class LidarTable:
             density = Density.model_validate(about["density"])
             table = cls(shapes, density, float(about["beam_angle"]), **arrays)
             table._check()
-            if table._crc32() != about["crc32"]:
+            if table._about() != json.dumps(about):
                 raise ValueError("its numbers were damaged")
         except OSError as error:
             raise ModelError(
