@@ -17,6 +17,7 @@ REQUIRES = [
     "matplotlib>=3.8",
     "numba>=0.60",
     "numpy>=1.26",
+    "pillow>=10.1",
     "pydantic>=2.6",
     "pyyaml>=6.0",
     "rich>=13",

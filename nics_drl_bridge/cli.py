@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
@@ -61,6 +61,26 @@ def _one_sentence() -> Iterator[None]:
     except KeyboardInterrupt:
         typer.echo("nics: interrupted; everything that was started has ended.", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, int, int], None]]:
+    """Gives a function that moves a bar on a terminal: what is done, how much, of how much.
+
+    Where standard error is no terminal it shows nothing; a total of 0 is not known yet.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as progress:
+        task = progress.add_task("", total=None)
+        yield lambda what, done, total: progress.update(
+            task, description=what, completed=done, total=total or None
+        )
 
 
 def _print_version(wanted: bool) -> None:
@@ -131,6 +151,39 @@ def generate(
             write_pictures(spec, identified, out / "pictures")
         typer.echo(model.report.rstrip())
         typer.echo(f"model written to {out}")
+
+
+@app.command()
+def bake(
+    lidar: Annotated[str, typer.Option(help="A shipped lidar (paper) or a YAML file.")] = "paper",
+    world: Annotated[
+        str | None, typer.Option(help="Bake the obstacles of this world (arena), or YAML file.")
+    ] = None,
+    shapes: Annotated[
+        Path | None, typer.Option(help="Bake the shapes of this YAML file, below its key shapes.")
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option(help="Bake the footprint of this robot (ackermann), or YAML file.")
+    ] = None,
+    budget: Annotated[
+        str | None, typer.Option(help="Find the best density within this memory, as 8MB.")
+    ] = None,
+    distances: Annotated[int | None, typer.Option(help="Grid distances, instead.")] = None,
+    rotations: Annotated[int | None, typer.Option(help="Grid rotations, instead.")] = None,
+    phases: Annotated[int | None, typer.Option(help="Points per beam, instead.")] = None,
+    out: Annotated[Path, typer.Option(help="The .npz file to write.")] = Path("lidar_table.npz"),
+) -> None:
+    """Bakes a lidar table and tells how far its ranges will be off."""
+    with _one_sentence():
+        from nics_drl_bridge.bake_order import BakeOrder, run
+
+        given = {"distances": distances, "rotations": rotations, "phases": phases}
+        density = {name: value for name, value in given.items() if value is not None}
+        order = BakeOrder(lidar, world, shapes, robot, budget, density, out)
+        with _progress() as told:
+            lines = run(order, told)
+        for line in lines:
+            typer.echo(line)
 
 
 @app.command()

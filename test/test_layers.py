@@ -25,7 +25,7 @@ LAYERS = (
     ("policy", "safety"),
     ("report",),
     ("nodes",),
-    ("demo",),
+    ("demo", "bake_order"),
     ("cli",),
 )
 
@@ -42,6 +42,8 @@ HOMES = {
     "typer": ("cli.py",),
     "gymnasium": ("env/*", "policy/*", "demo.py"),
     "numba": ("*kernels.py", "sim/world.py", "lidar/scanner.py"),
+    "PIL": ("lidar/maps.py",),
+    "llvmlite": ("*kernels.py",),
     "mujoco": ("highfidelity/*",),
     "torch": ("policy/train*.py",),
     "stable_baselines3": ("policy/train*.py",),

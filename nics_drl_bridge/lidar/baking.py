@@ -32,7 +32,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class _Grid:
+class Grid:
     """The cells of one shape: T rotations, D distances.
 
     Attributes:
@@ -73,7 +73,7 @@ def bake(
     """
     shapes = tuple(dict.fromkeys(shapes))
     outlines = Outlines.of(shapes)
-    grids = [_grid(spec, outlines, h, density) for h in range(len(shapes))]
+    grids = [grid_of(spec, outlines, h, density) for h in range(len(shapes))]
     cells = np.concatenate([np.zeros((0, 6), np.int64), *(g.cell.reshape(-1, 6) for g in grids)])
     ends = np.cumsum(cells[:, 1]) * density.phases
     if len(cells) and (ends[-1] > MOST_NUMBERS or np.abs(cells).max() > 32_767):
@@ -116,7 +116,7 @@ def with_shapes(spec: LidarSpec, table: LidarTable, shapes: Sequence[Shape]) -> 
     return bake(spec, (*table.shapes, *shapes), table.density)
 
 
-def _grid(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> _Grid:
+def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Grid:
     """Where the cells of a shape lie and how wide their rows are."""
     shape, radius, order = outlines.shapes[h], outlines.radii[h], outlines.orders[h]
     distances = np.linspace(radius, spec.range_max + radius, density.distances)
@@ -147,7 +147,7 @@ def _grid(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> _Gri
             cell[..., 2 + 2 * side : 4 + 2 * side][far_off] = climb[far_off]
     if cell[..., 1].max() > 32_767:
         raise ConfigError(f"{describe(shape)} with {spec.beams} beams: too many beams to bake.")
-    return _Grid(distances, np.arange(count) * unit, edges[parts // 2 :: parts], cell)
+    return Grid(distances, np.arange(count) * unit, edges[parts // 2 :: parts], cell)
 
 
 def _within(values: NDArray[Any], parts: int, outer: np.ufunc) -> NDArray[Any]:
@@ -234,7 +234,7 @@ def _miss(
 def _rows_of_turn(
     rows: NDArray[np.float32],
     starts: NDArray[np.int64],
-    grid: _Grid,
+    grid: Grid,
     t: int,
     outlines: Outlines,
     h: int,

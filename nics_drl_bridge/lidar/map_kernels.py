@@ -22,9 +22,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from llvmlite import ir
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import njit
+
+from nics_drl_bridge.lidar.map_memory_kernels import get, peek, put
 
 LANES = 48
 """Beams that move together: some vector registers wide, to hide the latency of the look-ups."""
@@ -35,60 +35,6 @@ PARALLEL = np.float32(1e-12)
 """Least component of a direction: the inverse stays finite."""
 SLACK = 1.0 + 1e-6
 """A return at exactly range_max must not be lost to rounding; `finish` decides."""
-
-
-def _scope(builder):  # type: ignore[no-untyped-def]
-    """The alias scope of the map, as LLVM metadata."""
-    module = builder.module
-    domain = module.add_metadata([ir.MetaDataString(module, "nics.map.domain")])
-    return module.add_metadata(
-        [module.add_metadata([ir.MetaDataString(module, "nics.map"), domain])]
-    )
-
-
-def _pointer(context, builder, signature, args):  # type: ignore[no-untyped-def]
-    array = context.make_array(signature.args[0])(context, builder, args[0])
-    return builder.gep(array.data, [args[1]])
-
-
-# Plain indexing leaves LLVM in doubt whether a store to the lanes changes the map, so that it
-# would not vectorise the jumps. These three say that it does not.
-
-
-@intrinsic
-def _peek(typing, array, index):  # type: ignore[no-untyped-def]
-    """array[index] of the map, which nothing here writes."""
-
-    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        value = builder.load(_pointer(context, builder, signature, args))
-        value.set_metadata("alias.scope", _scope(builder))
-        return value
-
-    return array.dtype(array, types.int64), generate
-
-
-@intrinsic
-def _get(typing, array, index):  # type: ignore[no-untyped-def]
-    """array[index] of the lanes, which are not the map."""
-
-    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        value = builder.load(_pointer(context, builder, signature, args))
-        value.set_metadata("noalias", _scope(builder))
-        return value
-
-    return array.dtype(array, types.int64), generate
-
-
-@intrinsic
-def _put(typing, array, index, value):  # type: ignore[no-untyped-def]
-    """array[index] = value in the lanes, which are not the map."""
-
-    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        store = builder.store(args[2], _pointer(context, builder, signature, args))
-        store.set_metadata("noalias", _scope(builder))
-        return context.get_dummy_value()
-
-    return types.void(array, types.int64, array.dtype), generate
 
 
 @njit(cache=True)
@@ -138,7 +84,7 @@ def ray(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
     where it comes out again. What is outside the map is free.
     """
     rows, columns = squares.shape[0] - 2, squares.shape[1] - 2
-    x, y, t = int(math.floor(u)), int(math.floor(v)), 0.0
+    x, y, t = math.floor(u), math.floor(v), 0.0
     solid = False
     if 0 <= x < columns and 0 <= y < rows:
         solid = squares[y + 1, x + 1] == 0
@@ -148,8 +94,8 @@ def ray(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
         t = max(x_in, y_in)
         if t < 0.0 or t > min(x_out, y_out) or t > limit:
             return np.inf
-        x = min(max(int(math.floor(u + du * t)), 0), columns - 1)
-        y = min(max(int(math.floor(v + dv * t)), 0), rows - 1)
+        x = min(max(math.floor(u + du * t), 0), columns - 1)
+        y = min(max(math.floor(v + dv * t), 0), rows - 1)
         if squares[y + 1, x + 1] == 0:
             return t
     x_line, y_line = _line(u, du, x), _line(v, dv, y)
@@ -272,31 +218,31 @@ def _jump(floats, ints, flat, here, limit):  # type: ignore[no-untyped-def]
     """Moves each lane to the end of the free square that it is in; whether any moved."""
     here = np.int32(here)
     for k in range(LANES):
-        x, y = _get(ints, k), _get(ints, LANES + k)
-        cell = here + x * _get(ints, 2 * LANES + k) + y * _get(ints, 3 * LANES + k)
-        bits = np.int32(_peek(flat, cell) >> np.uint32(_get(ints, 4 * LANES + k)))
+        x, y = get(ints, k), get(ints, LANES + k)
+        cell = here + x * get(ints, 2 * LANES + k) + y * get(ints, 3 * LANES + k)
+        bits = np.int32(peek(flat, cell) >> np.uint32(get(ints, 4 * LANES + k)))
         side = bits & np.int32(LONGEST)
         u, v, t = (
-            _get(floats, 4 * LANES + k),
-            _get(floats, 5 * LANES + k),
-            _get(floats, 6 * LANES + k),
+            get(floats, 4 * LANES + k),
+            get(floats, 5 * LANES + k),
+            get(floats, 6 * LANES + k),
         )
         x_side, y_side = x + side, y + side
-        x_line = (np.float32(x_side) - u) * _get(floats, 2 * LANES + k)
-        y_line = (np.float32(y_side) - v) * _get(floats, 3 * LANES + k)
+        x_line = (np.float32(x_side) - u) * get(floats, 2 * LANES + k)
+        y_line = (np.float32(y_side) - v) * get(floats, 3 * LANES + k)
         sideways = x_line < y_line
         ahead = x_line if sideways else y_line
         # Never back across a line: rounding might move a lane to and fro for ever.
-        x_new = max(np.int32(u + _get(floats, k) * ahead), x)
-        y_new = max(np.int32(v + _get(floats, LANES + k) * ahead), y)
+        x_new = max(np.int32(u + get(floats, k) * ahead), x)
+        y_new = max(np.int32(v + get(floats, LANES + k) * ahead), y)
         goes = (side > np.int32(0)) & (t < limit)
-        _put(ints, k, (x_side if sideways else x_new) if goes else x)
-        _put(ints, LANES + k, (y_new if sideways else y_side) if goes else y)
-        _put(floats, 6 * LANES + k, ahead if goes else t)
-        _put(ints, 5 * LANES + k, np.int32(goes))
+        put(ints, k, (x_side if sideways else x_new) if goes else x)
+        put(ints, LANES + k, (y_new if sideways else y_side) if goes else y)
+        put(floats, 6 * LANES + k, ahead if goes else t)
+        put(ints, 5 * LANES + k, np.int32(goes))
     moved = np.int32(0)
     for k in range(LANES):
-        moved += _get(ints, 5 * LANES + k)
+        moved += get(ints, 5 * LANES + k)
     return moved > 0
 
 

@@ -68,8 +68,8 @@ def load_map(
 
     Cells come out as those of Nav2's map_server: thresholds belong to what they name, colours
     count by their brightness (Rec. 709) in 256 steps, and pixels that are not opaque are unknown
-    unless the mode is `raw`. (Nav2 up to Jazzy averages red, green, blue, and alpha into the
-    darkness, and leaves pixels exactly on a threshold unknown; grey maps without alpha differ in
+    unless the mode is `raw`. (Older releases of Nav2 average red, green, blue, and alpha into
+    the darkness, and leave pixels exactly on a threshold unknown; grey maps without alpha differ in
     the latter only.)
 
     Args:

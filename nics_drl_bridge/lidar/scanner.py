@@ -27,8 +27,6 @@ Room = tuple[
     tuple[NDArray[np.int64], ...],
 ]
 NO_WALLS = np.zeros((0, 4))
-FEW_CORNERS = 2
-"""A shape of so few corners is scanned exactly by `auto`: that is as fast as a look-up."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +37,8 @@ class Scanner:
         spec: the lidar.
         table: of the shapes that may stand around.
         renderer: `baked` looks every shape up; `exact` computes every ray; `auto` takes what is
-            faster for each shape. Straight walls are exact in all: they cost no more than a
-            row of a table.
+            faster: the look-up, but for shapes larger than the range, in whose circle the lidar
+            nearly always is. There, and for straight walls, all compute every ray.
     """
 
     spec: LidarSpec
@@ -87,12 +85,12 @@ class Scanner:
 
     def _looked_up(self) -> NDArray[np.uint8]:
         """(H,) 1 where a shape is looked up."""
-        corners = np.diff(self.table.outlines.corner)
+        radii = self.table.outlines.radii
         if self.renderer == "exact":
-            return np.zeros(len(corners), np.uint8)
+            return np.zeros(len(radii), np.uint8)
         if self.renderer == "baked":
-            return np.ones(len(corners), np.uint8)
-        return np.asarray((corners == 0) | (corners > FEW_CORNERS), np.uint8)
+            return np.ones(len(radii), np.uint8)
+        return np.asarray(radii < self.spec.range_max, np.uint8)
 
     def room(self, bodies: int) -> Room:
         """Scratch that one thread needs to scan a world of so many bodies."""

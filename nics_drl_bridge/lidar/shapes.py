@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, TypeAdapter, field_validator, model_validator
 
-from nics_drl_bridge.config import Schema
+from nics_drl_bridge.config import Schema, load_yaml
 from nics_drl_bridge.errors import ModelError
 
 Array = NDArray[np.float64]
@@ -123,6 +124,19 @@ class Segment(Schema):
 
 Shape = Annotated[Circle | Rectangle | Polygon | Segment, Field(discriminator="kind")]
 SHAPES: TypeAdapter[tuple[Shape, ...]] = TypeAdapter(tuple[Shape, ...])
+
+
+class ShapeFile(Schema):
+    """The keys of a YAML file of shapes."""
+
+    shapes: tuple[Shape, ...] = Field(min_length=1)
+
+
+def load_shapes(path: Path) -> tuple[Shape, ...]:
+    """The shapes of a YAML file. Raises ConfigError with file, key and fix."""
+    return load_yaml(path, ShapeFile).shapes
+
+
 SQUARE = Rectangle(size=(0.3, 0.3))
 STRIP = Rectangle(size=(0.6, 0.06))
 

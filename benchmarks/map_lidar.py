@@ -1,0 +1,161 @@
+"""Static maps: jumps over free squares against walking from cell to cell.
+
+Two generated maps of 20 m x 20 m at 0.05 m: an office, and the same as a SLAM would leave it, with
+ragged edges and specks. One thread; ranges beyond range_max count as range_max.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from nics_drl_bridge.lidar import map_kernels
+from nics_drl_bridge.lidar.maps_grid import OCCUPIED, GridMap
+from nics_drl_bridge.lidar.spec import load_lidar
+
+SIZE, RESOLUTION = 20.0, 0.05
+CELLS = round(SIZE / RESOLUTION)
+LIDARS = ("paper", "paper_12m")
+SCANS, REPEATS, CLEARANCE = 1000, 7, 0.2
+
+
+def cells(metres: float) -> int:
+    """A length in cells."""
+    return round(metres / RESOLUTION)
+
+
+def office(seed: int) -> NDArray[np.bool_]:
+    """Rooms of 4 m along a corridor, with doors, furniture and round pillars."""
+    rng = np.random.default_rng(seed)
+    solid = np.zeros((CELLS, CELLS), bool)
+    wall, low, high = 2, cells(9.0), cells(11.0)
+    solid[[0, 1, -2, -1]] = solid[:, [0, 1, -2, -1]] = True
+    solid[low : low + wall] = solid[high : high + wall] = True
+    for x in range(0, CELLS, cells(4.0)):
+        solid[:low, x : x + wall] = solid[high:, x : x + wall] = True
+        door = x + cells(rng.uniform(0.8, 2.2))
+        for y in (low, high):
+            solid[y : y + wall, door : door + cells(0.9)] = False
+    rows, columns = np.mgrid[:CELLS, :CELLS]
+    for k in range(90):
+        y, x = rng.integers(5, CELLS - 20, 2)
+        height, width = rng.integers(2, 16, 2)
+        if low - 20 < y < high + 4:  # the corridor stays free
+            continue
+        if k < 60:
+            solid[y : y + height, x : x + width] = True
+        else:
+            solid |= (rows - y) ** 2 + (columns - x) ** 2 < height**2 / 4.0
+    return solid
+
+
+def slam(seed: int) -> NDArray[np.bool_]:
+    """The office with three of ten edge cells flipped, and specks."""
+    rng = np.random.default_rng(seed)
+    solid = office(seed)
+    edge = ndimage.binary_dilation(solid) & ~ndimage.binary_erosion(solid)
+    solid ^= edge & (rng.random(solid.shape) < 0.3)
+    return solid | (rng.random(solid.shape) < 7e-4)
+
+
+MAPS: dict[str, Callable[[int], NDArray[np.bool_]]] = {"office": office, "slam": slam}
+
+
+def poses(grid: GridMap, seed: int) -> NDArray[np.float64]:
+    """(SCANS, 4) x, y, cosine, sine of lidars in free places."""
+    rng = np.random.default_rng(seed)
+    places = np.argwhere(grid.distance_field > CLEARANCE)
+    chosen = places[rng.integers(0, len(places), SCANS)] + rng.uniform(-0.5, 0.5, (SCANS, 2))
+    heading = rng.uniform(-np.pi, np.pi, SCANS)
+    at = grid.cell_to_world(chosen)
+    return np.column_stack([at, np.cos(heading), np.sin(heading)])
+
+
+def batch(kernel: Callable[..., None]) -> Callable[..., None]:
+    """A compiled loop over scans."""
+
+    @njit(error_model="numpy")
+    def run(out, directions, beams, at, range_max, arrays):
+        for n in range(at.shape[0]):
+            out[n] = np.inf
+            x, y, c, s = at[n]
+            kernel(out[n], directions, beams, x, y, c, s, range_max, arrays)
+
+    return run
+
+
+def timed(run: Callable[..., None], *arguments: Any) -> tuple[NDArray[np.float32], float]:
+    """Scans, and scans per second of the best of some runs."""
+    out = np.empty((SCANS, len(arguments[0])), np.float32)
+    run(out, *arguments)
+    best = np.inf
+    for _ in range(REPEATS):
+        begin = time.perf_counter()
+        run(out, *arguments)
+        best = min(best, time.perf_counter() - begin)
+    return np.minimum(out, arguments[3]), SCANS / best
+
+
+def measure(seed: int) -> dict[str, Any]:
+    """One row per map and lidar."""
+    walk, jump = batch(map_kernels.exact_map_into), batch(map_kernels.map_into)
+    rows = []
+    for name, make in MAPS.items():
+        grid = GridMap((make(seed) * OCCUPIED).astype(np.int8), RESOLUTION)
+        map_kernels.free_squares(grid.blocked)  # compiles
+        begin = time.perf_counter()
+        squares, _ = grid.arrays
+        bake = time.perf_counter() - begin
+        for lidar in LIDARS:
+            spec = load_lidar(lidar)
+            beams = np.array([spec.angle_min, spec.angle_increment, float(spec.full_circle)])
+            at = poses(grid, seed + 1)
+            arguments = (spec.directions, beams, at, spec.range_max, grid.arrays)
+            exact, exact_speed = timed(walk, *arguments)
+            baked, baked_speed = timed(jump, *arguments)
+            error = baked.astype(np.float64) - exact
+            rows.append(
+                {
+                    "map": name,
+                    "beams": spec.beams,
+                    "range_max_m": spec.range_max,
+                    "exact_scans_per_s": round(exact_speed),
+                    "baked_scans_per_s": round(baked_speed),
+                    "ratio": round(baked_speed / exact_speed, 2),
+                    "rmse_m": float(np.sqrt((error**2).mean())),
+                    "beams_off_by_1_mm": int((np.abs(error) > 1e-3).sum()),
+                    "beams_compared": error.size,
+                    "table_bytes": squares.nbytes,
+                    "bake_s": round(bake, 4),
+                }
+            )
+    return {"threads": 1, "seed": seed, "rows": rows}
+
+
+def main() -> None:
+    """Prints a table, or one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    result = measure(given.seed)
+    if given.json:
+        sys.stdout.write(json.dumps(result) + "\n")
+        return
+    for row in result["rows"]:
+        for key, value in row.items():
+            sys.stdout.write(f"{key:<22}{value}\n")
+        sys.stdout.write("\n")
+
+
+if __name__ == "__main__":
+    main()
