@@ -33,21 +33,24 @@ SHARE, RMSE_M, PART = 0.1, 0.03, 1.0 / 3.0
 
 
 def timed(table: LidarTable, drawn: list[Batch], repeats: int) -> dict[str, list[float]]:
-    """Times of one batch [s]: exact, baked, and only filling the output."""
+    """Times of one batch [s], of several in a row: exact, baked, and only filling the output."""
     out = np.empty((len(drawn[0].lidar), SPEC.beams), np.float32)
     exact, baked = Scanner(SPEC, table, "exact"), Scanner(SPEC, table, "baked")
     full = [batch for batch in drawn if len(batch.lidar) == len(out)]
     bodies = [batch.bodies(exact) for batch in full]
-    times: dict[str, list[float]] = {"exact": [], "baked": [], "write": []}
-    for batch, placed in zip(full, bodies, strict=True):
-        calls = {
-            "exact": lambda b=batch, p=placed: exact.scan(b.lidar, p, out=out),
-            "baked": lambda b=batch, p=placed: baked.scan(b.lidar, p, out=out),
-            "write": lambda: out.fill(1.0),
-        }
-        for name, some in interleaved(calls, max(1, repeats // len(full))).items():
-            times[name] += some
-    return times
+    pairs = list(zip(full, bodies, strict=True))
+
+    def scans(scanner: Scanner) -> None:
+        for batch, placed in pairs:
+            scanner.scan(batch.lidar, placed, out=out)
+
+    def fills() -> None:
+        for _ in pairs:
+            out.fill(1.0)
+
+    calls = {"exact": lambda: scans(exact), "baked": lambda: scans(baked), "write": fills}
+    times = interleaved(calls, max(1, repeats // len(pairs)), warm=True)
+    return {name: [each / len(pairs) for each in some] for name, some in times.items()}
 
 
 def measure(name: str, scans: int, repeats: int) -> tuple[dict[str, float], dict[str, Any]]:

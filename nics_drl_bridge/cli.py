@@ -122,6 +122,9 @@ def generate(
     strict: Annotated[
         bool, typer.Option(help="Refuse a drive that did not move every input on its own.")
     ] = False,
+    budget: Annotated[
+        str | None, typer.Option(help="Greatest size of the lidar table, as 8MB; see nics bake.")
+    ] = None,
     pictures: Annotated[
         bool, typer.Option(help="Draw the fit into the folder pictures of the model.")
     ] = False,
@@ -134,15 +137,17 @@ def generate(
         from nics_drl_bridge.kinematics.readers import read_recording
         from nics_drl_bridge.kinematics.spec import load_robot
         from nics_drl_bridge.kinematics.topic_roles import topic_roles
+        from nics_drl_bridge.lidar.budget import parse_size
         from nics_drl_bridge.lidar.spec import load_lidar
         from nics_drl_bridge.sim.world import load_world
 
         check_place(out)
         spec, sensor, threshold = load_robot(robot), load_lidar(lidar), parse_alpha(alpha)
         shapes = load_world(world).shapes
+        size = None if budget is None else parse_size(budget)
         drive = read_recording(recording, spec, topic_roles(topics, topic or ()))
         model, identified = generate_model(
-            drive, spec, sensor, shapes, order, threshold, assume_textbook, strict
+            drive, spec, sensor, shapes, order, threshold, assume_textbook, strict, size
         )
         save_model(model, out)
         if pictures:

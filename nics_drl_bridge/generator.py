@@ -23,6 +23,7 @@ from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
 from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.budget import choose
 from nics_drl_bridge.lidar.shapes import Circle, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
@@ -139,6 +140,7 @@ def generate(
     alpha: fit.Alpha = "auto",
     assume: bool = False,
     strict: bool = False,
+    budget: int | None = None,
 ) -> tuple[SimulatorModel, Identified]:
     """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
 
@@ -151,12 +153,15 @@ def generate(
         alpha: pruning threshold of Eq. 2, or `auto`.
         assume: fill in from the textbook what the drive did not show, marked as assumed.
         strict: refuse a drive that did not move every input on its own.
+        budget: greatest size of the lidar table [bytes], see `lidar.budget`; by default a table
+            of the paper's density.
 
     Returns:
         The model, and all that was found out on the way.
     """
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
-    table = bake(lidar, (*shapes, Circle(radius=robot.footprint_radius)))
+    shapes = (*shapes, Circle(radius=robot.footprint_radius))
+    table = bake(lidar, shapes) if budget is None else choose(lidar, shapes, budget).table
     model = SimulatorModel(
         robot, identified.model, identified.calibration, lidar, table,
         identified.noise,

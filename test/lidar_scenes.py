@@ -52,7 +52,7 @@ def thin(rng: np.random.Generator, corners: int, reach: float = 0.4) -> Polygon:
 
 def off_centre(rng: np.random.Generator, corners: int, reach: float = 0.4) -> Polygon:
     """Its origin lies outside of it."""
-    return Polygon(points=star(rng, corners, reach / 2.0).outline + [0.6 * reach, 0.0])
+    return Polygon(points=star(rng, corners, reach / 2.0).outline + np.array([0.6 * reach, 0]))
 
 
 def clockwise(rng: np.random.Generator, corners: int, reach: float = 0.4) -> Polygon:

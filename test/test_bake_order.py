@@ -25,9 +25,7 @@ def shapes(tmp_path):
 
 def test_a_table_is_baked_within_a_budget_and_can_be_loaded(shapes, tmp_path):
     out, told = tmp_path / "sub" / "table.npz", []
-    lines = run(
-        BakeOrder(shapes=shapes, budget="300kB", out=out), lambda *what: told.append(what)
-    )
+    lines = run(BakeOrder(shapes=shapes, budget="300kB", out=out), lambda *what: told.append(what))
     table = LidarTable.load(out)
     assert table.shapes == (Circle(radius=0.15), Rectangle(size=(0.3, 0.3)))
     assert out.stat().st_size <= 300_000

@@ -60,7 +60,7 @@ def test_it_tells_its_version_and_its_commands(tmp_path):
     assert nics("--version", cwd=tmp_path).stdout == f"{__version__}\n"
     told = nics("--help", cwd=tmp_path)
     assert told.returncode == 0
-    assert {"generate", "demo"} <= set(told.stdout.split())
+    assert {"generate", "bake", "demo"} <= set(told.stdout.split())
 
 
 def test_an_unknown_command_or_option_is_refused(tmp_path):
@@ -156,4 +156,21 @@ def test_what_lies_at_the_place_of_the_model_is_left_alone(drive, tmp_path):
 
 def test_a_recording_of_another_robot_is_refused(drive, tmp_path):
     refused(nics("generate", drive, "--out", "car", "--robot", "mecanum", cwd=tmp_path))
+    assert names(tmp_path) == set()
+
+
+def test_bake_writes_a_table_within_a_budget_and_no_bar_into_a_pipe(tmp_path):
+    done = nics("bake", "--world", "arena", "--budget", "200kB", "--out", "t.npz", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert done.stdout.endswith("table written to t.npz\n")
+    assert {"density", "expected", "size", "time"} <= set(done.stdout.split())
+    assert names(tmp_path) == {"t.npz"}
+    assert 0 < (tmp_path / "t.npz").stat().st_size <= 200_000
+
+
+def test_bake_without_shapes_or_with_nonsense_is_refused(tmp_path):
+    assert "nothing to bake" in refused(nics("bake", cwd=tmp_path))
+    wrong = ("bake", "--world", "arena", "--budget", "much")
+    assert "'much': is no size" in refused(nics(*wrong, cwd=tmp_path))
     assert names(tmp_path) == set()

@@ -28,6 +28,8 @@ ROTATIONS = tuple(round(8 * 1.5**i) for i in range(24) if 8 * 1.5**i <= MOST_ROT
 BEGIN = 8
 PHASES = (4, 2, 8, 1)
 CELL_BYTES, NUMBER_BYTES, SHAPE_BYTES = 16, 4, 24
+DIGITS = 64
+"""A larger table writes its numbers with so many more digits, at most."""
 SCANS, OBSTACLES, SEED = 400, 10, 0
 Told = Callable[[str], None]
 
@@ -135,26 +137,28 @@ def densest(
 def choose(
     spec: LidarSpec, shapes: Sequence[Shape], budget: int, told: Told | None = None
 ) -> Choice:
-    """The table of at most so many bytes with the smallest expected error.
+    """The table with the smallest expected error whose file has at most so many bytes.
 
     For each number of phases it climbs over the rotations; distances take what is left.
 
     Args:
         spec: the lidar.
         shapes: to bake.
-        budget: greatest memory of the table [bytes].
+        budget: greatest size of the file [bytes]; in memory it takes 2 kB less.
         told: called with a sentence before each density is tried.
 
     Raises:
         ConfigError: the budget is too small.
     """
-    least = table_bytes(spec, shapes, LEAST)
+    smallest = bake(spec, shapes, LEAST)
+    least = len(smallest.dump()) + DIGITS
     if least > budget:
         raise ConfigError(
             f"a budget of {budget:,} bytes is too small: the smallest table of these shapes takes "
             f"{least:,} bytes; allow that, or bake fewer or smaller shapes."
         )
-    search = _Search(spec, shapes, min(budget, NUMBER_BYTES * MOST_NUMBERS), told)
+    room = min(budget - least + smallest.memory, NUMBER_BYTES * MOST_NUMBERS)
+    search = _Search(spec, smallest, room, told)
     round_ = all(isinstance(shape, Circle) for shape in shapes)
     begin = BEGIN
     for phases in PHASES:
@@ -166,11 +170,10 @@ class _Search:
     """The best table so far, and the errors of those that were tried."""
 
     def __init__(
-        self, spec: LidarSpec, shapes: Sequence[Shape], budget: int, told: Told | None
+        self, spec: LidarSpec, smallest: LidarTable, budget: int, told: Told | None
     ) -> None:
-        self.spec, self.shapes, self.budget, self.told = spec, shapes, budget, told
-        self.best = bake(spec, shapes, LEAST)
-        self.rmse = expected_rmse(spec, self.best)
+        self.spec, self.shapes, self.budget, self.told = spec, smallest.shapes, budget, told
+        self.best, self.rmse = smallest, expected_rmse(spec, smallest)
         self.seen: dict[tuple[int, int], float] = {}
 
     def climb(self, begin: int, phases: int, still: bool) -> int:

@@ -136,15 +136,20 @@ def edge(out, directions, beams, x1, y1, angle1, x2, y2, angle2):  # type: ignor
     for turn in range(turns):
         shift = 0.0 if turns == 1 else (turn - 1) * TWO_PI
         first, hits = beam_span(low + shift, high + shift, beams, count)
-        for k in range(hits):
-            i = first + k
-            if i >= count:
-                i -= count
-            along = directions[i, 0] * ey - directions[i, 1] * ex
-            if along != 0.0:
-                distance = cross / along
-                if distance >= 0.0:
-                    _lower(out, i, distance)
+        if hits > 0:
+            _cross(out, directions, first, min(first + hits, count), cross, ex, ey)
+            _cross(out, directions, 0, first + hits - count, cross, ex, ey)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyped-def]
+    """Fuses a straight line into the beams from `begin` to `end`, many at a time."""
+    for k in range(end - begin):
+        i = np.uintp(begin + k)
+        distance = np.float32(cross / (directions[i, 0] * ey - directions[i, 1] * ex))
+        distance = distance if distance >= 0.0 else np.float32(np.inf)
+        held = out[i]
+        out[i] = distance if distance < held else held
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)

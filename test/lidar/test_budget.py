@@ -41,7 +41,9 @@ def test_a_size_is_read_with_its_unit(text, size):
     assert parse_size(text) == size
 
 
-@pytest.mark.parametrize("text", ["", "MB", "8XB", "-8MB", "8 M B", "0MB", "nan", "1e400", "9" * 99])
+@pytest.mark.parametrize(
+    "text", ["", "MB", "8XB", "-8MB", "8 M B", "0MB", "nan", "1e400", "9" * 99]
+)
 def test_nonsense_is_no_size(text):
     with pytest.raises(ConfigError, match=r"^budget '.*': is no size; give one like 8MB, 500kB"):
         parse_size(text)
@@ -55,7 +57,7 @@ def test_the_size_of_a_table_is_known_before_it_is_baked(shapes, density):
     assert table_bytes(SPEC, shapes, density) == bake(SPEC, shapes, density).memory
 
 
-@pytest.mark.parametrize("budget", [60_000, 700_000, 4_000_000])
+@pytest.mark.parametrize("budget", [200_000, 700_000, 4_000_000])
 def test_as_many_distances_as_fit_are_taken(budget):
     density = densest(SPEC, MIXTURE, budget, 40, 2)
     more = density.model_copy(update={"distances": round(density.distances * 1.03) + 1})
@@ -88,10 +90,10 @@ def test_the_expected_error_agrees_with_scenes_that_it_has_not_seen(chosen):
         poses = poses[np.hypot(*poses[:, :2].T) > [shape.radius for shape in shapes]]
         bodies = exact.place(shapes[: len(poses)], poses)
         one, other = (
-            np.minimum(scanner.scan(np.zeros(3), bodies), SPEC.range_max)
+            np.nan_to_num(scanner.scan(np.zeros(3), bodies), posinf=SPEC.range_max, neginf=0.0)
             for scanner in (baked, exact)
         )
-        squares.append(np.mean(np.nan_to_num(one - other, nan=0.0, neginf=0.0) ** 2))
+        squares.append(np.mean((one - other) ** 2))
     assert np.sqrt(np.mean(squares)) == pytest.approx(chosen.rmse, rel=0.35)
     assert expected_rmse(SPEC, chosen.table, SEED + 1) == pytest.approx(chosen.rmse, rel=0.35)
 

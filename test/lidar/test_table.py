@@ -129,8 +129,8 @@ def test_a_flipped_bit_is_refused_or_changes_nothing(table, path):
         path.write_bytes(damaged)
         try:
             back = LidarTable.load(path)
-        except ModelError as error:
-            assert "\n" not in str(error)
+        except ModelError:
+            refused(path)
             found += 1
         else:
             assert back.dump() == content

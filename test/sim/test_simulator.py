@@ -9,7 +9,9 @@ from robots import FOOTPRINT, RADIUS, direct_model, field, lidar
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.sim.simulator import FastSimulator, Worlds
+from nics_drl_bridge.lidar.faults import scan_skewed, slice_poses
+from nics_drl_bridge.lidar.scanner import Scanner
+from nics_drl_bridge.sim.simulator import SLICES, FastSimulator, Worlds
 from nics_drl_bridge.sim.world import load_world
 
 ORIGIN = np.zeros((1, 1, 3))
@@ -178,6 +180,31 @@ def test_robots_see_each_other_and_not_themselves(renderer):
         assert behind == pytest.approx(expected - FOOTPRINT, abs=1e-3)
         assert np.isinf(simulator.data.ranges[0, 0, 0])
         simulator.step([[[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])
+
+
+@pytest.mark.parametrize("renderer", ["baked", "exact"])
+@pytest.mark.parametrize("skew", ["counter_clockwise", "clockwise"])
+def test_a_skewed_scan_is_put_together_from_where_the_robot_was(skew, renderer):
+    spec = lidar(beams=180, rate=10.0, mount=(0.1, 0.0, 0.3), faults={"skew": skew})
+    model, world = direct_model(sensor=spec), field(6.0, 4)
+    simulator = FastSimulator(model, world, 2, 2, renderer)
+    simulator.reset([3, 4])
+    command = np.array([[[1.0, 0.2, 1.5], [-0.5, 0.0, -1.0]], [[0.3, 0.0, 2.0], [0.5, 0.5, 0.0]]])
+    for _ in range(3):
+        simulator.step(command)
+    data = simulator.data
+    scanner = Scanner(spec, model.table, renderer)
+    for n in range(2):
+        for m in range(2):
+            others = data.bodies[n].copy()
+            others[-2 + m, 5] = 0.0  # it does not see itself
+            poses = slice_poses(data.pose[n, m], command[n, m], spec.sweep_time, SLICES, skew)
+            expected = scan_skewed(
+                lambda p, b=others: scanner.scan(p, b, world.all_walls())[0], poses
+            )
+            assert data.ranges[n, m] == pytest.approx(expected, abs=2e-3)
+            at_once = scanner.scan(data.pose[n, m], others, world.all_walls())[0]
+            assert (np.abs(at_once - expected) > 0.02).any()
 
 
 def test_robots_that_touch_are_both_marked():

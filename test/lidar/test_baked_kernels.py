@@ -1,0 +1,37 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from lidar_scenes import convex, star
+
+from nics_drl_bridge.lidar import baked_kernels as kernels
+from nics_drl_bridge.lidar.shapes import convex_hull
+
+
+@pytest.mark.parametrize("corners", [3, 4, 7, 50, 1000])
+@pytest.mark.parametrize("make", [convex, star])
+def test_climbing_along_a_hull_ends_at_its_silhouette_from_wherever_it_begins(make, corners):
+    rng = np.random.default_rng(corners)
+    hull = convex_hull(make(rng, corners).outline)
+    twice = np.concatenate([hull, hull])
+    count, radius = len(hull), np.hypot(*hull.T).max()
+    for _ in range(100):
+        distance = radius * (1.0 + 10.0 ** rng.uniform(-6.0, 1.0))
+        turn, skip = rng.uniform(-np.pi, np.pi), int(rng.integers(count + 1))
+        first, stride = int(rng.integers(count)), int(2 ** rng.integers(np.log2(count) + 1))
+        cos, sin = distance * np.cos(turn), distance * np.sin(turn)
+        along = distance**2 + twice[skip : skip + count] @ [cos, -sin]
+        across = twice[skip : skip + count] @ [sin, cos]
+        angles = np.arctan2(across, along)
+        for side, edge in ((1.0, angles.min()), (-1.0, angles.max())):
+            x, y = kernels.outermost(
+                twice, skip, count, first, min(stride, count - 1), distance**2, cos, sin, side
+            )
+            assert np.arctan2(y, x) == pytest.approx(edge, abs=1e-9)
+
+
+def test_the_fast_arc_tangent_agrees_with_the_exact_one_all_around():
+    angles = np.random.default_rng(0).uniform(-np.pi, np.pi, 20_000)
+    y, x = np.float32(3.0 * np.sin(angles)), np.float32(3.0 * np.cos(angles))
+    found = np.array([kernels.arctan2_single(b, a) for b, a in zip(y, x, strict=True)])
+    assert np.abs(found - np.arctan2(y, x)).max() < 5e-7

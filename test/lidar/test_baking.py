@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from lidar_scenes import POLYGONS
+from robots import lidar
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.baking import bake, with_shapes
+from nics_drl_bridge.lidar.scanner import Scanner
+from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle, Polygon
+from nics_drl_bridge.lidar.table import Density, padding
+
+SPEC = lidar(beams=360, range_min=0.0)
+SMALL = Density(distances=12, rotations=16)
+HERE = np.zeros((1, 3))
+
+
+def at_the_grid(table, shape, t, d):
+    """The pose of a shape straight ahead at a grid distance and rotation."""
+    grid = table.grid[0]
+    distance = np.linspace(shape.radius, grid[0], table.density.distances)[d]
+    turns = grid[1] * table.outlines.orders[0]
+    return np.array([(distance * (1.0 + 1e-6 * (d == 0)), 0.0, t * 2.0 * np.pi / turns)])
+
+
+@pytest.mark.parametrize("shape", [Circle(radius=0.25), SQUARE, STRIP])
+def test_on_the_grid_a_look_up_is_the_exact_scan(shape):
+    table = bake(SPEC, [shape], SMALL)
+    exact, baked = Scanner(SPEC, table, "exact"), Scanner(SPEC, table, "baked")
+    for t in range(5):
+        for d in range(table.density.distances - 1):
+            body = exact.place([shape], at_the_grid(table, shape, t, d))
+            one, other = baked.scan(HERE, body)[0], exact.scan(HERE, body)[0]
+            differ = np.isfinite(one) != np.isfinite(other)
+            assert differ.sum() <= 2  # only beams that graze a corner, decided by rounding
+            both = np.isfinite(one) & np.isfinite(other)
+            assert (np.abs(one[both] - other[both]) > 2e-4).sum() <= 2
+            assert both.any() or d == 10
+
+
+def test_equal_shapes_are_baked_once_and_circles_at_one_rotation():
+    table = bake(SPEC, (SQUARE, Circle(radius=0.2), SQUARE), SMALL)
+    assert table.shapes == (SQUARE, Circle(radius=0.2))
+    assert table.grid[:, 1].tolist() == [4.0, 1.0]  # a quarter of 16; none
+
+
+def test_rows_lie_apart_within_the_table_and_leave_room_at_its_end():
+    table = bake(SPEC, (SQUARE, STRIP), SMALL)
+    ends = table.start + table.cell[:, 1].astype(int) * table.density.phases
+    assert table.start[0] == 0
+    assert np.array_equal(table.start[1:], ends[:-1])
+    assert len(table.rows) == ends[-1] + padding(SPEC.angle_increment)
+
+
+@pytest.mark.parametrize("make", POLYGONS)
+def test_every_row_is_finite_and_lies_between_touching_and_out_of_range(make):
+    shape = make(np.random.default_rng(2), 30)
+    rows = bake(SPEC, [shape], SMALL).rows
+    assert np.isfinite(rows).all()
+    assert rows.min() >= 0.0
+    assert rows.max() <= SPEC.range_max + 2.0 * shape.radius
+
+
+def test_progress_runs_to_its_end():
+    told = []
+    bake(SPEC, (SQUARE, Circle(radius=0.2)), SMALL, progress=lambda *what: told.append(what))
+    assert told == [(i, 5) for i in range(1, 6)]
+
+
+def test_shapes_are_added_at_the_density_of_the_table():
+    table = bake(SPEC, [SQUARE], SMALL)
+    assert with_shapes(SPEC, table, [SQUARE]) is table
+    more = with_shapes(SPEC, table, [STRIP])
+    assert more.shapes == (SQUARE, STRIP)
+    assert more.density == SMALL
+
+
+@pytest.mark.parametrize(
+    "density",
+    [Density(distances=10_000, rotations=100_000, phases=8)],
+)
+def test_a_table_that_no_index_can_reach_is_refused(density, monkeypatch):
+    monkeypatch.setattr("nics_drl_bridge.lidar.baking.MOST_NUMBERS", 1000)
+    with pytest.raises(ConfigError, match="is too large; lower `distances`"):
+        bake(SPEC, [SQUARE], density.model_copy(update={"distances": 50, "rotations": 40}))
+
+
+def flat(distance):
+    """A wide wall across the main axis, and the body that puts it there."""
+    wall = Polygon(points=((0.0, -0.4), (0.02, -0.4), (0.02, 0.4), (0.0, 0.4)))
+    return wall, np.array([(distance, 0.0, 0.0)])
+
+
+def test_a_sensor_model_sees_the_angle_of_incidence():
+    seen = []
+
+    def model(ranges, incidence):
+        seen.append((ranges.copy(), incidence.copy()))
+        return ranges
+
+    wall, _ = flat(1.0)
+    table = bake(SPEC, [wall], Density(distances=40, rotations=4, phases=4), model)
+    assert np.array_equal(table.rows, bake(SPEC, [wall], table.density).rows)
+    # Rotation 0: a ray at angle a meets the wall at angle a, and its range is distance / cos a.
+    ranges, incidence = seen[20]
+    distance = np.linspace(wall.radius, wall.radius + 3.0, 40)[20]
+    truly = np.arccos(np.minimum(distance / ranges, 1.0))
+    assert incidence == pytest.approx(truly, abs=0.01)
+    assert incidence.max() > 0.15
+
+
+def test_a_beam_that_the_sensor_model_loses_goes_through_to_what_is_behind():
+    def grazing(ranges, incidence):
+        return np.where(incidence > 0.15, np.inf, ranges)
+
+    wall, pose = flat(1.5)
+    table = bake(SPEC, [wall], SMALL)
+    lossy = bake(SPEC, [wall], SMALL, grazing)
+    assert lossy.rows.shape == table.rows.shape
+    scans = []
+    for one in (table, lossy):
+        scanner = Scanner(SPEC, one, "baked")
+        behind = [[2.5, -2.0, 2.5, 2.0]]
+        scans.append(scanner.scan(HERE, scanner.place([wall], pose), behind)[0])
+    angle = np.abs(SPEC.angles)
+    on_wall = angle < np.arctan2(0.39, 1.5)
+    assert scans[0][on_wall].max() < 1.6
+    assert scans[1][on_wall & (angle < 0.1)].max() < 1.6
+    assert scans[1][on_wall & (angle > 0.2)].min() > 2.4
+    assert not np.isnan(scans[1]).any()

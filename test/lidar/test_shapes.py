@@ -1,0 +1,136 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import shapely
+from lidar_scenes import POLYGONS, random_shapes
+from pydantic import ValidationError
+
+from nics_drl_bridge.errors import ConfigError, ModelError
+from nics_drl_bridge.lidar.shapes import (
+    SHAPES,
+    SQUARE,
+    STRIP,
+    Circle,
+    Outlines,
+    Polygon,
+    Rectangle,
+    Segment,
+    convex_hull,
+    describe,
+    load_shapes,
+    place,
+    rotational_order,
+)
+
+
+def regular(corners, reach=0.3, shift=0.0):
+    angles = np.arange(corners) * 2.0 * np.pi / corners + 0.3
+    return Polygon(points=reach * np.stack([np.cos(angles), np.sin(angles)], axis=1) + shift)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        (Circle, {"radius": 0.0}),
+        (Circle, {"radius": float("inf")}),
+        (Circle, {"radius": 0.1, "colour": 1}),
+        (Rectangle, {"size": (0.3, 0.0)}),
+        (Rectangle, {"size": (-0.3, 0.1)}),
+        (Segment, {"ends": ((0.1, 0.2), (0.1, 0.2))}),
+        (Polygon, {"points": ((0, 0), (1, 0))}),
+        (Polygon, {"points": ((0, 0), (1, 0), (0, 0), (1, 0))}),
+        (Polygon, {"points": ((0, 0), (1, 0), (float("nan"), 1))}),
+    ],
+)
+def test_a_shape_without_extent_is_refused(kind, values):
+    with pytest.raises(ValidationError):
+        kind(**values)
+
+
+def test_the_radius_holds_every_corner_and_is_the_least():
+    for shape in random_shapes(1):
+        if not isinstance(shape, Circle):
+            assert np.hypot(*shape.outline.T).max() == pytest.approx(shape.radius)
+    assert SQUARE.radius == pytest.approx(0.15 * np.sqrt(2.0))
+
+
+def test_outlines_run_counter_clockwise_whichever_way_they_were_given():
+    points = ((0.0, 0.0), (0.4, 0.0), (0.3, 0.2))
+    for given in (points, points[::-1]):
+        assert shapely.LinearRing(Polygon(points=given).outline).is_ccw
+
+
+@pytest.mark.parametrize("make", POLYGONS)
+def test_hulls_are_those_of_plane_geometry(make):
+    for corners in (3, 10, 100):
+        outline = make(np.random.default_rng(corners), corners).outline
+        hull = convex_hull(outline)
+        expected = shapely.MultiPoint(outline).convex_hull
+        assert shapely.Polygon(hull).symmetric_difference(expected).area < 1e-12
+        assert shapely.LinearRing(hull).is_ccw
+        assert len(hull) <= len(outline)
+
+
+def test_a_hull_has_no_corner_on_its_edges_and_of_a_line_only_the_ends():
+    square = np.array([(0, 0), (1, 0), (2, 0), (2, 2), (1, 2), (0, 2), (0, 1)], float)
+    assert len(convex_hull(square)) == 4
+    assert convex_hull(np.array([(0, 0), (3, 3), (1, 1)], float)).tolist() == [[0, 0], [3, 3]]
+
+
+@pytest.mark.parametrize(
+    ("shape", "order"),
+    [
+        (SQUARE, 4),
+        (STRIP, 2),
+        (regular(3), 3),
+        (regular(5), 5),
+        (regular(12), 12),
+        (regular(5, shift=0.01), 1),
+        (Segment(ends=((0.0, 0.0), (1.0, 0.0))), 1),
+        (Circle(radius=0.2), 1),
+        (Polygon(points=((0.2, 0.2), (-0.2, -0.2), (0.2, -0.2), (-0.2, 0.2))), 2),
+        (Polygon(points=((-0.2, 0), (0.1, 0), (0.2, 0), (-0.1, 0))), 2),
+    ],
+)
+def test_how_often_a_shape_looks_the_same_in_a_turn(shape, order):
+    outline = shape.outline
+    hull = convex_hull(outline) if len(outline) else outline
+    assert order % rotational_order(outline, hull) == 0
+    if order > 2 or shape is STRIP:
+        assert rotational_order(outline, hull) == order
+
+
+def test_outlines_hold_all_shapes_one_after_the_other():
+    shapes = (Circle(radius=0.1), SQUARE, regular(5))
+    outlines = Outlines.of(shapes)
+    assert outlines.corner.tolist() == [0, 0, 4, 9]
+    assert outlines.hull.tolist() == [0, 2, 10, 20]
+    assert np.array_equal(outlines.corners[:4], SQUARE.outline)
+    assert np.array_equal(outlines.hulls[2:6], outlines.hulls[6:10])
+    assert outlines.orders.tolist() == [1, 4, 5]
+    assert [outlines.index_of(shape) for shape in shapes] == [0, 1, 2]
+    with pytest.raises(ModelError, match=r"rectangle of 0.6 x 0.06 m is not in .* bake it as well"):
+        outlines.index_of(STRIP)
+    assert Outlines.of(()).corners.shape == (0, 2)
+
+
+def test_place_writes_pose_its_direction_radius_and_shape():
+    body = place([[1.0, 2.0, 0.5]], [0.3], [4])[0]
+    assert body == pytest.approx([1.0, 2.0, 0.5, np.cos(0.5), np.sin(0.5), 0.3, 4.0])
+
+
+def test_every_shape_is_read_back_from_plain_data_and_has_a_description():
+    shapes = random_shapes(0)
+    assert SHAPES.validate_python(SHAPES.dump_python(shapes, mode="json")) == shapes
+    assert describe(Segment(ends=((0.0, 0.0), (3.0, 4.0)))) == "segment of 5 m"
+    assert len({describe(shape) for shape in shapes}) > 7
+
+
+def test_shapes_are_loaded_from_a_file_and_a_wrong_one_is_named(tmp_path):
+    path = tmp_path / "shapes.yaml"
+    path.write_text("shapes:\n  - {kind: circle, radius: 0.15}\n")
+    assert load_shapes(path) == (Circle(radius=0.15),)
+    path.write_text("shapes:\n  - {kind: circle, radius: -1}\n")
+    with pytest.raises(ConfigError, match="radius"):
+        load_shapes(path)
