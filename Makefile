@@ -33,6 +33,10 @@ EXTRAS := $(if $(SYSTEM_ROS),dev-without-ros,dev)
 # Written last, so a half-built .venv has none and is built anew; its name says for which Python
 # and which ROS 2 the environment is.
 READY := $(VENV)/.ready-py$(VERSION)-$(ROS)
+# An environment that has lost its executables is installed into anew.
+ifeq ($(wildcard $(BIN)/nics),)
+.PHONY: $(READY)
+endif
 DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Makefile
 
 OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12

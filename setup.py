@@ -22,6 +22,7 @@ REQUIRES = [
     "pyyaml>=6.0",
     "rich>=13",
     "scipy>=1.11",
+    "threadpoolctl>=3.1",
     "typer>=0.12",
 ]
 # ROS 2 from wheels, for a machine without a ROS 2 installation. Never install `lark` beside

@@ -171,6 +171,8 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the drive to learn")
     parser.add_argument("--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS))
     given = parser.parse_args()
+    if given.drives < 1:
+        parser.error(f"--drives {given.drives}: give 1 or more unseen drives.")
     try:
         robots = {name: measure(name, given) for name in given.robots}
     except BridgeError as error:

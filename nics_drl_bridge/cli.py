@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,10 +11,6 @@ import typer
 
 from nics_drl_bridge import __version__
 from nics_drl_bridge.errors import BridgeError
-
-# Before numpy is first imported: on matrices as small as a fit's, several threads wait for each
-# other, and on a busy machine a fit takes ten times as long.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130

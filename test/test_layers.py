@@ -16,7 +16,7 @@ PACKAGE = "nics_drl_bridge"
 # From the bottom up. What stands on one line does not import each other.
 LAYERS = (
     ("errors", "geometry", "random_kernels", "interface", "discovery"),
-    ("files", "config"),
+    ("files", "config", "threads"),
     ("kinematics", "lidar"),
     ("calibration",),
     ("generator",),
@@ -51,6 +51,7 @@ HOMES = {
     "onnxruntime": ("policy/*",),
     "pettingzoo": ("env/*",),
     "rosbags": ("kinematics/*",),
+    "threadpoolctl": ("threads.py",),
 }
 
 

@@ -114,7 +114,9 @@ def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     site_packages = next(venv.glob("lib/python3.*/site-packages"))
     (site_packages / "libraries.pth").write_text("\n".join(libraries), encoding="utf-8")
     pip = (sys.executable, "-m", "pip", "--python", venv / "bin" / "python")
-    run(*pip, "install", "--quiet", "--no-deps", "--no-index", wheel, cwd=venv.parent)
+    # Whatever of this package the libraries beside it hold is to be left alone.
+    given = ("--quiet", "--no-deps", "--no-index", "--ignore-installed")
+    run(*pip, "install", *given, wheel, cwd=venv.parent)
     return venv
 
 

@@ -31,12 +31,14 @@ from nics_drl_bridge.calibration.wheels import wheel_scales, wheels_swapped
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.kinematics.recording import Recording, check
 from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.threads import one_blas_thread
 
 Array = NDArray[np.float64]
 
 MIN_LENGTH = 1e-4  # m, rad
 
 
+@one_blas_thread
 def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
     """Estimates what the streams of a recording need before a fit.
 

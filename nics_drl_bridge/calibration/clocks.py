@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ Array = NDArray[np.float64]
 
 WHEELS_EXPLAINED = 0.5
 """The wheels must be explained by the commands to this share of their variance."""
+WITHIN_TICK = 12.0**-0.5
+"""Wheel speeds are taken as the mean over the tick that ends at their stamp; some drivers report
+them as they are at the stamp: a time is uncertain by where in the tick they hold."""
 MIN_TIME_S = 5e-4
 CERTAIN = 3.0
 """A correction below this many standard uncertainties is left out."""
@@ -110,7 +113,9 @@ def _wheel_delay(recording: Recording, spec: RobotSpec) -> Delay | None:
         return None
     tick = float(np.median(np.diff(wheels.t)))
     found = delay_of_response(recording.command, spec, (wheels.t - tick, wheels.t, wheels.values))
-    return found if found.explained > WHEELS_EXPLAINED else None
+    if not found.explained > WHEELS_EXPLAINED:
+        return None
+    return replace(found, sigma=float(np.hypot(found.sigma, WITHIN_TICK * tick)))
 
 
 def if_certain(value: float, sigma: float, least: float) -> float:

@@ -18,6 +18,7 @@ from nics_drl_bridge.calibration.timing import (
 )
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.threads import one_blas_thread
 
 Array = NDArray[np.float64]
 
@@ -40,6 +41,7 @@ class ShiftCurve:
     unexplained: Array
 
 
+@one_blas_thread
 def timing_curves(
     recording: Recording, spec: RobotSpec, calibration: Calibration
 ) -> tuple[ShiftCurve, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,8 @@ from nics_drl_bridge.calibration.calibration import Calibration
 from nics_drl_bridge.calibration.noise_model import Noise
 from nics_drl_bridge.calibration.open_loop import HORIZON_S, OpenLoop, open_loop_error, windows
 from nics_drl_bridge.calibration.plausibility import check_axes, check_units, mirror_note
-from nics_drl_bridge.calibration.refine import problem_of, refine
+from nics_drl_bridge.calibration.problem import problem_of
+from nics_drl_bridge.calibration.refine import refine
 from nics_drl_bridge.calibration.repair import repair
 from nics_drl_bridge.calibration.report import Findings, sentences
 from nics_drl_bridge.calibration.simplify import simplify
@@ -26,6 +28,7 @@ from nics_drl_bridge.kinematics.fit import ALPHA, ORDER, Alpha, Fit, fit
 from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.recording import Recording, Samples, Stream, check
 from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.threads import one_blas_thread
 
 TRAIN_SHARE = 2.0 / 3.0
 
@@ -64,6 +67,7 @@ class Identified:
     notes: tuple[str, ...]
 
 
+@one_blas_thread
 def identify(
     recording: Recording,
     spec: RobotSpec,
@@ -152,13 +156,9 @@ def cut(recording: Recording, until: float) -> Recording:
         raise RecordingError(
             f"{recording.source}: the training part ends at {until:g} s; use more than 0."
         )
-    return replace(
-        recording,
-        command=part(recording.command, SEARCH_S),
-        pose=part(recording.pose),
-        state=part(recording.state) if recording.state else None,
-        wheels=part(recording.wheels) if recording.wheels else None,
-    )
+    parts: dict[str, Any] = {name: part(stream) for name, stream in recording.streams.items()}
+    parts["command"] = part(recording.command, SEARCH_S)
+    return replace(recording, **parts)
 
 
 def _refined(

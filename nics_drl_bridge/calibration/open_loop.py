@@ -141,7 +141,9 @@ def _by_one_rollout(
 ) -> Array:
     """Relative poses (W, 3); an inferred state needs commands only, so all windows share it."""
     start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
-    grid = np.arange(min(start.min(), recording.command.t[0]) - 1.0, end.max() + model.dt, model.dt)
+    lead = np.ceil((max(0.0, start.min() - recording.command.t[0]) + 1.0) / model.dt)
+    # Whole steps before the first window: windows of regular poses then begin and end with a step.
+    grid = start.min() + model.dt * np.arange(-lead, (end.max() - start.min()) / model.dt + 2.0)
     begin = grid - calibration.command_latency_s
     command = held(recording.command, spec, begin, begin + model.dt)
     gains = np.array([r.gain for r in calibration.responses])

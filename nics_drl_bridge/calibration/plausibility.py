@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.calibration import stamps
+from nics_drl_bridge.calibration.least_squares import unexplained
 from nics_drl_bridge.calibration.signals import interval_means
-from nics_drl_bridge.calibration.timing import unexplained
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.kinematics.recording import Recording, Samples, Stream
 from nics_drl_bridge.kinematics.spec import RobotSpec, Variable

@@ -13,13 +13,6 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.calibration.calibration import Calibration, Response
-from nics_drl_bridge.calibration.course import (
-    Course,
-    course_of,
-    relative_ends,
-    tracked_ends,
-    tracked_slopes,
-)
 from nics_drl_bridge.calibration.free import (
     free_coefficients,
     free_time,
@@ -27,29 +20,24 @@ from nics_drl_bridge.calibration.free import (
     linear_term,
     may_turn,
 )
-from nics_drl_bridge.calibration.open_loop import Windows, predict, windows
-from nics_drl_bridge.calibration.timing import minimise, uncertainty
+from nics_drl_bridge.calibration.least_squares import minimise, uncertainty
+from nics_drl_bridge.calibration.problem import (
+    HORIZONS_S,
+    Problem,
+    prediction_errors,
+    prediction_slopes,
+)
 from nics_drl_bridge.kinematics.model import TaylorModel
-from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.kinematics.statistics import clustered_errors
 
 Array = NDArray[np.float64]
 
-HORIZONS_S = (1.0, 2.5, 5.0)
-SPACING_S = 0.25
-MIN_WINDOWS = 10
-HEADING_ARM_M = 0.3
-"""A heading error counts as a position error at this distance."""
 DIVERGED = 1e3
-OUTLYING = 10.0
-"""A window that ends this many times the usual error away holds a jump,"""
-OUTLYING_SHARE = 0.25
-"""if that is also more than this share of the longest path."""
-MOST_OUTLIERS = 0.3
 LEAST_SCALE = 0.05
-TURN_RAD = 1e-5
-"""By so much the rotation is turned to see what that does."""
+WITHIN = 12.0**-0.5
+"""A model moves by what holds at the start of a step: a time is uncertain by where in a step it
+lies, as a uniform distribution over the step is."""
 
 
 @dataclass(frozen=True)
@@ -70,22 +58,6 @@ class Refined:
 
 
 @dataclass(frozen=True)
-class Problem:
-    """What a refinement predicts: windows of one drive, the same for every model tried on them.
-
-    Attributes:
-        recording, spec: the drive and the robot.
-        chosen: windows of each horizon, without those that hold a jump of the pose.
-        courses: of X over them where the state was measured, else empty.
-    """
-
-    recording: Recording
-    spec: RobotSpec
-    chosen: tuple[Windows, ...]
-    courses: tuple[Course, ...]
-
-
-@dataclass(frozen=True)
 class _Free:
     """What may move: coefficients (D, K), a time of the calibration, its rotation."""
 
@@ -97,43 +69,6 @@ class _Free:
     def count(self) -> int:
         """How many coefficients."""
         return int(self.coefficients.sum())
-
-
-def problem_of(
-    model: TaylorModel,
-    calibration: Calibration,
-    recording: Recording,
-    spec: RobotSpec,
-    start: float,
-    stop: float,
-) -> Problem | None:
-    """Chooses the windows that a refinement predicts.
-
-    Args:
-        model: the fitted model.
-        calibration: of the drive.
-        recording: the drive.
-        spec: the robot.
-        start: of the part of the drive to use, from its first pose [s].
-        stop: its end [s].
-
-    Returns:
-        The problem, or None if the part is too short.
-    """
-    chosen = tuple(
-        windows(recording, calibration, start, stop, horizon, SPACING_S) for horizon in HORIZONS_S
-    )
-    chosen = tuple(
-        _without_outliers(w, model, calibration, recording, spec)
-        for w in chosen
-        if len(w.start_t) >= MIN_WINDOWS
-    )
-    if not chosen:
-        return None
-    courses: tuple[Course, ...] = ()
-    if recording.state is not None:
-        courses = tuple(course_of(model, calibration, recording, spec, w) for w in chosen)
-    return Problem(recording, spec, chosen, courses)
 
 
 def refine(problem: Problem, model: TaylorModel, calibration: Calibration) -> Refined:
@@ -154,10 +89,12 @@ def refine(problem: Problem, model: TaylorModel, calibration: Calibration) -> Re
     scale[free.count :] = LEAST_SCALE  # s, rad
 
     def residual(value: Array) -> Array:
-        return _bounded(_errors(problem, *_unpack(problem, free, model, calibration, value)))
+        there = _unpack(problem, free, model, calibration, value)
+        return _bounded(prediction_errors(problem, *there))
 
     def jacobian(value: Array) -> Array:
-        return _derivatives(problem, free, *_unpack(problem, free, model, calibration, value))
+        there = _unpack(problem, free, model, calibration, value)
+        return prediction_slopes(problem, *there, free.coefficients, free.turn)
 
     theta, slope, rest = minimise(
         residual, theta, scale, jacobian=jacobian if problem.courses else None
@@ -184,23 +121,6 @@ def _coefficient_errors(
         gain = abs(model.coefficients[d, tied[1]] / model.coefficients[d, tied[0]])
         errors[d, tied[1]] = gain * errors[d, tied[0]]
     return errors
-
-
-def _without_outliers(
-    chosen: Windows,
-    model: TaylorModel,
-    calibration: Calibration,
-    recording: Recording,
-    spec: RobotSpec,
-) -> Windows:
-    """Leaves out windows that a jump of the pose lies in, or at an end."""
-    error = predict(model, calibration, recording, spec, chosen) - chosen.end
-    size = np.hypot(error[:, 0], error[:, 1])
-    far = max(OUTLYING * float(np.median(size)), OUTLYING_SHARE * float(chosen.path.max()))
-    inside = size <= far
-    if inside.all() or inside.mean() < 1.0 - MOST_OUTLIERS or inside.sum() < MIN_WINDOWS:
-        return chosen
-    return Windows(*(values[inside] for values in vars(chosen).values()))
 
 
 def _pack(free: _Free, model: TaylorModel, calibration: Calibration) -> Array:
@@ -233,6 +153,8 @@ def _unpack(
     if "rotation_rad" in values:
         values["rotation_rad"] = float(geometry.wrap_angle(values["rotation_rad"]))
     spread = dict(zip(names, map(float, sigma[free.count :]), strict=True))
+    if free.time:
+        spread[free.time] = float(np.hypot(spread[free.time], WITHIN * model.dt))
     if lag_is_measured(calibration) and "clock_offset_s" in spread:
         spread["clock_offset_s"] = float(
             np.hypot(spread["clock_offset_s"], calibration.uncertainty["command_latency_s"])
@@ -256,43 +178,6 @@ def _response(model: TaylorModel, spec: RobotSpec, response: Response) -> Respon
     return replace(response, lag_s=lag, gain=float(model.coefficients[d, command]) / rate)
 
 
-def _errors(problem: Problem, model: TaylorModel, calibration: Calibration) -> Array:
-    """Errors (n,) of all predictions: x, y and heading of each window [m]."""
-    parts = []
-    with np.errstate(all="ignore"):  # a step of the search may diverge; it is then taken back
-        for k, chosen in enumerate(problem.chosen):
-            if problem.courses:
-                ends = relative_ends(problem.courses[k], model)[0]
-                predicted = tracked_ends(problem.courses[k], calibration, ends)
-            else:
-                predicted = predict(model, calibration, problem.recording, problem.spec, chosen)
-            error = predicted - chosen.end
-            error[:, 2] = HEADING_ARM_M * geometry.wrap_angle(error[:, 2])
-            parts.append(error.ravel())
-    return np.concatenate(parts)
-
-
 def _bounded(error: Array) -> Array:
     finite = np.nan_to_num(error, nan=DIVERGED)
     return np.asarray(np.clip(finite, -DIVERGED, DIVERGED))
-
-
-def _derivatives(
-    problem: Problem, free: _Free, model: TaylorModel, calibration: Calibration
-) -> Array:
-    """Derivatives (n, P) of `_errors` by the free coefficients and the rotation."""
-    parts = []
-    for course in problem.courses:
-        ends, moved = relative_ends(course, model, free.coefficients)
-        slope = tracked_slopes(course, calibration, ends, moved)
-        if free.turn:
-            turned = [
-                tracked_ends(course, replace(calibration, rotation_rad=angle), ends)
-                for angle in calibration.rotation_rad + np.array([-TURN_RAD, TURN_RAD])
-            ]
-            aside = (turned[1] - turned[0])[:, :, None]
-            aside[:, 2] = geometry.wrap_angle(aside[:, 2])
-            slope = np.concatenate([slope, aside / (2.0 * TURN_RAD)], axis=2)
-        slope[:, 2] *= HEADING_ARM_M
-        parts.append(slope.reshape(-1, slope.shape[2]))
-    return np.nan_to_num(np.concatenate(parts), nan=0.0)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.signal import lfilter
 
+from nics_drl_bridge.kinematics import features
 from nics_drl_bridge.kinematics.recording import Stream
 from nics_drl_bridge.kinematics.spec import RobotSpec
 
@@ -29,11 +30,28 @@ def held(command: Stream, spec: RobotSpec, start: Array, end: Array) -> Array:
     Returns:
         (..., C).
     """
+    values = np.concatenate([_before(command, spec)[None], command.values])
+    return _means_of_held(command.t, values, start, end)
+
+
+def held_features(
+    command: Stream, spec: RobotSpec, powers: NDArray[np.int64], start: Array, end: Array
+) -> Array:
+    """Means (..., K) of features (K, C) of held commands over intervals (...), as in `held`."""
+    values = np.concatenate([_before(command, spec)[None], command.values])
+    return _means_of_held(command.t, features.evaluate(values, powers), start, end)
+
+
+def _before(command: Stream, spec: RobotSpec) -> Array:
+    """Commands (C,) before the first."""
     still = np.clip(0.0, spec.command_low, spec.command_high)
-    before = np.where(np.ptp(command.values, axis=0) > 0.0, still, command.values[0])
-    low, high = min(start.min(), command.t[0]) - 1.0, max(end.max(), command.t[-1]) + 1.0
-    edges = np.concatenate([[low], command.t, [high]])
-    values = np.concatenate([before[None], command.values])
+    return np.asarray(np.where(np.ptp(command.values, axis=0) > 0.0, still, command.values[0]))
+
+
+def _means_of_held(t: Array, values: Array, start: Array, end: Array) -> Array:
+    """Means (..., K) over intervals of values (T + 1, K) that change at times (T,)."""
+    low, high = min(start.min(), t[0]) - 1.0, max(end.max(), t[-1]) + 1.0
+    edges = np.concatenate([[low], t, [high]])
     area = np.concatenate(
         [np.zeros((1, values.shape[1])), np.cumsum(values * np.diff(edges)[:, None], 0)]
     )

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from nics_drl_bridge.calibration.free import free_coefficients
-from nics_drl_bridge.calibration.refine import Problem, Refined, refine
+from nics_drl_bridge.calibration.problem import Problem
+from nics_drl_bridge.calibration.refine import Refined, refine
 from nics_drl_bridge.kinematics.spec import RobotSpec
 
 WORTH = 0.1

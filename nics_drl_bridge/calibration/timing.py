@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
-from nics_drl_bridge.calibration.signals import held, interval_means, lagged
+from nics_drl_bridge.calibration.least_squares import minimise, uncertainty, unexplained
+from nics_drl_bridge.calibration.signals import held, held_features, interval_means, lagged
 from nics_drl_bridge.kinematics import features
 from nics_drl_bridge.kinematics.recording import Stream
 from nics_drl_bridge.kinematics.spec import RobotSpec
@@ -30,12 +29,9 @@ DEFAULT_LAG_S = 0.1
 LAG_RANGE_S = (0.005, 2.0)
 MAX_ROWS = 2000
 EXACT = 1e-6
-DIFFERENCE = 1e-4
-TOLERANCE = 1e-7
 LONG_STEP = 1.5
 """A step this much longer than the usual one is a gap."""
 REGULAR = 0.8
-MAX_STEPS = 40
 
 
 @dataclass(frozen=True)
@@ -131,11 +127,10 @@ def response_residual(
     grid = np.arange(start.min() - LEAD_S, end.max() + STEP_S, STEP_S)
 
     def residual(lags: Array, delay: float) -> Array:
-        if spec.state:
-            response = inferred_states(command, spec, lags, delay, grid)
-        else:
-            response = held(command, spec, grid - delay, grid + STEP_S - delay)
-        chi = features.evaluate(response, powers)
+        if not spec.state:
+            means = held_features(command, spec, powers, start - delay, end - delay)
+            return unexplained(means, signal)
+        chi = features.evaluate(inferred_states(command, spec, lags, delay, grid), powers)
         return unexplained(interval_means(grid, chi, start, end), signal)
 
     return residual
@@ -200,19 +195,6 @@ def pose_residual(state: Stream, target: tuple[Array, Array, Array]) -> Callable
     return residual
 
 
-def unexplained(chi: Array, signal: Array) -> Array:
-    """What no linear combination of features (n, K) explains of a signal (n, D); flattened.
-
-    In shares of each component's spread.
-    """
-    spread = signal.std(axis=0)
-    scaled = (signal - signal.mean(axis=0)) / np.where(spread > 1e-9, spread, 1e9)
-    norm = np.linalg.norm(chi, axis=0)
-    chi = chi / np.where(norm > 0.0, norm, 1.0)
-    beta = np.linalg.lstsq(np.concatenate([np.ones((len(chi), 1)), chi], axis=1), scaled, 1e-10)[0]
-    return np.asarray(scaled - beta[0] - chi @ beta[1:]).ravel()
-
-
 def _search_or_zero(
     residual: Callable[[Array], Array], centers: tuple[float, ...] = (0.0,)
 ) -> Delay:
@@ -239,53 +221,3 @@ def _search(
     if float((rest**2).sum()) >= min(cost):
         found, rest = start, residual(start)
     return found, uncertainty(jacobian, rest), 1.0 - float((rest**2).mean())
-
-
-def minimise(
-    residual: Callable[[Array], Array],
-    start: Array,
-    scale: Array,
-    bounds: tuple[Array, Array] | None = None,
-    jacobian: Callable[[Array], Array] | None = None,
-) -> tuple[Array, Array, Array]:
-    """Least squares in steps of each parameter's own scale, however large its value is.
-
-    Args:
-        residual: of parameters (P,).
-        start: (P,).
-        scale: (P,) by which a parameter may be expected to move.
-        bounds: least and greatest parameters (P,).
-        jacobian: of the residual (n, P); by finite differences when None.
-
-    Returns:
-        Parameters (P,), Jacobian (n, P) and residual (n,) there.
-    """
-    low, high = bounds or (np.full(len(start), -np.inf), np.full(len(start), np.inf))
-    slope: Any = "2-point"
-    if jacobian is not None:
-        slope = lambda z: jacobian(start + (z - 1.0) * scale) * scale  # noqa: E731
-    found = least_squares(
-        lambda z: residual(start + (z - 1.0) * scale),
-        np.ones(len(start)),
-        jac=slope,
-        bounds=((low - start) / scale + 1.0, (high - start) / scale + 1.0),
-        diff_step=DIFFERENCE,
-        xtol=TOLERANCE,
-        ftol=TOLERANCE,
-        max_nfev=MAX_STEPS,
-    )
-    return start + (found.x - 1.0) * scale, found.jac / scale, np.asarray(found.fun)
-
-
-def uncertainty(jacobian: Array, residual: Array) -> Array:
-    """Standard uncertainty (P,) of least squares.
-
-    Widened for residuals that resemble their neighbours.
-    """
-    rest = residual - residual.mean()
-    power = float((rest**2).sum())
-    rho = float((rest[1:] * rest[:-1]).sum()) / power if power > 0.0 else 0.0
-    rho = float(np.clip(rho, 0.0, 0.95))
-    variance = power / max(1, len(residual) - jacobian.shape[1]) * (1.0 + rho) / (1.0 - rho)
-    covariance = np.linalg.pinv(jacobian.T @ jacobian) * variance
-    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))

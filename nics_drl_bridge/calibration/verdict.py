@@ -57,6 +57,12 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> tuple[st
             f"{_list(excitation.together)} always moved together, so their effects can't be told "
             "apart: the model holds for this proportion only; drive with each changing on its own."
         )
+    copies = [v.name for v in spec.state if v.name in linear.dependent]
+    if copies:
+        notes.append(
+            f"{_list(copies)} always followed from the other variables, so their effects can't be "
+            "told apart: the model does without, and holds for as long as that is so."
+        )
     coarse = [
         c.name
         for c in spec.command

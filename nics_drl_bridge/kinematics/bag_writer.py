@@ -37,8 +37,9 @@ def write_bag(
 ) -> None:
     """Writes a recording as a bag that `load_bag` reads back.
 
-    Commands become `/cmd_vel`, the pose `/odom`, or `/pose` when it has a clock of its own,
-    state and wheels `/joint_states`, the IMU `/imu`. Headers hold the streams' stamps.
+    Commands become `/cmd_vel`, the pose `/odom`; or `/pose` when it has a clock of its own or
+    odometry beside it, whose twist is then `/odom`. State and wheels become `/joint_states`,
+    the IMU `/imu`. Headers hold the streams' stamps.
 
     Args:
         recording: of the robot.
@@ -81,16 +82,18 @@ def _topics(
     recording: Recording, spec: RobotSpec, messages: _Messages
 ) -> list[tuple[str, str, Stream, Make]]:
     """Topic, type, stream and what makes a message of a row."""
-    own_clock = recording.pose.clock != recording.command.clock
+    beside = recording.odometry is not None or recording.pose.clock != recording.command.clock
     topics: list[tuple[str, str, Stream, Make]] = [
         (
             "/cmd_vel", topic_roles.TWIST, recording.command,
             lambda _, row: messages.twist(spec.to_cmd_vel(row)),
         ),
         ("/pose", topic_roles.POSE, recording.pose, messages.pose_stamped)
-        if own_clock
+        if beside
         else ("/odom", topic_roles.ODOMETRY, recording.pose, messages.odometry),
     ]  # fmt: skip
+    if recording.odometry is not None:
+        topics.append(("/odom", topic_roles.ODOMETRY, recording.odometry, messages.speeds))
     if recording.state is not None:
         names = [v.name for v in spec.state]
         still = np.array([v.unit in POSITION_UNITS for v in spec.state])
@@ -149,10 +152,18 @@ class _Messages:
         return self._new("geometry_msgs/PoseStamped", header, self._pose(row))
 
     def odometry(self, header: Any, row: Array) -> Any:
+        return self._odometry(header, row, np.zeros(3), np.zeros(36))
+
+    def speeds(self, header: Any, row: Array) -> Any:
+        """An odometry of which the twist alone was recorded."""
         unknown = np.zeros(36)
-        pose = self._new("geometry_msgs/PoseWithCovariance", self._pose(row), unknown)
-        twist = self._new("geometry_msgs/TwistWithCovariance", self.twist(np.zeros(3)), unknown)
-        return self._new("nav_msgs/Odometry", header, FRAMES[1], pose, twist)
+        unknown[0] = -1.0
+        return self._odometry(header, np.zeros(3), row, unknown)
+
+    def _odometry(self, header: Any, pose: Array, twist: Array, pose_covariance: Array) -> Any:
+        where = self._new("geometry_msgs/PoseWithCovariance", self._pose(pose), pose_covariance)
+        speed = self._new("geometry_msgs/TwistWithCovariance", self.twist(twist), np.zeros(36))
+        return self._new("nav_msgs/Odometry", header, FRAMES[1], where, speed)
 
     def joints(self, header: Any, names: list[str], position: Array, velocity: Array) -> Any:
         return self._new("sensor_msgs/JointState", header, names, position, velocity, np.zeros(0))

@@ -24,6 +24,7 @@ from nics_drl_bridge.kinematics.recording import Samples
 from nics_drl_bridge.kinematics.robust import plausible, usual_ranges
 from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.kinematics.statistics import errors_of
+from nics_drl_bridge.threads import one_blas_thread
 
 __all__ = ["ALPHA", "ORDER", "Alpha", "Fit", "fit", "prune"]
 
@@ -86,6 +87,7 @@ class Fit:
         return self.excitation.unmoved
 
 
+@one_blas_thread
 def fit(
     samples: Samples,
     spec: RobotSpec,

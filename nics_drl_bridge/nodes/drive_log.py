@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 
 from nics_drl_bridge.errors import BackendError, RecordingError
-from nics_drl_bridge.kinematics.bag_messages import imu_row, pose_row, stamp
+from nics_drl_bridge.kinematics.bag_messages import imu_row, pose_row, stamp, twist_row
 from nics_drl_bridge.kinematics.joints import JointMessage, Joints, gather, state_of, wheels_of
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec
@@ -71,7 +71,7 @@ class DriveLog:
 
     def __init__(self, spec: RobotSpec, roles: TopicRoles, now: Callable[[], int]) -> None:
         self._spec, self._roles, self._now = spec, roles, now
-        self._commands, self._odom = _Rows("cmd_vel"), _Rows("odom")
+        self._commands, self._odom, self._twist = _Rows("cmd_vel"), _Rows("odom"), _Rows("odom")
         self._pose, self._imu = _Rows("pose"), _Rows("imu")
         self._joints: list[JointMessage] = []
 
@@ -86,8 +86,11 @@ class DriveLog:
 
     def odometry(self, message: Odometry) -> Array | None:
         """Notes an odometry; returns its pose (3,), or None if it is old, NaN or inf."""
-        pose = np.array(pose_row(message))
-        return pose if self._odom.add(self._now(), stamp(message), pose) else None
+        now, header, pose = self._now(), stamp(message), np.array(pose_row(message))
+        if not self._odom.add(now, header, pose):
+            return None
+        self._twist.add(now, header, np.array(twist_row(message)))
+        return pose
 
     def pose(self, message: Any) -> None:
         """Notes a pose of motion capture or localisation."""
@@ -139,6 +142,8 @@ class DriveLog:
     def recording(self) -> Recording:
         """All streams on their clocks; the pose is that of `pose` where that topic spoke.
 
+        Beside such a pose, the twist of the odometry is kept to tell how noisy odometry is.
+
         Raises:
             RecordingError: too little was received.
         """
@@ -150,6 +155,8 @@ class DriveLog:
             "command": TopicData(commands.topic, commands.receive_ns, None, commands.values),
             "pose": pose.data(),
         }
+        if pose is self._pose and len(self._twist) >= FEWEST:
+            data["odometry"] = self._twist.data()
         if len(self._imu) >= FEWEST:
             data["imu"] = self._imu.data()
         if len(self._joints) >= FEWEST:

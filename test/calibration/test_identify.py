@@ -175,3 +175,13 @@ def test_a_part_without_a_window_is_refused(car):
     model = identify(recording, car).model
     with pytest.raises(RecordingError, match="hold no window of 5 s"):
         open_loop_error(model, Calibration(), recording, car, 17.0, 20.0)
+
+
+@pytest.mark.parametrize("name", ["mecanum", "differential"])
+def test_a_wheel_that_always_follows_from_the_others_is_named(name, request):
+    spec = request.getfixturevalue(name)
+    notes = " ".join(identify(drive(spec, duration=20.0), spec).notes)
+    # Four wheels that roll without slip have three speeds to choose.
+    told = "rear_right_wheel always followed from the other variables" in notes
+    assert told == (name == "mecanum")
+    assert "left_wheel always followed" not in notes

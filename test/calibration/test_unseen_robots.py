@@ -110,6 +110,34 @@ def test_a_robot_without_any_state_but_three_commands():
         assert terms(found)[dof][name] == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.parametrize("latency", [0.0, 0.15])
+def test_the_latency_of_a_robot_without_state_is_exact(latency):
+    spec = robot("stateless")
+    rng = np.random.default_rng(3)
+    t = np.arange(3000) * DT
+    command = rng.uniform(spec.command_low, spec.command_high, (3000 // HOLD, len(spec.command)))
+    command = np.repeat(command, HOLD, axis=0)
+    steps = geometry.exp(omni_twist(command) * DT)
+    pose = np.zeros((len(t), 3))
+    for k, step in enumerate(steps[:-1]):
+        pose[k + 1] = geometry.compose(pose[k], step)
+    found = identify(Recording(Stream(t - latency, command), Stream(t, pose)), spec)
+    assert found.calibration.command_latency_s == pytest.approx(latency, abs=1e-6)
+    assert found.held_out.mean_position_error_m < 1e-6
+
+
+def test_the_uncertainty_of_the_latency_covers_the_step_of_the_model():
+    spec = robot("long_car")
+    recording = recorded(spec, lambda c: c, car_twist, (5e-4, 1e-3), latency=0.15)
+    for wheels in (None, Stream(recording.state.t, recording.state.values[:, [1, 1]])):
+        pose = recording.pose if wheels is None else replace(recording.pose, clock="mocap")
+        drive = replace(recording, state=None, wheels=wheels, pose=pose)
+        found = identify(drive, spec).calibration
+        sigma = found.uncertainty["command_latency_s"]
+        assert abs(found.command_latency_s - 0.15) < 3.0 * sigma
+        assert sigma < DT
+
+
 def test_the_order_of_state_and_command_is_that_of_the_file():
     spec = robot("skid_steer")
     data = spec.model_dump()

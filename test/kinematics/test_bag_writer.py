@@ -12,6 +12,7 @@ from nics_drl_bridge.kinematics.bag_writer import write_bag
 from nics_drl_bridge.kinematics.readers import read_recording
 from nics_drl_bridge.kinematics.recording import Recording, Stream
 from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.kinematics.topic_roles import TopicRoles
 
 CAR = load_robot("ackermann")
 
@@ -40,6 +41,16 @@ def test_wheel_speeds_come_back(tmp_path):
     back = read_recording(tmp_path / "bag", CAR).wheels
     assert back is not None
     assert np.allclose(back.values, drive.wheels.values)
+
+
+def test_odometry_beside_a_pose_comes_back(tmp_path):
+    drive = Recording(stream(2), stream(3), odometry=stream(3, start=3.01))
+    write_bag(drive, tmp_path / "bag", CAR)
+    back = read_recording(tmp_path / "bag", CAR, TopicRoles(odom="/odom"))
+    assert np.allclose(back.pose.values, drive.pose.values)
+    assert np.allclose(back.odometry.values, drive.odometry.values)
+    assert back.odometry.t[0] - back.pose.t[0] == pytest.approx(0.01)
+    assert back.pose.clock == back.odometry.clock == back.command.clock
 
 
 def test_a_folder_that_is_there_is_left_alone(tmp_path):

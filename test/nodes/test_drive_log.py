@@ -32,13 +32,13 @@ class Drive:
         self.now_ns = START_NS
         self.spec, self.log = spec, DriveLog(spec, TopicRoles(), lambda: self.now_ns)
 
-    def hears(self, k, stamp_ns=None, x=None):
+    def hears(self, k, stamp_ns=None, x=None, twist=(0.0, 0.0, 0.0)):
         """Odometry number k, on its way for 20 ms."""
         stamp = START_NS + k * PERIOD_NS if stamp_ns is None else stamp_ns
         pose = [0.1 * k if x is None else x, 0.0, 0.0]
         self.now_ns = START_NS + k * PERIOD_NS + PERIOD_NS // 5
         return self.log.odometry(
-            conversions.odometry_to_ros(pose, np.zeros(3), stamp, FRAMES, VARIANCE)
+            conversions.odometry_to_ros(pose, np.array(twist), stamp, FRAMES, VARIANCE)
         )
 
     def sends(self, k):
@@ -97,6 +97,24 @@ def test_the_pose_of_motion_capture_and_the_imu_are_taken():
     recording = drive.log.recording()
     assert recording.pose.values[-1] == pytest.approx([0.0, 3.8, 0.5])
     assert recording.imu.values[-1] == pytest.approx([0.3, 0.0, -0.7])
+
+
+def test_beside_a_pose_of_motion_capture_the_twist_of_the_odometry_is_taken():
+    drive = Drive()
+    for k in range(20):
+        drive.sends(k)
+        drive.hears(k, twist=(0.1 * k, 0.0, math.nan if k == 5 else -0.2))
+        pose = PoseStamped()
+        pose.header.stamp = conversions.stamp_to_ros(START_NS + k * PERIOD_NS)
+        drive.log.pose(pose)
+    recording = check(drive.log.recording(), CAR)
+    assert recording.odometry.values[-1] == pytest.approx([1.9, 0.0, -0.2])
+    assert len(recording.odometry.t) == 19
+    assert recording.odometry.clock == recording.command.clock
+
+
+def test_an_odometry_that_is_the_pose_is_not_compared_with_itself():
+    assert Drive().goes(0, 20).log.recording().odometry is None
 
 
 def test_measured_wheels_are_the_state():

@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from nics_drl_bridge.calibration.calibrate import calibrate
+from nics_drl_bridge.calibration.curves import timing_curves
+from nics_drl_bridge.calibration.identify import identify
+from nics_drl_bridge.errors import FitError
+from nics_drl_bridge.kinematics.fit import fit
+from nics_drl_bridge.threads import one_blas_thread
+
+
+def blas_threads() -> set[int]:
+    """Of each BLAS that is loaded."""
+    np.ones((2, 2)) @ np.ones((2, 2))
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+
+@pytest.fixture(autouse=True)
+def two_threads():
+    with threadpool_limits(limits=2, user_api="blas"):
+        if blas_threads() != {2}:
+            pytest.skip("this BLAS has one thread only")
+        yield
+
+
+def test_linear_algebra_has_one_thread_for_as_long_as_the_function_runs():
+    assert one_blas_thread(blas_threads)() == {1}
+    assert blas_threads() == {2}
+
+
+def test_an_error_restores_the_threads_too():
+    @one_blas_thread
+    def fails():
+        raise FitError("no.")
+
+    with pytest.raises(FitError, match="no"):
+        fails()
+    assert blas_threads() == {2}
+
+
+@pytest.mark.parametrize("function", [calibrate, fit, identify, timing_curves])
+def test_whatever_solves_many_small_systems_is_limited(function):
+    seen = []
+
+    class Given:
+        """Not what the function takes: it only tells how many threads there are when used."""
+
+        def __getattr__(self, name):
+            seen.append(blas_threads())
+            raise FitError("seen.")
+
+    with pytest.raises(FitError, match="seen"):
+        function(*[Given()] * (3 if function is timing_curves else 2))
+    assert seen[0] == {1}
