@@ -10,6 +10,10 @@ from numba import njit
 from nics_drl_bridge.lidar import kernels
 
 
+EDGE = 1e-6
+"""So far within an edge, as a part of the whole width, is its range taken."""
+
+
 @njit(cache=True)
 def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[no-untyped-def]
     """Outermost directions of a shape straight ahead, and the corners that make them.
@@ -44,12 +48,11 @@ def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[n
 
 
 @njit(cache=True)
-def between(corners, radius, distance, cos, sin, edge):  # type: ignore[no-untyped-def]
-    """Range to a shape straight ahead, half-way between its edges; see `row`."""
-    middle = (edge[0] + edge[1]) / 2.0
+def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untyped-def]
+    """Range to a shape straight ahead in one direction [rad]; see `row`."""
     ray, out = np.empty((1, 2)), np.full(1, np.inf, np.float32)
-    ray[0, 0], ray[0, 1] = math.cos(middle), math.sin(middle)
-    beams = (middle, 1.0, 0.0)
+    ray[0, 0], ray[0, 1] = math.cos(angle), math.sin(angle)
+    beams = (angle, 1.0, 0.0)
     if corners.shape[0] == 0:
         kernels.circle(out, ray, beams, distance, 0.0, radius, np.inf)
     else:
@@ -87,10 +90,11 @@ def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # 
     while last > first and not np.isfinite(fine[last]):
         last -= 1
     if not np.isfinite(fine[first]):  # thinner than the points: seen by none
-        fine[:] = between(corners, radius, distance, cos, sin, edge)
+        fine[:] = along((edge[0] + edge[1]) / 2.0, corners, radius, distance, cos, sin)
         return
-    fine[:first] = fine[first]
-    fine[last + 1 :] = fine[last]
+    inside = EDGE * (edge[1] - edge[0])
+    fine[:first] = along(edge[0] + inside, corners, radius, distance, cos, sin)
+    fine[last + 1 :] = along(edge[1] - inside, corners, radius, distance, cos, sin)
 
 
 @njit(cache=True)

@@ -4,8 +4,8 @@ A scan is made in passes over the bodies in sight, each pass a short loop withou
 nearly all the time of a look-up is waiting, for a memory or after a wrong guess of a branch,
 and so the waiting of one body overlaps with the work on the next.
 
-Two rows, of the grid distances on both sides of the true one, are blended. A row is stored at
-`fine` points per beam, so that the bearing is met to 1/(2 fine) of a beam. Which beams hit
+Two rows, of the grid distances on both sides of the true one, are blended, and in each the two
+points on both sides of a beam. Which beams hit
 follows from the true silhouette, not from a row: a silhouette on the wrong side of a beam is
 by far the largest error of a plain look-up.
 """
@@ -19,12 +19,12 @@ from numba import njit
 
 from nics_drl_bridge.lidar import kernels
 
-BLOCK = 8
+BLOCK = 16
 """So many beams are fused at once; rows and lines are that much longer than their content."""
 DOUBLES, SINGLES, WHOLES = 6, 5, 2
 """Numbers per body that one pass hands to the next, by their kind."""
-ABOVE_ZERO = 2.0**24 + 0.5
-"""Added before a number is cut to a whole one, so that it is rounded to the nearest."""
+ABOVE_ZERO = 2.0**24
+"""Added before a number is cut to a whole one, so that it is rounded down."""
 PER_TURN = 0.5 / math.pi
 SINGLE = tuple(
     np.float32(factor)
@@ -240,26 +240,36 @@ def fuse(  # type: ignore[no-untyped-def]
             begin = max(begin + (first > begin), 0)
             hits = min(int(last), count - 1) - begin + 1
             if hits > 0:
-                point = int((begin - middle) * phases + ABOVE_ZERO) - int(ABOVE_ZERO)
+                exact = (begin - middle) * phases + ABOVE_ZERO
+                point = int(exact)
+                part = np.float32(exact - point)
+                point -= int(ABOVE_ZERO)
                 beam, phase = point >> shift, point & (phases - 1)
                 width, width2 = cell_of[cell, 1], cell_of[next_cell, 1]
-                skip = max(min(beam - cell_of[cell, 0], width - hits), 0)
-                skip2 = max(min(beam - cell_of[next_cell, 0], width2 - hits), 0)
+                skip = max(min(beam - cell_of[cell, 0], width - hits - 1), 0)
+                skip2 = max(min(beam - cell_of[next_cell, 0], width2 - hits - 1), 0)
                 near = row_of[cell] + phase * width + skip
                 far = row_of[next_cell] + phase * width2 + skip2
+                same = phase + 1 < phases  # the next point: of the next phase, or beam
+                near2 = near + width if same else near - phase * width + 1
+                far2 = far + width2 if same else far - phase * width2 + 1
                 padded = (hits + BLOCK - 1) // BLOCK * BLOCK
                 if limited or begin + padded > count:
                     for i in range(hits):
-                        value = rows[np.uintp(near + i)]
-                        value += share * (rows[np.uintp(far + i)] - value)
+                        value, other = rows[np.uintp(near + i)], rows[np.uintp(far + i)]
+                        value += part * (rows[np.uintp(near2 + i)] - value)
+                        other += part * (rows[np.uintp(far2 + i)] - other)
+                        value += share * (other - value)
                         value = value if value <= high else nothing
                         value = value if value >= low else close
                         held = ranges[n, m, np.uintp(begin + i)]
                         ranges[n, m, np.uintp(begin + i)] = value if value < held else held
                 else:
                     for i in range(np.int32(padded)):
-                        value = rows[np.uintp(near + i)]
-                        value += share * (rows[np.uintp(far + i)] - value)
+                        value, other = rows[np.uintp(near + i)], rows[np.uintp(far + i)]
+                        value += part * (rows[np.uintp(near2 + i)] - value)
+                        other += part * (rows[np.uintp(far2 + i)] - other)
+                        value += share * (other - value)
                         value = value if i < np.int32(hits) else nothing
                         held = ranges[n, m, np.uintp(begin + i)]
                         ranges[n, m, np.uintp(begin + i)] = value if value < held else held

@@ -35,7 +35,7 @@ class Density(Schema):
 
     distances: int = Field(default=100, ge=3, le=10_000)
     rotations: int = Field(default=240, ge=1, le=100_000)
-    phases: int = 4
+    phases: int = 1
 
     @field_validator("phases")
     @classmethod
@@ -105,7 +105,9 @@ class LidarTable:
         numbers[:, 2], numbers[:, 3] = rotations * parts, 1.0 / rotations
         counts = np.zeros((len(self.shapes), 6), np.int64)
         counts[:, 0], counts[:, 1] = distances, rotations
-        counts[:, 2] = [0 if isinstance(s, Circle) else n for s, n in zip(self.shapes, parts, strict=True)]
+        counts[:, 2] = [
+            0 if isinstance(s, Circle) else n for s, n in zip(self.shapes, parts, strict=True)
+        ]
         counts[:, 3], counts[:, 4] = self.grid[:, 2], outlines.hull[:-1]
         counts[:, 5] = np.diff(outlines.hull) // 2 // parts
         shift = self.density.phases.bit_length() - 1
