@@ -9,7 +9,6 @@ from numba import njit
 
 from nics_drl_bridge.lidar import kernels
 
-
 EDGE = 1e-6
 """So far within an edge, as a part of the whole width, is its range taken."""
 

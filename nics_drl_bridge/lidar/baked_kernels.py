@@ -127,8 +127,8 @@ def outermost(hulls, skip, corners, first, stride, d2, cos, sin, side):  # type:
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
 def cells_of(  # type: ignore[no-untyped-def]
-    found, bodies, n, limits, shape_of, grid_of, cell_of, hulls, which, x, y, distance, bearing, rx, ry, lx, ly,
-    blend, cell_at,
+    found, bodies, n, limits, shape_of, grid_of, cell_of, hulls, which, x, y, distance, bearing,
+    rx, ry, lx, ly, blend, cell_at,
 ):  # fmt: skip
     """Third pass: which cell each looks up, and its two silhouettes as (along, across).
 

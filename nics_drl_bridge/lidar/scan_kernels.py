@@ -5,7 +5,7 @@ from __future__ import annotations
 from numba import njit
 
 from nics_drl_bridge.lidar import baked_kernels as baking
-from nics_drl_bridge.lidar import kernels
+from nics_drl_bridge.lidar import kernels, map_kernels
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)
@@ -42,8 +42,8 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
             )
             baking.directions(found, x, y, distance, bearing)
             baking.cells_of(
-                found, bodies, n, limits, shape_of, grid_of, cell_of, hulls, which, x, y, distance, bearing,
-                rx, ry, lx, ly, blend, cell_at,
+                found, bodies, n, limits, shape_of, grid_of, cell_of, hulls, which, x, y, distance,
+                bearing, rx, ry, lx, ly, blend, cell_at,
             )  # fmt: skip
             kernels.clear(ranges, n, m)
             baking.spans(found, heading, beams, rx, ry, lx, ly, bearing, right, left)
@@ -61,3 +61,29 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
                         )  # fmt: skip
                 kernels.walls_into(out, directions, beams, sx, sy, c, s, walls)
                 kernels.finish(out, low, high)
+
+
+@njit(cache=True)
+def add_map(ranges, poses, chosen, sensor, map_arrays, exact):  # type: ignore[no-untyped-def]
+    """Fuses a static map into the scans of some worlds.
+
+    Args:
+        ranges: (N, M, B) scans, in place.
+        poses: (N, M, 3) of `base_link` in the world.
+        chosen: (n,) which worlds.
+        sensor: see `scanner.Scanner.arguments`.
+        map_arrays: see `maps_grid.GridMap.arrays`.
+        exact: whether to walk from cell to cell.
+    """
+    mount, directions, beams, limits = sensor[0], sensor[1], sensor[2], sensor[3]
+    for n in chosen:
+        for m in range(poses.shape[1]):
+            sx, sy, _, c, s = kernels.to_sensor(poses, n, m, mount)
+            out = ranges[n, m]
+            if exact:
+                map_kernels.exact_map_into(
+                    out, directions, beams, sx, sy, c, s, limits[1], map_arrays
+                )
+            else:
+                map_kernels.map_into(out, directions, beams, sx, sy, c, s, limits[1], map_arrays)
+            kernels.finish(out, limits[0], limits[1])

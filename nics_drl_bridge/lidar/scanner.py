@@ -15,6 +15,7 @@ from nics_drl_bridge.errors import ConfigError, ModelError
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import BLOCK, DOUBLES, SINGLES, WHOLES
 from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.maps_grid import GridMap
 from nics_drl_bridge.lidar.shapes import BODY, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable
@@ -39,11 +40,13 @@ class Scanner:
         renderer: `baked` looks every shape up; `exact` computes every ray; `auto` takes what is
             faster: the look-up, but for shapes larger than the range, in whose circle the lidar
             nearly always is. There, and for straight walls, all compute every ray.
+        grid: a static map that stands in every world, if any.
     """
 
     spec: LidarSpec
     table: LidarTable
     renderer: Renderer = "auto"
+    grid: GridMap | None = None
 
     def __post_init__(self) -> None:
         """Raises ModelError when the table was baked for another lidar."""
@@ -152,9 +155,19 @@ class Scanner:
         scan_kernels.scan_worlds(
             out[:, None], poses[:, None], worlds, bodies, -1, walls, self.arguments, room
         )
+        if self.grid is not None:
+            scan_kernels.add_map(
+                out[:, None], poses[:, None], worlds, self.arguments, self.grid.arrays,
+                self.renderer == "exact",
+            )  # fmt: skip
         return out
 
 
-def make_scanner(spec: LidarSpec, shapes: Sequence[Shape], renderer: Renderer = "auto") -> Scanner:
-    """A scanner with a table for the given shapes, baked now."""
-    return Scanner(spec, bake(spec, shapes), renderer)
+def make_scanner(
+    spec: LidarSpec,
+    shapes: Sequence[Shape],
+    renderer: Renderer = "auto",
+    grid: GridMap | None = None,
+) -> Scanner:
+    """A scanner with a table for the given shapes, baked now, and a static map."""
+    return Scanner(spec, bake(spec, shapes), renderer, grid)

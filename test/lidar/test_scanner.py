@@ -7,6 +7,7 @@ from robots import lidar
 
 from nics_drl_bridge.errors import ConfigError, ModelError
 from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.maps_grid import GridMap
 from nics_drl_bridge.lidar.scanner import RENDERERS, Scanner, make_scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle, Polygon, Rectangle, Segment
 from nics_drl_bridge.lidar.table import Density
@@ -308,3 +309,14 @@ def test_arrays_that_do_not_belong_together_are_refused(poses, bodies):
 def test_an_array_that_can_not_hold_the_scans_is_refused(out):
     with pytest.raises(ConfigError, match=r"must be \(1, 72\) float32"):
         make_scanner(lidar(), []).scan(HERE, [], out=out)
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+def test_a_static_map_is_seen_beside_the_bodies_and_within_the_limits(renderer):
+    spec = lidar(beams=4, angle_min=0.0, angle_max=2.0 * np.pi, range_min=0.3, range_max=3.0)
+    cells = np.zeros((100, 100), np.int8)
+    cells[:, 70] = cells[98, :] = cells[48, 50] = 100  # east at 2 m, north at 4.8 m, south, near
+    scanner = make_scanner(spec, [SQUARE], renderer, GridMap(cells, 0.1, origin=(-5.0, -5.0, 0.0)))
+    bodies = scanner.place([SQUARE], [[-1.0, 0.05, 0.0]])
+    ranges = scanner.scan([0.05, 0.05, 0.0], bodies)[0]
+    assert ranges == pytest.approx([1.95, np.inf, 0.9, -np.inf], abs=1e-3)
