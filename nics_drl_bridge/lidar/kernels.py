@@ -36,7 +36,7 @@ ATAN = (
 )
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
 def arctan2(y, x):  # type: ignore[no-untyped-def]
     """The angle of (x, y) within 3e-10 rad, without a branch and so many at a time.
 
@@ -121,7 +121,7 @@ def segment(out, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-
     edge(out, directions, beams, x1, y1, arctan2(y1, x1), x2, y2, arctan2(y2, x2))
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
 def edge(out, directions, beams, x1, y1, angle1, x2, y2, angle2):  # type: ignore[no-untyped-def]
     """The same, with the directions of its ends [rad]."""
     count = out.shape[0]
@@ -141,7 +141,7 @@ def edge(out, directions, beams, x1, y1, angle1, x2, y2, angle2):  # type: ignor
             _cross(out, directions, 0, first + hits - count, cross, ex, ey)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
 def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyped-def]
     """Fuses a straight line into the beams from `begin` to `end`, many at a time."""
     for k in range(end - begin):
@@ -165,7 +165,7 @@ def polygon(out, directions, beams, x, y, c, s, corners):  # type: ignore[no-unt
         ax, ay, angle = bx, by, next_angle
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
 def turned(x, y, c, s, corner):  # type: ignore[no-untyped-def]
     """Where a corner (2,) lies when its shape is turned by (c, s) and put at (x, y)."""
     return x + c * corner[0] - s * corner[1], y + s * corner[0] + c * corner[1]
