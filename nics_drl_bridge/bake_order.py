@@ -97,6 +97,7 @@ def _bake(
         size = parse_size(order.budget)
         choice = choose(spec, shapes, size, lambda density: told(f"trying {density}", 0, 0))
         return choice.table, choice.rmse
-    density = validate(dict(order.density), Density, "density")
+    default = {"phases": Density.for_beams(spec.angle_increment).phases}
+    density = validate(default | dict(order.density), Density, "density")
     table = bake(spec, shapes, density, progress=lambda done, total: told("baking", done, total))
     return table, expected_rmse(spec, table)

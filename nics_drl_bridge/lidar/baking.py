@@ -24,7 +24,6 @@ COARSE = np.radians(2.0)
 MOST_NUMBERS = 2**31 - 2**20
 MISS = 0.02
 """An edge that two corners would miss by so many beams is looked for along the hull."""
-DENSITY = Density()
 SensorModel = Callable[[NDArray[np.float32], NDArray[np.float64]], NDArray[np.float32]]
 """Ranges (P,) [m] and angles of incidence (P,) [rad] to the ranges that the device reports."""
 Progress = Callable[[int, int], None]
@@ -51,7 +50,7 @@ class Grid:
 def bake(
     spec: LidarSpec,
     shapes: Sequence[Shape],
-    density: Density = DENSITY,
+    density: Density | None = None,
     sensor_model: SensorModel | None = None,
     progress: Progress | None = None,
 ) -> LidarTable:
@@ -60,7 +59,7 @@ def bake(
     Args:
         spec: the lidar.
         shapes: H; equal ones are baked once.
-        density: of the grid.
+        density: of the grid; by default `Density.for_beams`.
         sensor_model: what the device makes of ranges and incidence, `inf` where it sees nothing;
             it is baked in and costs nothing later. Such a beam goes through to what is behind.
         progress: told how far it is.
@@ -72,6 +71,7 @@ def bake(
         ConfigError: the table would be too large.
     """
     shapes = tuple(dict.fromkeys(shapes))
+    density = density or Density.for_beams(spec.angle_increment)
     outlines = Outlines.of(shapes)
     grids = [grid_of(spec, outlines, h, density) for h in range(len(shapes))]
     cells = np.concatenate([np.zeros((0, 6), np.int64), *(g.cell.reshape(-1, 6) for g in grids)])
@@ -120,6 +120,8 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
     """Where the cells of a shape lie and how wide their rows are."""
     shape, radius, order = outlines.shapes[h], outlines.radii[h], outlines.orders[h]
     distances = np.linspace(radius, spec.range_max + radius, density.distances)
+    if not math.isclose(distances[-1] - radius, spec.range_max, rel_tol=1e-9):
+        raise ConfigError(f"{describe(shape)} is too large to bake; give it in metres.")
     distances[0] *= 1.0 + TOUCHING
     round_ = isinstance(shape, Circle)
     count = 1 if round_ else max(1, -(-density.rotations // order))

@@ -11,12 +11,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.errors import ConfigError, ModelError
+from nics_drl_bridge.errors import ConfigError, ModelError, nearest
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import BLOCK, DOUBLES, SINGLES, WHOLES
 from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.maps_grid import GridMap
-from nics_drl_bridge.lidar.shapes import BODY, Shape, place
+from nics_drl_bridge.lidar.shapes import BODY, SHAPE, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable
 
@@ -49,8 +49,12 @@ class Scanner:
     grid: GridMap | None = None
 
     def __post_init__(self) -> None:
-        """Raises ModelError when the table was baked for another lidar."""
+        """Raises ConfigError for an unknown renderer, ModelError for another lidar's table."""
         table, spec = self.table, self.spec
+        if self.renderer not in RENDERERS:
+            raise ConfigError(
+                f"unknown renderer {self.renderer!r}; {nearest(str(self.renderer), RENDERERS)}"
+            )
         if self.renderer == "exact" or not table.shapes:
             return
         if not math.isclose(table.beam_angle, spec.angle_increment, rel_tol=1e-9):
@@ -114,6 +118,15 @@ class Scanner:
         index = [self.table.outlines.index_of(shape) for shape in shapes]
         return place(poses, self.table.outlines.radii[index], index)
 
+    def _require_known(self, index: NDArray[np.float64]) -> None:
+        """Raises ModelError where the kernels would read beyond the table."""
+        known = len(self.table.shapes)
+        if index.size and not (index.min() >= 0 and index.max() < known):
+            raise ModelError(
+                f"a body is of a shape that is none of the {known} in the lidar table; make "
+                "bodies by `place` of the scanner that scans them."
+            )
+
     def scan(
         self,
         poses: ArrayLike,
@@ -134,6 +147,7 @@ class Scanner:
 
         Raises:
             ConfigError: an array has another shape.
+            ModelError: a body is of a shape that is not in the table.
         """
         poses = np.atleast_2d(np.asarray(poses, dtype=np.float64))
         shape = (len(poses), self.spec.beams)
@@ -142,12 +156,15 @@ class Scanner:
             bodies = np.zeros((len(poses), 0, BODY))
         elif bodies.ndim == 2:
             bodies = bodies[None]
-        walls = np.asarray(walls, dtype=np.float64).reshape(-1, 4)
+        walls = np.atleast_2d(np.asarray(walls if np.size(walls) else NO_WALLS, dtype=np.float64))
         out = np.empty(shape, np.float32) if out is None else out
         if poses.shape[1:] != (3,) or bodies.shape != (len(poses), bodies.shape[1], BODY):
             raise ConfigError(
                 f"poses {poses.shape} and bodies {bodies.shape} must be (N, 3) and (N, K, {BODY})."
             )
+        if walls.shape != (len(walls), 4):
+            raise ConfigError(f"walls {walls.shape} must be (W, 4).")
+        self._require_known(bodies[..., SHAPE])
         if out.shape != shape or out.dtype != np.float32:
             raise ConfigError(f"out is {out.shape} {out.dtype}; it must be {shape} float32.")
         worlds = np.arange(len(poses))

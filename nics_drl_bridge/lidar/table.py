@@ -21,6 +21,9 @@ from nics_drl_bridge.lidar.baked_kernels import BLOCK
 from nics_drl_bridge.lidar.shapes import SHAPES, Circle, Outlines, Shape
 
 FORMAT = "nics_drl_bridge/lidar_table/2"
+POINT_ANGLE = 0.01
+"""By default the points of a row are no farther apart, as far as `MOST_PHASES` go [rad]."""
+MOST_PHASES = 8
 
 
 class Density(Schema):
@@ -30,12 +33,18 @@ class Density(Schema):
         distances: grid distances, from the shape's own radius to out of range.
         rotations: grid rotations in a full turn; a shape that looks the same after a part of a
             turn is baked for that part only.
-        phases: points per beam, 1, 2, 4 or 8.
+        phases: points per beam, 1, 2, 4 or 8; see `for_beams`.
     """
 
     distances: int = Field(default=100, ge=3, le=10_000)
     rotations: int = Field(default=240, ge=1, le=100_000)
     phases: int = 1
+
+    @classmethod
+    def for_beams(cls, beam_angle: float) -> Density:
+        """The default for beams so far apart [rad]: few beams need several points each."""
+        wanted = math.ceil(math.log2(max(beam_angle / POINT_ANGLE, 1.0)))
+        return cls(phases=min(2**wanted, MOST_PHASES))
 
     @field_validator("phases")
     @classmethod

@@ -86,6 +86,19 @@ def test_a_table_that_no_index_can_reach_is_refused(density, monkeypatch):
         bake(SPEC, [SQUARE], density.model_copy(update={"distances": 50, "rotations": 40}))
 
 
+def test_the_points_of_a_row_are_near_each_other_whatever_the_beams():
+    def phases(beams):
+        return Density.for_beams(2.0 * np.pi / beams).phases
+
+    assert [phases(beams) for beams in (2048, 720, 360, 180, 90, 36, 1)] == [1, 1, 2, 4, 8, 8, 8]
+    assert bake(lidar(beams=180), [SQUARE]).density.phases == 4
+
+
+def test_a_shape_beyond_all_measure_is_refused():
+    with pytest.raises(ConfigError, match=r"circle of radius 1e.17 m is too large to bake"):
+        bake(SPEC, [Circle(radius=1e17)])
+
+
 def flat(distance):
     """A wide wall across the main axis, and the body that puts it there."""
     wall = Polygon(points=((0.0, -0.4), (0.02, -0.4), (0.02, 0.4), (0.0, 0.4)))

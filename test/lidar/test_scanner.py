@@ -7,6 +7,7 @@ from robots import lidar
 
 from nics_drl_bridge.errors import ConfigError, ModelError
 from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.budget import expected_rmse
 from nics_drl_bridge.lidar.maps_grid import GridMap
 from nics_drl_bridge.lidar.scanner import RENDERERS, Scanner, make_scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle, Polygon, Rectangle, Segment
@@ -303,6 +304,34 @@ def test_the_table_of_another_lidar_is_refused(change):
 def test_arrays_that_do_not_belong_together_are_refused(poses, bodies):
     with pytest.raises(ConfigError, match=r"must be \(N, 3\) and \(N, K, 7\)"):
         make_scanner(lidar(), [SQUARE]).scan(poses, bodies)
+
+
+@pytest.mark.parametrize("walls", [np.zeros(3), np.zeros((2, 2)), np.zeros((1, 1, 4))])
+def test_walls_that_are_not_four_numbers_each_are_refused(walls):
+    with pytest.raises(ConfigError, match=r"walls \(.*\) must be \(W, 4\)"):
+        make_scanner(lidar(), []).scan(HERE, [], walls)
+
+
+@pytest.mark.parametrize("index", [2.0, -1.0, np.nan])
+@pytest.mark.parametrize("renderer", RENDERERS)
+def test_a_body_of_another_scanner_is_refused_before_it_is_looked_for(renderer, index):
+    scanner = make_scanner(lidar(), [SQUARE, STRIP], renderer)
+    bodies = scanner.place([SQUARE], [(1.0, 0.0, 0.0)])
+    bodies[0, -1] = index
+    with pytest.raises(ModelError, match="none of the 2 in the lidar table; make bodies by"):
+        scanner.scan(HERE, bodies)
+
+
+def test_an_unknown_renderer_is_refused_with_the_nearest():
+    with pytest.raises(ConfigError, match="unknown renderer 'backed'; did you mean 'baked'"):
+        make_scanner(lidar(), [SQUARE], "backed")
+
+
+@pytest.mark.parametrize("beams", [1, 7, 36, 360])
+def test_few_beams_are_baked_as_finely_as_many(beams):
+    spec = lidar(beams=beams)
+    coarse = expected_rmse(spec, bake(spec, [STRIP], Density(phases=1)))
+    assert expected_rmse(spec, bake(spec, [STRIP])) < min(0.05, 0.85 * coarse)
 
 
 @pytest.mark.parametrize("out", [np.zeros((2, 72), np.float32), np.zeros((1, 72))])

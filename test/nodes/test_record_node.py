@@ -149,7 +149,7 @@ def test_without_odometry_or_a_listener_it_says_where_it_looked(launch, meet, do
     unheard = FakeRobot(peer)
     peer.node.destroy_subscription(next(iter(peer.node.subscriptions)))
     deaf = launch("record_node", domain_id, out=out)
-    unheard.until(lambda: None not in (code_of(silent), code_of(deaf)), "both end")
+    unheard.until(lambda: None not in (code_of(silent), code_of(deaf)), "both end", 90.0)
     assert (code_of(silent), code_of(deaf)) == (2, 2)
     where = f"(namespace '/bot', ROS domain {domain_id}): nothing arrived within 10 s"
     assert f"topic '/bot/wheel_odom' {where}" in said(silent)
