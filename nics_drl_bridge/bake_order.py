@@ -9,7 +9,7 @@ from pathlib import Path
 
 from nics_drl_bridge.config import validate
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.files import check_above, write_bytes
 from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.budget import choose, expected_rmse, parse_size
@@ -69,6 +69,7 @@ def run(order: BakeOrder, told: Told) -> list[str]:
     """
     if order.out.is_dir():
         raise ConfigError(f"{order.out}: is a folder; give the name of a file.")
+    check_above(order.out)
     if order.budget is not None and order.density:
         raise ConfigError("--budget finds the density; leave out either it or the density.")
     spec, shapes = load_lidar(order.lidar), order.all_shapes()

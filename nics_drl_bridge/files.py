@@ -77,12 +77,21 @@ def check_folder(path: Path, marker: str) -> Path:
         raise ConfigError(
             f"{path}: holds other files and no {marker!r}; give a new folder, or empty this one."
         )
-    above = next(parent for parent in path.parents if parent.exists())
+    check_above(path)
+    return path
+
+
+def check_above(path: Path) -> None:
+    """Makes sure that something can be made at a path, without making anything.
+
+    Raises:
+        ConfigError: it lies where nothing can be written.
+    """
+    above = next(parent for parent in path.resolve().parents if parent.exists())
     if not above.is_dir():
         raise ConfigError(f"{path}: {above} is a file, not a folder; choose another place.")
     if not os.access(above, os.W_OK | os.X_OK):
         raise ConfigError(f"{path}: {above} can't be written to; choose another place.")
-    return path
 
 
 @contextmanager

@@ -82,3 +82,14 @@ def test_a_wrong_file_of_shapes_is_named(shapes, tmp_path, text):
 def test_a_folder_is_not_taken_for_a_file(shapes, tmp_path):
     with pytest.raises(ConfigError, match="is a folder; give the name of a file"):
         run(BakeOrder(shapes=shapes, out=tmp_path), lambda *what: None)
+
+
+def test_a_place_that_can_not_be_written_is_told_before_the_work(shapes, tmp_path):
+    (tmp_path / "file").write_text("")
+    done = []
+    with pytest.raises(ConfigError, match="is a file, not a folder; choose another place"):
+        run(
+            BakeOrder(shapes=shapes, out=tmp_path / "file" / "t.npz"),
+            lambda *what: done.append(what),
+        )
+    assert not done
