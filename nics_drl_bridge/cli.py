@@ -53,7 +53,10 @@ def _one_sentence() -> Iterator[None]:
         place = f"{error.filename}: " if error.filename else ""
         typer.echo(f"nics: {place}{error.strerror or error}; choose another place.", err=True)
         raise typer.Exit(EXIT_BAD_INPUT) from None
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SystemError) as error:
+        # Ctrl-C in a compiled function comes out of it as a SystemError.
+        if not isinstance(error.__cause__ or error, KeyboardInterrupt):
+            raise
         typer.echo("nics: interrupted; everything that was started has ended.", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
