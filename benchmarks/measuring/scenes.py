@@ -60,8 +60,7 @@ def random_batch(
     spec: LidarSpec = SPEC,
     obstacles: int = OBSTACLES,
 ) -> Batch:
-    """Obstacles anywhere on a square field that the lidar's range just spans, the lidar in its
-    middle, none of them nearer than its least range.
+    """Obstacles anywhere within the lidar's range, none of them nearer than its least one.
 
     They may overlap each other, and take turns when there are several shapes.
     """
@@ -71,9 +70,11 @@ def random_batch(
     for k, shape in enumerate(shapes):
         wanting = np.arange(scans)
         while len(wanting):
-            place = rng.uniform(-spec.range_max, spec.range_max, (len(wanting), 2))
-            heading = rng.uniform(-np.pi, np.pi, (len(wanting), 1))
-            poses[wanting, k] = np.concatenate([place, heading], axis=1)
+            far = spec.range_max * np.sqrt(rng.random(len(wanting)))
+            bearing, heading = rng.uniform(-np.pi, np.pi, (2, len(wanting)))
+            poses[wanting, k] = np.stack(
+                [far * np.cos(bearing), far * np.sin(bearing), heading], axis=1
+            )
             wanting = wanting[gap(shape, poses[wanting, k]) <= spec.range_min]
     return Batch(shapes, poses, np.zeros((scans, 3)))
 

@@ -280,7 +280,8 @@ def _incidence(fine: NDArray[np.float32], step: float) -> NDArray[np.float64]:
     """
     slope = np.abs(np.diff(fine.astype(np.float64))) / step
     moves = np.flatnonzero(slope)
-    if len(moves):
-        slope[: moves[0]], slope[moves[-1] + 1 :] = slope[moves[0]], slope[moves[-1]]
+    if len(moves):  # the outermost step ends at the edge, within a point: the next one counts
+        first, last = min(moves[0] + 1, moves[-1]), max(moves[-1] - 1, moves[0])
+        slope[:first], slope[last + 1 :] = slope[first], slope[last]
     both = np.minimum(np.append(slope, np.inf), np.append(np.inf, slope))
     return np.asarray(np.arctan2(both, fine))
