@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool, Trigger
 
+from nics_drl_bridge.calibration.noise_model import Noise
+from nics_drl_bridge.generator import save_model
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.sim.world import load_world
 from nodes.peer import stamp_ns
@@ -253,14 +256,17 @@ def test_the_covariance_of_its_odometry_is_filled_and_grows_on_the_way(lockstep)
     assert (after[1] == before[1]).all()
 
 
-def test_the_true_twist_is_how_the_true_pose_moves(lockstep, model):
-    lockstep.reset(episode_seed=0, episode_start=[0.0, 0.0, 0.0], episode_start_given=True)
-    lockstep.step(0.6)
-    before = conversions.odometry_from_ros(lockstep.said["ground_truth"][-1])[0]
-    lockstep.step(0.6)
-    after, twist = conversions.odometry_from_ros(lockstep.said["ground_truth"][-1])
-    moved = math.dist(after[:2], before[:2])  # and drifted, by what the model does not explain
-    assert twist[0] * model.control_period == pytest.approx(moved, rel=1e-3)
+def test_the_true_twist_is_how_the_true_pose_moves(launch, meet, domain_id, model, tmp_path):
+    save_model(replace(model, noise=Noise()), tmp_path / "still")  # one that does not drift
+    peer = meet(domain_id)
+    launch("simulator_node", domain_id, mode="lockstep", model=str(tmp_path / "still"), **FRAMES)
+    robot = Watched(peer, 0.0)
+    robot.reset(episode_seed=0, episode_start=[0.0, 0.0, 0.0], episode_start_given=True)
+    robot.step(0.6)
+    before = conversions.odometry_from_ros(robot.said["ground_truth"][-1])[0]
+    robot.step(0.6)
+    after, twist = conversions.odometry_from_ros(robot.said["ground_truth"][-1])
+    assert twist[0] * model.control_period == pytest.approx(math.dist(after[:2], before[:2]))
     assert twist[0] > 0.1
 
 
