@@ -83,26 +83,23 @@ def test_straight_only_of_a_differential_robot_names_the_turn_command(differenti
     assert harmless(found, differential)
 
 
-def test_constant_speed_gives_a_model_without_speed_and_says_so(car):
+@pytest.mark.parametrize(
+    ("column", "constant", "name", "advice"),
+    [
+        (0, 0.6, "speed_command", "holds for this drive's constant value only"),
+        (1, -0.4, "steering_command", "drive with steering_command changing over its whole range"),
+    ],
+)
+def test_a_constant_command_gives_a_model_without_it_and_says_so(
+    car, column, constant, name, advice
+):
     commands = random_commands(car)
-    commands[:, 0] = 0.6
-    recording = driven(car, commands)
-    recording = replace(recording, state=None)
-    found = identify(recording, car)
-    assert "speed_command" in found.fit.unmoved
-    assert said(found, "holds for this drive's constant value only")
-    with pytest.raises(FitError, match="speed_command never moved"):
-        identify(recording, car, strict=True)
-
-
-def test_constant_steering_gives_a_model_without_steering_and_says_so(car):
-    commands = random_commands(car)
-    commands[:, 1] = -0.4
+    commands[:, column] = constant
     recording = replace(driven(car, commands), state=None)
     found = identify(recording, car)
-    assert "steering_command" in found.fit.unmoved
-    assert said(found, "drive with steering_command changing over its whole range")
-    with pytest.raises(FitError, match="steering_command never moved"):
+    assert name in found.fit.unmoved
+    assert said(found, advice)
+    with pytest.raises(FitError, match=f"{name} never moved"):
         identify(recording, car, strict=True)
 
 

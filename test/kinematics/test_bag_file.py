@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 
 import numpy as np
 import pytest
@@ -163,28 +163,26 @@ def test_flipped_bytes_never_lose_messages_or_end_in_a_traceback(bag, seed):
         assert len(read.pose.t) == len(bags.poses())
 
 
-def test_messages_that_the_summary_promises_must_be_there(tmp_path):
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        ("DELETE FROM messages WHERE id % 50 = 0", "where the bag's summary promises"),
+        (
+            "UPDATE messages SET timestamp = timestamp + 3600000000000 WHERE id = 77",
+            "outside of the time span",
+        ),
+        (
+            "UPDATE messages SET data = x'0001' WHERE id = 8",
+            "topic '/cmd_vel': message 7 can't be decoded as geometry_msgs/msg/Twist",
+        ),
+    ],
+    ids=["missing", "out_of_time", "garbled"],
+)
+def test_messages_that_do_not_fit_the_bags_summary_are_refused(tmp_path, damage, said):
     bag = bags.write(tmp_path / "bag", bags.drive(), "sqlite3")
-    with sqlite3.connect(storage_file(bag)) as base:
-        base.execute("DELETE FROM messages WHERE id % 50 = 0")
-    base.close()
-    assert "where the bag's summary promises" in refused(bag)
-
-
-def test_messages_outside_of_the_time_span_are_refused(tmp_path):
-    bag = bags.write(tmp_path / "bag", bags.drive(), "sqlite3")
-    with sqlite3.connect(storage_file(bag)) as base:
-        base.execute("UPDATE messages SET timestamp = timestamp + 3600000000000 WHERE id = 77")
-    base.close()
-    assert "outside of the time span" in refused(bag)
-
-
-def test_a_message_that_can_not_be_decoded_is_named(tmp_path):
-    bag = bags.write(tmp_path / "bag", bags.drive(), "sqlite3")
-    with sqlite3.connect(storage_file(bag)) as base:
-        base.execute("UPDATE messages SET data = x'0001' WHERE id = 8")
-    base.close()
-    assert "topic '/cmd_vel': message 7 can't be decoded as geometry_msgs/msg/Twist" in refused(bag)
+    with closing(sqlite3.connect(storage_file(bag))) as base, base:
+        base.execute(damage)
+    assert said in refused(bag)
 
 
 @pytest.mark.parametrize("sign", ["?", "#", "%20"])
