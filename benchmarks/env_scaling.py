@@ -1,0 +1,145 @@
+"""What an env step costs with more worlds, robots, obstacles and beams.
+
+One thread, differential robots, 10 kinematic substeps, observation, reward and autoreset, random
+actions. Unless it is what grows: 256 worlds of one robot, 10 circles on 8 x 8 m, 720 beams.
+Robots and obstacles get a field that grows with them, so that as many as before are in range;
+what then grows faster than their number is the search for them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measuring.fields import field, side_of
+from measuring.rates import interleaved, medians
+
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.generator import open_model
+from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.sim.world import World
+
+MODEL = open_model("differential")
+WORLDS, OBSTACLES, SIDE, BEAMS = 256, 10, 8.0, 720
+SWEEPS: dict[str, tuple[int, ...]] = {
+    "worlds": (1, 4, 16, 64, 256, 1024, 4096, 16384),
+    "robots": (1, 2, 4, 8, 16, 32, 64),
+    "obstacles": (1, 4, 16, 64, 256),
+    "beams": (36, 90, 180, 360, 720, 1440, 2048),
+}
+AREA_PER_ROBOT, AREA_PER_OBSTACLE = 12.0, 4.0
+"""[m^2]"""
+ROBOT_STEPS = 256
+"""Robots of all worlds together while their number in each grows."""
+
+
+def environment(worlds: int, robots: int, world: World, beams: int) -> BridgeVectorEnv:
+    """Worlds of robots that have to reach goals."""
+    model = MODEL
+    if beams != model.lidar.beams:
+        lidar = model.lidar.model_copy(update={"beams": beams})
+        lidar = type(lidar).model_validate(lidar.model_dump())
+        model = replace(model, lidar=lidar, table=bake(lidar, model.table.shapes))
+    task = "navigation" if robots == 1 else "cooperative_reaching"
+    options = None if robots == 1 else {"robots": robots}
+    return BridgeVectorEnv(
+        worlds, model, world, task=task, task_options=options, copy=False, max_episode_steps=300
+    )
+
+
+def sweep(name: str, value: int) -> BridgeVectorEnv:
+    """The environment of one point of a curve."""
+    world = field(OBSTACLES, SIDE)
+    if name == "worlds":
+        return environment(value, 1, world, BEAMS)
+    if name == "robots":
+        side = max(SIDE, side_of(value, AREA_PER_ROBOT))
+        return environment(max(1, ROBOT_STEPS // value), value, field(OBSTACLES, side), BEAMS)
+    if name == "obstacles":
+        return environment(
+            WORLDS, 1, field(value, max(SIDE, side_of(value, AREA_PER_OBSTACLE))), BEAMS
+        )
+    return environment(WORLDS, 1, world, value)
+
+
+def stepper(env: BridgeVectorEnv) -> Callable[[], None]:
+    """A call that steps an environment once, by the same random actions again and again."""
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(16)]
+    count = [0]
+
+    def step() -> None:
+        env.step(actions[count[0] % len(actions)])
+        count[0] += 1
+
+    return step
+
+
+def measure(name: str, repeats: int) -> tuple[list[int], list[float]]:
+    """The values of a curve, and the cost of an env step at each [us]."""
+    costs = []
+    for value in SWEEPS[name]:
+        env = sweep(name, value)
+        seconds = medians(interleaved({value: stepper(env)}, max(5, repeats // env.num_envs)))
+        costs.append(1e6 * seconds[value] / env.num_envs)
+        env.close()
+    return list(SWEEPS[name]), costs
+
+
+def run(repeats: int) -> dict[str, Any]:
+    """All curves: `NAME` and `NAME_us`; of robots also the cost per robot."""
+    result: dict[str, Any] = {}
+    for name in SWEEPS:
+        result[name], result[f"{name}_us"] = measure(name, repeats)
+    per_robot = np.array(result["robots_us"]) / np.array(result["robots"])
+    result["robots_us_per_robot"] = per_robot.tolist()
+    return result
+
+
+def draw(result: dict[str, Any], file: Path) -> None:
+    """The curves side by side, on logarithmic axes."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 3.2), layout="constrained")
+    for axes, name in zip(figure.subplots(1, len(SWEEPS)), SWEEPS, strict=True):
+        costs = result["robots_us_per_robot" if name == "robots" else f"{name}_us"]
+        axes.loglog(result[name], costs, "o-")
+        axes.set_xlabel(name)
+        axes.set_ylabel("us per robot and step" if name == "robots" else "us per env step")
+        axes.grid(visible=True, which="both", alpha=0.3)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=100)
+
+
+def table_of(result: dict[str, Any]) -> str:
+    """One line per point."""
+    text = f"{'':<11}{'':>8}{'us per env step':>17}{'per robot':>12}\n"
+    for name in SWEEPS:
+        for k, (value, cost) in enumerate(zip(result[name], result[f"{name}_us"], strict=True)):
+            one = f"{result['robots_us_per_robot'][k]:>12.2f}" if name == "robots" else ""
+            text += f"{name:<11}{value:>8}{cost:>17.2f}{one}\n"
+    return text
+
+
+def main() -> None:
+    """Prints a table, or one JSON object; draws the curves if a file is named."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--repeats", type=int, default=20_000, help="env steps of each point")
+    parser.add_argument("--picture", type=Path, help="draw the curves into this file")
+    given = parser.parse_args()
+    result = run(given.repeats)
+    if given.picture:
+        draw(result, given.picture)
+    sys.stdout.write(json.dumps(result) + "\n" if given.json else table_of(result))
+
+
+if __name__ == "__main__":
+    main()

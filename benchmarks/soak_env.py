@@ -1,0 +1,138 @@
+"""Millions of steps in a row: does memory grow, does a NaN appear, does a world get stuck?
+
+Worlds of every kind (still and moving obstacles, maps, teams, domain randomisation) take turns;
+each is stepped by random actions, with autoreset.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+
+PAGE = 4096
+LIMIT = 300
+WORLDS = 256
+CASES: dict[str, dict[str, Any]] = {
+    "arena": {"model": "differential", "world": "arena"},
+    "arena, same step": {"model": "ackermann", "autoreset_mode": "SameStep"},
+    "room": {"model": "mecanum", "world": "room"},
+    "crowd": {"model": "differential", "world": "crowd"},
+    "randomised": {"model": "differential", "world": "clutter", "randomisation": "strong"},
+    "team": {"model": "differential", "world": "arena", "task": "cooperative_reaching"},
+}
+"""Arguments of `BridgeVectorEnv`."""
+
+
+@dataclass
+class Findings:
+    """What was seen in one case.
+
+    Attributes:
+        steps: env steps that were made.
+        nans: numbers that are not finite, in observations, rewards and true poses.
+        episodes: how many ended.
+        longest: steps of the longest episode; beyond the limit a world is stuck.
+        still: most steps in a row in which a free robot that was told to move did not.
+    """
+
+    steps: int = 0
+    nans: int = 0
+    episodes: int = 0
+    longest: int = 0
+    still: int = 0
+
+
+def resident_mb() -> float:
+    """Memory of this process that is resident [MB]."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE / 1e6
+
+
+def not_finite(*arrays: NDArray[Any]) -> int:
+    """How many numbers are not finite."""
+    return sum(int(np.count_nonzero(~np.isfinite(array))) for array in arrays)
+
+
+def soak(env: BridgeVectorEnv, steps: int, found: Findings, rng: np.random.Generator) -> None:
+    """Steps an environment that has been reset."""
+    data = env.simulator.data
+    length = np.zeros(env.num_envs, np.int64)
+    still = np.zeros(data.collided.shape, np.int64)
+    shape, kind = env.action_space.shape, env.action_space.dtype
+    for _ in range(max(1, steps // env.num_envs)):
+        before = data.pose.copy()
+        actions = rng.uniform(-1.0, 1.0, shape).astype(kind)
+        seen, reward, terminated, truncated, _ = env.step(actions)
+        found.nans += not_finite(seen, reward, data.pose, data.odom)
+        length += 1
+        over = terminated | truncated
+        found.episodes += int(over.sum())
+        found.longest = max(found.longest, int(length.max()))
+        length[over] = 0
+        moved = (data.pose != before).any(axis=-1) | (data.collided != 0) | env.ended
+        still = np.where(moved | over[:, None], 0, still + 1)
+        found.still = max(found.still, int(still.max()))
+        found.steps += env.num_envs
+
+
+def run(steps: int, seed: int) -> dict[str, Any]:
+    """All cases in turn, the first round to warm up and for the memory to settle."""
+    environments = {name: BridgeVectorEnv(WORLDS, **case) for name, case in CASES.items()}
+    found = {name: Findings() for name in CASES}
+    rng = np.random.default_rng(seed)
+    for k, env in enumerate(environments.values()):
+        env.reset(seed=seed + 1000 * k)
+    rounds, begin = 20, time.perf_counter()
+    memory = []
+    for _ in range(rounds):
+        for name, env in environments.items():
+            soak(env, steps // (rounds * len(CASES)), found[name], rng)
+        memory.append(resident_mb())
+    stuck = sum(one.longest > LIMIT + 1 or one.still > LIMIT for one in found.values())
+    return {
+        "steps": sum(one.steps for one in found.values()),
+        "seconds": time.perf_counter() - begin,
+        "rss_start_mb": memory[1],
+        "rss_end_mb": memory[-1],
+        "rss_growth_mb": memory[-1] - memory[1],
+        "nans": sum(one.nans for one in found.values()),
+        "stuck_worlds": stuck,
+        "episodes": sum(one.episodes for one in found.values()),
+        "cases": {name: vars(one) for name, one in found.items()},
+    }
+
+
+def table_of(result: dict[str, Any]) -> str:
+    """One line per case, and the sum."""
+    text = f"{'case':<18}{'steps':>12}{'episodes':>10}{'longest':>9}{'still':>7}{'NaN':>5}\n"
+    for name, one in result["cases"].items():
+        text += f"{name:<18}{one['steps']:>12}{one['episodes']:>10}{one['longest']:>9}"
+        text += f"{one['still']:>7}{one['nans']:>5}\n"
+    return text + (
+        f"{result['steps']} steps in {result['seconds']:.0f} s; memory grew by "
+        f"{result['rss_growth_mb']:.1f} MB to {result['rss_end_mb']:.0f} MB\n"
+    )
+
+
+def main() -> None:
+    """Prints a table, or one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--steps", type=int, default=20_000_000, help="env steps in all")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    result = run(given.steps, given.seed)
+    sys.stdout.write(json.dumps(result) + "\n" if given.json else table_of(result))
+
+
+if __name__ == "__main__":
+    main()
