@@ -105,7 +105,7 @@ class Pedestrian(Schema):
     range: float = Field(default=0.3, gt=0.0)
     wall_repulsion: float = Field(default=10.0, ge=0.0)
     wall_range: float = Field(default=0.2, gt=0.0)
-    foresight: float = Field(default=2.0, ge=0.0)
+    foresight: float = Field(default=0.4, ge=0.0)
     view: float = Field(default=math.radians(200.0), ge=0.0, le=2.0 * math.pi)
     behind: float = Field(default=0.5, ge=0.0, le=1.0)
     fluctuation: float = Field(default=0.1, ge=0.0)

@@ -18,7 +18,7 @@ from nics_drl_bridge.sim.separation_kernels import clearance, map_direction, map
 
 NEAREST = 1e-3
 """Least distance that a force is computed for [m]: at 0 it has no direction."""
-FAR = 10.0
+FAR = 8.0
 """Beyond so many ranges a force is nothing."""
 STRONGEST = 5.0
 """Greatest acceleration [m/s^2]: people do no more, and the model's grows without bound."""
@@ -49,9 +49,11 @@ def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-un
     """
     sx, sy = vx * foresight, vy * foresight
     qx, qy = rx - sx, ry - sy
-    one, two = math.hypot(rx, ry), max(math.hypot(qx, qy), NEAREST)
+    one, two = math.sqrt(rx * rx + ry * ry), max(math.sqrt(qx * qx + qy * qy), NEAREST)
     both = one + two
     b = 0.5 * math.sqrt(max(both * both - sx * sx - sy * sy, NEAREST * NEAREST))
+    if b > FAR * reach:
+        return 0.0, 0.0
     size = strength / reach * math.exp(-b / reach) * both / (4.0 * b)
     return size * (rx / one + qx / two), size * (ry / one + qy / two)
 
@@ -59,7 +61,7 @@ def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-un
 @njit(cache=True)
 def _sight(ex, ey, fx, fy, row):  # type: ignore[no-untyped-def]
     """The weight (8) of a force on a walker that looks along e: 1, or less from behind."""
-    seen = -(ex * fx + ey * fy) >= row[at.VIEW] * math.hypot(fx, fy)
+    seen = -(ex * fx + ey * fy) >= row[at.VIEW] * math.sqrt(fx * fx + fy * fy)
     return 1.0 if seen else row[at.BEHIND]
 
 
@@ -76,7 +78,7 @@ def _from_bodies(k, ex, ey, bodies, marks, first, speeds, row):  # type: ignore[
         else:
             vx, vy = speeds[j - first, 0], speeds[j - first, 1]
         near = bodies[k, 5] + bodies[j, 5]
-        far = near + FAR * row[at.RANGE] + math.hypot(vx, vy) * row[at.FORESIGHT]
+        far = near + FAR * row[at.RANGE] + math.sqrt(vx * vx + vy * vy) * row[at.FORESIGHT]
         away2 = rx * rx + ry * ry
         if away2 > far * far or away2 == 0.0:
             continue
@@ -94,14 +96,17 @@ def _from_bodies(k, ex, ey, bodies, marks, first, speeds, row):  # type: ignore[
 def _from_walls(x, y, radius, walls, distances, row):  # type: ignore[no-untyped-def]
     """The forces (5) of the nearest point of each wall, and of the static map."""
     ax, ay, reach = 0.0, 0.0, row[at.WALL_RANGE]
+    far = radius + FAR * reach
     for w in range(walls.shape[0]):
         px, py = on_wall(x, y, walls[w])
-        away = math.hypot(x - px, y - py)
-        if 0.0 < away < radius + FAR * reach:
+        ox, oy = x - px, y - py
+        away2 = ox * ox + oy * oy
+        if 0.0 < away2 < far * far:
+            away = math.sqrt(away2)
             size = row[at.WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
-            ax, ay = ax + size * (x - px) / away, ay + size * (y - py) / away
+            ax, ay = ax + size * ox / away, ay + size * oy / away
     away = map_distance(x, y, distances)
-    if away < radius + FAR * reach:
+    if away < far:
         nx, ny = map_direction(x, y, distances)
         size = row[at.WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
         ax, ay = ax - size * nx, ay - size * ny

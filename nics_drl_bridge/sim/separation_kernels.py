@@ -80,9 +80,11 @@ def clearance(x, y, k, scene):  # type: ignore[no-untyped-def]
         least, nx, ny = half[1] - abs(y), 0.0, math.copysign(1.0, y)
     for w in range(walls.shape[0]):
         px, py = on_wall(x, y, walls[w])
-        away = math.hypot(px - x, py - y)
-        if away < least and away > 0.0:
-            least, nx, ny = away, (px - x) / away, (py - y) / away
+        ox, oy = px - x, py - y
+        away2 = ox * ox + oy * oy
+        if least > 0.0 and 0.0 < away2 < least * least:
+            least = math.sqrt(away2)
+            nx, ny = ox / least, oy / least
     for j in range(bodies.shape[0]):
         if j != k and bodies[j, 5] > 0.0:
             ox, oy, reach = bodies[j, 0] - x, bodies[j, 1] - y, least + bodies[j, 5]
@@ -116,14 +118,15 @@ def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
 def _hold_bodies(dx, dy, k, bodies, first, speeds, rows, period, bend):  # type: ignore[no-untyped-def]
     """Holds the displacement of body k within the room that the other bodies leave it."""
     x, y, radius = bodies[k, 0], bodies[k, 1], bodies[k, 5]
-    length = math.hypot(dx, dy)
+    length = math.sqrt(dx * dx + dy * dy)
     for j in range(bodies.shape[0]):
         if j == k or bodies[j, 5] <= 0.0:
             continue
         ox, oy, near = bodies[j, 0] - x, bodies[j, 1] - y, radius + bodies[j, 5]
         step = 0.0
         if j >= first:
-            step = math.hypot(speeds[j - first, 0], speeds[j - first, 1]) * period
+            vx, vy = speeds[j - first, 0], speeds[j - first, 1]
+            step = math.sqrt(vx * vx + vy * vy) * period
         reach = near + 2.0 * (length + SLACK) + step
         away2 = ox * ox + oy * oy
         if away2 >= reach * reach or away2 == 0.0:
@@ -142,22 +145,24 @@ def _hold_bodies(dx, dy, k, bodies, first, speeds, rows, period, bend):  # type:
 @njit(cache=True)
 def _hold_walls(dx, dy, x, y, radius, walls, half, bend):  # type: ignore[no-untyped-def]
     """Holds a displacement within the field and on this side of its walls."""
+    reach = radius + math.sqrt(dx * dx + dy * dy) + 2.0 * SLACK
     for side in (-1.0, 1.0):
         dx, dy = _hold(dx, dy, side, 0.0, half[0] - radius - side * x, bend)
         dx, dy = _hold(dx, dy, 0.0, side, half[1] - radius - side * y, bend)
     for w in range(walls.shape[0]):
         px, py = on_wall(x, y, walls[w])
-        away = math.hypot(px - x, py - y)
-        if away > 0.0:
-            nx, ny = (px - x) / away, (py - y) / away
-            dx, dy = _hold(dx, dy, nx, ny, away - radius, bend)
+        ox, oy = px - x, py - y
+        away2 = ox * ox + oy * oy
+        if 0.0 < away2 < reach * reach:
+            away = math.sqrt(away2)
+            dx, dy = _hold(dx, dy, ox / away, oy / away, away - radius, bend)
     return dx, dy
 
 
 @njit(cache=True)
 def _hold_map(dx, dy, x, y, radius, distances, bend):  # type: ignore[no-untyped-def]
     """Holds a displacement clear of the static map."""
-    length = math.hypot(dx, dy)
+    length = math.sqrt(dx * dx + dy * dy)
     here = map_distance(x, y, distances) - radius
     if here - SLACK > length or length == 0.0:
         return dx, dy
