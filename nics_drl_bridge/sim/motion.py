@@ -79,10 +79,11 @@ class Patrol(Schema):
 class Pedestrian(Schema):
     """Walks to random goals, by the social force model of Helbing and Molnar (1995).
 
-    The defaults are those of "Social force model for pedestrian dynamics", Phys. Rev. E 51, and
-    its names: the speeds are the mean of 1.34 m/s and one standard deviation, 0.26 m/s, around it.
-    Distances are between the surfaces of the discs, as in Helbing, Farkas and Vicsek (2000), for
-    obstacles and robots are of any size.
+    The symbols and defaults are those of "Social force model for pedestrian dynamics", Phys. Rev.
+    E 51, 4282, but for two things. The ellipses of the repulsion follow the relative velocity, as
+    in Johansson, Helbing and Shukla (2007), and distances are between the surfaces of the discs,
+    as in Helbing, Farkas and Vicsek (2000). The speeds are the paper's 1.34 m/s and one standard
+    deviation, 0.26 m/s, to both sides.
 
     Attributes:
         speed: least and greatest desired speed; one is drawn for an episode, and the walker is
@@ -92,7 +93,7 @@ class Pedestrian(Schema):
         range: sigma of it [m].
         wall_repulsion: U0 of walls [m^2/s^2].
         wall_range: R of it [m].
-        foresight: delta t, by which the steps of others are thought ahead [s].
+        foresight: delta t, by which the others' motion is thought ahead [s].
         view: 2 phi, the angle of sight [rad].
         behind: c, how much counts what is out of sight.
         fluctuation: standard deviation of a random acceleration [m/s^2].
@@ -105,7 +106,7 @@ class Pedestrian(Schema):
     range: float = Field(default=0.3, gt=0.0)
     wall_repulsion: float = Field(default=10.0, ge=0.0)
     wall_range: float = Field(default=0.2, gt=0.0)
-    foresight: float = Field(default=0.4, ge=0.0)
+    foresight: float = Field(default=1.0, ge=0.0)
     view: float = Field(default=math.radians(200.0), ge=0.0, le=2.0 * math.pi)
     behind: float = Field(default=0.5, ge=0.0, le=1.0)
     fluctuation: float = Field(default=0.1, ge=0.0)

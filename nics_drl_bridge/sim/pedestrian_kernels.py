@@ -3,7 +3,9 @@
 "Social force model for pedestrian dynamics", Phys. Rev. E 51, 4282; the numbers of equations are
 theirs. A walker is driven towards its goal (2), repelled by others along ellipses that think
 their next step ahead (3, 4) and by walls (5), less by what is out of sight (8), and disturbed by
-a fluctuation. Bodies are discs of any size, so distances are between surfaces.
+a fluctuation. Bodies are discs of any size, so distances are between surfaces. The step that is
+thought ahead is that of the relative motion (Johansson, Helbing, Shukla 2007): with the other's
+alone, a walker sees a robot that stands in its way too late, and pushes against it.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-un
 
     Args:
         rx, ry: from the other to this one [m], not zero.
-        vx, vy: velocity of the other [m/s].
+        vx, vy: velocity of the other, relative to this one [m/s].
         foresight: dt [s].
         strength: V0 [m^2/s^2].
         reach: sigma [m].
@@ -77,6 +79,7 @@ def _from_bodies(k, ex, ey, bodies, marks, first, speeds, row):  # type: ignore[
             vx, vy = marks[j, at.VX], marks[j, at.VY]
         else:
             vx, vy = speeds[j - first, 0], speeds[j - first, 1]
+        vx, vy = vx - marks[k, at.VX], vy - marks[k, at.VY]
         near = bodies[k, 5] + bodies[j, 5]
         far = near + FAR * row[at.RANGE] + math.sqrt(vx * vx + vy * vy) * row[at.FORESIGHT]
         away2 = rx * rx + ry * ry

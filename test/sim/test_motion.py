@@ -142,7 +142,7 @@ def test_a_patrol_waits_while_a_robot_stands_in_its_way():
     assert np.ptp(seen.places[60:100, 0], axis=0).max() < 1e-3
     assert -0.39 < seen.places[100, 0, 0] < -0.34
     assert (seen.places[:, 0, 1] == 0.0).all()
-    assert seen.places[-1, 0, 0] > 1.5
+    assert seen.places[:, 0, 0].max() > 1.95  # it got to the other end after all
     assert seen.gaps([0.2, 0.2]).min() > -TOUCH
 
 
@@ -170,7 +170,7 @@ def test_walkers_reach_their_goals_and_keep_apart(seed):
     new, reached = np.sum([arrivals(seen, k) for k in range(count)], axis=0)
     assert reached > 0.9 * new
     assert reached > 100  # in 1000 s of walking, some 4 m each
-    assert (seen.gaps(radii).min(axis=1) < 0.05).mean() < 0.01
+    assert (seen.gaps(radii).min(axis=1) < 0.05).mean() < 0.001
     assert seen.speeds.mean() > 0.8
 
 
@@ -184,7 +184,7 @@ def test_a_walker_goes_around_a_robot_that_stands_in_the_way(aside):
         marks[0, [at.GOAL_X, at.GOAL_Y, at.UNTIL]] = 4.0, 0.0, 1e9
         track = walk_on(marks, places, [0.25, 0.25], half, seed)
         away = np.linalg.norm(track - places[1], axis=1)
-        assert away.min() > 0.55
+        assert away.min() > 0.65  # the radii are half a metre together
         assert np.linalg.norm(track - (4.0, 0.0), axis=1).min() < 0.35
 
 
