@@ -26,6 +26,8 @@ PASSES = 3
 """A displacement is bent so often before what remains too much is shortened."""
 FINEST = 0.25
 """Least step along a way through a static map, in cells."""
+HALVINGS = 8
+"""The last step of it is halved so often to find where the way ends."""
 
 
 @njit(cache=True)
@@ -161,7 +163,7 @@ def _hold_walls(dx, dy, x, y, radius, walls, half, bend):  # type: ignore[no-unt
 
 @njit(cache=True)
 def _hold_map(dx, dy, x, y, radius, distances, bend):  # type: ignore[no-untyped-def]
-    """Holds a displacement clear of the static map."""
+    """Holds a displacement clear of the static map; it walks ahead by the room that it finds."""
     length = math.sqrt(dx * dx + dy * dy)
     here = map_distance(x, y, distances) - radius
     if here - SLACK > length or length == 0.0:
@@ -172,15 +174,20 @@ def _hold_map(dx, dy, x, y, radius, distances, bend):  # type: ignore[no-untyped
     if here <= SLACK and dx * nx + dy * ny <= 0.0 and nx * nx + ny * ny > 0.0:
         # It touches the map; it may go where there is more room.
         return (dx, dy) if map_distance(x + dx, y + dy, distances) - radius >= here else (0.0, 0.0)
-    free, way, finest = 0.0, 0.0, FINEST * distances[1][4]
-    while way < length:
-        way = min(way + max(map_distance(
-            x + dx * way / length, y + dy * way / length, distances
-        ) - radius, finest), length)  # fmt: skip
-        share = way / length
-        if map_distance(x + dx * share, y + dy * share, distances) - radius < SLACK:
+    free, way, finest = 0.0, 0.0, FINEST * distances[1][4] / length
+    room = here
+    while way < 1.0:
+        way = min(way + max(room / length, finest), 1.0)
+        room = map_distance(x + dx * way, y + dy * way, distances) - radius
+        if room < SLACK:
             break
-        free = share
+        free = way
+    for _ in range(HALVINGS if free < way else 0):
+        middle = 0.5 * (free + way)
+        if map_distance(x + dx * middle, y + dy * middle, distances) - radius < SLACK:
+            way = middle
+        else:
+            free = middle
     return dx * free, dy * free
 
 

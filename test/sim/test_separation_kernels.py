@@ -89,6 +89,37 @@ def test_one_bends_along_a_wall_where_the_other_stops():
     assert np.abs(restrain(0.05, 0.05, 0, scene, 1, nobody, rows, PERIOD, False)).max() < 1e-12
 
 
+@pytest.mark.parametrize("bends", [True, False])
+def test_a_field_without_walls_holds_them_too(bends):
+    rng, rows, nobody = np.random.default_rng(0), plans([at.WANDER]), np.zeros((0, 2))
+    _, bodies = crowd(0, count=1, robots=0)
+    bodies[0, 5], reached = 0.1, np.zeros(2)
+    for _ in range(300):
+        bodies[0, :2] = rng.uniform(-1.0, 1.0, 2) * (HALF - 0.1)
+        scene = (bodies, WALLS[:0], HALF, NO_DISTANCES)
+        moved = restrain(*rng.normal(0.0, 1.0, 2), 0, scene, 1, nobody, rows, PERIOD, bends)
+        reached = np.maximum(reached, np.abs(bodies[0, :2] + moved))
+    assert (reached <= HALF - 0.1 + TOUCH).all()
+    assert (reached > HALF - 0.11).all()
+
+
+@pytest.mark.parametrize("bends", [True, False])
+@pytest.mark.parametrize("way", [0.05, 0.3, 2.0])
+def test_nobody_jumps_through_a_thin_wall_of_a_map(bends, way):
+    cells = np.zeros((60, 60), np.int8)
+    cells[:, 40] = 100  # 5 cm thick, from x = 0.5 m
+    _, bodies = crowd(0, count=1, robots=0)
+    bodies[0, :2], bodies[0, 5] = 0.0, 0.2
+    thin = distance_arrays(GridMap(cells, 0.05, (-1.5, -1.5, 0.0)))
+    scene = (bodies, WALLS[:0], np.full(2, 5.0), thin)
+    rows, nobody = plans([at.WANDER]), np.zeros((0, 2))
+    for _ in range(20):
+        moved = restrain(way, 0.0, 0, scene, 1, nobody, rows, PERIOD, bends)
+        bodies[0, :2] += moved
+    assert 0.28 < bodies[0, 0] < 0.3 + 1e-3
+    assert restrain(-0.1, 0.0, 0, scene, 1, nobody, rows, PERIOD, bends) == (-0.1, 0.0)
+
+
 def test_what_overlaps_already_may_leave_but_get_no_deeper():
     _, bodies = crowd(0, count=2, robots=0)
     bodies[:, :2], bodies[:, 5] = [(0.0, 0.0), (0.15, 0.0)], 0.1
