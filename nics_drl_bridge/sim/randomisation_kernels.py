@@ -1,0 +1,60 @@
+"""Compiled draws of domain randomisation, each fixed by seed, robot and place alone.
+
+Shared arguments: `seeds` (n,) of the episodes; `group` is what the numbers are for, one of the
+constants below. A place whose bounds are equal takes that value and draws nothing, and a group
+never shifts the draws of another.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from nics_drl_bridge import random_kernels as random
+
+KINEMATICS, LATENCY, ODOMETRY, LIDAR, CHOICES, OBSTACLES = range(6)
+PLACES = 1 << 20
+"""More than a group has places; the counters of two groups never meet."""
+GROUPS = 8
+
+
+@njit(cache=True)
+def _share(seed, robot, group, place):  # type: ignore[no-untyped-def]
+    """The draw in [0, 1) of one place."""
+    counter = (robot * GROUPS + group) * PLACES + place
+    return random.uniform(seed, random.RANDOMISATION_STREAM, counter)
+
+
+@njit(cache=True, nogil=True)
+def draw_between(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
+    """Fills out (n, M, Q) evenly between low (Q,) and high (Q,)."""
+    for n in range(out.shape[0]):
+        for m in range(out.shape[1]):
+            for q in range(out.shape[2]):
+                value = low[q]
+                if high[q] != value:
+                    value += _share(seeds[n], m, group, q) * (high[q] - value)
+                out[n, m, q] = value
+
+
+@njit(cache=True, nogil=True)
+def draw_whole(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
+    """Fills out (n, M, Q) with whole numbers: evenly between low and high, cut down."""
+    for n in range(out.shape[0]):
+        for m in range(out.shape[1]):
+            for q in range(out.shape[2]):
+                value = low[q]
+                if high[q] != value:
+                    value += _share(seeds[n], m, group, q) * (high[q] - value)
+                out[n, m, q] = np.int64(math.floor(value))
+
+
+@njit(cache=True, nogil=True)
+def draw_choice(out, column, values, seeds):  # type: ignore[no-untyped-def]
+    """Fills one column of out (n, M, P) with one of the values (V,), each as likely."""
+    for n in range(out.shape[0]):
+        for m in range(out.shape[1]):
+            share = _share(seeds[n], m, CHOICES, column)
+            out[n, m, column] = values[int(share * values.shape[0])]

@@ -1,0 +1,217 @@
+"""Compiled separation: a round obstacle moves no further than the room that it has.
+
+Around every obstacle each wall, body and side of the field leaves a half plane: along the unit
+vector to its nearest point there is so much `room`. Two that both move may take half of the gap
+each, so that they need not know of each other's step (buffered Voronoi cells; Zhou, Wang,
+Bandyopadhyay, Schwager 2017). A displacement within all half planes touches nothing, at no time
+of the period.
+
+Shared arguments, all of one world: `bodies` (K + M, 7), see `lidar.shapes.BODY`, robots from index
+`first`; `walls` (W, 4); `half` (2,) half the size of the field [m]; `distances` see
+`motion.distance_arrays`; `scene` is (bodies, walls, half, distances).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from nics_drl_bridge.sim import motion_layout as at
+
+SLACK = 1e-6
+"""Room that is never used, in metres: rounding must not make two bodies touch."""
+PASSES = 3
+"""A displacement is bent so often before what remains too much is shortened."""
+FINEST = 0.25
+"""Least step along a way through a static map, in cells."""
+HALVINGS = 8
+"""The last step of it is halved so often to find where the way ends."""
+
+
+@njit(cache=True)
+def on_wall(x, y, wall):  # type: ignore[no-untyped-def]
+    """The point of a straight wall (4,) that is nearest to a point."""
+    ex, ey = wall[2] - wall[0], wall[3] - wall[1]
+    length2 = ex * ex + ey * ey
+    share = 0.0
+    if length2 > 0.0:
+        share = min(max(((x - wall[0]) * ex + (y - wall[1]) * ey) / length2, 0.0), 1.0)
+    return wall[0] + share * ex, wall[1] + share * ey
+
+
+@njit(cache=True)
+def map_distance(x, y, distances):  # type: ignore[no-untyped-def]
+    """Distance from a point to the static map [m], between the centres of cells bilinearly."""
+    grid, frame = distances
+    rows, columns = grid.shape
+    if rows < 2 or columns < 2:
+        return np.inf
+    dx, dy = x - frame[0], y - frame[1]
+    u = (frame[2] * dx + frame[3] * dy) / frame[4] - 0.5
+    v = (frame[2] * dy - frame[3] * dx) / frame[4] - 0.5
+    u, v = min(max(u, 0.0), columns - 1.0), min(max(v, 0.0), rows - 1.0)
+    j, i = min(int(u), columns - 2), min(int(v), rows - 2)
+    if grid[i, j] == np.inf:
+        return np.inf
+    u, v = u - j, v - i
+    low = grid[i, j] * (1.0 - u) + grid[i, j + 1] * u
+    high = grid[i + 1, j] * (1.0 - u) + grid[i + 1, j + 1] * u
+    return low * (1.0 - v) + high * v
+
+
+@njit(cache=True)
+def map_direction(x, y, distances):  # type: ignore[no-untyped-def]
+    """Unit vector to the nearest point of the static map; zero where there is none."""
+    step = 0.5 * distances[1][4]
+    gx = map_distance(x - step, y, distances) - map_distance(x + step, y, distances)
+    gy = map_distance(x, y - step, distances) - map_distance(x, y + step, distances)
+    length = math.hypot(gx, gy)
+    if not 0.0 < length < np.inf:
+        return 0.0, 0.0
+    return gx / length, gy / length
+
+
+@njit(cache=True)
+def clearance(x, y, k, scene):  # type: ignore[no-untyped-def]
+    """Distance from a point to the nearest thing but body k, and the unit vector to it."""
+    bodies, walls, half, distances = scene
+    least, nx, ny = half[0] - abs(x), math.copysign(1.0, x), 0.0
+    if half[1] - abs(y) < least:
+        least, nx, ny = half[1] - abs(y), 0.0, math.copysign(1.0, y)
+    for w in range(walls.shape[0]):
+        px, py = on_wall(x, y, walls[w])
+        ox, oy = px - x, py - y
+        away2 = ox * ox + oy * oy
+        if least > 0.0 and 0.0 < away2 < least * least:
+            least = math.sqrt(away2)
+            nx, ny = ox / least, oy / least
+    for j in range(bodies.shape[0]):
+        if j != k and bodies[j, 5] > 0.0:
+            ox, oy, reach = bodies[j, 0] - x, bodies[j, 1] - y, least + bodies[j, 5]
+            away2 = ox * ox + oy * oy
+            if reach > 0.0 and 0.0 < away2 < reach * reach:
+                away = math.sqrt(away2)
+                least, nx, ny = away - bodies[j, 5], ox / away, oy / away
+    away = map_distance(x, y, distances)
+    if away < least:
+        nx, ny = map_direction(x, y, distances)
+        least = away
+    return least, nx, ny
+
+
+@njit(cache=True)
+def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
+    """A displacement that leads no further than `room` along n.
+
+    What is too much is cut off (`bend`), or the whole is shortened.
+    """
+    ahead = dx * nx + dy * ny
+    room = max(room - SLACK, 0.0)
+    if ahead <= room:
+        return dx, dy
+    if bend:
+        return dx - (ahead - room) * nx, dy - (ahead - room) * ny
+    return dx * (room / ahead), dy * (room / ahead)
+
+
+@njit(cache=True)
+def _hold_bodies(dx, dy, k, bodies, first, speeds, rows, period, bend):  # type: ignore[no-untyped-def]
+    """Holds the displacement of body k within the room that the other bodies leave it."""
+    x, y, radius = bodies[k, 0], bodies[k, 1], bodies[k, 5]
+    length = math.sqrt(dx * dx + dy * dy)
+    for j in range(bodies.shape[0]):
+        if j == k or bodies[j, 5] <= 0.0:
+            continue
+        ox, oy, near = bodies[j, 0] - x, bodies[j, 1] - y, radius + bodies[j, 5]
+        step = 0.0
+        if j >= first:
+            vx, vy = speeds[j - first, 0], speeds[j - first, 1]
+            step = math.sqrt(vx * vx + vy * vy) * period
+        reach = near + 2.0 * (length + SLACK) + step
+        away2 = ox * ox + oy * oy
+        if away2 >= reach * reach or away2 == 0.0:
+            continue
+        away = math.sqrt(away2)
+        nx, ny, room = ox / away, oy / away, away - near
+        if j >= first:
+            towards = speeds[j - first, 0] * nx + speeds[j - first, 1] * ny
+            room += min(towards, 0.0) * period
+        elif rows[j, at.KIND] != at.STILL:
+            room *= 0.5
+        dx, dy = _hold(dx, dy, nx, ny, room, bend)
+    return dx, dy
+
+
+@njit(cache=True)
+def _hold_walls(dx, dy, x, y, radius, walls, half, bend):  # type: ignore[no-untyped-def]
+    """Holds a displacement within the field and on this side of its walls."""
+    reach = radius + math.sqrt(dx * dx + dy * dy) + 2.0 * SLACK
+    for side in (-1.0, 1.0):
+        dx, dy = _hold(dx, dy, side, 0.0, half[0] - radius - side * x, bend)
+        dx, dy = _hold(dx, dy, 0.0, side, half[1] - radius - side * y, bend)
+    for w in range(walls.shape[0]):
+        px, py = on_wall(x, y, walls[w])
+        ox, oy = px - x, py - y
+        away2 = ox * ox + oy * oy
+        if 0.0 < away2 < reach * reach:
+            away = math.sqrt(away2)
+            dx, dy = _hold(dx, dy, ox / away, oy / away, away - radius, bend)
+    return dx, dy
+
+
+@njit(cache=True)
+def _hold_map(dx, dy, x, y, radius, distances, bend):  # type: ignore[no-untyped-def]
+    """Holds a displacement clear of the static map; it walks ahead by the room that it finds."""
+    length = math.sqrt(dx * dx + dy * dy)
+    here = map_distance(x, y, distances) - radius
+    if here - SLACK > length or length == 0.0:
+        return dx, dy
+    nx, ny = map_direction(x, y, distances)
+    if bend:
+        return _hold(dx, dy, nx, ny, here, True)
+    if here <= SLACK and dx * nx + dy * ny <= 0.0 and nx * nx + ny * ny > 0.0:
+        # It touches the map; it may go where there is more room.
+        return (dx, dy) if map_distance(x + dx, y + dy, distances) - radius >= here else (0.0, 0.0)
+    free, way, finest = 0.0, 0.0, FINEST * distances[1][4] / length
+    room = here
+    while way < 1.0:
+        way = min(way + max(room / length, finest), 1.0)
+        room = map_distance(x + dx * way, y + dy * way, distances) - radius
+        if room < SLACK:
+            break
+        free = way
+    for _ in range(HALVINGS if free < way else 0):
+        middle = 0.5 * (free + way)
+        if map_distance(x + dx * middle, y + dy * middle, distances) - radius < SLACK:
+            way = middle
+        else:
+            free = middle
+    return dx * free, dy * free
+
+
+@njit(cache=True)
+def restrain(dx, dy, k, scene, first, speeds, rows, period, bends):  # type: ignore[no-untyped-def]
+    """The part of a displacement [m] that body k can make within a period.
+
+    Args:
+        k: of the body, below `first`.
+        speeds: (M, 2) velocity of the robots in `map` [m/s].
+        rows: (K, P) plans, which tell what moves.
+        period: [s].
+        bends: whether it slides along what is in the way, or keeps its direction.
+    """
+    bodies, walls, half, distances = scene
+    x, y, radius = bodies[k, 0], bodies[k, 1], bodies[k, 5]
+    for _ in range(PASSES if bends else 0):
+        wished_x, wished_y = dx, dy
+        dx, dy = _hold_bodies(dx, dy, k, bodies, first, speeds, rows, period, True)
+        dx, dy = _hold_walls(dx, dy, x, y, radius, walls, half, True)
+        dx, dy = _hold_map(dx, dy, x, y, radius, distances, True)
+        if dx == wished_x and dy == wished_y:
+            break
+    # Shortening keeps what was held before, so after it everything holds.
+    dx, dy = _hold_bodies(dx, dy, k, bodies, first, speeds, rows, period, False)
+    dx, dy = _hold_walls(dx, dy, x, y, radius, walls, half, False)
+    return _hold_map(dx, dy, x, y, radius, distances, False)

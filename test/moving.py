@@ -1,0 +1,98 @@
+"""A field in which obstacles move, and all that can be seen of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nics_drl_bridge.lidar.shapes import place
+from nics_drl_bridge.sim import motion_kernels as kernels
+from nics_drl_bridge.sim.motion import MARK, NO_DISTANCES, plan_arrays
+
+PERIOD = 0.1
+
+
+@dataclass(frozen=True)
+class Watched:
+    """Of every period, in one world: K obstacles, M robots.
+
+    Attributes:
+        places: (T + 1, K + M, 2) where the bodies were [m].
+        headings: (T + 1, K) of the obstacles.
+        velocities: (T, K, 3).
+        marks: (T, K, F).
+    """
+
+    places: np.ndarray
+    headings: np.ndarray
+    velocities: np.ndarray
+    marks: np.ndarray
+
+    @property
+    def speeds(self) -> np.ndarray:
+        return np.hypot(self.velocities[..., 0], self.velocities[..., 1])
+
+    def gaps(self, radii) -> np.ndarray:
+        """(T + 1, pairs) between the surfaces of an obstacle and any other body."""
+        bodies, count = self.places.shape[1], self.velocities.shape[1]
+        one, other = np.triu_indices(bodies, 1)
+        one, other = one[one < count], other[one < count]
+        away = np.linalg.norm(self.places[:, one] - self.places[:, other], axis=-1)
+        return away - (np.asarray(radii)[one] + np.asarray(radii)[other])
+
+
+def sides(half):
+    x, y = half
+    return np.array([(-x, -y, x, -y), (x, -y, x, y), (x, y, -x, y), (-x, y, -x, -y)])
+
+
+def scattered(radii, half, rng, walls=None, free=0.05):
+    """Places (len(radii), 2) at which nothing touches."""
+    found = []
+    for k, radius in enumerate(radii):
+        while True:
+            at = rng.uniform(-1.0, 1.0, 2) * (np.asarray(half) - radius - free)
+            clear = all(
+                np.linalg.norm(at - other) > radius + radii[j] + free
+                for j, other in enumerate(found)
+            )
+            for wall in () if walls is None else walls:
+                one, other = np.reshape(wall, (2, 2))
+                share = np.clip((at - one) @ (other - one) / np.sum((other - one) ** 2), 0.0, 1.0)
+                clear &= np.linalg.norm(at - one - share * (other - one)) > radius + free
+            if clear:
+                found.append(at)
+                break
+        assert len(found) == k + 1
+    return np.array(found)
+
+
+def watch(
+    motions, places, radii, half=(3.0, 3.0), steps=2000, seed=1, walls=None, distances=NO_DISTANCES,
+    robots=None,
+):  # fmt: skip
+    """Lets the first K of the bodies move, see `Watched`; `robots` (T, M, 2) velocities move the
+    others."""
+    count, half = len(motions), np.asarray(half, dtype=np.float64)
+    poses = np.concatenate([places, np.zeros((len(places), 1))], axis=1)[None]
+    bodies = place(poses, np.asarray(radii)[None], np.zeros((1, len(places))))
+    marks, velocity = np.zeros((1, count, MARK)), np.zeros((1, count, 3))
+    walls = sides(half) if walls is None else np.concatenate([sides(half), walls])
+    plans, seen = plan_arrays(motions), []
+    still = np.zeros((1, len(places) - count, 2))
+    kernels.begin(marks, 0, bodies, plans, half, seed)
+    where, headings = [bodies[0, :, :2].copy()], [bodies[0, :count, 2].copy()]
+    for t in range(steps):
+        speeds = still if robots is None else robots[t][None]
+        kernels.steer(
+            velocity, marks, 0, bodies, count, speeds, plans, walls, half, seed, t, PERIOD,
+            distances,
+        )  # fmt: skip
+        bodies[0, :count, :3] += velocity[0] * PERIOD
+        bodies[0, count:, :2] += speeds[0] * PERIOD
+        where.append(bodies[0, :, :2].copy())
+        headings.append(bodies[0, :count, 2].copy())
+        seen.append((velocity[0].copy(), marks[0].copy()))
+    velocities, remembered = (np.array(part) for part in zip(*seen, strict=True))
+    return Watched(np.array(where), np.array(headings), velocities, remembered)

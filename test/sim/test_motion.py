@@ -1,0 +1,307 @@
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from moving import PERIOD, scattered, sides, watch
+from pydantic import TypeAdapter
+from shapely import LineString, MultiLineString, box, unary_union
+
+from nics_drl_bridge.config import Schema, validate
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.maps_grid import GridMap
+from nics_drl_bridge.lidar.shapes import place
+from nics_drl_bridge.sim import motion_kernels as kernels
+from nics_drl_bridge.sim import motion_layout as at
+from nics_drl_bridge.sim.motion import (
+    MARK,
+    NO_DISTANCES,
+    Motion,
+    Patrol,
+    Pedestrian,
+    Wander,
+    distance_arrays,
+    plan_arrays,
+)
+
+WANDER, WALKER = Wander(speed=(0.3, 0.8)), Pedestrian()
+SQUARE = Patrol(waypoints=((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)), speed=0.7)
+MIXED = [WANDER, SQUARE, WALKER, None, WALKER, WANDER]
+WALLS = np.array([(-3.0, 0.5, -0.5, 0.5), (0.8, -1.0, 0.8, 3.0)])
+TOUCH = 1e-9
+
+
+class Mover(Schema):
+    motion: Motion
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(
+    "motions", [[WANDER] * 6, [WALKER] * 6, MIXED], ids=["wander", "walk", "mixed"]
+)
+@pytest.mark.parametrize("walls", [None, WALLS], ids=["open", "walled"])
+def test_nothing_ever_touches_or_leaves_the_field(motions, walls, seed):
+    radii = np.array([0.2, 0.3, 0.15, 0.25, 0.2, 0.3, 0.2, 0.2])  # the last two are robots
+    rng = np.random.default_rng(seed)
+    places = scattered(radii, (3.0, 3.0), rng, walls)
+    seen = watch(motions, places, radii, walls=walls, seed=seed)
+    assert seen.gaps(radii).min() > -TOUCH
+    reach = np.abs(seen.places[:, :6]).max(axis=(0, 2)) + radii[:6]
+    assert reach.max() < 3.0 + TOUCH
+    if walls is not None:
+        solid = MultiLineString([wall.reshape(2, 2) for wall in walls])
+        for k in range(6):  # the whole way, not only where a period ends
+            track = LineString(np.concatenate([seen.places[:, k], seen.places[-1:, k]]))
+            assert track.distance(solid) > radii[k] - TOUCH
+
+
+@pytest.mark.parametrize("motions", [[WANDER] * 6, MIXED], ids=["wander", "mixed"])
+def test_two_that_move_do_not_touch_within_a_period_either(motions):
+    radii = np.full(6, 0.25)
+    seen = watch(motions, scattered(radii, (2.0, 2.0), np.random.default_rng(0)), radii, (2.0, 2.0))
+    for share in (0.25, 0.5, 0.75):
+        between = seen.places[:-1] + share * np.diff(seen.places, axis=0)
+        away = np.linalg.norm(between[:, :, None] - between[:, None], axis=-1)
+        assert away[:, ~np.eye(6, dtype=bool)].min() > 0.5 - TOUCH
+
+
+def test_what_has_no_motion_stands_still():
+    seen = watch(MIXED, scattered([0.2] * 6, (3.0, 3.0), np.random.default_rng(0)), [0.2] * 6)
+    assert (seen.velocities[:, 3] == 0.0).all()
+    assert (seen.speeds[:, [0, 1, 2, 4, 5]].max(axis=0) > 0.2).all()
+
+
+def test_speeds_stay_within_their_bounds():
+    seen = watch(MIXED, scattered([0.2] * 6, (3.0, 3.0), np.random.default_rng(0)), [0.2] * 6)
+    drawn, fastest = seen.marks[-1, :, at.SPEED], seen.speeds.max(axis=0)
+    for k, motion in enumerate(MIXED):
+        if motion is not None:
+            low, high = np.broadcast_to(motion.speed, 2)
+            assert low <= drawn[k] <= high
+            assert fastest[k] <= (high if motion is WALKER else drawn[k]) * (1.0 + 1e-12)
+    assert np.abs(seen.velocities[..., 2]).max() <= kernels.TURN
+
+
+def test_an_obstacle_looks_where_it_goes():
+    seen = watch([WANDER], np.zeros((1, 2)), [0.2], steps=300)
+    ahead = np.arctan2(seen.velocities[:, 0, 1], seen.velocities[:, 0, 0])
+    off = np.angle(np.exp(1j * (seen.headings[1:, 0] - ahead)))
+    assert np.median(np.abs(off)) < 1e-9
+
+
+def test_a_wandering_obstacle_goes_straight_where_the_way_is_free():
+    seen = watch([WANDER], np.zeros((1, 2)), [0.2], half=(50.0, 50.0), steps=200)
+    way = np.diff(seen.places[:, 0], axis=0)
+    assert np.allclose(way, way[0])
+    assert np.allclose(seen.speeds, seen.marks[0, 0, at.SPEED])
+
+
+def test_wandering_obstacles_turn_away_before_they_touch_and_never_get_stuck():
+    seen = watch([WANDER], np.zeros((1, 2)), [0.2], steps=3000)
+    room = 3.0 - 0.2 - np.abs(seen.places[:, 0]).max(axis=1)
+    assert (room < 0.02).mean() < 0.01
+    crowd = watch([WANDER] * 8, scattered([0.2] * 8, (3.0, 3.0), np.random.default_rng(5)),
+                  [0.2] * 8, steps=3000)  # fmt: skip
+    for begin in range(0, 3000, 200):  # in any 20 s each of them gets somewhere
+        part = crowd.places[begin : begin + 200]
+        assert (np.ptp(part, axis=0).max(axis=1) > 0.3).all()
+
+
+def on_path(corners, speed, pause, times):
+    """Where a patrol is that was at the first corner at time 0, by interpolation in time."""
+    when, where, now = [0.0], [corners[0]], 0.0
+    for one, other in pairwise(corners):
+        for spent, stop in ((pause, one), (np.linalg.norm(np.subtract(other, one)) / speed, other)):
+            now += spent
+            when.append(now)
+            where.append(stop)
+    where = np.array(where)
+    return np.stack([np.interp(times, when, where[:, i]) for i in range(2)], axis=1)
+
+
+@pytest.mark.parametrize("loop", [True, False])
+@pytest.mark.parametrize("pause", [0.0, 0.37])
+@pytest.mark.parametrize("speed", [0.73, 6.0])
+def test_a_patrol_is_at_every_time_where_its_path_says(loop, pause, speed):
+    points = [(-2.0, -2.0), (1.0, -2.0), (1.1, -1.9), (1.0, 2.0)]
+    patrol = Patrol(waypoints=points, speed=speed, loop=loop, pause=pause)
+    seen = watch([patrol], np.array(points[:1]), [0.2], steps=400)
+    once = points if loop else [*points, points[2], points[1]]
+    times = np.arange(401) * PERIOD
+    expected = on_path(once * 60, speed, pause, times)
+    assert np.abs(seen.places[:, 0] - expected).max() < 1e-9
+
+
+def test_a_patrol_waits_while_a_robot_stands_in_its_way():
+    patrol = Patrol(waypoints=((-2.0, 0.0), (2.0, 0.0)), speed=0.5, loop=False)
+    places = np.array([(-2.0, 0.0), (0.0, 0.1)])
+    leaves = np.zeros((160, 1, 2))
+    leaves[100:120, 0, 1] = 1.0
+    seen = watch([patrol], places, [0.2, 0.2], steps=160, robots=leaves)
+    assert np.ptp(seen.places[60:100, 0], axis=0).max() < 1e-3
+    assert -0.39 < seen.places[100, 0, 0] < -0.34
+    assert (seen.places[:, 0, 1] == 0.0).all()
+    assert seen.places[:, 0, 0].max() > 1.95  # it got to the other end after all
+    assert seen.gaps([0.2, 0.2]).min() > -TOUCH
+
+
+def test_patrols_that_meet_head_on_stop_and_do_not_touch():
+    there = Patrol(waypoints=((-2.0, 0.0), (2.0, 0.0)), speed=0.5)
+    back = Patrol(waypoints=((2.0, 0.0), (-2.0, 0.0)), speed=1.0)
+    seen = watch([there, back], np.array([(-2.0, 0.0), (2.0, 0.0)]), [0.3, 0.3], steps=200)
+    assert 0.0 <= seen.gaps([0.3, 0.3]).min() < 0.01
+    assert seen.speeds[-1].max() < 1e-3
+
+
+def arrivals(seen, k):
+    """How often walker k got a new goal, and how often because it had reached the old one."""
+    goals = seen.marks[:, k, at.GOAL_X : at.GOAL_Y + 1]
+    new = np.flatnonzero(np.any(goals[1:] != goals[:-1], axis=1))
+    left = np.linalg.norm(seen.places[new + 1, k] - goals[new], axis=1)
+    return len(new), int((left < 0.3).sum())
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_walkers_reach_their_goals_and_keep_apart(seed):
+    count, radii = 5, [0.2] * 6
+    places = scattered(radii, (4.0, 4.0), np.random.default_rng(seed))
+    seen = watch([WALKER] * count, places, radii, half=(4.0, 4.0), seed=seed)
+    new, reached = np.sum([arrivals(seen, k) for k in range(count)], axis=0)
+    assert reached > 0.9 * new
+    assert reached > 100  # in 1000 s of walking, some 4 m each
+    assert (seen.gaps(radii).min(axis=1) < 0.05).mean() < 0.001
+    assert seen.speeds.mean() > 0.8
+
+
+@pytest.mark.parametrize("aside", [0.0, 0.05, -0.2])
+def test_a_walker_goes_around_a_robot_that_stands_in_the_way(aside):
+    half = (10.0, 2.0)
+    for seed in range(5):
+        places = np.array([(-4.0, 0.0), (0.0, aside)])
+        seen = watch([WALKER], places, [0.25, 0.25], half=half, seed=seed, steps=1)
+        marks = seen.marks[0].copy()
+        marks[0, [at.GOAL_X, at.GOAL_Y, at.UNTIL]] = 4.0, 0.0, 1e9
+        track = walk_on(marks, places, [0.25, 0.25], half, seed)
+        away = np.linalg.norm(track - places[1], axis=1)
+        assert away.min() > 0.65  # the radii are half a metre together
+        assert np.linalg.norm(track - (4.0, 0.0), axis=1).min() < 0.35
+
+
+def walk_on(marks, places, radii, half, seed, steps=120):
+    """The way (T, 2) of one walker with given marks, until it is at its goal."""
+    poses = np.concatenate([places, np.zeros((2, 1))], axis=1)[None]
+    bodies = place(poses, np.asarray(radii)[None], np.zeros((1, 2)))
+    marks, velocity, track = marks[None].copy(), np.zeros((1, 1, 3)), []
+    walls, half, plans = sides(half), np.asarray(half), plan_arrays([WALKER])
+    goal = marks[0, 0, at.GOAL_X].copy()
+    for t in range(steps):
+        kernels.steer(
+            velocity, marks, 0, bodies, 1, np.zeros((1, 1, 2)), plans, walls, half, seed, t + 1,
+            PERIOD, NO_DISTANCES,
+        )  # fmt: skip
+        if marks[0, 0, at.GOAL_X] != goal:
+            break
+        bodies[0, 0, :2] += velocity[0, 0, :2] * PERIOD
+        track.append(bodies[0, 0, :2].copy())
+    return np.array(track)
+
+
+def test_a_walker_alone_takes_up_its_speed_as_the_model_says():
+    alone = Pedestrian(fluctuation=0.0, wall_repulsion=0.0)
+    seen = watch([alone], np.zeros((1, 2)), [0.2], half=(200.0, 200.0), steps=40)
+    speed = seen.marks[0, 0, at.SPEED]
+    expected = speed * (1.0 - (1.0 - PERIOD / alone.relaxation) ** np.arange(1, 41))
+    assert np.allclose(seen.speeds[:, 0], expected, rtol=1e-9)
+
+
+def in_batch(seeds, motions=tuple(MIXED), steps=200):
+    count, worlds = len(motions), len(seeds)
+    radii, half = np.full((worlds, count + 1), 0.2), np.array([3.0, 3.0])
+    places = scattered([0.2] * (count + 1), half, np.random.default_rng(0))
+    poses = np.tile(np.concatenate([places, np.zeros((count + 1, 1))], 1), (worlds, 1, 1))
+    bodies = place(poses, radii, np.zeros_like(radii))
+    marks, velocity = np.full((worlds, count, MARK), 7.0), np.full((worlds, count, 3), 9.0)
+    plans, still = plan_arrays(motions), np.zeros((worlds, 1, 2))
+    for n, seed in enumerate(seeds):
+        kernels.begin(marks, n, bodies, plans, half, seed)
+    for t in range(steps):
+        for n, seed in enumerate(seeds):
+            kernels.steer(
+                velocity, marks, n, bodies, count, still, plans, sides(half), half, seed, t,
+                PERIOD, NO_DISTANCES,
+            )  # fmt: skip
+        bodies[:, :count, :3] += velocity * PERIOD
+    return bodies
+
+
+def test_a_seed_gives_the_same_motion_in_any_batch():
+    together = in_batch([11, 5, 2**63 - 1])
+    for n, seed in enumerate([11, 5, 2**63 - 1]):
+        assert np.array_equal(in_batch([seed])[0], together[n])
+    assert np.abs(together[0, :, :2] - together[1, :, :2]).max() > 0.5
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.4])
+@pytest.mark.parametrize("motion", [WANDER, WALKER], ids=["wander", "walk"])
+def test_what_moves_keeps_clear_of_a_static_map(motion, heading):
+    cells = np.zeros((120, 120), np.int8)
+    cells[40:50, 20:70], cells[70:100, 80:84], cells[20:23, 90:93] = 100, 100, 100
+    grid = GridMap(cells, 0.05, (-2.5, -3.0, heading))
+    corners = np.stack(np.nonzero(grid.blocked), axis=1)
+    squares = [box(j * 0.05, i * 0.05, (j + 1) * 0.05, (i + 1) * 0.05) for i, j in corners]
+    solid, (x, y, _) = unary_union(squares), grid.origin
+    c, s = np.cos(heading), np.sin(heading)
+    radius, count, rng, places = 0.2, 4, np.random.default_rng(0), []
+    while len(places) < count:
+        spot = scattered([radius], (2.5, 2.5), rng)[0]
+        row, column = grid.world_to_cell(spot)
+        inside = 0 <= row < 120 and 0 <= column < 120
+        if (not inside or grid.distance_field[row, column] > radius + 0.1) and all(
+            np.linalg.norm(spot - other) > 0.5 for other in places
+        ):
+            places.append(spot)
+    seen = watch([motion] * count, np.array(places), [radius] * count,
+                 distances=distance_arrays(grid))  # fmt: skip
+    d = seen.places - (x, y)
+    local = np.stack([c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0]], axis=-1)
+    for k in range(count):
+        assert LineString(local[:, k]).distance(solid) > radius - 0.005
+        assert np.ptp(local[:, k], axis=0).max() > 2.0
+    assert seen.gaps([radius] * count).min() > -TOUCH
+
+
+@pytest.mark.parametrize(
+    ("motion", "sentence"),
+    [
+        ({"kind": "wander", "speed": [0.8, 0.3]}, "speed must be [least, greatest]"),
+        ({"kind": "wander", "speed": [0.0, 0.3]}, "above 0"),
+        ({"kind": "wander", "speed": [1.0, 30.0]}, "at most 10 m/s"),
+        ({"kind": "patrol", "waypoints": [[0, 0]], "speed": 1.0}, "motion.patrol.waypoints"),
+        ({"kind": "patrol", "waypoints": [[0, 0], [0, 0]], "speed": 1.0}, "must differ"),
+        ({"kind": "patrol", "waypoints": [[0, 0], [1, 0], [0, 0]], "speed": 1.0}, "must differ"),
+        ({"kind": "pedestrian", "relaxation": 0.0}, "relaxation"),
+        ({"kind": "pedestrain"}, "'wander', 'patrol', 'pedestrian'"),
+    ],
+)
+def test_a_wrong_motion_is_one_sentence(motion, sentence):
+    with pytest.raises(ConfigError) as caught:
+        validate({"motion": motion}, Mover, "world.yaml")
+    assert sentence in str(caught.value)
+
+
+def test_motions_are_read_by_their_kind():
+    read = TypeAdapter(Motion).validate_python
+    assert read({"kind": "pedestrian"}) == Pedestrian()
+    back = {"kind": "patrol", "waypoints": [[0, 0], [1, 0], [0, 0]], "speed": 1, "loop": False}
+    assert isinstance(read(back), Patrol)
+
+
+def test_plans_hold_the_waypoints_of_all_patrols_one_after_the_other():
+    rows, waypoints = plan_arrays(
+        [None, SQUARE, WANDER, Patrol(waypoints=((0, 0), (1, 1)), speed=1)]
+    )
+    assert rows[:, at.KIND].tolist() == [at.STILL, at.PATROL, at.WANDER, at.PATROL]
+    assert rows[[1, 3], at.FIRST].tolist() == [0, 4]
+    assert np.array_equal(waypoints, [*SQUARE.waypoints, (0, 0), (1, 1)])
+    assert [part.shape for part in plan_arrays([])] == [(0, 16), (0, 2)]
