@@ -18,15 +18,28 @@ import numpy as np
 from numba import njit
 
 from nics_drl_bridge.lidar import kernels
+from nics_drl_bridge.lidar.map_memory_kernels import get, peek, put
 
 BLOCK = 16
 """So many beams are fused at once; rows and lines are that much longer than their content."""
-DOUBLES, SINGLES, WHOLES = 6, 5, 2
-"""Numbers per body that one pass hands to the next, by their kind."""
+LANES = 272
+"""So many bodies, of several scans, go through the passes together; a multiple of `BLOCK`."""
+WIDE, SINGLE, WHOLE = 11, 8, 18
+X, Y, TURN, COS, SIN, AHEAD, RADIUS, ROUND, MIDDLE, RIGHT, LEFT = (
+    k * LANES for k in range(11)
+)
+DISTANCE, BEARING, ALONG, ACROSS, ALONG2, ACROSS2, PART, BLEND = (
+    k * LANES for k in range(8)
+)
+WORLD, ROBOT, SHAPE, START, FIRST, WIDTH, START2, FIRST2, WIDTH2, BEGIN, HITS, NEAR, NEAR2, FAR, FAR2, CELL, HULL, CLIMB = (
+    k * LANES for k in range(18)
+)
+PER_METRE, ROTATIONS, PARTS_PER_ROTATION, FIRST_CELL, CELLS_PER_PART, HULL_END, CORNERS_PER_PART, ROUND_RADIUS, CORNERS = range(9)
+ABOUT = 16
 ABOVE_ZERO = 2.0**24
 """Added before a number is cut to a whole one, so that it is rounded down."""
 PER_TURN = 0.5 / math.pi
-SINGLE = tuple(
+ATAN = tuple(
     np.float32(factor)
     for factor in (
         0.999999881,
@@ -41,32 +54,25 @@ SINGLE = tuple(
 )
 
 
+
+
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def in_sight(bodies, n, me, sx, sy, range_max, baked, which, x, y, distance):  # type: ignore[no-untyped-def]
-    """First pass: packs the bodies in sight: which, offset, and the square of the distance.
-
-    Args:
-        bodies: (N, K, 7), see `shapes.BODY`.
-        n: which world.
-        me: the body that carries the lidar, or -1.
-        sx, sy: of the lidar in the world [m].
-        range_max: [m].
-        baked: (H,) whether a shape is to be looked up.
-        which, x, y, distance: results, of the first bodies only.
-
-    Returns:
-        How many can be looked up, and how many in sight can't: not baked, or so near that the
-        lidar is within their circle.
-    """
+def in_sight(found, begin, end, bodies, n, m, me, sx, sy, ahead, range_max, baked, wide, whole):  # type: ignore[no-untyped-def]
+    left = 0
     n = np.uintp(n)
-    found, left = 0, 0
-    for k in range(bodies.shape[1]):
+    for k in range(begin, end):
+        k = np.uintp(k)
         dx, dy, radius = bodies[n, k, 0] - sx, bodies[n, k, 1] - sy, bodies[n, k, 5]
         d2 = dx * dx + dy * dy
         reach = range_max + radius
-        which[found], x[found], y[found], distance[found] = k, dx, dy, d2
+        i = found
+        shape = int(bodies[n, k, 6])
+        wide[i + X], wide[i + Y], wide[i + RADIUS] = dx, dy, radius
+        wide[i + TURN], wide[i + COS], wide[i + SIN] = bodies[n, k, 2], bodies[n, k, 3], bodies[n, k, 4]
+        wide[i + AHEAD] = ahead
+        whole[i + WORLD], whole[i + ROBOT], whole[i + SHAPE] = n, m, shape * ABOUT
         seen = (d2 <= reach * reach) & (radius > 0.0) & (k != me)
-        kept = seen & (d2 >= radius * radius) & (baked[np.uintp(bodies[n, k, 6])] != 0)
+        kept = seen & (d2 >= radius * radius) & (baked[np.uintp(shape)] != 0)
         found += kept
         left += seen & (not kept)
     return found, left
@@ -82,12 +88,17 @@ def left_out(bodies, n, k, me, sx, sy, range_max, baked):  # type: ignore[no-unt
     return seen and (baked[int(bodies[n, k, 6])] == 0 or d2 < radius * radius)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def directions(found, x, y, distance, bearing):  # type: ignore[no-untyped-def]
-    """Second pass: distance and bearing in the world of each."""
-    for k in range((found + BLOCK - 1) // BLOCK * BLOCK):
-        distance[k] = math.sqrt(distance[k])
-        bearing[k] = kernels.arctan2(y[k], x[k])
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def directions(padded, wide, single):  # type: ignore[no-untyped-def]
+    for k in range(padded):
+        i = k
+        x, y = wide[i + X], wide[i + Y]
+        single[i + ALONG], single[i + ACROSS] = x, y
+        single[i + DISTANCE] = x * x + y * y
+    for k in range(padded):
+        i = k
+        single[i + DISTANCE] = math.sqrt(single[i + DISTANCE])
+        single[i + BEARING] = arctan2_single(single[i + ACROSS], single[i + ALONG])
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
@@ -105,18 +116,18 @@ def outermost(hulls, skip, corners, first, stride, d2, cos, sin, side):  # type:
         side: which.
     """
     best = first
-    one = np.uintp(skip + best)
-    x = d2 + cos * hulls[one, 0] - sin * hulls[one, 1]
-    y = sin * hulls[one, 0] + cos * hulls[one, 1]
+    one = np.uintp(2) * np.uintp(skip + best)
+    x = d2 + cos * hulls[one] - sin * hulls[one + np.uintp(1)]
+    y = sin * hulls[one] + cos * hulls[one + np.uintp(1)]
     while stride > 0:
         for _ in range(corners):
             moved = False
             for step in (stride, corners - stride):
                 other = best + step
                 other -= corners if other >= corners else 0
-                one = np.uintp(skip + other)
-                ax = d2 + cos * hulls[one, 0] - sin * hulls[one, 1]
-                ay = sin * hulls[one, 0] + cos * hulls[one, 1]
+                one = np.uintp(2) * np.uintp(skip + other)
+                ax = d2 + cos * hulls[one] - sin * hulls[one + np.uintp(1)]
+                ay = sin * hulls[one] + cos * hulls[one + np.uintp(1)]
                 if side * (x * ay - y * ax) < 0.0:
                     best, x, y, moved = other, ax, ay, True
             if not moved:
@@ -125,63 +136,95 @@ def outermost(hulls, skip, corners, first, stride, d2, cos, sin, side):  # type:
     return x, y
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def cells_of(  # type: ignore[no-untyped-def]
-    found, bodies, n, limits, shape_of, grid_of, cell_of, hulls, which, x, y, distance, bearing,
-    rx, ry, lx, ly, blend, cell_at,
-):  # fmt: skip
-    """Third pass: which cell each looks up, and its two silhouettes as (along, across).
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def cells_of(padded, distances, about, wide, single, whole):  # type: ignore[no-untyped-def]
+    zero, last = np.int32(0), np.int32(distances - 2)
+    for k in range(padded):
+        h = get(whole, k + SHAPE)
+        place = (get(single, k + DISTANCE) - get(wide, k + RADIUS)) * peek(about, h + PER_METRE)
+        step = np.int32(max(min(np.int32(place), last), zero))
+        put(single, k + BLEND, np.float32(place - step))
+        share = (get(wide, k + TURN) - get(single, k + BEARING)) * PER_TURN
+        share -= np.floor(share)
+        rotations = peek(about, h + ROTATIONS)
+        turn = np.int32(share * rotations + 0.5)
+        turn = np.int32(max(min(turn, np.int32(rotations)), zero))  # a heading may be no number
+        sector = np.int32((turn + 0.5) * peek(about, h + PARTS_PER_ROTATION))
+        cell = peek(about, h + FIRST_CELL) + turn * distances - sector * peek(about, h + CELLS_PER_PART)
+        put(whole, k + CELL, np.int32(np.int32(cell) + step))
+        skip = peek(about, h + HULL_END) - sector * peek(about, h + CORNERS_PER_PART)
+        put(whole, k + HULL, np.int32(skip))
+        put(wide, k + ROUND, peek(about, h + ROUND_RADIUS))
 
-    The silhouette is exact: of the corners that it can be within the cell, the outermost.
-    """
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def silhouettes(padded, cells, hulls, wide, single, whole):  # type: ignore[no-untyped-def]
+    zero = np.int32(0)
+    for k in range(padded):
+        cell, skip = np.int64(get(whole, k + CELL)), np.int64(get(whole, k + HULL))
+        cell = cell * 8
+        put(whole, k + START, peek(cells, cell))
+        put(whole, k + FIRST, peek(cells, cell + 1))
+        put(whole, k + WIDTH, peek(cells, cell + 2))
+        put(whole, k + START2, peek(cells, cell + 8))
+        put(whole, k + FIRST2, peek(cells, cell + 9))
+        put(whole, k + WIDTH2, peek(cells, cell + 10))
+        x, y, c, s = get(wide, k + X), get(wide, k + Y), get(wide, k + COS), get(wide, k + SIN)
+        round_ = get(wide, k + ROUND)
+        d2 = x * x + y * y
+        cos, sin = c * x + s * y, s * x - c * y  # against the bearing, times d
+        other = peek(cells, cell + 4)
+        p, q = 2 * (skip + peek(cells, cell + 3)), 2 * (skip + max(other, zero))
+        hx, hy = peek(hulls, p), peek(hulls, p + 1)
+        ax, ay = d2 + cos * hx - sin * hy, sin * hx + cos * hy
+        hx, hy = peek(hulls, q), peek(hulls, q + 1)
+        bx, by = d2 + cos * hx - sin * hy, sin * hx + cos * hy
+        outer = ax * by - ay * bx < 0.0
+        ax, ay = bx if outer else ax, by if outer else ay
+        tangent = math.sqrt(max(d2 - round_ * round_, 0.0))
+        put(single, k + ALONG, np.float32(tangent if round_ > 0.0 else ax))
+        put(single, k + ACROSS, np.float32(-round_ if round_ > 0.0 else ay))
+        other2 = peek(cells, cell + 6)
+        p, q = 2 * (skip + peek(cells, cell + 5)), 2 * (skip + max(other2, zero))
+        hx, hy = peek(hulls, p), peek(hulls, p + 1)
+        ax, ay = d2 + cos * hx - sin * hy, sin * hx + cos * hy
+        hx, hy = peek(hulls, q), peek(hulls, q + 1)
+        bx, by = d2 + cos * hx - sin * hy, sin * hx + cos * hy
+        outer = ax * by - ay * bx > 0.0
+        ax, ay = bx if outer else ax, by if outer else ay
+        put(single, k + ALONG2, np.float32(tangent if round_ > 0.0 else ax))
+        put(single, k + ACROSS2, np.float32(round_ if round_ > 0.0 else ay))
+        put(whole, k + CLIMB, np.int32(min(other, other2)))
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+def climb(i, corners, cells, hulls, wide, single, whole):  # type: ignore[no-untyped-def]
+    x, y, c, s = wide[i + X], wide[i + Y], wide[i + COS], wide[i + SIN]
+    cos, sin, d2 = c * x + s * y, s * x - c * y, x * x + y * y
+    cell, skip = np.uintp(whole[i + CELL]) * np.uintp(8), whole[i + HULL]
+    first, other = cells[cell + np.uintp(3)], cells[cell + np.uintp(4)]
+    if other < 0:
+        single[i + ALONG], single[i + ACROSS] = outermost(hulls, skip, corners, first, -other, d2, cos, sin, 1.0)
+    first, other = cells[cell + np.uintp(5)], cells[cell + np.uintp(6)]
+    if other < 0:
+        single[i + ALONG2], single[i + ACROSS2] = outermost(hulls, skip, corners, first, -other, d2, cos, sin, -1.0)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def climbs(found, about, cells, hulls, wide, single, whole):  # type: ignore[no-untyped-def]
     for k in range(found):
-        b = np.uintp(which[k])
-        h = np.uintp(bodies[n, b, 6])
-        d, radius, distances = distance[k], shape_of[h, 0], grid_of[h, 0]
-        place = (d - radius) * shape_of[h, 1]
-        step = min(int(place), distances - 2)
-        blend[k] = place - step
-        which[k] = (d + radius > limits[1]) | (d - radius < limits[0])
-        parts = grid_of[h, 2]
-        if parts == 0:
-            lx[k], ly[k] = math.sqrt(max(d * d - radius * radius, 0.0)), radius
-            rx[k], ry[k] = lx[k], -radius
-            cell_at[k] = grid_of[h, 3] + step
-            continue
-        share = (bodies[n, b, 2] - bearing[k]) * PER_TURN
-        turn = int((share - math.floor(share)) * shape_of[h, 2] + 0.5)
-        sector = int((turn + 0.5) * shape_of[h, 3])
-        cell = np.uintp(grid_of[h, 3] + (turn - sector * grid_of[h, 1]) * distances + step)
-        cell_at[k] = cell
-        skip = grid_of[h, 4] + (parts - sector) * grid_of[h, 5]
-        c, s = bodies[n, b, 3], bodies[n, b, 4]
-        cos, sin = c * x[k] + s * y[k], s * x[k] - c * y[k]  # against the bearing, times d
-        corners = grid_of[h, 5] * parts
-        first, other = cell_of[cell, 2], cell_of[cell, 3]
-        one = np.uintp(skip + first)
-        right_x = d * d + cos * hulls[one, 0] - sin * hulls[one, 1]
-        right_y = sin * hulls[one, 0] + cos * hulls[one, 1]
-        if other < 0:
-            right_x, right_y = outermost(hulls, skip, corners, first, -other, d * d, cos, sin, 1.0)
-        elif other != first:
-            one = np.uintp(skip + other)
-            ax = d * d + cos * hulls[one, 0] - sin * hulls[one, 1]
-            ay = sin * hulls[one, 0] + cos * hulls[one, 1]
-            outer = right_x * ay - right_y * ax < 0.0
-            right_x, right_y = ax if outer else right_x, ay if outer else right_y
-        first, other = cell_of[cell, 4], cell_of[cell, 5]
-        one = np.uintp(skip + first)
-        left_x = d * d + cos * hulls[one, 0] - sin * hulls[one, 1]
-        left_y = sin * hulls[one, 0] + cos * hulls[one, 1]
-        if other < 0:
-            left_x, left_y = outermost(hulls, skip, corners, first, -other, d * d, cos, sin, -1.0)
-        elif other != first:
-            one = np.uintp(skip + other)
-            ax = d * d + cos * hulls[one, 0] - sin * hulls[one, 1]
-            ay = sin * hulls[one, 0] + cos * hulls[one, 1]
-            outer = left_x * ay - left_y * ax > 0.0
-            left_x, left_y = ax if outer else left_x, ay if outer else left_y
-        rx[k], ry[k], lx[k], ly[k] = right_x, right_y, left_x, left_y
+        i = k
+        if whole[i + CLIMB] < 0:
+            corners = int(about[np.uintp(whole[i + SHAPE] + CORNERS)])
+            climb(i, corners, cells, hulls, wide, single, whole)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def edges(padded, single):  # type: ignore[no-untyped-def]
+    for k in range(padded):
+        i = k
+        single[i + ALONG] = arctan2_single(single[i + ACROSS], single[i + ALONG])
+        single[i + ALONG2] = arctan2_single(single[i + ACROSS2], single[i + ALONG2])
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
@@ -190,89 +233,127 @@ def arctan2_single(y, x):  # type: ignore[no-untyped-def]
     ax, ay = abs(x), abs(y)
     ratio = min(ax, ay) / max(ax, ay)
     s = ratio * ratio
-    r = SINGLE[7]
-    r = r * s + SINGLE[6]
-    r = r * s + SINGLE[5]
-    r = r * s + SINGLE[4]
-    r = r * s + SINGLE[3]
-    r = r * s + SINGLE[2]
-    r = r * s + SINGLE[1]
-    r = (r * s + SINGLE[0]) * ratio
+    r = ATAN[7]
+    r = r * s + ATAN[6]
+    r = r * s + ATAN[5]
+    r = r * s + ATAN[4]
+    r = r * s + ATAN[3]
+    r = r * s + ATAN[2]
+    r = r * s + ATAN[1]
+    r = (r * s + ATAN[0]) * ratio
     r = np.float32(kernels.HALF_PI) - r if ay > ax else r
     r = np.float32(math.pi) - r if x < np.float32(0.0) else r
     return math.copysign(r, y)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def spans(found, heading, beams, rx, ry, lx, ly, bearing, right, left):  # type: ignore[no-untyped-def]
-    """Fourth pass: bearing and both silhouettes in beams, the right one within the first turn."""
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def spans(padded, beams, wide, single):  # type: ignore[no-untyped-def]
+    """Bearing and both silhouettes in beams, the right one within the first turn."""
     per_beam = 1.0 / beams[1]
     turn = 2.0 * math.pi * per_beam
     per_turn = 1.0 / turn
-    padded = (found + BLOCK - 1) // BLOCK * BLOCK
     for k in range(padded):
-        rx[k] = arctan2_single(ry[k], rx[k])
-    for k in range(padded):
-        lx[k] = arctan2_single(ly[k], lx[k])
-    for k in range(padded):
-        low, high = rx[k] * per_beam, lx[k] * per_beam
-        middle = (bearing[k] - heading - beams[0]) * per_beam
+        i = k
+        low, high = single[i + ALONG] * per_beam, single[i + ALONG2] * per_beam
+        middle = (single[i + BEARING] - wide[i + AHEAD]) * per_beam
         middle -= math.floor((middle + low) * per_turn) * turn
-        bearing[k], right[k], left[k] = middle, middle + low, middle + high
+        wide[i + MIDDLE], wide[i + RIGHT], wide[i + LEFT] = middle, middle + low, middle + high
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def fuse(  # type: ignore[no-untyped-def]
-    ranges, n, m, found, beams, limits, row_of, cell_of, rows, shift, bearing, right, left, blend,
-    which, cell_at,
-):  # fmt: skip
-    """Last pass: lowers the beams of every span to the blended rows of its cell."""
-    phases = 1 << shift
+def aim(i, count, shift, wide, single, whole):  # type: ignore[no-untyped-def]
+    one, zero = np.int32(1), np.int32(0)
+    first, last, middle = wide[i + RIGHT], wide[i + LEFT], wide[i + MIDDLE]
+    begin = np.int32(first)
+    begin = np.int32(max(np.int32(begin + np.int32(first > begin)), zero))
+    hits = np.int32(min(np.int32(last), np.int32(count - one)) - begin + one)
+    phases = np.int32(one << shift)
+    exact = (begin - middle) * phases + ABOVE_ZERO
+    point = np.int32(exact)
+    single[i + PART] = exact - point
+    point = np.int32(point - np.int32(ABOVE_ZERO))
+    beam, phase = np.int32(point >> shift), np.int32(point & np.int32(phases - one))
+    width, width2 = whole[i + WIDTH], whole[i + WIDTH2]
+    skip = np.int32(max(min(np.int32(beam - whole[i + FIRST]), np.int32(width - hits - one)), zero))
+    skip2 = np.int32(max(min(np.int32(beam - whole[i + FIRST2]), np.int32(width2 - hits - one)), zero))
+    near = np.int32(whole[i + START] + phase * width + skip)
+    far = np.int32(whole[i + START2] + phase * width2 + skip2)
+    same = np.int32(phase + one) < phases
+    whole[i + NEAR], whole[i + FAR] = near, far
+    whole[i + NEAR2] = np.int32(near + width) if same else np.int32(near - phase * width + one)
+    whole[i + FAR2] = np.int32(far + width2) if same else np.int32(far - phase * width2 + one)
+    whole[i + BEGIN], whole[i + HITS] = begin, hits
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def aims(padded, count, shift, wide, single, whole):  # type: ignore[no-untyped-def]
+    for k in range(padded):
+        aim(k, count, shift, wide, single, whole)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+def lower(ranges, i, limits, rows, single, whole):  # type: ignore[no-untyped-def]
+    """Lowers the beams of a span to the blended rows of its cell."""
     nothing, close = np.float32(np.inf), np.float32(-np.inf)
     low, high = np.float32(limits[0]), np.float32(limits[1])
+    n, m, begin, hits = np.uintp(whole[i + WORLD]), np.uintp(whole[i + ROBOT]), whole[i + BEGIN], whole[i + HITS]
+    near, near2, far, far2 = np.uintp(whole[i + NEAR]), np.uintp(whole[i + NEAR2]), np.uintp(whole[i + FAR]), np.uintp(whole[i + FAR2])
+    part, share = single[i + PART], single[i + BLEND]
+    padded = (hits + BLOCK - 1) // BLOCK * BLOCK
+    begin = np.uintp(begin)
+    if begin + padded <= ranges.shape[2]:
+        for j in range(np.int32(padded)):
+            z = np.uintp(j)
+            value, other = rows[near + z], rows[far + z]
+            value += part * (rows[near2 + z] - value)
+            other += part * (rows[far2 + z] - other)
+            value += share * (other - value)
+            value = value if value <= high else nothing
+            value = value if value >= low else close
+            value = value if j < np.int32(hits) else nothing
+            held = ranges[n, m, begin + z]
+            ranges[n, m, begin + z] = value if value < held else held
+    else:
+        for j in range(hits):
+            z = np.uintp(j)
+            value, other = rows[near + z], rows[far + z]
+            value += part * (rows[near2 + z] - value)
+            other += part * (rows[far2 + z] - other)
+            value += share * (other - value)
+            value = value if value <= high else nothing
+            value = value if value >= low else close
+            held = ranges[n, m, begin + z]
+            ranges[n, m, begin + z] = value if value < held else held
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def fuse(found, ranges, beams, limits, rows, shift, wide, single, whole):  # type: ignore[no-untyped-def]
     turn = 2.0 * math.pi / beams[1]
-    count = ranges.shape[2]
     for k in range(found):
-        middle, first, last, cell = bearing[k], right[k], left[k], np.uintp(cell_at[k])
-        next_cell, share, limited = cell + np.uintp(1), blend[k], which[k] != 0
-        for _ in range(2):  # over the seam once at most, and no end where a pose is not a number
-            begin = int(first)  # to convert is faster than to round up or down
-            begin = max(begin + (first > begin), 0)
-            hits = min(int(last), count - 1) - begin + 1
-            if hits > 0:
-                exact = (begin - middle) * phases + ABOVE_ZERO
-                point = int(exact)
-                part = np.float32(exact - point)
-                point -= int(ABOVE_ZERO)
-                beam, phase = point >> shift, point & (phases - 1)
-                width, width2 = cell_of[cell, 1], cell_of[next_cell, 1]
-                skip = max(min(beam - cell_of[cell, 0], width - hits - 1), 0)
-                skip2 = max(min(beam - cell_of[next_cell, 0], width2 - hits - 1), 0)
-                near = row_of[cell] + phase * width + skip
-                far = row_of[next_cell] + phase * width2 + skip2
-                same = phase + 1 < phases  # the next point: of the next phase, or beam
-                near2 = near + width if same else near - phase * width + 1
-                far2 = far + width2 if same else far - phase * width2 + 1
-                padded = (hits + BLOCK - 1) // BLOCK * BLOCK
-                if limited or begin + padded > count:
-                    for i in range(hits):
-                        value, other = rows[np.uintp(near + i)], rows[np.uintp(far + i)]
-                        value += part * (rows[np.uintp(near2 + i)] - value)
-                        other += part * (rows[np.uintp(far2 + i)] - other)
-                        value += share * (other - value)
-                        value = value if value <= high else nothing
-                        value = value if value >= low else close
-                        held = ranges[n, m, np.uintp(begin + i)]
-                        ranges[n, m, np.uintp(begin + i)] = value if value < held else held
-                else:
-                    for i in range(np.int32(padded)):
-                        value, other = rows[np.uintp(near + i)], rows[np.uintp(far + i)]
-                        value += part * (rows[np.uintp(near2 + i)] - value)
-                        other += part * (rows[np.uintp(far2 + i)] - other)
-                        value += share * (other - value)
-                        value = value if i < np.int32(hits) else nothing
-                        held = ranges[n, m, np.uintp(begin + i)]
-                        ranges[n, m, np.uintp(begin + i)] = value if value < held else held
-            if last < turn:
-                break
-            middle, first, last = middle - turn, first - turn, last - turn
+        i = k
+        if whole[i + HITS] > 0:
+            lower(ranges, i, limits, rows, single, whole)
+    for k in range(found):
+        i = k
+        if wide[i + LEFT] >= turn:  # over the seam once at most
+            wide[i + MIDDLE], wide[i + RIGHT], wide[i + LEFT] = (
+                wide[i + MIDDLE] - turn, wide[i + RIGHT] - turn, wide[i + LEFT] - turn
+            )
+            aim(i, np.int32(ranges.shape[2]), np.int32(shift), wide, single, whole)
+            if whole[i + HITS] > 0:
+                lower(ranges, i, limits, rows, single, whole)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def look_up(found, ranges, beams, limits, lookup, room):  # type: ignore[no-untyped-def]
+    about, distances, cells, rows, shift, hulls = lookup
+    wide, single, whole = room
+    padded = (found + BLOCK - 1) // BLOCK * BLOCK
+    directions(padded, wide, single)
+    cells_of(padded, distances, about, wide, single, whole)
+    silhouettes(padded, cells, hulls, wide, single, whole)
+    climbs(found, about, cells, hulls, wide, single, whole)
+    edges(padded, single)
+    spans(padded, beams, wide, single)
+    aims(padded, np.int32(ranges.shape[2]), np.int32(shift), wide, single, whole)
+    fuse(found, ranges, beams, limits, rows, shift, wide, single, whole)

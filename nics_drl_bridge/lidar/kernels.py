@@ -189,13 +189,20 @@ def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
         out[i] = value if value >= low else np.float32(-np.inf)
 
 
+@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
+def sensor_pose(poses, n, m, mount):  # type: ignore[no-untyped-def]
+    """x, y, heading of a lidar in its world, from poses (N, M, 3) and the mount (3,)."""
+    x, y, heading = poses[n, m, 0], poses[n, m, 1], poses[n, m, 2]
+    if mount[0] != 0.0 or mount[1] != 0.0:
+        c, s = math.cos(heading), math.sin(heading)
+        x, y = x + c * mount[0] - s * mount[1], y + s * mount[0] + c * mount[1]
+    return x, y, heading + mount[2]
+
+
 @njit(cache=True, error_model="numpy", _nrt=False)
 def to_sensor(poses, n, m, mount):  # type: ignore[no-untyped-def]
-    """x, y, heading, cos, sin of a lidar in its world, from poses (N, M, 3) and the mount (3,)."""
-    c, s = math.cos(poses[n, m, 2]), math.sin(poses[n, m, 2])
-    x = poses[n, m, 0] + c * mount[0] - s * mount[1]
-    y = poses[n, m, 1] + s * mount[0] + c * mount[1]
-    heading = poses[n, m, 2] + mount[2]
+    """The same, and cos and sin of its heading."""
+    x, y, heading = sensor_pose(poses, n, m, mount)
     return x, y, heading, math.cos(heading), math.sin(heading)
 
 

@@ -17,7 +17,10 @@ from pydantic import Field, field_validator
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.files import npz_bytes, npz_mapped, sha256
-from nics_drl_bridge.lidar.baked_kernels import BLOCK
+from nics_drl_bridge.lidar.baked_kernels import (
+    ABOUT, BLOCK, CELLS_PER_PART, CORNERS, CORNERS_PER_PART, FIRST_CELL, HULL_END,
+    PARTS_PER_ROTATION, PER_METRE, ROTATIONS, ROUND_RADIUS,
+)  # fmt: skip
 from nics_drl_bridge.lidar.shapes import SHAPES, Circle, Outlines, Shape
 
 FORMAT = "nics_drl_bridge/lidar_table/2"
@@ -107,20 +110,26 @@ class LidarTable:
         corners per part. Then `start`, `cell`, `rows`, log2 of the phases, the hulls.
         """
         outlines, distances = self.outlines, self.density.distances
-        rotations, parts = self.grid[:, 1], outlines.orders
-        numbers = np.zeros((len(self.shapes), 4))
-        numbers[:, 0] = outlines.radii
-        numbers[:, 1] = (distances - 1) / (self.grid[:, 0] - outlines.radii)
-        numbers[:, 2], numbers[:, 3] = rotations * parts, 1.0 / rotations
-        counts = np.zeros((len(self.shapes), 6), np.int64)
-        counts[:, 0], counts[:, 1] = distances, rotations
-        counts[:, 2] = [
-            0 if isinstance(s, Circle) else n for s, n in zip(self.shapes, parts, strict=True)
-        ]
-        counts[:, 3], counts[:, 4] = self.grid[:, 2], outlines.hull[:-1]
-        counts[:, 5] = np.diff(outlines.hull) // 2 // parts
+        parts, rotations = outlines.orders, self.grid[:, 1]
+        corners = np.diff(outlines.hull) // 2
+        about = np.zeros((len(self.shapes), ABOUT))
+        about[:, PER_METRE] = (distances - 1) / (self.grid[:, 0] - outlines.radii)
+        about[:, ROTATIONS], about[:, PARTS_PER_ROTATION] = rotations * parts, 1.0 / rotations
+        about[:, FIRST_CELL], about[:, CELLS_PER_PART] = self.grid[:, 2], rotations * distances
+        about[:, HULL_END] = outlines.hull[:-1] + corners
+        about[:, CORNERS_PER_PART] = corners // parts
+        about[:, CORNERS] = corners
+        round_ = np.array([isinstance(shape, Circle) for shape in self.shapes], bool)
+        about[round_, ROTATIONS], about[round_, ROUND_RADIUS] = 0.0, outlines.radii[round_]
         shift = self.density.phases.bit_length() - 1
-        return numbers, counts, self.start, self.cell, self.rows, shift, outlines.hulls
+        hulls = np.ascontiguousarray(outlines.hulls).ravel()
+        return about.ravel(), distances, self._packed(), self.rows, shift, hulls
+
+    def _packed(self) -> NDArray[np.int32]:
+        """Flat (cells * 8,): start, and the cell."""
+        packed = np.zeros((len(self.start), 8), np.int32)
+        packed[:, 0], packed[:, 1:7] = self.start, self.cell
+        return packed.ravel()
 
     @property
     def memory(self) -> int:
