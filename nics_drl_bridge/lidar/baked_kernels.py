@@ -19,23 +19,23 @@ from numba import njit
 
 from nics_drl_bridge.lidar import kernels
 from nics_drl_bridge.lidar.map_memory_kernels import get, peek, put
+from nics_drl_bridge.lidar.block_kernels import BLOCK, lower_beam, lower_block, prefetch
 
-BLOCK = 16
-"""So many beams are fused at once; rows and lines are that much longer than their content."""
 LANES = 272
 """So many bodies, of several scans, go through the passes together; a multiple of `BLOCK`."""
-WIDE, SINGLE, WHOLE = 11, 8, 18
-X, Y, TURN, COS, SIN, AHEAD, RADIUS, ROUND, MIDDLE, RIGHT, LEFT = (
-    k * LANES for k in range(11)
+WIDE, SINGLE, WHOLE = 19, 8, 15
+X, Y, TURN, COS, SIN, AHEAD, RADIUS, ROUND, MIDDLE, RIGHT, LEFT, RIGHT_X, RIGHT_Y, RIGHT_X2, RIGHT_Y2, LEFT_X, LEFT_Y, LEFT_X2, LEFT_Y2 = (
+    k * LANES for k in range(19)
 )
 DISTANCE, BEARING, ALONG, ACROSS, ALONG2, ACROSS2, PART, BLEND = (
     k * LANES for k in range(8)
 )
-WORLD, ROBOT, SHAPE, START, FIRST, WIDTH, START2, FIRST2, WIDTH2, BEGIN, HITS, NEAR, NEAR2, FAR, FAR2, CELL, HULL, CLIMB = (
-    k * LANES for k in range(18)
+ROW, SHAPE, START, FIRST, START2, FIRST2, BEGIN, HITS, NEAR, NEAR2, FAR, FAR2, CELL, HULL, CLIMB = (
+    k * LANES for k in range(15)
 )
 PER_METRE, ROTATIONS, PARTS_PER_ROTATION, FIRST_CELL, CELLS_PER_PART, HULL_END, CORNERS_PER_PART, ROUND_RADIUS, CORNERS = range(9)
 ABOUT = 16
+AHEAD_OF = 8
 ABOVE_ZERO = 2.0**24
 """Added before a number is cut to a whole one, so that it is rounded down."""
 PER_TURN = 0.5 / math.pi
@@ -57,25 +57,29 @@ ATAN = tuple(
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def in_sight(found, begin, end, bodies, n, m, me, sx, sy, ahead, range_max, baked, wide, whole):  # type: ignore[no-untyped-def]
+def in_sight(i, begin, end, bodies, n, row, me, sx, sy, ahead, range_max, baked, wide, whole):  # type: ignore[no-untyped-def]
     left = 0
     n = np.uintp(n)
     for k in range(begin, end):
-        k = np.uintp(k)
-        dx, dy, radius = bodies[n, k, 0] - sx, bodies[n, k, 1] - sy, bodies[n, k, 5]
+        b = np.uintp(k)
+        dx, dy, radius = bodies[n, b, 0] - sx, bodies[n, b, 1] - sy, bodies[n, b, 5]
         d2 = dx * dx + dy * dy
         reach = range_max + radius
-        i = found
-        shape = int(bodies[n, k, 6])
-        wide[i + X], wide[i + Y], wide[i + RADIUS] = dx, dy, radius
-        wide[i + TURN], wide[i + COS], wide[i + SIN] = bodies[n, k, 2], bodies[n, k, 3], bodies[n, k, 4]
-        wide[i + AHEAD] = ahead
-        whole[i + WORLD], whole[i + ROBOT], whole[i + SHAPE] = n, m, shape * ABOUT
+        shape = int(bodies[n, b, 6])
+        put(wide, i + X, dx)
+        put(wide, i + Y, dy)
+        put(wide, i + TURN, bodies[n, b, 2])
+        put(wide, i + COS, bodies[n, b, 3])
+        put(wide, i + SIN, bodies[n, b, 4])
+        put(wide, i + AHEAD, ahead)
+        put(wide, i + RADIUS, radius)
+        put(whole, i + ROW, np.int32(row))
+        put(whole, i + SHAPE, np.int32(shape * ABOUT))
         seen = (d2 <= reach * reach) & (radius > 0.0) & (k != me)
         kept = seen & (d2 >= radius * radius) & (baked[np.uintp(shape)] != 0)
-        found += kept
+        i += kept
         left += seen & (not kept)
-    return found, left
+    return i, left
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
@@ -158,54 +162,67 @@ def cells_of(padded, distances, about, wide, single, whole):  # type: ignore[no-
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
-def silhouettes(padded, cells, hulls, wide, single, whole):  # type: ignore[no-untyped-def]
+def fetch(found, cells, hulls, wide, whole):  # type: ignore[no-untyped-def]
     zero = np.int32(0)
+    for k in range(found):
+        cell, skip = np.int64(get(whole, k + CELL)) * 4, get(whole, k + HULL)
+        put(whole, k + START, cells[np.uintp(cell)])
+        put(whole, k + FIRST, cells[np.uintp(cell + 1)])
+        put(whole, k + START2, cells[np.uintp(cell + 4)])
+        put(whole, k + FIRST2, cells[np.uintp(cell + 5)])
+        right, left = cells[np.uintp(cell + 2)], cells[np.uintp(cell + 3)]
+        other, other2 = right >> 16, left >> 16
+        put(whole, k + CLIMB, np.int32(other | other2))
+        p = 2 * np.int64(skip + np.int32(right & 0xFFFF))
+        put(wide, k + RIGHT_X, hulls[np.uintp(p)])
+        put(wide, k + RIGHT_Y, hulls[np.uintp(p + 1)])
+        p = 2 * np.int64(skip + np.int32(max(other, zero)))
+        put(wide, k + RIGHT_X2, hulls[np.uintp(p)])
+        put(wide, k + RIGHT_Y2, hulls[np.uintp(p + 1)])
+        p = 2 * np.int64(skip + np.int32(left & 0xFFFF))
+        put(wide, k + LEFT_X, hulls[np.uintp(p)])
+        put(wide, k + LEFT_Y, hulls[np.uintp(p + 1)])
+        p = 2 * np.int64(skip + np.int32(max(other2, zero)))
+        put(wide, k + LEFT_X2, hulls[np.uintp(p)])
+        put(wide, k + LEFT_Y2, hulls[np.uintp(p + 1)])
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def silhouettes(padded, wide, single):  # type: ignore[no-untyped-def]
     for k in range(padded):
-        cell, skip = np.int64(get(whole, k + CELL)), np.int64(get(whole, k + HULL))
-        cell = cell * 8
-        put(whole, k + START, peek(cells, cell))
-        put(whole, k + FIRST, peek(cells, cell + 1))
-        put(whole, k + WIDTH, peek(cells, cell + 2))
-        put(whole, k + START2, peek(cells, cell + 8))
-        put(whole, k + FIRST2, peek(cells, cell + 9))
-        put(whole, k + WIDTH2, peek(cells, cell + 10))
         x, y, c, s = get(wide, k + X), get(wide, k + Y), get(wide, k + COS), get(wide, k + SIN)
         round_ = get(wide, k + ROUND)
         d2 = x * x + y * y
         cos, sin = c * x + s * y, s * x - c * y  # against the bearing, times d
-        other = peek(cells, cell + 4)
-        p, q = 2 * (skip + peek(cells, cell + 3)), 2 * (skip + max(other, zero))
-        hx, hy = peek(hulls, p), peek(hulls, p + 1)
+        hx, hy = get(wide, k + RIGHT_X), get(wide, k + RIGHT_Y)
         ax, ay = d2 + cos * hx - sin * hy, sin * hx + cos * hy
-        hx, hy = peek(hulls, q), peek(hulls, q + 1)
+        hx, hy = get(wide, k + RIGHT_X2), get(wide, k + RIGHT_Y2)
         bx, by = d2 + cos * hx - sin * hy, sin * hx + cos * hy
         outer = ax * by - ay * bx < 0.0
         ax, ay = bx if outer else ax, by if outer else ay
         tangent = math.sqrt(max(d2 - round_ * round_, 0.0))
         put(single, k + ALONG, np.float32(tangent if round_ > 0.0 else ax))
         put(single, k + ACROSS, np.float32(-round_ if round_ > 0.0 else ay))
-        other2 = peek(cells, cell + 6)
-        p, q = 2 * (skip + peek(cells, cell + 5)), 2 * (skip + max(other2, zero))
-        hx, hy = peek(hulls, p), peek(hulls, p + 1)
+        hx, hy = get(wide, k + LEFT_X), get(wide, k + LEFT_Y)
         ax, ay = d2 + cos * hx - sin * hy, sin * hx + cos * hy
-        hx, hy = peek(hulls, q), peek(hulls, q + 1)
+        hx, hy = get(wide, k + LEFT_X2), get(wide, k + LEFT_Y2)
         bx, by = d2 + cos * hx - sin * hy, sin * hx + cos * hy
         outer = ax * by - ay * bx > 0.0
         ax, ay = bx if outer else ax, by if outer else ay
         put(single, k + ALONG2, np.float32(tangent if round_ > 0.0 else ax))
         put(single, k + ACROSS2, np.float32(round_ if round_ > 0.0 else ay))
-        put(whole, k + CLIMB, np.int32(min(other, other2)))
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
 def climb(i, corners, cells, hulls, wide, single, whole):  # type: ignore[no-untyped-def]
     x, y, c, s = wide[i + X], wide[i + Y], wide[i + COS], wide[i + SIN]
     cos, sin, d2 = c * x + s * y, s * x - c * y, x * x + y * y
-    cell, skip = np.uintp(whole[i + CELL]) * np.uintp(8), whole[i + HULL]
-    first, other = cells[cell + np.uintp(3)], cells[cell + np.uintp(4)]
+    cell, skip = np.uintp(whole[i + CELL]) * np.uintp(4), whole[i + HULL]
+    right, left = cells[cell + np.uintp(2)], cells[cell + np.uintp(3)]
+    first, other = right & 0xFFFF, right >> 16
     if other < 0:
         single[i + ALONG], single[i + ACROSS] = outermost(hulls, skip, corners, first, -other, d2, cos, sin, 1.0)
-    first, other = cells[cell + np.uintp(5)], cells[cell + np.uintp(6)]
+    first, other = left & 0xFFFF, left >> 16
     if other < 0:
         single[i + ALONG2], single[i + ACROSS2] = outermost(hulls, skip, corners, first, -other, d2, cos, sin, -1.0)
 
@@ -261,28 +278,32 @@ def spans(padded, beams, wide, single):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def aim(i, count, shift, wide, single, whole):  # type: ignore[no-untyped-def]
+def aim(k, count, shift, wide, single, whole):  # type: ignore[no-untyped-def]
     one, zero = np.int32(1), np.int32(0)
-    first, last, middle = wide[i + RIGHT], wide[i + LEFT], wide[i + MIDDLE]
+    first, last, middle = get(wide, k + RIGHT), get(wide, k + LEFT), get(wide, k + MIDDLE)
     begin = np.int32(first)
     begin = np.int32(max(np.int32(begin + np.int32(first > begin)), zero))
     hits = np.int32(min(np.int32(last), np.int32(count - one)) - begin + one)
     phases = np.int32(one << shift)
     exact = (begin - middle) * phases + ABOVE_ZERO
     point = np.int32(exact)
-    single[i + PART] = exact - point
+    put(single, k + PART, np.float32(exact - point))
     point = np.int32(point - np.int32(ABOVE_ZERO))
     beam, phase = np.int32(point >> shift), np.int32(point & np.int32(phases - one))
-    width, width2 = whole[i + WIDTH], whole[i + WIDTH2]
-    skip = np.int32(max(min(np.int32(beam - whole[i + FIRST]), np.int32(width - hits - one)), zero))
-    skip2 = np.int32(max(min(np.int32(beam - whole[i + FIRST2]), np.int32(width2 - hits - one)), zero))
-    near = np.int32(whole[i + START] + phase * width + skip)
-    far = np.int32(whole[i + START2] + phase * width2 + skip2)
+    place, place2 = get(whole, k + FIRST), get(whole, k + FIRST2)
+    low, low2 = np.int32(place >> 16), np.int32(place2 >> 16)
+    width, width2 = np.int32(place & 0xFFFF), np.int32(place2 & 0xFFFF)
+    skip = np.int32(max(min(np.int32(beam - low), np.int32(width - hits - one)), zero))
+    skip2 = np.int32(max(min(np.int32(beam - low2), np.int32(width2 - hits - one)), zero))
+    near = np.int32(get(whole, k + START) + phase * width + skip)
+    far = np.int32(get(whole, k + START2) + phase * width2 + skip2)
     same = np.int32(phase + one) < phases
-    whole[i + NEAR], whole[i + FAR] = near, far
-    whole[i + NEAR2] = np.int32(near + width) if same else np.int32(near - phase * width + one)
-    whole[i + FAR2] = np.int32(far + width2) if same else np.int32(far - phase * width2 + one)
-    whole[i + BEGIN], whole[i + HITS] = begin, hits
+    put(whole, k + NEAR, near)
+    put(whole, k + FAR, far)
+    put(whole, k + NEAR2, np.int32(near + width) if same else np.int32(near - phase * width + one))
+    put(whole, k + FAR2, np.int32(far + width2) if same else np.int32(far - phase * width2 + one))
+    put(whole, k + BEGIN, begin)
+    put(whole, k + HITS, hits)
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
@@ -292,56 +313,51 @@ def aims(padded, count, shift, wide, single, whole):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def lower(ranges, i, limits, rows, single, whole):  # type: ignore[no-untyped-def]
+def lower(ranges, k, limits, rows, single, whole):  # type: ignore[no-untyped-def]
     """Lowers the beams of a span to the blended rows of its cell."""
-    nothing, close = np.float32(np.inf), np.float32(-np.inf)
-    low, high = np.float32(limits[0]), np.float32(limits[1])
-    n, m, begin, hits = np.uintp(whole[i + WORLD]), np.uintp(whole[i + ROBOT]), whole[i + BEGIN], whole[i + HITS]
-    near, near2, far, far2 = np.uintp(whole[i + NEAR]), np.uintp(whole[i + NEAR2]), np.uintp(whole[i + FAR]), np.uintp(whole[i + FAR2])
-    part, share = single[i + PART], single[i + BLEND]
-    padded = (hits + BLOCK - 1) // BLOCK * BLOCK
-    begin = np.uintp(begin)
-    if begin + padded <= ranges.shape[2]:
-        for j in range(np.int32(padded)):
-            z = np.uintp(j)
-            value, other = rows[near + z], rows[far + z]
-            value += part * (rows[near2 + z] - value)
-            other += part * (rows[far2 + z] - other)
-            value += share * (other - value)
-            value = value if value <= high else nothing
-            value = value if value >= low else close
-            value = value if j < np.int32(hits) else nothing
-            held = ranges[n, m, begin + z]
-            ranges[n, m, begin + z] = value if value < held else held
+    count = ranges.shape[2]
+    begin, hits = np.int64(get(whole, k + BEGIN)), np.int64(get(whole, k + HITS))
+    near, near2, far, far2 = np.int64(get(whole, k + NEAR)), np.int64(get(whole, k + NEAR2)), np.int64(get(whole, k + FAR)), np.int64(get(whole, k + FAR2))
+    weights = get(single, k + PART), get(single, k + BLEND)
+    at = np.int64(get(whole, k + ROW)) * count + begin
+    blocks = (hits + BLOCK - 1) // BLOCK
+    if begin + blocks * BLOCK <= count:
+        for b in range(blocks):
+            j = b * BLOCK
+            lower_block(ranges, at + j, rows, (near + j, near2 + j, far + j, far2 + j), weights, limits, (np.int32(0), np.int32(hits - j)))
     else:
+        low, high = limits
+        part, share = weights
         for j in range(hits):
-            z = np.uintp(j)
-            value, other = rows[near + z], rows[far + z]
-            value += part * (rows[near2 + z] - value)
-            other += part * (rows[far2 + z] - other)
+            value, other = peek(rows, near + j), peek(rows, far + j)
+            value += part * (peek(rows, near2 + j) - value)
+            other += part * (peek(rows, far2 + j) - other)
             value += share * (other - value)
-            value = value if value <= high else nothing
-            value = value if value >= low else close
-            held = ranges[n, m, begin + z]
-            ranges[n, m, begin + z] = value if value < held else held
+            value = value if value <= high else np.float32(np.inf)
+            value = value if value >= low else np.float32(-np.inf)
+            lower_beam(ranges, at + j, value)
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
 def fuse(found, ranges, beams, limits, rows, shift, wide, single, whole):  # type: ignore[no-untyped-def]
     turn = 2.0 * math.pi / beams[1]
+    limits_ = np.float32(limits[0]), np.float32(limits[1])
     for k in range(found):
-        i = k
-        if whole[i + HITS] > 0:
-            lower(ranges, i, limits, rows, single, whole)
+        near, far = np.int64(get(whole, k + AHEAD_OF + NEAR)), np.int64(get(whole, k + AHEAD_OF + FAR))
+        prefetch(rows, near)
+        prefetch(rows, far)
+        prefetch(rows, near + BLOCK)
+        prefetch(rows, far + BLOCK)
+        if get(whole, k + HITS) > 0:
+            lower(ranges, k, limits_, rows, single, whole)
     for k in range(found):
-        i = k
-        if wide[i + LEFT] >= turn:  # over the seam once at most
-            wide[i + MIDDLE], wide[i + RIGHT], wide[i + LEFT] = (
-                wide[i + MIDDLE] - turn, wide[i + RIGHT] - turn, wide[i + LEFT] - turn
-            )
-            aim(i, np.int32(ranges.shape[2]), np.int32(shift), wide, single, whole)
-            if whole[i + HITS] > 0:
-                lower(ranges, i, limits, rows, single, whole)
+        if get(wide, k + LEFT) >= turn:  # over the seam once at most
+            put(wide, k + MIDDLE, get(wide, k + MIDDLE) - turn)
+            put(wide, k + RIGHT, get(wide, k + RIGHT) - turn)
+            put(wide, k + LEFT, get(wide, k + LEFT) - turn)
+            aim(k, np.int32(ranges.shape[2]), np.int32(shift), wide, single, whole)
+            if get(whole, k + HITS) > 0:
+                lower(ranges, k, limits_, rows, single, whole)
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)
@@ -351,7 +367,8 @@ def look_up(found, ranges, beams, limits, lookup, room):  # type: ignore[no-unty
     padded = (found + BLOCK - 1) // BLOCK * BLOCK
     directions(padded, wide, single)
     cells_of(padded, distances, about, wide, single, whole)
-    silhouettes(padded, cells, hulls, wide, single, whole)
+    fetch(found, cells, hulls, wide, whole)
+    silhouettes(padded, wide, single)
     climbs(found, about, cells, hulls, wide, single, whole)
     edges(padded, single)
     spans(padded, beams, wide, single)

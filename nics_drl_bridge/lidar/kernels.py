@@ -118,16 +118,16 @@ def circle(out, directions, beams, x, y, radius, range_max):  # type: ignore[no-
 @njit(cache=True, error_model="numpy", _nrt=False)
 def segment(out, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
     """Exact ranges to the straight wall from (x1, y1) to (x2, y2)."""
-    edge(out, directions, beams, x1, y1, arctan2(y1, x1), x2, y2, arctan2(y2, x2))
+    edge(out, directions, beams, x1, y1, arctan2(y1, x1), x2, y2, arctan2(y2, x2), False)
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
-def edge(out, directions, beams, x1, y1, angle1, x2, y2, angle2):  # type: ignore[no-untyped-def]
-    """The same, with the directions of its ends [rad]."""
+def edge(out, directions, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore[no-untyped-def]
+    """The same, with the directions of its ends [rad]; `one_sided`: only seen from its right."""
     count = out.shape[0]
     ex, ey = x2 - x1, y2 - y1
     cross = x1 * ey - y1 * ex
-    if cross == 0.0:  # seen edge-on
+    if cross == 0.0 or (one_sided and cross > 0.0):  # seen edge-on, or from behind
         return
     low, high = (angle1, angle2) if cross > 0.0 else (angle2, angle1)
     if high < low:
@@ -155,14 +155,37 @@ def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyp
 @njit(cache=True, error_model="numpy", _nrt=False)
 def polygon(out, directions, beams, x, y, c, s, corners):  # type: ignore[no-untyped-def]
     """Exact ranges to the outline `corners` (V, 2), turned by (c, s), with its origin at (x, y)."""
-    last = corners.shape[0] - 1
+    last, cull = corners.shape[0] - 1, beside_convex(x, y, c, s, corners)
     ax, ay = turned(x, y, c, s, corners[last])
     angle = arctan2(ay, ax)
     for v in range(last + 1):
         bx, by = turned(x, y, c, s, corners[v])
         next_angle = arctan2(by, bx)
-        edge(out, directions, beams, ax, ay, angle, bx, by, next_angle)
+        edge(out, directions, beams, ax, ay, angle, bx, by, next_angle, cull)
         ax, ay, angle = bx, by, next_angle
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
+    """Whether an outline turns to the left only, and does not go around the lidar: see `polygon`.
+
+    Only then the sides that are seen from within can be left out.
+    """
+    last = corners.shape[0] - 1
+    ax, ay = turned(x, y, c, s, corners[last])
+    bx, by = turned(x, y, c, s, corners[max(last - 1, 0)])
+    ex, ey = ax - bx, ay - by
+    rounds = 0
+    for v in range(last + 1):
+        bx, by = turned(x, y, c, s, corners[v])
+        gx, gy = bx - ax, by - ay
+        if ex * gy - ey * gx < 0.0:
+            return False
+        if (ay <= 0.0) != (by <= 0.0):
+            cross = ax * by - ay * bx
+            rounds += int(ay <= 0.0 and cross > 0.0) - int(ay > 0.0 and cross < 0.0)
+        ax, ay, ex, ey = bx, by, gx, gy
+    return rounds == 0
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)

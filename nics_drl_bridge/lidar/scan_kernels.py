@@ -42,7 +42,7 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
             while begin < count:
                 end = min(count, begin + LANES - found)
                 found, left = baking.in_sight(
-                    found, begin, end, bodies, n, m, me, sx, sy, heading + beams[0], high, baked,
+                    found, begin, end, bodies, n, n * poses.shape[1] + m, me, sx, sy, heading + beams[0], high, baked,
                     wide, whole,
                 )
                 begin, missed = end, missed + left
@@ -61,6 +61,16 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
                 kernels.walls_into(out, directions, beams, sx, sy, c, s, walls)
                 kernels.finish(out, low, high)
     baking.look_up(found, ranges, beams, limits, lookup, room)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def all_known(bodies, shapes):  # type: ignore[no-untyped-def]
+    """Whether all bodies (N, K, 7) are of one of so many shapes."""
+    known = True
+    for n in range(bodies.shape[0]):
+        for k in range(bodies.shape[1]):
+            known &= (bodies[n, k, 6] >= 0.0) & (bodies[n, k, 6] < shapes)
+    return known
 
 
 @njit(cache=True)

@@ -16,7 +16,7 @@ from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import LANES, SINGLE, WHOLE, WIDE
 from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.maps_grid import GridMap
-from nics_drl_bridge.lidar.shapes import BODY, SHAPE, Shape, place
+from nics_drl_bridge.lidar.shapes import BODY, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable
 
@@ -118,10 +118,10 @@ class Scanner:
         index = [self.table.outlines.index_of(shape) for shape in shapes]
         return place(poses, self.table.outlines.radii[index], index)
 
-    def _require_known(self, index: NDArray[np.float64]) -> None:
+    def _require_known(self, bodies: NDArray[np.float64]) -> None:
         """Raises ModelError where the kernels would read beyond the table."""
         known = len(self.table.shapes)
-        if index.size and not (index.min() >= 0 and index.max() < known):
+        if not scan_kernels.all_known(bodies, known):
             raise ModelError(
                 f"a body is of a shape that is none of the {known} in the lidar table; make "
                 "bodies by `place` of the scanner that scans them."
@@ -164,7 +164,7 @@ class Scanner:
             )
         if walls.shape != (len(walls), 4):
             raise ConfigError(f"walls {walls.shape} must be (W, 4).")
-        self._require_known(bodies[..., SHAPE])
+        self._require_known(bodies)
         if out.shape != shape or out.dtype != np.float32:
             raise ConfigError(f"out is {out.shape} {out.dtype}; it must be {shape} float32.")
         worlds = np.arange(len(poses))

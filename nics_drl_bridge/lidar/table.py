@@ -126,10 +126,10 @@ class LidarTable:
         return about.ravel(), distances, self._packed(), self.rows, shift, hulls
 
     def _packed(self) -> NDArray[np.int32]:
-        """Flat (cells * 8,): start, and the cell."""
-        packed = np.zeros((len(self.start), 8), np.int32)
-        packed[:, 0], packed[:, 1:7] = self.start, self.cell
-        return packed.ravel()
+        """(cells * 4,) where each row begins; its first beam and width; two corners; two more."""
+        cell = self.cell.astype(np.int32)
+        pairs = (cell[:, [0, 3, 5]] << 16) | cell[:, [1, 2, 4]]
+        return np.column_stack([self.start, pairs]).ravel()
 
     @property
     def memory(self) -> int:
