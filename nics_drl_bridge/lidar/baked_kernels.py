@@ -23,15 +23,15 @@ from nics_drl_bridge.lidar.block_kernels import BLOCK, lower_beam, lower_block, 
 
 LANES = 272
 """So many bodies, of several scans, go through the passes together; a multiple of `BLOCK`."""
-WIDE, SINGLE, WHOLE = 19, 8, 15
+WIDE, SINGLE, WHOLE = 19, 8, 16
 X, Y, TURN, COS, SIN, AHEAD, RADIUS, ROUND, MIDDLE, RIGHT, LEFT, RIGHT_X, RIGHT_Y, RIGHT_X2, RIGHT_Y2, LEFT_X, LEFT_Y, LEFT_X2, LEFT_Y2 = (
     k * LANES for k in range(19)
 )
 DISTANCE, BEARING, ALONG, ACROSS, ALONG2, ACROSS2, PART, BLEND = (
     k * LANES for k in range(8)
 )
-ROW, SHAPE, START, FIRST, START2, FIRST2, BEGIN, HITS, NEAR, NEAR2, FAR, FAR2, CELL, HULL, CLIMB = (
-    k * LANES for k in range(15)
+ROW, SHAPE, START, FIRST, START2, FIRST2, BEGIN, HITS, NEAR, NEAR2, FAR, FAR2, CELL, HULL, CLIMB, BACK = (
+    k * LANES for k in range(16)
 )
 PER_METRE, ROTATIONS, PARTS_PER_ROTATION, FIRST_CELL, CELLS_PER_PART, HULL_END, CORNERS_PER_PART, ROUND_RADIUS, CORNERS = range(9)
 ABOUT = 16
@@ -298,12 +298,16 @@ def aim(k, count, shift, wide, single, whole):  # type: ignore[no-untyped-def]
     near = np.int32(get(whole, k + START) + phase * width + skip)
     far = np.int32(get(whole, k + START2) + phase * width2 + skip2)
     same = np.int32(phase + one) < phases
-    put(whole, k + NEAR, near)
-    put(whole, k + FAR, far)
-    put(whole, k + NEAR2, np.int32(near + width) if same else np.int32(near - phase * width + one))
-    put(whole, k + FAR2, np.int32(far + width2) if same else np.int32(far - phase * width2 + one))
-    put(whole, k + BEGIN, begin)
+    two, block = np.int32(2 * BLOCK), np.int32(BLOCK)
+    padded = np.int32(max(np.int32(hits + np.int32(block - one)) & np.int32(-block), two))
+    back = np.int32(max(np.int32(begin + padded - count), zero))
+    put(whole, k + NEAR, np.int32(near - back))
+    put(whole, k + FAR, np.int32(far - back))
+    put(whole, k + NEAR2, (np.int32(near + width) if same else np.int32(near - phase * width + one)) - back)
+    put(whole, k + FAR2, (np.int32(far + width2) if same else np.int32(far - phase * width2 + one)) - back)
+    put(whole, k + BEGIN, np.int32(begin - back))
     put(whole, k + HITS, hits)
+    put(whole, k + BACK, back)
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
@@ -320,12 +324,17 @@ def lower(ranges, k, limits, rows, single, whole):  # type: ignore[no-untyped-de
     near, near2, far, far2 = np.int64(get(whole, k + NEAR)), np.int64(get(whole, k + NEAR2)), np.int64(get(whole, k + FAR)), np.int64(get(whole, k + FAR2))
     weights = get(single, k + PART), get(single, k + BLEND)
     at = np.int64(get(whole, k + ROW)) * count + begin
-    blocks = (hits + BLOCK - 1) // BLOCK
-    if begin + blocks * BLOCK <= count:
-        for b in range(blocks):
-            j = b * BLOCK
-            lower_block(ranges, at + j, rows, (near + j, near2 + j, far + j, far2 + j), weights, limits, (np.int32(0), np.int32(hits - j)))
+    back = get(whole, k + BACK)
+    hit = np.int32(hits)
+    if min(begin, near, far) >= 0:
+        lower_block(ranges, at, rows, (near, near2, far, far2), weights, limits, (back, hit))
+        j = BLOCK
+        lower_block(ranges, at + j, rows, (near + j, near2 + j, far + j, far2 + j), weights, limits, (np.int32(back - j), hit))
+        for j in range(2 * BLOCK, hits, BLOCK):
+            lower_block(ranges, at + j, rows, (near + j, near2 + j, far + j, far2 + j), weights, limits, (np.int32(back - j), hit))
     else:
+        j = np.int64(back)
+        at, near, near2, far, far2 = at + j, near + j, near2 + j, far + j, far2 + j
         low, high = limits
         part, share = weights
         for j in range(hits):

@@ -123,7 +123,9 @@ class LidarTable:
         about[round_, ROTATIONS], about[round_, ROUND_RADIUS] = 0.0, outlines.radii[round_]
         shift = self.density.phases.bit_length() - 1
         hulls = np.ascontiguousarray(outlines.hulls).ravel()
-        return about.ravel(), distances, self._packed(), self.rows, shift, hulls
+        missing = max(2 * BLOCK - padding(self.beam_angle), 0)
+        rows = np.append(self.rows, np.zeros(missing, np.float32)) if missing else self.rows
+        return about.ravel(), distances, self._packed(), rows, shift, hulls
 
     def _packed(self) -> NDArray[np.int32]:
         """(cells * 4,) where each row begins; its first beam and width; two corners; two more."""
