@@ -58,14 +58,15 @@ ATAN = tuple(
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
 def in_sight(i, begin, end, bodies, n, row, me, sx, sy, ahead, range_max, baked, wide, whole):  # type: ignore[no-untyped-def]
-    left = 0
+    left, unknown = 0, 0
     n = np.uintp(n)
     for k in range(begin, end):
         b = np.uintp(k)
         dx, dy, radius = bodies[n, b, 0] - sx, bodies[n, b, 1] - sy, bodies[n, b, 5]
         d2 = dx * dx + dy * dy
         reach = range_max + radius
-        shape = int(bodies[n, b, 6])
+        known = (bodies[n, b, 6] >= 0.0) & (bodies[n, b, 6] < baked.shape[0])
+        shape = int(bodies[n, b, 6]) if known else 0
         put(wide, i + X, dx)
         put(wide, i + Y, dy)
         put(wide, i + TURN, bodies[n, b, 2])
@@ -75,11 +76,12 @@ def in_sight(i, begin, end, bodies, n, row, me, sx, sy, ahead, range_max, baked,
         put(wide, i + RADIUS, radius)
         put(whole, i + ROW, np.int32(row))
         put(whole, i + SHAPE, np.int32(shape * ABOUT))
-        seen = (d2 <= reach * reach) & (radius > 0.0) & (k != me)
+        seen = known & (d2 <= reach * reach) & (radius > 0.0) & (k != me)
         kept = seen & (d2 >= radius * radius) & (baked[np.uintp(shape)] != 0)
         i += kept
         left += seen & (not kept)
-    return i, left
+        unknown += not known
+    return i, left, unknown
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
@@ -88,7 +90,8 @@ def left_out(bodies, n, k, me, sx, sy, range_max, baked):  # type: ignore[no-unt
     dx, dy, radius = bodies[n, k, 0] - sx, bodies[n, k, 1] - sy, bodies[n, k, 5]
     d2 = dx * dx + dy * dy
     reach = range_max + radius
-    seen = radius > 0.0 and k != me and d2 <= reach * reach
+    shape = bodies[n, k, 6]
+    seen = shape >= 0.0 and shape < baked.shape[0] and k != me and d2 <= reach * reach and radius > 0.0
     return seen and (baked[int(bodies[n, k, 6])] == 0 or d2 < radius * radius)
 
 

@@ -30,9 +30,9 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
     """
     mount, directions, beams, limits, baked, outlines, lookup = sensor
     corners, corner = outlines
-    wide, _, whole = room
+    wide, whole = room[0], room[2]
     low, high, count = limits[0], limits[1], bodies.shape[1]
-    found = 0
+    found, unknown = 0, 0
     for n in chosen:
         for m in range(poses.shape[1]):
             kernels.clear(ranges, n, m)
@@ -41,14 +41,14 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
             begin, missed = 0, 0
             while begin < count:
                 end = min(count, begin + LANES - found)
-                found, left = baking.in_sight(
+                found, left, strange = baking.in_sight(
                     found, begin, end, bodies, n, n * poses.shape[1] + m, me, sx, sy, heading + beams[0], high, baked,
                     wide, whole,
                 )
-                begin, missed = end, missed + left
+                begin, missed, unknown = end, missed + left, unknown + strange
                 if found == LANES:
                     baking.look_up(found, ranges, beams, limits, lookup, room)
-                    found = 0
+                    found, unknown = 0, 0
             if missed > 0 or walls.shape[0] > 0:
                 c, s = math.cos(heading), math.sin(heading)
                 out = ranges[n, m]
@@ -61,16 +61,7 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
                 kernels.walls_into(out, directions, beams, sx, sy, c, s, walls)
                 kernels.finish(out, low, high)
     baking.look_up(found, ranges, beams, limits, lookup, room)
-
-
-@njit(cache=True, error_model="numpy", _nrt=False)
-def all_known(bodies, shapes):  # type: ignore[no-untyped-def]
-    """Whether all bodies (N, K, 7) are of one of so many shapes."""
-    known = True
-    for n in range(bodies.shape[0]):
-        for k in range(bodies.shape[1]):
-            known &= (bodies[n, k, 6] >= 0.0) & (bodies[n, k, 6] < shapes)
-    return known
+    return unknown == 0
 
 
 @njit(cache=True)

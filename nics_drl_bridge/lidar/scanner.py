@@ -118,15 +118,6 @@ class Scanner:
         index = [self.table.outlines.index_of(shape) for shape in shapes]
         return place(poses, self.table.outlines.radii[index], index)
 
-    def _require_known(self, bodies: NDArray[np.float64]) -> None:
-        """Raises ModelError where the kernels would read beyond the table."""
-        known = len(self.table.shapes)
-        if not scan_kernels.all_known(bodies, known):
-            raise ModelError(
-                f"a body is of a shape that is none of the {known} in the lidar table; make "
-                "bodies by `place` of the scanner that scans them."
-            )
-
     def scan(
         self,
         poses: ArrayLike,
@@ -164,14 +155,18 @@ class Scanner:
             )
         if walls.shape != (len(walls), 4):
             raise ConfigError(f"walls {walls.shape} must be (W, 4).")
-        self._require_known(bodies)
         if out.shape != shape or out.dtype != np.float32:
             raise ConfigError(f"out is {out.shape} {out.dtype}; it must be {shape} float32.")
         worlds = np.arange(len(poses))
         room = self.room(bodies.shape[1])
-        scan_kernels.scan_worlds(
+        known = scan_kernels.scan_worlds(
             out[:, None], poses[:, None], worlds, bodies, -1, walls, self.arguments, room
         )
+        if not known:
+            raise ModelError(
+                f"a body is of a shape that is none of the {len(self.table.shapes)} in the lidar "
+                "table; make bodies by `place` of the scanner that scans them."
+            )
         if self.grid is not None:
             scan_kernels.add_map(
                 out[:, None], poses[:, None], worlds, self.arguments, self.grid.arrays,
