@@ -1,8 +1,11 @@
 """Compiled inner loops of the baked lidar: look up and fuse (Eq. 3, 4).
 
-A scan is made in passes over the bodies in sight, each pass a short loop without branches:
-nearly all the time of a look-up is waiting, for a memory or after a wrong guess of a branch,
-and so the waiting of one body overlaps with the work on the next.
+The bodies in sight of several scans go through some passes together, each a short loop without
+branches: nearly all the time of a look-up is waiting, for a memory or after a wrong guess of a
+branch, and so the waiting of one body overlaps with the work on the next. What one pass finds
+out the next ones read from lanes: one array of each kind of number, in which every quantity has
+`LANES` places of its own at a fixed offset, so that LLVM sees that they do not overlap. What a
+pass makes of a body depends on that body only, so that a scan is the same in any batch.
 
 Two rows, of the grid distances on both sides of the true one, are blended, and in each the two
 points on both sides of a beam. Which beams hit
@@ -17,25 +20,34 @@ import math
 import numpy as np
 from numba import njit
 
-from nics_drl_bridge.lidar import kernels
-from nics_drl_bridge.lidar.map_memory_kernels import get, peek, put
 from nics_drl_bridge.lidar.block_kernels import BLOCK, lower_beam, lower_block, prefetch
+from nics_drl_bridge.lidar.map_memory_kernels import get, peek, put
 
-LANES = 272
-"""So many bodies, of several scans, go through the passes together; a multiple of `BLOCK`."""
-WIDE, SINGLE, WHOLE = 19, 8, 16
-X, Y, TURN, COS, SIN, AHEAD, RADIUS, ROUND, MIDDLE, RIGHT, LEFT, RIGHT_X, RIGHT_Y, RIGHT_X2, RIGHT_Y2, LEFT_X, LEFT_Y, LEFT_X2, LEFT_Y2 = (
-    k * LANES for k in range(19)
+LANES = 144
+"""So many bodies go through the passes together: a multiple of `BLOCK`, and few enough that the
+scans that they belong to stay in the nearest cache."""
+WIDE, SINGLE, WHOLE = 20, 8, 15
+"""Quantities in double and single precision and in whole numbers."""
+X, Y, TURN, COS, SIN, RADIUS, AHEAD, AT, ROUND, MIDDLE, RIGHT, LEFT = (k * LANES for k in range(12))
+"""Of a body: offset from the lidar, heading, cos, sin, radius; the bearing of beam 0 in the world
+and where the scan begins in memory; radius of a circle or 0; bearing and silhouettes in beams."""
+RIGHT_X, RIGHT_Y, RIGHT_X2, RIGHT_Y2, LEFT_X, LEFT_Y, LEFT_X2, LEFT_Y2 = (
+    k * LANES for k in range(12, 20)
 )
-DISTANCE, BEARING, ALONG, ACROSS, ALONG2, ACROSS2, PART, BLEND = (
-    k * LANES for k in range(8)
+"""The two corners of the hull that can be the right silhouette, and the left one."""
+DISTANCE, BEARING, ALONG, ACROSS, ALONG2, ACROSS2, PART, BLEND = (k * LANES for k in range(8))
+"""The silhouettes along and across the bearing, then `ALONG` and `ALONG2` as angles; shares of the
+next point and of the farther row."""
+SHAPE, CELL, HULL, CLIMB, START, PLACE, START2, PLACE2, BEGIN, HITS, BACK = (
+    k * LANES for k in range(11)
 )
-ROW, SHAPE, START, FIRST, START2, FIRST2, BEGIN, HITS, NEAR, NEAR2, FAR, FAR2, CELL, HULL, CLIMB, BACK = (
-    k * LANES for k in range(16)
-)
-PER_METRE, ROTATIONS, PARTS_PER_ROTATION, FIRST_CELL, CELLS_PER_PART, HULL_END, CORNERS_PER_PART, ROUND_RADIUS, CORNERS = range(9)
-ABOUT = 16
-AHEAD_OF = 8
+NEAR, NEAR2, FAR, FAR2 = (k * LANES for k in range(11, 15))
+"""The cell and the next one, packed as in the table; the span of beams; where the points begin."""
+PER_METRE, ROTATIONS, PARTS_PER_ROTATION, FIRST_CELL, CELLS_PER_PART = range(5)
+HULL_END, CORNERS_PER_PART, CORNERS, ROUND_RADIUS, ABOUT = range(5, 10)
+"""What the kernels know of a shape, see `table.LidarTable.lookup`; so many numbers."""
+SOON = 8
+"""The rows of the body so many places on are asked for."""
 ABOVE_ZERO = 2.0**24
 """Added before a number is cut to a whole one, so that it is rounded down."""
 PER_TURN = 0.5 / math.pi
@@ -54,34 +66,48 @@ ATAN = tuple(
 )
 
 
-
-
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def in_sight(i, begin, end, bodies, n, row, me, sx, sy, ahead, range_max, baked, wide, whole):  # type: ignore[no-untyped-def]
-    left, unknown = 0, 0
-    n = np.uintp(n)
+def in_sight(found, begin, end, bodies, n, me, scan, range_max, baked, wide, whole):  # type: ignore[no-untyped-def]
+    """First pass: packs the bodies in sight of one scan into the lanes.
+
+    Args:
+        found: how many lanes are taken.
+        begin, end: which bodies; there are lanes for all of them.
+        bodies: (N, K, 7), see `shapes.BODY`.
+        n: which world.
+        me: the body that carries the lidar, or -1.
+        scan: x and y of the lidar in the world [m], the bearing of beam 0 [rad], and the index
+            of its range from where the ranges begin.
+        range_max: [m].
+        baked: (H,) whether a shape is to be looked up.
+        wide, whole: lanes.
+
+    Returns:
+        How many lanes are taken now, and how many bodies in sight can't be looked up: not baked,
+        or so near that the lidar is within their circle.
+    """
+    n, left = np.uintp(n), 0
+    sx, sy, ahead, at = scan
     for k in range(begin, end):
         b = np.uintp(k)
         dx, dy, radius = bodies[n, b, 0] - sx, bodies[n, b, 1] - sy, bodies[n, b, 5]
         d2 = dx * dx + dy * dy
         reach = range_max + radius
-        known = (bodies[n, b, 6] >= 0.0) & (bodies[n, b, 6] < baked.shape[0])
-        shape = int(bodies[n, b, 6]) if known else 0
-        put(wide, i + X, dx)
-        put(wide, i + Y, dy)
-        put(wide, i + TURN, bodies[n, b, 2])
-        put(wide, i + COS, bodies[n, b, 3])
-        put(wide, i + SIN, bodies[n, b, 4])
-        put(wide, i + AHEAD, ahead)
-        put(wide, i + RADIUS, radius)
-        put(whole, i + ROW, np.int32(row))
-        put(whole, i + SHAPE, np.int32(shape * ABOUT))
-        seen = known & (d2 <= reach * reach) & (radius > 0.0) & (k != me)
+        shape = np.int32(bodies[n, b, 6])
+        put(wide, found + X, dx)
+        put(wide, found + Y, dy)
+        put(wide, found + TURN, bodies[n, b, 2])
+        put(wide, found + COS, bodies[n, b, 3])
+        put(wide, found + SIN, bodies[n, b, 4])
+        put(wide, found + RADIUS, radius)
+        put(wide, found + AHEAD, ahead)
+        put(wide, found + AT, at)
+        put(whole, found + SHAPE, np.int32(shape * ABOUT))
+        seen = (d2 <= reach * reach) & (radius > 0.0) & (k != me)
         kept = seen & (d2 >= radius * radius) & (baked[np.uintp(shape)] != 0)
-        i += kept
+        found += kept
         left += seen & (not kept)
-        unknown += not known
-    return i, left, unknown
+    return found, left
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
@@ -90,164 +116,11 @@ def left_out(bodies, n, k, me, sx, sy, range_max, baked):  # type: ignore[no-unt
     dx, dy, radius = bodies[n, k, 0] - sx, bodies[n, k, 1] - sy, bodies[n, k, 5]
     d2 = dx * dx + dy * dy
     reach = range_max + radius
-    shape = bodies[n, k, 6]
-    seen = shape >= 0.0 and shape < baked.shape[0] and k != me and d2 <= reach * reach and radius > 0.0
+    seen = radius > 0.0 and k != me and d2 <= reach * reach
     return seen and (baked[int(bodies[n, k, 6])] == 0 or d2 < radius * radius)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
-def directions(padded, wide, single):  # type: ignore[no-untyped-def]
-    for k in range(padded):
-        i = k
-        x, y = wide[i + X], wide[i + Y]
-        single[i + ALONG], single[i + ACROSS] = x, y
-        single[i + DISTANCE] = x * x + y * y
-    for k in range(padded):
-        i = k
-        single[i + DISTANCE] = math.sqrt(single[i + DISTANCE])
-        single[i + BEARING] = arctan2_single(single[i + ACROSS], single[i + ALONG])
-
-
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
-def outermost(hulls, skip, corners, first, stride, d2, cos, sin, side):  # type: ignore[no-untyped-def]
-    """Climbs along a hull to its right (side 1) or left (-1) silhouette, as (along, across).
-
-    Seen from outside, the direction of the corners rises and falls once around the hull: the best
-    corner among its neighbours is the best of all. Only shapes of many corners need it, nearby.
-
-    Args:
-        hulls, skip, corners: the hull begins at `skip` and has so many corners.
-        first: the corner to begin at.
-        stride: to begin with, a power of 2.
-        d2, cos, sin: of the shape, see `cells_of`.
-        side: which.
-    """
-    best = first
-    one = np.uintp(2) * np.uintp(skip + best)
-    x = d2 + cos * hulls[one] - sin * hulls[one + np.uintp(1)]
-    y = sin * hulls[one] + cos * hulls[one + np.uintp(1)]
-    while stride > 0:
-        for _ in range(corners):
-            moved = False
-            for step in (stride, corners - stride):
-                other = best + step
-                other -= corners if other >= corners else 0
-                one = np.uintp(2) * np.uintp(skip + other)
-                ax = d2 + cos * hulls[one] - sin * hulls[one + np.uintp(1)]
-                ay = sin * hulls[one] + cos * hulls[one + np.uintp(1)]
-                if side * (x * ay - y * ax) < 0.0:
-                    best, x, y, moved = other, ax, ay, True
-            if not moved:
-                break
-        stride >>= 1
-    return x, y
-
-
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
-def cells_of(padded, distances, about, wide, single, whole):  # type: ignore[no-untyped-def]
-    zero, last = np.int32(0), np.int32(distances - 2)
-    for k in range(padded):
-        h = get(whole, k + SHAPE)
-        place = (get(single, k + DISTANCE) - get(wide, k + RADIUS)) * peek(about, h + PER_METRE)
-        step = np.int32(max(min(np.int32(place), last), zero))
-        put(single, k + BLEND, np.float32(place - step))
-        share = (get(wide, k + TURN) - get(single, k + BEARING)) * PER_TURN
-        share -= np.floor(share)
-        rotations = peek(about, h + ROTATIONS)
-        turn = np.int32(share * rotations + 0.5)
-        turn = np.int32(max(min(turn, np.int32(rotations)), zero))  # a heading may be no number
-        sector = np.int32((turn + 0.5) * peek(about, h + PARTS_PER_ROTATION))
-        cell = peek(about, h + FIRST_CELL) + turn * distances - sector * peek(about, h + CELLS_PER_PART)
-        put(whole, k + CELL, np.int32(np.int32(cell) + step))
-        skip = peek(about, h + HULL_END) - sector * peek(about, h + CORNERS_PER_PART)
-        put(whole, k + HULL, np.int32(skip))
-        put(wide, k + ROUND, peek(about, h + ROUND_RADIUS))
-
-
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
-def fetch(found, cells, hulls, wide, whole):  # type: ignore[no-untyped-def]
-    zero = np.int32(0)
-    for k in range(found):
-        cell, skip = np.int64(get(whole, k + CELL)) * 4, get(whole, k + HULL)
-        put(whole, k + START, cells[np.uintp(cell)])
-        put(whole, k + FIRST, cells[np.uintp(cell + 1)])
-        put(whole, k + START2, cells[np.uintp(cell + 4)])
-        put(whole, k + FIRST2, cells[np.uintp(cell + 5)])
-        right, left = cells[np.uintp(cell + 2)], cells[np.uintp(cell + 3)]
-        other, other2 = right >> 16, left >> 16
-        put(whole, k + CLIMB, np.int32(other | other2))
-        p = 2 * np.int64(skip + np.int32(right & 0xFFFF))
-        put(wide, k + RIGHT_X, hulls[np.uintp(p)])
-        put(wide, k + RIGHT_Y, hulls[np.uintp(p + 1)])
-        p = 2 * np.int64(skip + np.int32(max(other, zero)))
-        put(wide, k + RIGHT_X2, hulls[np.uintp(p)])
-        put(wide, k + RIGHT_Y2, hulls[np.uintp(p + 1)])
-        p = 2 * np.int64(skip + np.int32(left & 0xFFFF))
-        put(wide, k + LEFT_X, hulls[np.uintp(p)])
-        put(wide, k + LEFT_Y, hulls[np.uintp(p + 1)])
-        p = 2 * np.int64(skip + np.int32(max(other2, zero)))
-        put(wide, k + LEFT_X2, hulls[np.uintp(p)])
-        put(wide, k + LEFT_Y2, hulls[np.uintp(p + 1)])
-
-
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
-def silhouettes(padded, wide, single):  # type: ignore[no-untyped-def]
-    for k in range(padded):
-        x, y, c, s = get(wide, k + X), get(wide, k + Y), get(wide, k + COS), get(wide, k + SIN)
-        round_ = get(wide, k + ROUND)
-        d2 = x * x + y * y
-        cos, sin = c * x + s * y, s * x - c * y  # against the bearing, times d
-        hx, hy = get(wide, k + RIGHT_X), get(wide, k + RIGHT_Y)
-        ax, ay = d2 + cos * hx - sin * hy, sin * hx + cos * hy
-        hx, hy = get(wide, k + RIGHT_X2), get(wide, k + RIGHT_Y2)
-        bx, by = d2 + cos * hx - sin * hy, sin * hx + cos * hy
-        outer = ax * by - ay * bx < 0.0
-        ax, ay = bx if outer else ax, by if outer else ay
-        tangent = math.sqrt(max(d2 - round_ * round_, 0.0))
-        put(single, k + ALONG, np.float32(tangent if round_ > 0.0 else ax))
-        put(single, k + ACROSS, np.float32(-round_ if round_ > 0.0 else ay))
-        hx, hy = get(wide, k + LEFT_X), get(wide, k + LEFT_Y)
-        ax, ay = d2 + cos * hx - sin * hy, sin * hx + cos * hy
-        hx, hy = get(wide, k + LEFT_X2), get(wide, k + LEFT_Y2)
-        bx, by = d2 + cos * hx - sin * hy, sin * hx + cos * hy
-        outer = ax * by - ay * bx > 0.0
-        ax, ay = bx if outer else ax, by if outer else ay
-        put(single, k + ALONG2, np.float32(tangent if round_ > 0.0 else ax))
-        put(single, k + ACROSS2, np.float32(round_ if round_ > 0.0 else ay))
-
-
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def climb(i, corners, cells, hulls, wide, single, whole):  # type: ignore[no-untyped-def]
-    x, y, c, s = wide[i + X], wide[i + Y], wide[i + COS], wide[i + SIN]
-    cos, sin, d2 = c * x + s * y, s * x - c * y, x * x + y * y
-    cell, skip = np.uintp(whole[i + CELL]) * np.uintp(4), whole[i + HULL]
-    right, left = cells[cell + np.uintp(2)], cells[cell + np.uintp(3)]
-    first, other = right & 0xFFFF, right >> 16
-    if other < 0:
-        single[i + ALONG], single[i + ACROSS] = outermost(hulls, skip, corners, first, -other, d2, cos, sin, 1.0)
-    first, other = left & 0xFFFF, left >> 16
-    if other < 0:
-        single[i + ALONG2], single[i + ACROSS2] = outermost(hulls, skip, corners, first, -other, d2, cos, sin, -1.0)
-
-
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
-def climbs(found, about, cells, hulls, wide, single, whole):  # type: ignore[no-untyped-def]
-    for k in range(found):
-        i = k
-        if whole[i + CLIMB] < 0:
-            corners = int(about[np.uintp(whole[i + SHAPE] + CORNERS)])
-            climb(i, corners, cells, hulls, wide, single, whole)
-
-
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
-def edges(padded, single):  # type: ignore[no-untyped-def]
-    for k in range(padded):
-        i = k
-        single[i + ALONG] = arctan2_single(single[i + ACROSS], single[i + ALONG])
-        single[i + ALONG2] = arctan2_single(single[i + ACROSS2], single[i + ALONG2])
-
-
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
 def arctan2_single(y, x):  # type: ignore[no-untyped-def]
     """As `kernels.arctan2` in single precision, within 2e-7 rad."""
     ax, ay = abs(x), abs(y)
@@ -261,30 +134,199 @@ def arctan2_single(y, x):  # type: ignore[no-untyped-def]
     r = r * s + ATAN[2]
     r = r * s + ATAN[1]
     r = (r * s + ATAN[0]) * ratio
-    r = np.float32(kernels.HALF_PI) - r if ay > ax else r
+    r = np.float32(0.5 * math.pi) - r if ay > ax else r
     r = np.float32(math.pi) - r if x < np.float32(0.0) else r
     return math.copysign(r, y)
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def directions(padded, wide, single):  # type: ignore[no-untyped-def]
+    """Second pass: distance and bearing in the world of each."""
+    for k in range(padded):
+        x, y = get(wide, k + X), get(wide, k + Y)
+        put(single, k + ALONG, np.float32(x))
+        put(single, k + ACROSS, np.float32(y))
+        put(single, k + DISTANCE, np.float32(x * x + y * y))
+    for k in range(padded):
+        put(single, k + DISTANCE, math.sqrt(get(single, k + DISTANCE)))
+        put(single, k + BEARING, arctan2_single(get(single, k + ACROSS), get(single, k + ALONG)))
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def cells_of(padded, distances, about, wide, single, whole):  # type: ignore[no-untyped-def]
+    """Third pass: which cell each looks up, and where its hull begins.
+
+    The numbers are kept within the table whatever they are: a heading may be none, and lanes that
+    nobody took hold what was there before.
+    """
+    zero, last = np.int32(0), np.int32(distances - 2)
+    for k in range(padded):
+        h = np.int64(get(whole, k + SHAPE))
+        place = (get(single, k + DISTANCE) - get(wide, k + RADIUS)) * peek(about, h + PER_METRE)
+        step = np.int32(max(min(np.int32(place), last), zero))
+        put(single, k + BLEND, np.float32(place - step))
+        share = (get(wide, k + TURN) - get(single, k + BEARING)) * PER_TURN
+        share -= np.floor(share)
+        rotations = peek(about, h + ROTATIONS)
+        turn = np.int32(share * rotations + 0.5)
+        turn = np.int32(max(min(turn, np.int32(rotations)), zero))
+        sector = np.int32((turn + 0.5) * peek(about, h + PARTS_PER_ROTATION))
+        cell = turn * distances - sector * peek(about, h + CELLS_PER_PART)
+        put(whole, k + CELL, np.int32(np.int32(cell + peek(about, h + FIRST_CELL)) + step))
+        hull = peek(about, h + HULL_END) - sector * peek(about, h + CORNERS_PER_PART)
+        put(whole, k + HULL, np.int32(hull))
+        put(wide, k + ROUND, peek(about, h + ROUND_RADIUS))
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def fetch(found, cells, hulls, wide, whole):  # type: ignore[no-untyped-def]
+    """Fourth pass: the only one that waits for the cells, and does nothing else.
+
+    Args:
+        found: how many lanes are taken.
+        cells: (cells * 4,) int32, see `table.LidarTable.lookup`.
+        hulls: (2 * corners,), see `shapes.Outlines`.
+        wide, whole: lanes.
+    """
+    zero = np.int32(0)
+    for k in range(found):
+        cell, skip = np.int64(get(whole, k + CELL)) * 4, get(whole, k + HULL)
+        put(whole, k + START, cells[np.uintp(cell)])
+        put(whole, k + PLACE, cells[np.uintp(cell + 1)])
+        put(whole, k + START2, cells[np.uintp(cell + 4)])
+        put(whole, k + PLACE2, cells[np.uintp(cell + 5)])
+        right, left = cells[np.uintp(cell + 2)], cells[np.uintp(cell + 3)]
+        other, other2 = np.int32(right >> 16), np.int32(left >> 16)
+        put(whole, k + CLIMB, np.int32(other | other2))  # below zero if one of them is
+        corner = 2 * np.int64(skip + (right & 0xFFFF))
+        put(wide, k + RIGHT_X, hulls[np.uintp(corner)])
+        put(wide, k + RIGHT_Y, hulls[np.uintp(corner + 1)])
+        corner = 2 * np.int64(skip + max(other, zero))
+        put(wide, k + RIGHT_X2, hulls[np.uintp(corner)])
+        put(wide, k + RIGHT_Y2, hulls[np.uintp(corner + 1)])
+        corner = 2 * np.int64(skip + (left & 0xFFFF))
+        put(wide, k + LEFT_X, hulls[np.uintp(corner)])
+        put(wide, k + LEFT_Y, hulls[np.uintp(corner + 1)])
+        corner = 2 * np.int64(skip + max(other2, zero))
+        put(wide, k + LEFT_X2, hulls[np.uintp(corner)])
+        put(wide, k + LEFT_Y2, hulls[np.uintp(corner + 1)])
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+def seen_from(d2, cos, sin, x, y):  # type: ignore[no-untyped-def]
+    """A corner (x, y) of a hull as (along, across) the bearing, times the distance.
+
+    `d2` is the square of the distance, `cos` and `sin` are of the heading against the bearing,
+    times the distance.
+    """
+    return d2 + cos * x - sin * y, sin * x + cos * y
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def silhouettes(padded, wide, single):  # type: ignore[no-untyped-def]
+    """Fifth pass: the two silhouettes as (along, across), of two corners the outer one."""
+    for k in range(padded):
+        x, y, c, s = get(wide, k + X), get(wide, k + Y), get(wide, k + COS), get(wide, k + SIN)
+        d2, cos, sin = x * x + y * y, c * x + s * y, s * x - c * y
+        radius = get(wide, k + ROUND)
+        tangent = math.sqrt(max(d2 - radius * radius, 0.0))
+        ax, ay = seen_from(d2, cos, sin, get(wide, k + RIGHT_X), get(wide, k + RIGHT_Y))
+        bx, by = seen_from(d2, cos, sin, get(wide, k + RIGHT_X2), get(wide, k + RIGHT_Y2))
+        outer = ax * by - ay * bx < 0.0
+        ax, ay = bx if outer else ax, by if outer else ay
+        put(single, k + ALONG, np.float32(tangent if radius > 0.0 else ax))
+        put(single, k + ACROSS, np.float32(-radius if radius > 0.0 else ay))
+        ax, ay = seen_from(d2, cos, sin, get(wide, k + LEFT_X), get(wide, k + LEFT_Y))
+        bx, by = seen_from(d2, cos, sin, get(wide, k + LEFT_X2), get(wide, k + LEFT_Y2))
+        outer = ax * by - ay * bx > 0.0
+        ax, ay = bx if outer else ax, by if outer else ay
+        put(single, k + ALONG2, np.float32(tangent if radius > 0.0 else ax))
+        put(single, k + ACROSS2, np.float32(radius if radius > 0.0 else ay))
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def outermost(hulls, skip, corners, first, stride, d2, cos, sin, side):  # type: ignore[no-untyped-def]
+    """Climbs along a hull to its right (side 1) or left (-1) silhouette, as (along, across).
+
+    Seen from outside, the direction of the corners rises and falls once around the hull: the best
+    corner among its neighbours is the best of all. Only shapes of many corners need it, nearby.
+
+    Args:
+        hulls: (2 * corners,) of all hulls, see `shapes.Outlines`.
+        skip, corners: the hull begins at this corner and has so many.
+        first: the corner to begin at.
+        stride: to begin with, a power of 2.
+        d2, cos, sin: of the shape, see `seen_from`.
+        side: which.
+    """
+    best = first
+    one = 2 * (skip + best)
+    x, y = seen_from(d2, cos, sin, hulls[np.uintp(one)], hulls[np.uintp(one + 1)])
+    while stride > 0:
+        for _ in range(corners):
+            moved = False
+            for step in (stride, corners - stride):
+                other = best + step
+                other -= corners if other >= corners else 0
+                one = 2 * (skip + other)
+                ax, ay = seen_from(d2, cos, sin, hulls[np.uintp(one)], hulls[np.uintp(one + 1)])
+                if side * (x * ay - y * ax) < 0.0:
+                    best, x, y, moved = other, ax, ay, True
+            if not moved:
+                break
+        stride >>= 1
+    return x, y
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+def climb(k, about, cells, hulls, wide, single, whole):  # type: ignore[no-untyped-def]
+    """Replaces the silhouettes of one body for which the cell names no two corners."""
+    x, y, c, s = get(wide, k + X), get(wide, k + Y), get(wide, k + COS), get(wide, k + SIN)
+    d2, cos, sin = x * x + y * y, c * x + s * y, s * x - c * y
+    cell, skip = np.int64(get(whole, k + CELL)) * 4, np.int64(get(whole, k + HULL))
+    corners = np.int64(peek(about, np.int64(get(whole, k + SHAPE)) + CORNERS))
+    right, left = np.int64(peek(cells, cell + 2)), np.int64(peek(cells, cell + 3))
+    if right < 0:
+        first, stride = right & 0xFFFF, -(right >> 16)
+        ax, ay = outermost(hulls, skip, corners, first, stride, d2, cos, sin, 1.0)
+        put(single, k + ALONG, np.float32(ax))
+        put(single, k + ACROSS, np.float32(ay))
+    if left < 0:
+        first, stride = left & 0xFFFF, -(left >> 16)
+        ax, ay = outermost(hulls, skip, corners, first, stride, d2, cos, sin, -1.0)
+        put(single, k + ALONG2, np.float32(ax))
+        put(single, k + ACROSS2, np.float32(ay))
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
 def spans(padded, beams, wide, single):  # type: ignore[no-untyped-def]
-    """Bearing and both silhouettes in beams, the right one within the first turn."""
+    """Sixth pass: bearing and both silhouettes in beams, the right one within the first turn."""
     per_beam = 1.0 / beams[1]
     turn = 2.0 * math.pi * per_beam
     per_turn = 1.0 / turn
     for k in range(padded):
-        i = k
-        low, high = single[i + ALONG] * per_beam, single[i + ALONG2] * per_beam
-        middle = (single[i + BEARING] - wide[i + AHEAD]) * per_beam
-        middle -= math.floor((middle + low) * per_turn) * turn
-        wide[i + MIDDLE], wide[i + RIGHT], wide[i + LEFT] = middle, middle + low, middle + high
+        put(single, k + ALONG, arctan2_single(get(single, k + ACROSS), get(single, k + ALONG)))
+        put(single, k + ALONG2, arctan2_single(get(single, k + ACROSS2), get(single, k + ALONG2)))
+    for k in range(padded):
+        low, high = get(single, k + ALONG) * per_beam, get(single, k + ALONG2) * per_beam
+        middle = (get(single, k + BEARING) - get(wide, k + AHEAD)) * per_beam
+        middle -= np.floor((middle + low) * per_turn) * turn
+        put(wide, k + MIDDLE, middle)
+        put(wide, k + RIGHT, middle + low)
+        put(wide, k + LEFT, middle + high)
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
 def aim(k, count, shift, wide, single, whole):  # type: ignore[no-untyped-def]
-    one, zero = np.int32(1), np.int32(0)
+    """Seventh pass, of one body: which beams are hit, and where in `rows` their points begin.
+
+    The span is fused in whole blocks, two at least: most need no more, and to guess how many
+    blocks there are would fail at every other body. Where they would reach beyond the last of
+    `count` beams, they begin so many beams sooner, `BACK`.
+    """
+    zero, one, block = np.int32(0), np.int32(1), np.int32(BLOCK)
     first, last, middle = get(wide, k + RIGHT), get(wide, k + LEFT), get(wide, k + MIDDLE)
-    begin = np.int32(first)
+    begin = np.int32(first)  # to convert is faster than to round up or down
     begin = np.int32(max(np.int32(begin + np.int32(first > begin)), zero))
     hits = np.int32(min(np.int32(last), np.int32(count - one)) - begin + one)
     phases = np.int32(one << shift)
@@ -293,87 +335,88 @@ def aim(k, count, shift, wide, single, whole):  # type: ignore[no-untyped-def]
     put(single, k + PART, np.float32(exact - point))
     point = np.int32(point - np.int32(ABOVE_ZERO))
     beam, phase = np.int32(point >> shift), np.int32(point & np.int32(phases - one))
-    place, place2 = get(whole, k + FIRST), get(whole, k + FIRST2)
-    low, low2 = np.int32(place >> 16), np.int32(place2 >> 16)
-    width, width2 = np.int32(place & 0xFFFF), np.int32(place2 & 0xFFFF)
-    skip = np.int32(max(min(np.int32(beam - low), np.int32(width - hits - one)), zero))
-    skip2 = np.int32(max(min(np.int32(beam - low2), np.int32(width2 - hits - one)), zero))
-    near = np.int32(get(whole, k + START) + phase * width + skip)
-    far = np.int32(get(whole, k + START2) + phase * width2 + skip2)
-    same = np.int32(phase + one) < phases
-    two, block = np.int32(2 * BLOCK), np.int32(BLOCK)
-    padded = np.int32(max(np.int32(hits + np.int32(block - one)) & np.int32(-block), two))
+    last_phase = np.int32(phase + one) == phases  # then the next point is of the next beam
+    padded = np.int32(np.int32(hits + np.int32(block - one)) & np.int32(-block))
+    padded = np.int32(max(padded, np.int32(2 * block)))
     back = np.int32(max(np.int32(begin + padded - count), zero))
-    put(whole, k + NEAR, np.int32(near - back))
-    put(whole, k + FAR, np.int32(far - back))
-    put(whole, k + NEAR2, (np.int32(near + width) if same else np.int32(near - phase * width + one)) - back)
-    put(whole, k + FAR2, (np.int32(far + width2) if same else np.int32(far - phase * width2 + one)) - back)
     put(whole, k + BEGIN, np.int32(begin - back))
     put(whole, k + HITS, hits)
     put(whole, k + BACK, back)
+    place, place2 = get(whole, k + PLACE), get(whole, k + PLACE2)
+    width, width2 = np.int32(place & 0xFFFF), np.int32(place2 & 0xFFFF)
+    skip = np.int32(min(np.int32(beam - (place >> 16)), np.int32(width - hits - one)))
+    skip2 = np.int32(min(np.int32(beam - (place2 >> 16)), np.int32(width2 - hits - one)))
+    near = np.int32(get(whole, k + START) + phase * width + max(skip, zero) - back)
+    far = np.int32(get(whole, k + START2) + phase * width2 + max(skip2, zero) - back)
+    put(whole, k + NEAR, near)
+    put(whole, k + FAR, far)
+    put(whole, k + NEAR2, np.int32(near - phase * width + one if last_phase else near + width))
+    put(whole, k + FAR2, np.int32(far - phase * width2 + one if last_phase else far + width2))
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
 def aims(padded, count, shift, wide, single, whole):  # type: ignore[no-untyped-def]
+    """Seventh pass, see `aim`."""
     for k in range(padded):
         aim(k, count, shift, wide, single, whole)
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def lower(ranges, k, limits, rows, single, whole):  # type: ignore[no-untyped-def]
-    """Lowers the beams of a span to the blended rows of its cell."""
-    count = ranges.shape[2]
-    begin, hits = np.int64(get(whole, k + BEGIN)), np.int64(get(whole, k + HITS))
-    near, near2, far, far2 = np.int64(get(whole, k + NEAR)), np.int64(get(whole, k + NEAR2)), np.int64(get(whole, k + FAR)), np.int64(get(whole, k + FAR2))
+def lower(ranges, k, limits, rows, wide, single, whole):  # type: ignore[no-untyped-def]
+    """Last pass, of one body: lowers the beams of its span to the blended rows of its cell."""
+    begin, hits, back = get(whole, k + BEGIN), get(whole, k + HITS), get(whole, k + BACK)
+    near, near2 = np.int64(get(whole, k + NEAR)), np.int64(get(whole, k + NEAR2))
+    far, far2 = np.int64(get(whole, k + FAR)), np.int64(get(whole, k + FAR2))
     weights = get(single, k + PART), get(single, k + BLEND)
-    at = np.int64(get(whole, k + ROW)) * count + begin
-    back = get(whole, k + BACK)
-    hit = np.int32(hits)
+    at, points = np.int64(get(wide, k + AT)) + begin, (near, near2, far, far2)
+    if hits <= 0:
+        return
     if min(begin, near, far) >= 0:
-        lower_block(ranges, at, rows, (near, near2, far, far2), weights, limits, (back, hit))
-        j = BLOCK
-        lower_block(ranges, at + j, rows, (near + j, near2 + j, far + j, far2 + j), weights, limits, (np.int32(back - j), hit))
+        lower_block(ranges, at, rows, points, 0, weights, limits, (back, hits))
+        lower_block(ranges, at, rows, points, BLOCK, weights, limits, (back, hits))
         for j in range(2 * BLOCK, hits, BLOCK):
-            lower_block(ranges, at + j, rows, (near + j, near2 + j, far + j, far2 + j), weights, limits, (np.int32(back - j), hit))
-    else:
-        j = np.int64(back)
-        at, near, near2, far, far2 = at + j, near + j, near2 + j, far + j, far2 + j
-        low, high = limits
-        part, share = weights
-        for j in range(hits):
+            lower_block(ranges, at, rows, points, j, weights, limits, (back, hits))
+    else:  # no block fits: few beams, or a span at the last ones and the table's first row
+        for j in range(back, back + hits):
             value, other = peek(rows, near + j), peek(rows, far + j)
-            value += part * (peek(rows, near2 + j) - value)
-            other += part * (peek(rows, far2 + j) - other)
-            value += share * (other - value)
-            value = value if value <= high else np.float32(np.inf)
-            value = value if value >= low else np.float32(-np.inf)
+            value += weights[0] * (peek(rows, near2 + j) - value)
+            other += weights[0] * (peek(rows, far2 + j) - other)
+            value += weights[1] * (other - value)
+            value = value if value <= limits[1] else np.float32(np.inf)
+            value = value if value >= limits[0] else np.float32(-np.inf)
             lower_beam(ranges, at + j, value)
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
 def fuse(found, ranges, beams, limits, rows, shift, wide, single, whole):  # type: ignore[no-untyped-def]
-    turn = 2.0 * math.pi / beams[1]
-    limits_ = np.float32(limits[0]), np.float32(limits[1])
+    """Last pass: all spans, and once more those over the seam of the turn."""
+    turn, count = 2.0 * math.pi / beams[1], np.int32(ranges.shape[2])
+    within = np.float32(limits[0]), np.float32(limits[1])
     for k in range(found):
-        near, far = np.int64(get(whole, k + AHEAD_OF + NEAR)), np.int64(get(whole, k + AHEAD_OF + FAR))
-        prefetch(rows, near)
-        prefetch(rows, far)
-        prefetch(rows, near + BLOCK)
-        prefetch(rows, far + BLOCK)
-        if get(whole, k + HITS) > 0:
-            lower(ranges, k, limits_, rows, single, whole)
+        soon = min(k + SOON, found - 1)
+        near, far = np.int64(get(whole, soon + NEAR)), np.int64(get(whole, soon + FAR))
+        for line in (0, BLOCK):
+            prefetch(rows, near + line)
+            prefetch(rows, far + line)
+        lower(ranges, k, within, rows, wide, single, whole)
     for k in range(found):
-        if get(wide, k + LEFT) >= turn:  # over the seam once at most
-            put(wide, k + MIDDLE, get(wide, k + MIDDLE) - turn)
-            put(wide, k + RIGHT, get(wide, k + RIGHT) - turn)
-            put(wide, k + LEFT, get(wide, k + LEFT) - turn)
-            aim(k, np.int32(ranges.shape[2]), np.int32(shift), wide, single, whole)
-            if get(whole, k + HITS) > 0:
-                lower(ranges, k, limits_, rows, single, whole)
+        if get(wide, k + LEFT) >= turn:
+            for each in (MIDDLE, RIGHT, LEFT):
+                put(wide, k + each, get(wide, k + each) - turn)
+            aim(k, count, np.int32(shift), wide, single, whole)
+            lower(ranges, k, within, rows, wide, single, whole)
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)
 def look_up(found, ranges, beams, limits, lookup, room):  # type: ignore[no-untyped-def]
+    """All passes after the first: fuses the bodies on the lanes into their scans.
+
+    Args:
+        found: how many lanes are taken.
+        ranges: (N, M, B) in place.
+        beams, limits, lookup: see `scanner.Scanner.arguments`.
+        room: see `scanner.Scanner.room`.
+    """
     about, distances, cells, rows, shift, hulls = lookup
     wide, single, whole = room
     padded = (found + BLOCK - 1) // BLOCK * BLOCK
@@ -381,8 +424,9 @@ def look_up(found, ranges, beams, limits, lookup, room):  # type: ignore[no-unty
     cells_of(padded, distances, about, wide, single, whole)
     fetch(found, cells, hulls, wide, whole)
     silhouettes(padded, wide, single)
-    climbs(found, about, cells, hulls, wide, single, whole)
-    edges(padded, single)
+    for k in range(found):
+        if get(whole, k + CLIMB) < 0:
+            climb(k, about, cells, hulls, wide, single, whole)
     spans(padded, beams, wide, single)
     aims(padded, np.int32(ranges.shape[2]), np.int32(shift), wide, single, whole)
     fuse(found, ranges, beams, limits, rows, shift, wide, single, whole)

@@ -8,18 +8,18 @@ from numba import njit
 
 from nics_drl_bridge.lidar import baked_kernels as baking
 from nics_drl_bridge.lidar import kernels, map_kernels
-from nics_drl_bridge.lidar.baked_kernels import LANES
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)
 def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # type: ignore[no-untyped-def]
     """Scans of the robots of some worlds.
 
-    All arrays are taken out of their tuples once, here: to do so for each scan took as long as
-    the look-ups.
+    Bodies that are looked up wait on the lanes until these are full, while the next scans begin:
+    the minimum does not mind in which order. All arrays are taken out of their tuples once, here:
+    to do so for each scan took as long as the look-ups.
 
     Args:
-        ranges: (N, M, B) result.
+        ranges: (N, M, B) result, whose beams stand one after the other.
         poses: (N, M, 3) of `base_link` in the world.
         chosen: (n,) which worlds.
         bodies: (N, K, 7), see `shapes.BODY`.
@@ -30,38 +30,37 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
     """
     mount, directions, beams, limits, baked, outlines, lookup = sensor
     corners, corner = outlines
-    wide, whole = room[0], room[2]
-    low, high, count = limits[0], limits[1], bodies.shape[1]
-    found, unknown = 0, 0
+    wide, _, whole = room
+    high, count, found = limits[1], bodies.shape[1], 0
+    of_world, of_robot = ranges.strides[0] // 4, ranges.strides[1] // 4
     for n in chosen:
         for m in range(poses.shape[1]):
             kernels.clear(ranges, n, m)
             me = first + m if first >= 0 else -1
             sx, sy, heading = kernels.sensor_pose(poses, n, m, mount)
+            scan = sx, sy, heading + beams[0], float(n * of_world + m * of_robot)
             begin, missed = 0, 0
             while begin < count:
-                end = min(count, begin + LANES - found)
-                found, left, strange = baking.in_sight(
-                    found, begin, end, bodies, n, n * poses.shape[1] + m, me, sx, sy, heading + beams[0], high, baked,
-                    wide, whole,
+                end = min(count, begin + baking.LANES - found)
+                found, left = baking.in_sight(
+                    found, begin, end, bodies, n, me, scan, high, baked, wide, whole
                 )
-                begin, missed, unknown = end, missed + left, unknown + strange
-                if found == LANES:
+                begin, missed = end, missed + left
+                if found == baking.LANES:
                     baking.look_up(found, ranges, beams, limits, lookup, room)
-                    found, unknown = 0, 0
+                    found = 0
             if missed > 0 or walls.shape[0] > 0:
-                c, s = math.cos(heading), math.sin(heading)
                 out = ranges[n, m]
-                for k in range(bodies.shape[1] if missed > 0 else 0):
+                c, s = math.cos(heading), math.sin(heading)
+                for k in range(count if missed > 0 else 0):
                     if baking.left_out(bodies, n, k, me, sx, sy, high, baked):
                         kernels.body_into(
                             out, directions, beams, sx, sy, c, s, bodies[n, k], corners, corner,
                             high,
                         )  # fmt: skip
                 kernels.walls_into(out, directions, beams, sx, sy, c, s, walls)
-                kernels.finish(out, low, high)
+                kernels.finish(out, limits[0], high)
     baking.look_up(found, ranges, beams, limits, lookup, room)
-    return unknown == 0
 
 
 @njit(cache=True)

@@ -16,7 +16,7 @@ from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import LANES, SINGLE, WHOLE, WIDE
 from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.maps_grid import GridMap
-from nics_drl_bridge.lidar.shapes import BODY, Shape, place
+from nics_drl_bridge.lidar.shapes import BODY, SHAPE, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable
 
@@ -101,7 +101,7 @@ class Scanner:
         return np.asarray((radii < self.spec.range_max) & ~notched, np.uint8)
 
     def room(self, bodies: int) -> Room:
-        """Scratch that one thread needs to scan a world of so many bodies."""
+        """Scratch that one thread needs to scan a world, of however many bodies."""
         return (
             np.zeros(WIDE * LANES),
             np.zeros(SINGLE * LANES, np.float32),
@@ -117,6 +117,15 @@ class Scanner:
         poses = np.asarray(poses, dtype=np.float64)
         index = [self.table.outlines.index_of(shape) for shape in shapes]
         return place(poses, self.table.outlines.radii[index], index)
+
+    def _require_known(self, index: NDArray[np.float64]) -> None:
+        """Raises ModelError where the kernels would read beyond the table."""
+        known = len(self.table.shapes)
+        if index.size and not (index.min() >= 0 and index.max() < known):
+            raise ModelError(
+                f"a body is of a shape that is none of the {known} in the lidar table; make "
+                "bodies by `place` of the scanner that scans them."
+            )
 
     def scan(
         self,
@@ -155,18 +164,17 @@ class Scanner:
             )
         if walls.shape != (len(walls), 4):
             raise ConfigError(f"walls {walls.shape} must be (W, 4).")
+        self._require_known(bodies[..., SHAPE])
         if out.shape != shape or out.dtype != np.float32:
             raise ConfigError(f"out is {out.shape} {out.dtype}; it must be {shape} float32.")
+        if out.strides[1] != out.itemsize:  # the kernels need beams one after the other
+            out[:] = self.scan(poses, bodies, walls)
+            return out
         worlds = np.arange(len(poses))
         room = self.room(bodies.shape[1])
-        known = scan_kernels.scan_worlds(
+        scan_kernels.scan_worlds(
             out[:, None], poses[:, None], worlds, bodies, -1, walls, self.arguments, room
         )
-        if not known:
-            raise ModelError(
-                f"a body is of a shape that is none of the {len(self.table.shapes)} in the lidar "
-                "table; make bodies by `place` of the scanner that scans them."
-            )
         if self.grid is not None:
             scan_kernels.add_map(
                 out[:, None], poses[:, None], worlds, self.arguments, self.grid.arrays,

@@ -25,7 +25,7 @@ def test_climbing_along_a_hull_ends_at_its_silhouette_from_wherever_it_begins(ma
         angles = np.arctan2(across, along)
         for side, edge in ((1.0, angles.min()), (-1.0, angles.max())):
             x, y = kernels.outermost(
-                twice, skip, count, first, min(stride, count - 1), distance**2, cos, sin, side
+                twice.ravel(), skip, count, first, min(stride, count - 1), distance**2, cos, sin, side
             )
             assert np.arctan2(y, x) == pytest.approx(edge, abs=1e-9)
 
