@@ -167,22 +167,21 @@ def polygon(out, directions, beams, x, y, c, s, corners):  # type: ignore[no-unt
 
 @njit(cache=True, error_model="numpy", _nrt=False)
 def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
-    """Whether an outline turns to the left only, and does not go around the lidar: see `polygon`.
+    """Whether an outline only turns to the left, and not around the lidar; see `polygon`.
 
-    Only then the sides that are seen from within can be left out.
+    Then a ray meets it first on a side that has the lidar to its right. Where a side points at the
+    lidar, it may stand on it: that is not beside.
     """
-    last = corners.shape[0] - 1
-    ax, ay = turned(x, y, c, s, corners[last])
+    last, rounds = corners.shape[0] - 1, 0
     bx, by = turned(x, y, c, s, corners[max(last - 1, 0)])
+    ax, ay = turned(x, y, c, s, corners[last])
     ex, ey = ax - bx, ay - by
-    rounds = 0
     for v in range(last + 1):
         bx, by = turned(x, y, c, s, corners[v])
-        gx, gy = bx - ax, by - ay
-        if ex * gy - ey * gx < 0.0:
+        gx, gy, cross = bx - ax, by - ay, ax * by - ay * bx
+        if ex * gy - ey * gx < 0.0 or cross == 0.0:
             return False
-        if (ay <= 0.0) != (by <= 0.0):
-            cross = ax * by - ay * bx
+        if (ay <= 0.0) != (by <= 0.0):  # it passes the ray ahead, or the one behind
             rounds += int(ay <= 0.0 and cross > 0.0) - int(ay > 0.0 and cross < 0.0)
         ax, ay, ex, ey = bx, by, gx, gy
     return rounds == 0

@@ -167,7 +167,9 @@ class Scanner:
         self._require_known(bodies[..., SHAPE])
         if out.shape != shape or out.dtype != np.float32:
             raise ConfigError(f"out is {out.shape} {out.dtype}; it must be {shape} float32.")
-        if out.strides[1] != out.itemsize:  # the kernels need beams one after the other
+        if not (
+            out.flags.c_contiguous or out.strides[1] == out.itemsize
+        ):  # the kernels need beams one after the other
             out[:] = self.scan(poses, bodies, walls)
             return out
         worlds = np.arange(len(poses))
