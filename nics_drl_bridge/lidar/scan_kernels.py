@@ -7,7 +7,7 @@ import math
 from numba import njit
 
 from nics_drl_bridge.lidar import baked_kernels as baking
-from nics_drl_bridge.lidar import kernels, map_kernels
+from nics_drl_bridge.lidar import fuse_kernels, kernels, map_kernels
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)
@@ -47,7 +47,7 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
                 )
                 begin, missed = end, missed + left
                 if found == baking.LANES:
-                    baking.look_up(found, ranges, beams, limits, lookup, room)
+                    fuse_kernels.look_up(found, ranges, beams, limits, lookup, room)
                     found = 0
             if missed > 0 or walls.shape[0] > 0:
                 out = ranges[n, m]
@@ -60,7 +60,7 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
                         )  # fmt: skip
                 kernels.walls_into(out, directions, beams, sx, sy, c, s, walls)
                 kernels.finish(out, limits[0], high)
-    baking.look_up(found, ranges, beams, limits, lookup, room)
+    fuse_kernels.look_up(found, ranges, beams, limits, lookup, room)
 
 
 @njit(cache=True)

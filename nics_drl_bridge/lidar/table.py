@@ -19,7 +19,6 @@ from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.files import npz_bytes, npz_mapped, sha256
 from nics_drl_bridge.lidar.baked_kernels import (
     ABOUT,
-    BLOCK,
     CELLS_PER_PART,
     CORNERS,
     CORNERS_PER_PART,
@@ -30,6 +29,7 @@ from nics_drl_bridge.lidar.baked_kernels import (
     ROTATIONS,
     ROUND_RADIUS,
 )
+from nics_drl_bridge.lidar.block_kernels import BLOCK
 from nics_drl_bridge.lidar.shapes import SHAPES, Circle, Outlines, Shape
 
 FORMAT = "nics_drl_bridge/lidar_table/2"
