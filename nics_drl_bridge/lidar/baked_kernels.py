@@ -1,13 +1,11 @@
-"""Compiled inner loops of the baked lidar: look up and fuse (Eq. 3, 4).
+"""Compiled inner loops of the baked lidar: look up (Eq. 3); `fuse_kernels` does the rest.
 
-A scan is made in passes over the bodies in sight, each pass a short loop without branches:
-nearly all the time of a look-up is waiting, for a memory or after a wrong guess of a branch,
-and so the waiting of one body overlaps with the work on the next.
-
-Two rows, of the grid distances on both sides of the true one, are blended, and in each the two
-points on both sides of a beam. Which beams hit
-follows from the true silhouette, not from a row: a silhouette on the wrong side of a beam is
-by far the largest error of a plain look-up.
+The bodies in sight of several scans go through some passes together, each a short loop without
+branches: nearly all the time of a look-up is waiting, for a memory or after a wrong guess of a
+branch, and so the waiting of one body overlaps with the work on the next. What one pass finds
+out the next ones read from lanes: one array of each kind of number, in which every quantity has
+`LANES` places of its own at a fixed offset, so that LLVM sees that they do not overlap. What a
+pass makes of a body depends on that body only, so that a scan is the same in any batch.
 """
 
 from __future__ import annotations
@@ -17,16 +15,33 @@ import math
 import numpy as np
 from numba import njit
 
-from nics_drl_bridge.lidar import kernels
+from nics_drl_bridge.lidar.map_memory_kernels import get, peek, put
 
-BLOCK = 16
-"""So many beams are fused at once; rows and lines are that much longer than their content."""
-DOUBLES, SINGLES, WHOLES = 6, 5, 2
-"""Numbers per body that one pass hands to the next, by their kind."""
-ABOVE_ZERO = 2.0**24
-"""Added before a number is cut to a whole one, so that it is rounded down."""
+LANES = 144
+"""So many bodies go through the passes together: a multiple of `BLOCK`, and few enough that the
+scans that they belong to stay in the nearest cache."""
+WIDE, SINGLE, WHOLE = 20, 8, 15
+"""Quantities in double and single precision and in whole numbers."""
+X, Y, TURN, COS, SIN, RADIUS, AHEAD, AT, ROUND, MIDDLE, RIGHT, LEFT = (k * LANES for k in range(12))
+"""Of a body: offset from the lidar, heading, cos, sin, radius; the bearing of beam 0 in the world
+and where the scan begins in memory; radius of a circle or 0; bearing and silhouettes in beams."""
+RIGHT_X, RIGHT_Y, RIGHT_X2, RIGHT_Y2, LEFT_X, LEFT_Y, LEFT_X2, LEFT_Y2 = (
+    k * LANES for k in range(12, 20)
+)
+"""The two corners of the hull that can be the right silhouette, and the left one."""
+DISTANCE, BEARING, ALONG, ACROSS, ALONG2, ACROSS2, PART, BLEND = (k * LANES for k in range(8))
+"""The silhouettes along and across the bearing, then `ALONG` and `ALONG2` as angles; shares of the
+next point and of the farther row."""
+SHAPE, CELL, HULL, CLIMB, START, PLACE, START2, PLACE2, BEGIN, HITS, BACK = (
+    k * LANES for k in range(11)
+)
+NEAR, NEAR2, FAR, FAR2 = (k * LANES for k in range(11, 15))
+"""The cell and the next one, packed as in the table; the span of beams; where the points begin."""
+PER_METRE, ROTATIONS, PARTS_PER_ROTATION, FIRST_CELL, CELLS_PER_PART = range(5)
+HULL_END, CORNERS_PER_PART, CORNERS, ROUND_RADIUS, ABOUT = range(5, 10)
+"""What the kernels know of a shape, see `table.LidarTable.lookup`; so many numbers."""
 PER_TURN = 0.5 / math.pi
-SINGLE = tuple(
+ATAN = tuple(
     np.float32(factor)
     for factor in (
         0.999999881,
@@ -42,31 +57,44 @@ SINGLE = tuple(
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def in_sight(bodies, n, me, sx, sy, range_max, baked, which, x, y, distance):  # type: ignore[no-untyped-def]
-    """First pass: packs the bodies in sight: which, offset, and the square of the distance.
+def in_sight(found, begin, end, bodies, n, me, scan, range_max, baked, wide, whole):  # type: ignore[no-untyped-def]
+    """First pass: packs the bodies in sight of one scan into the lanes.
 
     Args:
+        found: how many lanes are taken.
+        begin, end: which bodies; there are lanes for all of them.
         bodies: (N, K, 7), see `shapes.BODY`.
         n: which world.
         me: the body that carries the lidar, or -1.
-        sx, sy: of the lidar in the world [m].
+        scan: x and y of the lidar in the world [m], the bearing of beam 0 [rad], and the index
+            of its range from where the ranges begin.
         range_max: [m].
         baked: (H,) whether a shape is to be looked up.
-        which, x, y, distance: results, of the first bodies only.
+        wide, whole: lanes.
 
     Returns:
-        How many can be looked up, and how many in sight can't: not baked, or so near that the
-        lidar is within their circle.
+        How many lanes are taken now, and how many bodies in sight can't be looked up: not baked,
+        or so near that the lidar is within their circle.
     """
-    n = np.uintp(n)
-    found, left = 0, 0
-    for k in range(bodies.shape[1]):
-        dx, dy, radius = bodies[n, k, 0] - sx, bodies[n, k, 1] - sy, bodies[n, k, 5]
+    n, left = np.uintp(n), 0
+    sx, sy, ahead, at = scan
+    for k in range(begin, end):
+        b = np.uintp(k)
+        dx, dy, radius = bodies[n, b, 0] - sx, bodies[n, b, 1] - sy, bodies[n, b, 5]
         d2 = dx * dx + dy * dy
         reach = range_max + radius
-        which[found], x[found], y[found], distance[found] = k, dx, dy, d2
+        shape = np.int32(bodies[n, b, 6])
+        put(wide, found + X, dx)
+        put(wide, found + Y, dy)
+        put(wide, found + TURN, bodies[n, b, 2])
+        put(wide, found + COS, bodies[n, b, 3])
+        put(wide, found + SIN, bodies[n, b, 4])
+        put(wide, found + RADIUS, radius)
+        put(wide, found + AHEAD, ahead)
+        put(wide, found + AT, at)
+        put(whole, found + SHAPE, np.int32(shape * ABOUT))
         seen = (d2 <= reach * reach) & (radius > 0.0) & (k != me)
-        kept = seen & (d2 >= radius * radius) & (baked[np.uintp(bodies[n, k, 6])] != 0)
+        kept = seen & (d2 >= radius * radius) & (baked[np.uintp(shape)] != 0)
         found += kept
         left += seen & (not kept)
     return found, left
@@ -83,11 +111,127 @@ def left_out(bodies, n, k, me, sx, sy, range_max, baked):  # type: ignore[no-unt
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def directions(found, x, y, distance, bearing):  # type: ignore[no-untyped-def]
+def arctan2_single(y, x):  # type: ignore[no-untyped-def]
+    """As `kernels.arctan2` in single precision, within 2e-7 rad."""
+    ax, ay = abs(x), abs(y)
+    ratio = min(ax, ay) / max(ax, ay)
+    s = ratio * ratio
+    r = ATAN[7]
+    r = r * s + ATAN[6]
+    r = r * s + ATAN[5]
+    r = r * s + ATAN[4]
+    r = r * s + ATAN[3]
+    r = r * s + ATAN[2]
+    r = r * s + ATAN[1]
+    r = (r * s + ATAN[0]) * ratio
+    r = np.float32(0.5 * math.pi) - r if ay > ax else r
+    r = np.float32(math.pi) - r if x < np.float32(0.0) else r
+    return math.copysign(r, y)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def directions(padded, wide, single):  # type: ignore[no-untyped-def]
     """Second pass: distance and bearing in the world of each."""
-    for k in range((found + BLOCK - 1) // BLOCK * BLOCK):
-        distance[k] = math.sqrt(distance[k])
-        bearing[k] = kernels.arctan2(y[k], x[k])
+    for k in range(padded):
+        x, y = get(wide, k + X), get(wide, k + Y)
+        put(single, k + ALONG, np.float32(x))
+        put(single, k + ACROSS, np.float32(y))
+        put(single, k + DISTANCE, np.float32(x * x + y * y))
+    for k in range(padded):
+        put(single, k + DISTANCE, math.sqrt(get(single, k + DISTANCE)))
+        put(single, k + BEARING, arctan2_single(get(single, k + ACROSS), get(single, k + ALONG)))
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def cells_of(padded, distances, about, wide, single, whole):  # type: ignore[no-untyped-def]
+    """Third pass: which cell each looks up, and where its hull begins.
+
+    The numbers are kept within the table whatever they are: a heading may be none, and lanes that
+    nobody took hold what was there before.
+    """
+    zero, last = np.int32(0), np.int32(distances - 2)
+    for k in range(padded):
+        h = np.int64(get(whole, k + SHAPE))
+        place = (get(single, k + DISTANCE) - get(wide, k + RADIUS)) * peek(about, h + PER_METRE)
+        step = np.int32(max(min(np.int32(place), last), zero))
+        put(single, k + BLEND, np.float32(place - step))
+        share = (get(wide, k + TURN) - get(single, k + BEARING)) * PER_TURN
+        share -= np.floor(share)
+        rotations = peek(about, h + ROTATIONS)
+        turn = np.int32(share * rotations + 0.5)
+        turn = np.int32(max(min(turn, np.int32(rotations)), zero))
+        sector = np.int32((turn + 0.5) * peek(about, h + PARTS_PER_ROTATION))
+        cell = turn * distances - sector * peek(about, h + CELLS_PER_PART)
+        put(whole, k + CELL, np.int32(np.int32(cell + peek(about, h + FIRST_CELL)) + step))
+        hull = peek(about, h + HULL_END) - sector * peek(about, h + CORNERS_PER_PART)
+        put(whole, k + HULL, np.int32(hull))
+        put(wide, k + ROUND, peek(about, h + ROUND_RADIUS))
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def fetch(found, cells, hulls, wide, whole):  # type: ignore[no-untyped-def]
+    """Fourth pass: the only one that waits for the cells, and does nothing else.
+
+    Args:
+        found: how many lanes are taken.
+        cells: (cells * 4,) int32, see `table.LidarTable.lookup`.
+        hulls: (2 * corners,), see `shapes.Outlines`.
+        wide, whole: lanes.
+    """
+    zero = np.int32(0)
+    for k in range(found):
+        cell, skip = np.int64(get(whole, k + CELL)) * 4, get(whole, k + HULL)
+        put(whole, k + START, cells[np.uintp(cell)])
+        put(whole, k + PLACE, cells[np.uintp(cell + 1)])
+        put(whole, k + START2, cells[np.uintp(cell + 4)])
+        put(whole, k + PLACE2, cells[np.uintp(cell + 5)])
+        right, left = cells[np.uintp(cell + 2)], cells[np.uintp(cell + 3)]
+        other, other2 = np.int32(right >> 16), np.int32(left >> 16)
+        put(whole, k + CLIMB, np.int32(other | other2))  # below zero if one of them is
+        corner = 2 * np.int64(skip + (right & 0xFFFF))
+        put(wide, k + RIGHT_X, hulls[np.uintp(corner)])
+        put(wide, k + RIGHT_Y, hulls[np.uintp(corner + 1)])
+        corner = 2 * np.int64(skip + max(other, zero))
+        put(wide, k + RIGHT_X2, hulls[np.uintp(corner)])
+        put(wide, k + RIGHT_Y2, hulls[np.uintp(corner + 1)])
+        corner = 2 * np.int64(skip + (left & 0xFFFF))
+        put(wide, k + LEFT_X, hulls[np.uintp(corner)])
+        put(wide, k + LEFT_Y, hulls[np.uintp(corner + 1)])
+        corner = 2 * np.int64(skip + max(other2, zero))
+        put(wide, k + LEFT_X2, hulls[np.uintp(corner)])
+        put(wide, k + LEFT_Y2, hulls[np.uintp(corner + 1)])
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+def seen_from(d2, cos, sin, x, y):  # type: ignore[no-untyped-def]
+    """A corner (x, y) of a hull as (along, across) the bearing, times the distance.
+
+    `d2` is the square of the distance, `cos` and `sin` are of the heading against the bearing,
+    times the distance.
+    """
+    return d2 + cos * x - sin * y, sin * x + cos * y
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def silhouettes(padded, wide, single):  # type: ignore[no-untyped-def]
+    """Fifth pass: the two silhouettes as (along, across), of two corners the outer one."""
+    for k in range(padded):
+        x, y, c, s = get(wide, k + X), get(wide, k + Y), get(wide, k + COS), get(wide, k + SIN)
+        d2, cos, sin = x * x + y * y, c * x + s * y, s * x - c * y
+        radius = get(wide, k + ROUND)
+        tangent = math.sqrt(max(d2 - radius * radius, 0.0))
+        ax, ay = seen_from(d2, cos, sin, get(wide, k + RIGHT_X), get(wide, k + RIGHT_Y))
+        bx, by = seen_from(d2, cos, sin, get(wide, k + RIGHT_X2), get(wide, k + RIGHT_Y2))
+        outer = ax * by - ay * bx < 0.0
+        ax, ay = bx if outer else ax, by if outer else ay
+        put(single, k + ALONG, np.float32(tangent if radius > 0.0 else ax))
+        put(single, k + ACROSS, np.float32(-radius if radius > 0.0 else ay))
+        ax, ay = seen_from(d2, cos, sin, get(wide, k + LEFT_X), get(wide, k + LEFT_Y))
+        bx, by = seen_from(d2, cos, sin, get(wide, k + LEFT_X2), get(wide, k + LEFT_Y2))
+        outer = ax * by - ay * bx > 0.0
+        ax, ay = bx if outer else ax, by if outer else ay
+        put(single, k + ALONG2, np.float32(tangent if radius > 0.0 else ax))
+        put(single, k + ACROSS2, np.float32(radius if radius > 0.0 else ay))
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
@@ -98,25 +242,24 @@ def outermost(hulls, skip, corners, first, stride, d2, cos, sin, side):  # type:
     corner among its neighbours is the best of all. Only shapes of many corners need it, nearby.
 
     Args:
-        hulls, skip, corners: the hull begins at `skip` and has so many corners.
+        hulls: (2 * corners,) of all hulls, see `shapes.Outlines`.
+        skip, corners: the hull begins at this corner and has so many.
         first: the corner to begin at.
         stride: to begin with, a power of 2.
-        d2, cos, sin: of the shape, see `cells_of`.
+        d2, cos, sin: of the shape, see `seen_from`.
         side: which.
     """
     best = first
-    one = np.uintp(skip + best)
-    x = d2 + cos * hulls[one, 0] - sin * hulls[one, 1]
-    y = sin * hulls[one, 0] + cos * hulls[one, 1]
+    one = 2 * (skip + best)
+    x, y = seen_from(d2, cos, sin, hulls[np.uintp(one)], hulls[np.uintp(one + 1)])
     while stride > 0:
         for _ in range(corners):
             moved = False
             for step in (stride, corners - stride):
                 other = best + step
                 other -= corners if other >= corners else 0
-                one = np.uintp(skip + other)
-                ax = d2 + cos * hulls[one, 0] - sin * hulls[one, 1]
-                ay = sin * hulls[one, 0] + cos * hulls[one, 1]
+                one = 2 * (skip + other)
+                ax, ay = seen_from(d2, cos, sin, hulls[np.uintp(one)], hulls[np.uintp(one + 1)])
                 if side * (x * ay - y * ax) < 0.0:
                     best, x, y, moved = other, ax, ay, True
             if not moved:
@@ -126,153 +269,20 @@ def outermost(hulls, skip, corners, first, stride, d2, cos, sin, side):  # type:
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def cells_of(  # type: ignore[no-untyped-def]
-    found, bodies, n, limits, shape_of, grid_of, cell_of, hulls, which, x, y, distance, bearing,
-    rx, ry, lx, ly, blend, cell_at,
-):  # fmt: skip
-    """Third pass: which cell each looks up, and its two silhouettes as (along, across).
-
-    The silhouette is exact: of the corners that it can be within the cell, the outermost.
-    """
-    for k in range(found):
-        b = np.uintp(which[k])
-        h = np.uintp(bodies[n, b, 6])
-        d, radius, distances = distance[k], shape_of[h, 0], grid_of[h, 0]
-        place = (d - radius) * shape_of[h, 1]
-        step = min(int(place), distances - 2)
-        blend[k] = place - step
-        which[k] = (d + radius > limits[1]) | (d - radius < limits[0])
-        parts = grid_of[h, 2]
-        if parts == 0:
-            lx[k], ly[k] = math.sqrt(max(d * d - radius * radius, 0.0)), radius
-            rx[k], ry[k] = lx[k], -radius
-            cell_at[k] = grid_of[h, 3] + step
-            continue
-        share = (bodies[n, b, 2] - bearing[k]) * PER_TURN
-        turn = int((share - math.floor(share)) * shape_of[h, 2] + 0.5)
-        sector = int((turn + 0.5) * shape_of[h, 3])
-        cell = np.uintp(grid_of[h, 3] + (turn - sector * grid_of[h, 1]) * distances + step)
-        cell_at[k] = cell
-        skip = grid_of[h, 4] + (parts - sector) * grid_of[h, 5]
-        c, s = bodies[n, b, 3], bodies[n, b, 4]
-        cos, sin = c * x[k] + s * y[k], s * x[k] - c * y[k]  # against the bearing, times d
-        corners = grid_of[h, 5] * parts
-        first, other = cell_of[cell, 2], cell_of[cell, 3]
-        one = np.uintp(skip + first)
-        right_x = d * d + cos * hulls[one, 0] - sin * hulls[one, 1]
-        right_y = sin * hulls[one, 0] + cos * hulls[one, 1]
-        if other < 0:
-            right_x, right_y = outermost(hulls, skip, corners, first, -other, d * d, cos, sin, 1.0)
-        elif other != first:
-            one = np.uintp(skip + other)
-            ax = d * d + cos * hulls[one, 0] - sin * hulls[one, 1]
-            ay = sin * hulls[one, 0] + cos * hulls[one, 1]
-            outer = right_x * ay - right_y * ax < 0.0
-            right_x, right_y = ax if outer else right_x, ay if outer else right_y
-        first, other = cell_of[cell, 4], cell_of[cell, 5]
-        one = np.uintp(skip + first)
-        left_x = d * d + cos * hulls[one, 0] - sin * hulls[one, 1]
-        left_y = sin * hulls[one, 0] + cos * hulls[one, 1]
-        if other < 0:
-            left_x, left_y = outermost(hulls, skip, corners, first, -other, d * d, cos, sin, -1.0)
-        elif other != first:
-            one = np.uintp(skip + other)
-            ax = d * d + cos * hulls[one, 0] - sin * hulls[one, 1]
-            ay = sin * hulls[one, 0] + cos * hulls[one, 1]
-            outer = left_x * ay - left_y * ax > 0.0
-            left_x, left_y = ax if outer else left_x, ay if outer else left_y
-        rx[k], ry[k], lx[k], ly[k] = right_x, right_y, left_x, left_y
-
-
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
-def arctan2_single(y, x):  # type: ignore[no-untyped-def]
-    """As `kernels.arctan2` in single precision, within 2e-7 rad."""
-    ax, ay = abs(x), abs(y)
-    ratio = min(ax, ay) / max(ax, ay)
-    s = ratio * ratio
-    r = SINGLE[7]
-    r = r * s + SINGLE[6]
-    r = r * s + SINGLE[5]
-    r = r * s + SINGLE[4]
-    r = r * s + SINGLE[3]
-    r = r * s + SINGLE[2]
-    r = r * s + SINGLE[1]
-    r = (r * s + SINGLE[0]) * ratio
-    r = np.float32(kernels.HALF_PI) - r if ay > ax else r
-    r = np.float32(math.pi) - r if x < np.float32(0.0) else r
-    return math.copysign(r, y)
-
-
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def spans(found, heading, beams, rx, ry, lx, ly, bearing, right, left):  # type: ignore[no-untyped-def]
-    """Fourth pass: bearing and both silhouettes in beams, the right one within the first turn."""
-    per_beam = 1.0 / beams[1]
-    turn = 2.0 * math.pi * per_beam
-    per_turn = 1.0 / turn
-    padded = (found + BLOCK - 1) // BLOCK * BLOCK
-    for k in range(padded):
-        rx[k] = arctan2_single(ry[k], rx[k])
-    for k in range(padded):
-        lx[k] = arctan2_single(ly[k], lx[k])
-    for k in range(padded):
-        low, high = rx[k] * per_beam, lx[k] * per_beam
-        middle = (bearing[k] - heading - beams[0]) * per_beam
-        middle -= math.floor((middle + low) * per_turn) * turn
-        bearing[k], right[k], left[k] = middle, middle + low, middle + high
-
-
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
-def fuse(  # type: ignore[no-untyped-def]
-    ranges, n, m, found, beams, limits, row_of, cell_of, rows, shift, bearing, right, left, blend,
-    which, cell_at,
-):  # fmt: skip
-    """Last pass: lowers the beams of every span to the blended rows of its cell."""
-    phases = 1 << shift
-    nothing, close = np.float32(np.inf), np.float32(-np.inf)
-    low, high = np.float32(limits[0]), np.float32(limits[1])
-    turn = 2.0 * math.pi / beams[1]
-    count = ranges.shape[2]
-    for k in range(found):
-        middle, first, last, cell = bearing[k], right[k], left[k], np.uintp(cell_at[k])
-        next_cell, share, limited = cell + np.uintp(1), blend[k], which[k] != 0
-        for _ in range(2):  # over the seam once at most, and no end where a pose is not a number
-            begin = int(first)  # to convert is faster than to round up or down
-            begin = max(begin + (first > begin), 0)
-            hits = min(int(last), count - 1) - begin + 1
-            if hits > 0:
-                exact = (begin - middle) * phases + ABOVE_ZERO
-                point = int(exact)
-                part = np.float32(exact - point)
-                point -= int(ABOVE_ZERO)
-                beam, phase = point >> shift, point & (phases - 1)
-                width, width2 = cell_of[cell, 1], cell_of[next_cell, 1]
-                skip = max(min(beam - cell_of[cell, 0], width - hits - 1), 0)
-                skip2 = max(min(beam - cell_of[next_cell, 0], width2 - hits - 1), 0)
-                near = row_of[cell] + phase * width + skip
-                far = row_of[next_cell] + phase * width2 + skip2
-                same = phase + 1 < phases  # the next point: of the next phase, or beam
-                near2 = near + width if same else near - phase * width + 1
-                far2 = far + width2 if same else far - phase * width2 + 1
-                padded = (hits + BLOCK - 1) // BLOCK * BLOCK
-                if limited or begin + padded > count:
-                    for i in range(hits):
-                        value, other = rows[np.uintp(near + i)], rows[np.uintp(far + i)]
-                        value += part * (rows[np.uintp(near2 + i)] - value)
-                        other += part * (rows[np.uintp(far2 + i)] - other)
-                        value += share * (other - value)
-                        value = value if value <= high else nothing
-                        value = value if value >= low else close
-                        held = ranges[n, m, np.uintp(begin + i)]
-                        ranges[n, m, np.uintp(begin + i)] = value if value < held else held
-                else:
-                    for i in range(np.int32(padded)):
-                        value, other = rows[np.uintp(near + i)], rows[np.uintp(far + i)]
-                        value += part * (rows[np.uintp(near2 + i)] - value)
-                        other += part * (rows[np.uintp(far2 + i)] - other)
-                        value += share * (other - value)
-                        value = value if i < np.int32(hits) else nothing
-                        held = ranges[n, m, np.uintp(begin + i)]
-                        ranges[n, m, np.uintp(begin + i)] = value if value < held else held
-            if last < turn:
-                break
-            middle, first, last = middle - turn, first - turn, last - turn
+def climb(k, about, cells, hulls, wide, single, whole):  # type: ignore[no-untyped-def]
+    """Replaces the silhouettes of one body for which the cell names no two corners."""
+    x, y, c, s = get(wide, k + X), get(wide, k + Y), get(wide, k + COS), get(wide, k + SIN)
+    d2, cos, sin = x * x + y * y, c * x + s * y, s * x - c * y
+    cell, skip = np.int64(get(whole, k + CELL)) * 4, np.int64(get(whole, k + HULL))
+    corners = np.int64(peek(about, np.int64(get(whole, k + SHAPE)) + CORNERS))
+    right, left = np.int64(peek(cells, cell + 2)), np.int64(peek(cells, cell + 3))
+    if right < 0:
+        first, stride = right & 0xFFFF, -(right >> 16)
+        ax, ay = outermost(hulls, skip, corners, first, stride, d2, cos, sin, 1.0)
+        put(single, k + ALONG, np.float32(ax))
+        put(single, k + ACROSS, np.float32(ay))
+    if left < 0:
+        first, stride = left & 0xFFFF, -(left >> 16)
+        ax, ay = outermost(hulls, skip, corners, first, stride, d2, cos, sin, -1.0)
+        put(single, k + ALONG2, np.float32(ax))
+        put(single, k + ACROSS2, np.float32(ay))

@@ -118,16 +118,16 @@ def circle(out, directions, beams, x, y, radius, range_max):  # type: ignore[no-
 @njit(cache=True, error_model="numpy", _nrt=False)
 def segment(out, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
     """Exact ranges to the straight wall from (x1, y1) to (x2, y2)."""
-    edge(out, directions, beams, x1, y1, arctan2(y1, x1), x2, y2, arctan2(y2, x2))
+    edge(out, directions, beams, x1, y1, arctan2(y1, x1), x2, y2, arctan2(y2, x2), False)
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
-def edge(out, directions, beams, x1, y1, angle1, x2, y2, angle2):  # type: ignore[no-untyped-def]
-    """The same, with the directions of its ends [rad]."""
+def edge(out, directions, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore[no-untyped-def]
+    """The same, with the directions of its ends [rad]; `one_sided`: only seen from its right."""
     count = out.shape[0]
     ex, ey = x2 - x1, y2 - y1
     cross = x1 * ey - y1 * ex
-    if cross == 0.0:  # seen edge-on
+    if cross == 0.0 or (one_sided and cross > 0.0):  # seen edge-on, or from behind
         return
     low, high = (angle1, angle2) if cross > 0.0 else (angle2, angle1)
     if high < low:
@@ -155,14 +155,36 @@ def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyp
 @njit(cache=True, error_model="numpy", _nrt=False)
 def polygon(out, directions, beams, x, y, c, s, corners):  # type: ignore[no-untyped-def]
     """Exact ranges to the outline `corners` (V, 2), turned by (c, s), with its origin at (x, y)."""
-    last = corners.shape[0] - 1
+    last, cull = corners.shape[0] - 1, beside_convex(x, y, c, s, corners)
     ax, ay = turned(x, y, c, s, corners[last])
     angle = arctan2(ay, ax)
     for v in range(last + 1):
         bx, by = turned(x, y, c, s, corners[v])
         next_angle = arctan2(by, bx)
-        edge(out, directions, beams, ax, ay, angle, bx, by, next_angle)
+        edge(out, directions, beams, ax, ay, angle, bx, by, next_angle, cull)
         ax, ay, angle = bx, by, next_angle
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
+    """Whether an outline only turns to the left, and not around the lidar; see `polygon`.
+
+    Then a ray meets it first on a side that has the lidar to its right. Where a side points at the
+    lidar, it may stand on it: that is not beside.
+    """
+    last, rounds = corners.shape[0] - 1, 0
+    bx, by = turned(x, y, c, s, corners[max(last - 1, 0)])
+    ax, ay = turned(x, y, c, s, corners[last])
+    ex, ey = ax - bx, ay - by
+    for v in range(last + 1):
+        bx, by = turned(x, y, c, s, corners[v])
+        gx, gy, cross = bx - ax, by - ay, ax * by - ay * bx
+        if ex * gy - ey * gx < 0.0 or cross == 0.0:
+            return False
+        if (ay <= 0.0) != (by <= 0.0):  # it passes the ray ahead, or the one behind
+            rounds += int(ay <= 0.0 and cross > 0.0) - int(ay > 0.0 and cross < 0.0)
+        ax, ay, ex, ey = bx, by, gx, gy
+    return rounds == 0
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
@@ -189,13 +211,20 @@ def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
         out[i] = value if value >= low else np.float32(-np.inf)
 
 
+@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
+def sensor_pose(poses, n, m, mount):  # type: ignore[no-untyped-def]
+    """x, y, heading of a lidar in its world, from poses (N, M, 3) and the mount (3,)."""
+    x, y, heading = poses[n, m, 0], poses[n, m, 1], poses[n, m, 2]
+    if mount[0] != 0.0 or mount[1] != 0.0:
+        c, s = math.cos(heading), math.sin(heading)
+        x, y = x + c * mount[0] - s * mount[1], y + s * mount[0] + c * mount[1]
+    return x, y, heading + mount[2]
+
+
 @njit(cache=True, error_model="numpy", _nrt=False)
 def to_sensor(poses, n, m, mount):  # type: ignore[no-untyped-def]
-    """x, y, heading, cos, sin of a lidar in its world, from poses (N, M, 3) and the mount (3,)."""
-    c, s = math.cos(poses[n, m, 2]), math.sin(poses[n, m, 2])
-    x = poses[n, m, 0] + c * mount[0] - s * mount[1]
-    y = poses[n, m, 1] + s * mount[0] + c * mount[1]
-    heading = poses[n, m, 2] + mount[2]
+    """The same, and cos and sin of its heading."""
+    x, y, heading = sensor_pose(poses, n, m, mount)
     return x, y, heading, math.cos(heading), math.sin(heading)
 
 

@@ -1,8 +1,9 @@
 """Reads and writes that tell LLVM what plain indexing does not: lanes never overlap the map.
 
-Without it, LLVM must assume that writing to a lane may change the map that another lane is about
-to read, and does not turn the loop of `map_kernels` over lanes into vector instructions. The
-instructions carry scoped alias metadata: the map's reads belong to one scope, and the accesses to
+The map is what nobody writes meanwhile: a grid map, or a lidar table. Without it, LLVM must assume
+that writing to a lane may change the map that another lane is about to read, and does not turn the
+loops of `map_kernels` and `baked_kernels` over lanes into vector instructions. The instructions
+carry scoped alias metadata: the map's reads belong to one scope, and the accesses to
 lanes declare that they are not in it. All indices must be within the array and not negative.
 """
 

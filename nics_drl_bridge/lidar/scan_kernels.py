@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import math
+
 from numba import njit
 
 from nics_drl_bridge.lidar import baked_kernels as baking
-from nics_drl_bridge.lidar import kernels, map_kernels
+from nics_drl_bridge.lidar import fuse_kernels, kernels, map_kernels
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)
 def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # type: ignore[no-untyped-def]
     """Scans of the robots of some worlds.
 
-    All arrays are taken out of their tuples once, here: to do so for each scan took as long as
-    the look-ups.
+    Bodies that are looked up wait on the lanes until these are full, while the next scans begin:
+    the minimum does not mind in which order. All arrays are taken out of their tuples once, here:
+    to do so for each scan took as long as the look-ups.
 
     Args:
-        ranges: (N, M, B) result.
+        ranges: (N, M, B) result, whose beams stand one after the other.
         poses: (N, M, 3) of `base_link` in the world.
         chosen: (n,) which worlds.
         bodies: (N, K, 7), see `shapes.BODY`.
@@ -27,40 +30,37 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
     """
     mount, directions, beams, limits, baked, outlines, lookup = sensor
     corners, corner = outlines
-    shape_of, grid_of, row_of, cell_of, rows, shift, hulls = lookup
-    doubles, singles, wholes = room
-    x, y, distance, bearing, right, left = doubles
-    rx, ry, lx, ly, blend = singles
-    which, cell_at = wholes
-    low, high = limits[0], limits[1]
+    wide, _, whole = room
+    high, count, found = limits[1], bodies.shape[1], 0
+    of_world, of_robot = ranges.strides[0] // 4, ranges.strides[1] // 4
     for n in chosen:
         for m in range(poses.shape[1]):
-            me = first + m if first >= 0 else -1
-            sx, sy, heading, c, s = kernels.to_sensor(poses, n, m, mount)
-            found, missed = baking.in_sight(
-                bodies, n, me, sx, sy, high, baked, which, x, y, distance
-            )
-            baking.directions(found, x, y, distance, bearing)
-            baking.cells_of(
-                found, bodies, n, limits, shape_of, grid_of, cell_of, hulls, which, x, y, distance,
-                bearing, rx, ry, lx, ly, blend, cell_at,
-            )  # fmt: skip
             kernels.clear(ranges, n, m)
-            baking.spans(found, heading, beams, rx, ry, lx, ly, bearing, right, left)
-            baking.fuse(
-                ranges, n, m, found, beams, limits, row_of, cell_of, rows, shift, bearing, right,
-                left, blend, which, cell_at,
-            )  # fmt: skip
+            me = first + m if first >= 0 else -1
+            sx, sy, heading = kernels.sensor_pose(poses, n, m, mount)
+            scan = sx, sy, heading + beams[0], float(n * of_world + m * of_robot)
+            begin, missed = 0, 0
+            while begin < count:
+                end = min(count, begin + baking.LANES - found)
+                found, left = baking.in_sight(
+                    found, begin, end, bodies, n, me, scan, high, baked, wide, whole
+                )
+                begin, missed = end, missed + left
+                if found == baking.LANES:
+                    fuse_kernels.look_up(found, ranges, beams, limits, lookup, room)
+                    found = 0
             if missed > 0 or walls.shape[0] > 0:
                 out = ranges[n, m]
-                for k in range(bodies.shape[1] if missed > 0 else 0):
+                c, s = math.cos(heading), math.sin(heading)
+                for k in range(count if missed > 0 else 0):
                     if baking.left_out(bodies, n, k, me, sx, sy, high, baked):
                         kernels.body_into(
                             out, directions, beams, sx, sy, c, s, bodies[n, k], corners, corner,
                             high,
                         )  # fmt: skip
                 kernels.walls_into(out, directions, beams, sx, sy, c, s, walls)
-                kernels.finish(out, low, high)
+                kernels.finish(out, limits[0], high)
+    fuse_kernels.look_up(found, ranges, beams, limits, lookup, room)
 
 
 @njit(cache=True)

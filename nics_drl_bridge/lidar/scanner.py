@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError, ModelError, nearest
 from nics_drl_bridge.lidar import scan_kernels
-from nics_drl_bridge.lidar.baked_kernels import BLOCK, DOUBLES, SINGLES, WHOLES
+from nics_drl_bridge.lidar.baked_kernels import LANES, SINGLE, WHOLE, WIDE
 from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.maps_grid import GridMap
 from nics_drl_bridge.lidar.shapes import BODY, SHAPE, Shape, place
@@ -22,11 +22,7 @@ from nics_drl_bridge.lidar.table import LidarTable
 
 Renderer = Literal["auto", "baked", "exact"]
 RENDERERS: tuple[Renderer, ...] = ("auto", "baked", "exact")
-Room = tuple[
-    tuple[NDArray[np.float64], ...],
-    tuple[NDArray[np.float32], ...],
-    tuple[NDArray[np.int64], ...],
-]
+Room = tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.int32]]
 NO_WALLS = np.zeros((0, 4))
 FEW_CORNERS = 16
 """A concave shape of so few corners is scanned exactly by `auto`."""
@@ -105,12 +101,11 @@ class Scanner:
         return np.asarray((radii < self.spec.range_max) & ~notched, np.uint8)
 
     def room(self, bodies: int) -> Room:
-        """Scratch that one thread needs to scan a world of so many bodies."""
-        bodies = (bodies // BLOCK + 1) * BLOCK
+        """Scratch that one thread needs to scan a world, of however many bodies."""
         return (
-            tuple(np.ones(bodies) for _ in range(DOUBLES)),
-            tuple(np.ones(bodies, np.float32) for _ in range(SINGLES)),
-            tuple(np.zeros(bodies, np.int64) for _ in range(WHOLES)),
+            np.zeros(WIDE * LANES),
+            np.zeros(SINGLE * LANES, np.float32),
+            np.zeros(WHOLE * LANES, np.int32),
         )
 
     def place(self, shapes: Sequence[Shape], poses: ArrayLike) -> NDArray[np.float64]:
@@ -172,6 +167,11 @@ class Scanner:
         self._require_known(bodies[..., SHAPE])
         if out.shape != shape or out.dtype != np.float32:
             raise ConfigError(f"out is {out.shape} {out.dtype}; it must be {shape} float32.")
+        if not (
+            out.flags.c_contiguous or out.strides[1] == out.itemsize
+        ):  # the kernels need beams one after the other
+            out[:] = self.scan(poses, bodies, walls)
+            return out
         worlds = np.arange(len(poses))
         room = self.room(bodies.shape[1])
         scan_kernels.scan_worlds(

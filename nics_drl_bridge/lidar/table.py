@@ -17,7 +17,19 @@ from pydantic import Field, field_validator
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.files import npz_bytes, npz_mapped, sha256
-from nics_drl_bridge.lidar.baked_kernels import BLOCK
+from nics_drl_bridge.lidar.baked_kernels import (
+    ABOUT,
+    CELLS_PER_PART,
+    CORNERS,
+    CORNERS_PER_PART,
+    FIRST_CELL,
+    HULL_END,
+    PARTS_PER_ROTATION,
+    PER_METRE,
+    ROTATIONS,
+    ROUND_RADIUS,
+)
+from nics_drl_bridge.lidar.block_kernels import BLOCK
 from nics_drl_bridge.lidar.shapes import SHAPES, Circle, Outlines, Shape
 
 FORMAT = "nics_drl_bridge/lidar_table/2"
@@ -101,26 +113,38 @@ class LidarTable:
     def lookup(self) -> tuple[Any, ...]:
         """What the kernels take.
 
-        Numbers of each shape (H, 4): radius [m], cells per metre, rotations in a full turn,
-        parts of a turn after which it looks the same per rotation. Counts (H, 6): distances,
-        rotations in a part, parts (0 for a circle), first cell, first corner of the hull,
-        corners per part. Then `start`, `cell`, `rows`, log2 of the phases, the hulls.
+        Flat (H * ABOUT,) numbers of each shape: cells per metre; rotations in a full turn, 0 for a
+        circle; parts of a turn after which it looks the same per rotation; first cell; cells per
+        part; the corner after the hull's last; corners per part; corners; radius of a circle [m],
+        0 for others. Then the distances, the cells, the rows, log2 of the phases, and the hulls.
         """
         outlines, distances = self.outlines, self.density.distances
-        rotations, parts = self.grid[:, 1], outlines.orders
-        numbers = np.zeros((len(self.shapes), 4))
-        numbers[:, 0] = outlines.radii
-        numbers[:, 1] = (distances - 1) / (self.grid[:, 0] - outlines.radii)
-        numbers[:, 2], numbers[:, 3] = rotations * parts, 1.0 / rotations
-        counts = np.zeros((len(self.shapes), 6), np.int64)
-        counts[:, 0], counts[:, 1] = distances, rotations
-        counts[:, 2] = [
-            0 if isinstance(s, Circle) else n for s, n in zip(self.shapes, parts, strict=True)
-        ]
-        counts[:, 3], counts[:, 4] = self.grid[:, 2], outlines.hull[:-1]
-        counts[:, 5] = np.diff(outlines.hull) // 2 // parts
+        parts, rotations = outlines.orders, self.grid[:, 1]
+        corners = np.diff(outlines.hull) // 2
+        round_ = np.array([isinstance(shape, Circle) for shape in self.shapes], bool)
+        about = np.zeros((len(self.shapes), ABOUT))
+        about[:, PER_METRE] = (distances - 1) / (self.grid[:, 0] - outlines.radii)
+        about[:, ROTATIONS] = np.where(round_, 0.0, rotations * parts)
+        about[:, PARTS_PER_ROTATION] = 1.0 / rotations
+        about[:, FIRST_CELL], about[:, CELLS_PER_PART] = self.grid[:, 2], rotations * distances
+        about[:, HULL_END] = outlines.hull[:-1] + corners
+        about[:, CORNERS_PER_PART], about[:, CORNERS] = corners // parts, corners
+        about[:, ROUND_RADIUS] = np.where(round_, outlines.radii, 0.0)
+        missing = max(2 * BLOCK - padding(self.beam_angle), 0)  # two blocks are read at least
+        rows = np.append(self.rows, np.zeros(missing, np.float32)) if missing else self.rows
         shift = self.density.phases.bit_length() - 1
-        return numbers, counts, self.start, self.cell, self.rows, shift, outlines.hulls
+        return about.ravel(), distances, self._packed, rows, shift, outlines.hulls.ravel()
+
+    @property
+    def _packed(self) -> NDArray[np.int32]:
+        """(cells * 4,) `start` and `cell`, two numbers in one, so that one cache line holds both.
+
+        Where the row begins; its first beam and its width; the other and the first corner of the
+        right edge; those of the left one.
+        """
+        cell = self.cell.astype(np.int32)
+        pairs = (cell[:, [0, 3, 5]] << 16) | cell[:, [1, 2, 4]]
+        return np.column_stack([self.start, pairs]).ravel()
 
     @property
     def memory(self) -> int:

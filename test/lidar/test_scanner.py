@@ -6,6 +6,7 @@ from lidar_scenes import POLYGONS, Scene, by_plane_geometry, random_scene, rando
 from robots import lidar
 
 from nics_drl_bridge.errors import ConfigError, ModelError
+from nics_drl_bridge.lidar.baked_kernels import LANES
 from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.budget import expected_rmse
 from nics_drl_bridge.lidar.maps_grid import GridMap
@@ -151,6 +152,22 @@ def test_a_lidar_inside_a_circle_sees_its_far_side(renderer):
     assert ranges == pytest.approx(0.1 * c + np.sqrt(0.25**2 - (0.1 * s) ** 2), abs=1e-5)
 
 
+@pytest.mark.parametrize("part", [0.3, 0.8, 1.5])
+def test_an_outline_that_crosses_itself_is_seen_from_anywhere(part):
+    star = 0.5 * np.stack([f(0.8 * np.pi * np.arange(5)) for f in (np.cos, np.sin)], axis=1)
+    bow = np.array([(-0.5, -0.3), (0.5, 0.3), (0.5, -0.3), (-0.5, 0.3)])
+    for outline in (star, bow):
+        shape = Polygon(points=tuple(map(tuple, outline)))
+        scanner = make_scanner(lidar(beams=90), [shape], "exact")
+        ends = np.concatenate([outline, np.roll(outline, -1, axis=0)], axis=1)
+        for angle in np.linspace(0.1, 6.2, 20):
+            robot = [part * 0.5 * np.cos(angle), part * 0.5 * np.sin(angle), angle]
+            bodies = scanner.place([shape], [(0.0, 0.0, 0.0)])
+            seen, walls = scanner.scan(robot, bodies)[0], scanner.scan(robot, [], ends)[0]
+            assert np.array_equal(np.isinf(seen), np.isinf(walls))
+            assert finite(seen, scanner.spec) == pytest.approx(finite(walls, scanner.spec))
+
+
 def test_a_wall_seen_edge_on_returns_nothing():
     scanner = make_scanner(lidar(beams=8), ())
     assert np.isinf(scanner.scan(HERE, [], [[1.0, 0.0, 2.0, 0.0]])).all()
@@ -202,6 +219,34 @@ def test_a_scan_in_a_batch_is_the_scan_alone_to_the_bit(renderer):
     into = np.full_like(batch, np.nan)
     assert scanner.scan(robots, bodies, walls, out=into) is into
     assert np.array_equal(into, batch)
+
+
+@pytest.mark.parametrize("beams", [7, 20, 40, 720])
+def test_a_world_of_more_bodies_than_lanes_is_the_minimum_of_its_parts_to_the_bit(beams):
+    scanner = make_scanner(lidar(beams=beams), random_shapes(5), "baked")
+    rng, shapes = np.random.default_rng(beams), scanner.table.shapes
+    count, worlds = 2 * LANES + 5, 3
+    poses = rng.uniform(-1.0, 1.0, (worlds, count, 3)) * [4.0, 4.0, np.pi]
+    bodies = scanner.place([shapes[k % len(shapes)] for k in range(count)], poses)
+    robots = rng.uniform(-1.0, 1.0, (worlds, 3))
+    for part in (1, 7, LANES - 1, LANES, LANES + 1):
+        pieces = [scanner.scan(robots, bodies[:, k : k + part]) for k in range(0, count, part)]
+        assert np.array_equal(scanner.scan(robots, bodies), np.minimum.reduce(pieces))
+
+
+@pytest.mark.parametrize("renderer", RENDERERS)
+def test_an_array_of_any_layout_is_filled(renderer):
+    scanner = make_scanner(lidar(beams=40), [SQUARE, STRIP], renderer)
+    poses = np.random.default_rng(0).uniform(-1.5, 1.5, (6, 10, 3))
+    bodies = scanner.place([SQUARE, STRIP] * 5, poses)
+    expected = scanner.scan(np.zeros((6, 3)), bodies)
+    for out in (
+        np.zeros((6, 80), np.float32)[:, ::2],
+        np.zeros((6, 90), np.float32)[:, 7:47],
+        np.zeros((12, 40), np.float32)[::-2],
+        np.zeros((40, 6), np.float32).T,
+    ):
+        assert np.array_equal(scanner.scan(np.zeros((6, 3)), bodies, out=out), expected)
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
