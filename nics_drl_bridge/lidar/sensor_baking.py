@@ -67,7 +67,7 @@ def _cosines(table: LidarTable, grids: Sequence[Grid]) -> NDArray[np.float32]:
                 grid.distances,
                 turn,
                 grid.edges[t],
-                table.beam_angle / table.density.phases,
+                table.beam_angle,
                 table.density.phases,
             )
     return np.minimum(cosines, np.float32(1.0))

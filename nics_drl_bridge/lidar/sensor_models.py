@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import AfterValidator, Field, TypeAdapter, model_validator
+from pydantic import AfterValidator, Field, TypeAdapter, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, load_yaml
 
@@ -32,7 +32,18 @@ class IncidenceDropout(Schema):
     """
 
     kind: Literal["incidence_dropout"] = "incidence_dropout"
-    greatest_incidence: float = Field(gt=0.0, lt=math.pi / 2.0)
+    greatest_incidence: float
+
+    @field_validator("greatest_incidence")
+    @classmethod
+    def _acute(cls, angle: float) -> float:
+        if not 0.0 < angle < math.pi / 2.0:
+            raise ValueError("must lie between 0 and a right angle, in radians")
+        return angle
+
+    def __str__(self) -> str:
+        """In a few words."""
+        return f"nothing from beyond {math.degrees(self.greatest_incidence):.4g} deg of incidence"
 
     def lost(
         self, ranges: Ranges, incidence: NDArray[np.float64], reflectivity: float | None
@@ -63,6 +74,11 @@ class Intensity(Schema):
     exponent: float = Field(default=1.0, ge=0.0, le=100.0)
     threshold: float = Field(default=0.0, ge=0.0)
     saturation: float | None = Field(default=None, gt=0.0)
+
+    def __str__(self) -> str:
+        """In a few words."""
+        lost = f", below {self.threshold:g} nothing" if self.threshold else ""
+        return f"intensity {self.gain:g} at 1 m{lost}, reflectivity {self.reflectivity:g}"
 
     @model_validator(mode="after")
     def _reachable(self) -> Intensity:
