@@ -102,7 +102,7 @@ class Intensity(Schema):
             reflectivity: of the surface, None where it names none.
         """
         light = self.gain * self.reflectance(np.cos(incidence), reflectivity)
-        return np.asarray(light < self.threshold * np.square(np.maximum(ranges, NEAREST)))
+        return np.asarray(light / np.square(np.maximum(ranges, NEAREST)) < self.threshold)
 
     @property
     def device(self) -> NDArray[np.float64]:

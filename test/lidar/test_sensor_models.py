@@ -67,7 +67,8 @@ def test_a_file_of_sensor_models_reads_to_what_it_says(tmp_path):
         ("[{kind: incidence_dropout, greatest_incidence: 75}]", "must lie between 0 and a right "
          "angle, in radians, not 75."),
         ("[{kind: intensity}, {kind: intensity}]", "one model of the kind intensity; keep one"),
-        ("[{kind: intensity, threshold: 2, saturation: 1}]", "threshold must be at most saturation"),
+        ("[{kind: intensity, threshold: 2, saturation: 1}]", "threshold must be at most "
+         "saturation"),
         ("[{kind: intensity, reflectivity: 0}]", "should be greater than 0, not 0."),
     ],
 )  # fmt: skip
