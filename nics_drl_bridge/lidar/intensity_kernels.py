@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numba import njit
 
-from nics_drl_bridge.lidar import bake_kernels, kernels, map_kernels
+from nics_drl_bridge.lidar import bake_kernels, kernels, map_kernels, scan_kernels
 from nics_drl_bridge.lidar import baked_kernels as baking
 from nics_drl_bridge.lidar.sensor_models import NEAREST
 
@@ -134,57 +134,13 @@ def grid(scan, directions, beams, place, range_max, surface, map_arrays, exact):
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)
-def fuse(scan, found, beams, row_of, cell_of, rows, reflectance, shift, spans, blend, cell_at):  # type: ignore[no-untyped-def]
-    """As `baked_kernels.fuse`, with the reflectance blended from the same points as the ranges.
-
-    Args:
-        scan: see `circle`.
-        found, beams, row_of, cell_of, rows, shift, blend, cell_at: see `baked_kernels.fuse`.
-        reflectance: (R,) see `table.LidarTable`.
-        spans: bearing, right and left edge of each body in beams.
-    """
+def fuse(scan, ranges, reflectance):  # type: ignore[no-untyped-def]
+    """Fuses a body that was looked up alone: its ranges (B,) and its reflectance (B,)."""
     nearest, light, _ = scan
-    bearing, right, left = spans
-    phases, count = 1 << shift, nearest.shape[0]
-    turn = 2.0 * math.pi / beams[1]
-    for k in range(found):
-        middle, first, last, cell = bearing[k], right[k], left[k], cell_at[k]
-        for _ in range(2):  # over the seam once at most
-            begin = max(math.ceil(first), 0)
-            hits = min(math.floor(last), count - 1) - begin + 1
-            if hits > 0:
-                exact = (begin - middle) * phases
-                point = math.floor(exact)
-                part = np.float32(exact - point)
-                near, near2 = points(row_of, cell_of, cell, point, shift, hits)
-                far, far2 = points(row_of, cell_of, cell + 1, point, shift, hits)
-                share = np.float32(blend[k])
-                for i in range(hits):
-                    a, b = np.uintp(near + i), np.uintp(near2 + i)
-                    c, d, at = np.uintp(far + i), np.uintp(far2 + i), np.uintp(begin + i)
-                    value = rows[a] + part * (rows[b] - rows[a])
-                    other = rows[c] + part * (rows[d] - rows[c])
-                    value += share * (other - value)
-                    one = reflectance[a] + part * (reflectance[b] - reflectance[a])
-                    two = reflectance[c] + part * (reflectance[d] - reflectance[c])
-                    one += share * (two - one)
-                    held = nearest[at]
-                    nearest[at] = value if value < held else held
-                    light[at] = one if value < held else light[at]
-            if last < turn:
-                break
-            middle, first, last = middle - turn, first - turn, last - turn
-
-
-@njit(cache=True, error_model="numpy", _nrt=False)
-def points(row_of, cell_of, cell, point, shift, hits):  # type: ignore[no-untyped-def]
-    """Where a cell's row holds the two points on both sides of the first beam of a span."""
-    phases = 1 << shift
-    beam, phase = point >> shift, point & (phases - 1)
-    width = cell_of[cell, 1]
-    skip = max(min(beam - cell_of[cell, 0], width - hits - 1), 0)
-    near = row_of[cell] + phase * width + skip
-    return near, near + width if phase + 1 < phases else near - phase * width + 1
+    for i in range(nearest.shape[0]):
+        nearer = ranges[i] < nearest[i]
+        light[i] = reflectance[i] if nearer else light[i]
+        nearest[i] = ranges[i] if nearer else nearest[i]
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)
@@ -199,50 +155,68 @@ def report(intensities, ranges, scan, device):  # type: ignore[no-untyped-def]
         intensities[i] = value if abs(ranges[i]) < np.float32(np.inf) else nothing
 
 
+@njit(cache=True, error_model="numpy", _nrt=False)
+def set_apart(apart, pose, bodies, n, me, sx, sy, range_max, baked):  # type: ignore[no-untyped-def]
+    """Puts every body of a world that can be looked up into a world of its own, with the robot.
+
+    Args:
+        apart: poses (K, 1, 3) and bodies (K, 1, 7), results; a radius of 0 where there is none.
+        pose: (3,) of the robot.
+        bodies, n, me, sx, sy, range_max, baked: see `baked_kernels.left_out`.
+    """
+    poses, alone = apart
+    for k in range(bodies.shape[1]):
+        for i in range(poses.shape[2]):
+            poses[k, 0, i] = pose[i]
+        for i in range(alone.shape[2]):
+            alone[k, 0, i] = bodies[n, k, i]
+        reach = range_max + bodies[n, k, 5]
+        near = math.hypot(bodies[n, k, 0] - sx, bodies[n, k, 1] - sy) <= reach
+        if k == me or not near or baking.left_out(bodies, n, k, me, sx, sy, range_max, baked):
+            alone[k, 0, 5] = 0.0
+
+
 @njit(cache=True, error_model="numpy")
 def intensities_of_worlds(  # type: ignore[no-untyped-def]
-    intensities, ranges, poses, chosen, bodies, first, lines, sensor, room, scan, reflectance,
+    intensities, ranges, poses, chosen, bodies, first, lines, sensors, room, scan, apart, found,
     surfaces, device, map_arrays, exact,
 ):  # fmt: skip
     """Intensities that belong to the scans of the robots of some worlds.
 
+    What a body gives is looked up as scans are, twice: from the ranges, and from the reflectances
+    in their place.
+
     Args:
         intensities: (N, M, B) float32 result [the device's unit].
         ranges: (N, M, B) what the robots measured: where it is not finite the intensity is 0.
-        poses, chosen, bodies, first, sensor, room: see `scan_kernels.scan_worlds`.
+        poses, chosen, bodies, first, room: see `scan_kernels.scan_worlds`.
         lines: (W, 4) walls.
+        sensors: see `scanner.Scanner.arguments`, and the same with reflectances for ranges.
         scan: scratch, (B,) float32 three times.
-        reflectance: (R,) see `table.LidarTable`.
+        apart: scratch, see `set_apart`.
+        found: scratch, (K, 1, B) float32 twice, and all the numbers up to K.
         surfaces: (H,) reflectivity of each shape.
         device: (4,) see `sensor_models.Intensity.device`.
         map_arrays, exact: see `scan_kernels.add_map`.
     """
-    mount, directions, beams, limits, baked, outlines, lookup = sensor
+    sensor, bright = sensors
+    mount, directions, beams, limits, baked, outlines = sensor[:6]
     corners, corner = outlines
-    shape_of, grid_of, row_of, cell_of, rows, shift, hulls = lookup
-    (x, y, distance, bearing, right, left), (rx, ry, lx, ly, blend), (which, cell_at) = room
-    high, plain = limits[1], (device[EXPONENT], device[REFLECTIVITY])
+    near, light, every = found
+    high, plain, none = limits[1], (device[EXPONENT], device[REFLECTIVITY]), lines[:0]
     for n in chosen:
         for m in range(poses.shape[1]):
             me = first + m if first >= 0 else -1
-            sx, sy, heading, c, s = kernels.to_sensor(poses, n, m, mount)
-            found, missed = baking.in_sight(
-                bodies, n, me, sx, sy, high, baked, which, x, y, distance
-            )
-            baking.directions(found, x, y, distance, bearing)
-            baking.cells_of(
-                found, bodies, n, limits, shape_of, grid_of, cell_of, hulls, which, x, y, distance,
-                bearing, rx, ry, lx, ly, blend, cell_at,
-            )  # fmt: skip
-            baking.spans(found, heading, beams, rx, ry, lx, ly, bearing, right, left)
-            scan[0][:], scan[1][:] = np.float32(np.inf), np.float32(0.0)
-            fuse(
-                scan, found, beams, row_of, cell_of, rows, reflectance, shift,
-                (bearing, right, left), blend, cell_at,
-            )  # fmt: skip
+            sx, sy, _, c, s = kernels.to_sensor(poses, n, m, mount)
             place = (sx, sy, c, s)
-            for k in range(bodies.shape[1] if missed > 0 else 0):
-                if baking.left_out(bodies, n, k, me, sx, sy, high, baked):
+            set_apart(apart, poses[n, m], bodies, n, me, sx, sy, high, baked)
+            scan_kernels.scan_worlds(near, apart[0], every, apart[1], -1, none, sensor, room)
+            scan_kernels.scan_worlds(light, apart[0], every, apart[1], -1, none, bright, room)
+            scan[0][:], scan[1][:] = np.float32(np.inf), np.float32(0.0)
+            for k in range(bodies.shape[1]):
+                if apart[1][k, 0, 5] > 0.0:
+                    fuse(scan, near[k, 0], light[k, 0])
+                elif baking.left_out(bodies, n, k, me, sx, sy, high, baked):
                     surface = (device[EXPONENT], surfaces[int(bodies[n, k, 6])])
                     body(
                         scan, directions, beams, place, bodies[n, k], corners, corner, surface, high

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -196,8 +196,8 @@ class Scanner:
             ConfigError: an array has another shape.
             ModelError: the table holds no intensities, or a body is of a shape that is not in it.
         """
-        bright, reflectance = intensity_of(self.table.sensor_model), self.table.reflectance
-        if bright is None or reflectance is None:
+        bright = intensity_of(self.table.sensor_model)
+        if bright is None:
             raise ModelError(
                 f"the table of the lidar {self.spec.name!r} holds no intensities; bake it with a "
                 "sensor model of the kind `intensity`."
@@ -207,14 +207,25 @@ class Scanner:
         ranges = np.atleast_2d(np.asarray(ranges, np.float32))
         if ranges.shape != out.shape:
             raise ConfigError(f"ranges {ranges.shape} must be {out.shape}, as the scans are.")
-        map_arrays = NO_MAP if self.grid is None else self.grid.arrays
+        count, beams = bodies.shape[1], self.spec.beams
         intensity_kernels.intensities_of_worlds(
-            out[:, None], ranges[:, None], poses[:, None], np.arange(len(poses)), bodies, -1,
-            walls, self.arguments, self.room(bodies.shape[1]),
-            tuple(np.empty((3, self.spec.beams), np.float32)), reflectance,
-            self._reflectivities(bright), bright.device, map_arrays, self.renderer == "exact",
+            out[:, None], ranges[:, None], poses[:, None], np.arange(len(poses)), bodies, -1, walls,
+            (self.arguments, self._bright_arguments), self.room(count),
+            tuple(np.empty((3, beams), np.float32)),
+            (np.empty((count, 1, 3)), np.empty((count, 1, BODY))),
+            (*np.empty((2, count, 1, beams), np.float32), np.arange(count)),
+            self._reflectivities(bright), bright.device,
+            NO_MAP if self.grid is None else self.grid.arrays, self.renderer == "exact",
         )  # fmt: skip
         return out
+
+    @cached_property
+    def _bright_arguments(self) -> tuple[Any, ...]:
+        """As `arguments`, with the reflectances of the table in place of its ranges."""
+        mount, directions, beams, _, baked, outlines, _ = self.arguments
+        rows = self.table.rows if self.table.reflectance is None else self.table.reflectance
+        lookup = replace(self.table, rows=rows).lookup
+        return mount, directions, beams, np.array([-1.0, np.inf]), baked, outlines, lookup
 
     def _reflectivities(self, bright: Intensity) -> NDArray[np.float64]:
         """(H,) of each shape."""
