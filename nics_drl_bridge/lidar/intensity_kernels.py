@@ -64,8 +64,9 @@ def segment(scan, directions, beams, x1, y1, x2, y2, surface):  # type: ignore[n
     if surface[0] == 1.0:  # without a power, many at a time
         white, one = np.float32(surface[1]), np.float32(1.0)
         for i in range(nearest.shape[0]):
-            value = white * min(away / nearest[i], one)
-            light[i] = value if nearest[i] < before[i] else light[i]
+            now, held, kept = nearest[i], before[i], light[i]
+            value = white * min(away / now, one)
+            light[i] = value if now < held else kept
         return
     for i in range(nearest.shape[0]):
         if nearest[i] < before[i]:
@@ -134,13 +135,21 @@ def grid(scan, directions, beams, place, range_max, surface, map_arrays, exact):
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)
-def fuse(scan, ranges, reflectance):  # type: ignore[no-untyped-def]
-    """Fuses a body that was looked up alone: its ranges (B,) and its reflectance (B,)."""
+def fuse(scan, beams, bearing, half, ranges, reflectance):  # type: ignore[no-untyped-def]
+    """Fuses a body that was looked up alone: its ranges (B,) and its reflectance (B,).
+
+    Only the beams between `bearing - half` and `bearing + half` [rad] can meet it.
+    """
     nearest, light, _ = scan
-    for i in range(nearest.shape[0]):
-        nearer = ranges[i] < nearest[i]
-        light[i] = reflectance[i] if nearer else light[i]
-        nearest[i] = ranges[i] if nearer else nearest[i]
+    count, turns = nearest.shape[0], 1 if beams[2] > 0.0 else 3
+    for turn in range(turns):
+        middle = bearing + (0.0 if turns == 1 else (turn - 1) * kernels.TWO_PI)
+        first, hits = kernels.beam_span(middle - half, middle + half, beams, count)
+        for k in range(hits):
+            i = first + k
+            i -= count if i >= count else 0
+            if ranges[i] < nearest[i]:
+                nearest[i], light[i] = ranges[i], reflectance[i]
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)
@@ -214,8 +223,12 @@ def intensities_of_worlds(  # type: ignore[no-untyped-def]
             scan_kernels.scan_worlds(light, apart[0], every, apart[1], -1, none, bright, room)
             scan[0][:], scan[1][:] = np.float32(np.inf), np.float32(0.0)
             for k in range(bodies.shape[1]):
-                if apart[1][k, 0, 5] > 0.0:
-                    fuse(scan, near[k, 0], light[k, 0])
+                radius = apart[1][k, 0, 5]
+                if radius > 0.0:
+                    dx, dy = bodies[n, k, 0] - sx, bodies[n, k, 1] - sy
+                    half = math.asin(min(radius / math.hypot(dx, dy), 1.0)) + beams[1]
+                    bearing = kernels.arctan2(c * dy - s * dx, c * dx + s * dy)
+                    fuse(scan, beams, bearing, half, near[k, 0], light[k, 0])
                 elif baking.left_out(bodies, n, k, me, sx, sy, high, baked):
                     surface = (device[EXPONENT], surfaces[int(bodies[n, k, 6])])
                     body(
