@@ -39,12 +39,12 @@ def calls_of(
 ) -> tuple[dict[str, Callable[[], object]], dict[str, int]]:
     """What is timed, by name: ranges of each table, and both channels. And bytes of each table."""
     batch, calls, sizes = random_batch(SHAPES, scans, 0), {}, {}
+    out, light = np.empty((2, scans, SPEC.beams), np.float32)
     for name, model in MODELS.items():
         scanner = Scanner(SPEC, bake(SPEC, SHAPES, density, model), "baked")
-        bodies, out = batch.bodies(scanner), np.empty((scans, SPEC.beams), np.float32)
+        bodies = batch.bodies(scanner)
         sizes[name] = scanner.table.memory
         calls[name] = partial(scanner.scan, batch.lidar, bodies, out=out)
-    light = np.empty_like(out)
     scan = calls["both"]
 
     def ranges_and_intensities() -> None:
