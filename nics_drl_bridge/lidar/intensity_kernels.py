@@ -153,11 +153,14 @@ def fuse(scan, beams, bearing, half, ranges, reflectance):  # type: ignore[no-un
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)
-def report(intensities, ranges, scan, device):  # type: ignore[no-untyped-def]
-    """Intensities (B,) of the beams that return anything, 0 of the others."""
+def report(intensities, ranges, scan, device, range_min):  # type: ignore[no-untyped-def]
+    """Intensities (B,) of the beams that return anything, 0 of the others.
+
+    What is too close, and reported nevertheless, is as bright as at `range_min`.
+    """
     nearest, light, _ = scan
     gain, most = np.float32(device[GAIN]), np.float32(device[SATURATION])
-    least, nothing = np.float32(NEAREST), np.float32(0.0)
+    least, nothing = np.float32(max(NEAREST, range_min)), np.float32(0.0)
     for i in range(nearest.shape[0]):
         away = max(nearest[i], least)
         value = min(gain * light[i] / (away * away), most)
@@ -236,7 +239,7 @@ def intensities_of_worlds(  # type: ignore[no-untyped-def]
                     )
             walls(scan, directions, beams, place, lines, plain)
             grid(scan, directions, beams, place, high, plain, map_arrays, exact)
-            report(intensities[n, m], ranges[n, m], scan, device)
+            report(intensities[n, m], ranges[n, m], scan, device, limits[0])
 
 
 @njit(cache=True)

@@ -57,7 +57,7 @@ class Intensity(Schema):
 
     That is the range equation of a laser for a diffuse surface that is wider than the beam, in
     free air: Jelalian, Laser Radar Systems (1992); in this form Hoefle and Pfeifer, Correction of
-    laser scanning intensity data (2007), Eq. 4, with the exponent 1 of Lambert's law.
+    laser scanning intensity data (2007), with the exponent 1 of Lambert's law.
 
     Attributes:
         gain: intensity of a white surface, met at right angles at 1 m [the device's unit].

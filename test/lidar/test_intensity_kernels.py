@@ -220,6 +220,18 @@ def test_only_beams_that_return_have_an_intensity():
     assert np.array_equal(lossy, np.where(np.isfinite(ranges), found, 0.0))
 
 
+@pytest.mark.parametrize("renderer", RENDERERS)
+def test_what_is_too_close_and_reported_nevertheless_is_as_bright_as_at_range_min(renderer):
+    spec, shape = lidar(beams=90, range_min=0.5), Circle(radius=0.5)
+    scanner = lit(spec, [shape], Intensity(reflectivity=1.0), renderer)
+    body = scanner.place([shape], [[0.8, 0.0, 0.0]])
+    ranges = scanner.scan(HERE, body)
+    ahead = np.argmin(np.abs(spec.angles))
+    assert np.isneginf(ranges[0, ahead])
+    ranges[np.isneginf(ranges)] = spec.range_min
+    assert scanner.intensities(ranges, HERE, body)[0, ahead] == pytest.approx(4.0, rel=0.02)
+
+
 def test_a_device_reports_no_more_than_its_saturation():
     spec = lidar(beams=90)
     walls = [[1.0, -9.0, 1.0, 9.0]]
