@@ -13,6 +13,7 @@ from nics_drl_bridge.files import check_above, write_bytes
 from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.budget import choose, expected_rmse, parse_size
+from nics_drl_bridge.lidar.sensor_models import load_sensor_models
 from nics_drl_bridge.lidar.shapes import Circle, Shape, describe, load_shapes
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import Density, LidarTable
@@ -34,6 +35,7 @@ class BakeOrder:
         budget: greatest memory, as text.
         density: keys of `Density`, instead of a budget.
         out: the file to write.
+        sensor_model: a YAML file of it, in place of that of the lidar.
     """
 
     lidar: str = "paper"
@@ -43,6 +45,14 @@ class BakeOrder:
     budget: str | None = None
     density: Mapping[str, int] = field(default_factory=dict)
     out: Path = Path("lidar_table.npz")
+    sensor_model: Path | None = None
+
+    def spec(self) -> LidarSpec:
+        """The lidar, with the sensor model to bake in."""
+        spec = load_lidar(self.lidar)
+        if self.sensor_model is None:
+            return spec
+        return spec.model_copy(update={"sensor_model": load_sensor_models(self.sensor_model)})
 
     def all_shapes(self) -> tuple[Shape, ...]:
         """Each shape once. Raises ConfigError when there is none."""
@@ -72,7 +82,7 @@ def run(order: BakeOrder, told: Told) -> list[str]:
     check_above(order.out)
     if order.budget is not None and order.density:
         raise ConfigError("--budget finds the density; leave out either it or the density.")
-    spec, shapes = load_lidar(order.lidar), order.all_shapes()
+    spec, shapes = order.spec(), order.all_shapes()
     begin = time.perf_counter()
     table, rmse = _bake(order, spec, shapes, told)
     took = time.perf_counter() - begin
@@ -81,6 +91,7 @@ def run(order: BakeOrder, told: Told) -> list[str]:
     density = table.density
     return [
         f"lidar           {spec.name}, {spec.beams} beams, to {spec.range_max:g} m",
+        *(f"sensor model    {model}" for model in spec.sensor_model),
         *(f"shape           {describe(shape)}" for shape in shapes),
         f"density         {density.distances} distances x {density.rotations} rotations, "
         f"{density.phases} points per beam",

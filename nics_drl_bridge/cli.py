@@ -174,6 +174,9 @@ def bake(
     distances: Annotated[int | None, typer.Option(help="Grid distances, instead.")] = None,
     rotations: Annotated[int | None, typer.Option(help="Grid rotations, instead.")] = None,
     phases: Annotated[int | None, typer.Option(help="Points per beam, instead.")] = None,
+    sensor_model: Annotated[
+        Path | None, typer.Option(help="A YAML file of it, instead of that of the lidar.")
+    ] = None,
     out: Annotated[Path, typer.Option(help="The .npz file to write.")] = Path("lidar_table.npz"),
 ) -> None:
     """Bakes a lidar table and tells how far its ranges will be off."""
@@ -182,7 +185,7 @@ def bake(
 
         given = {"distances": distances, "rotations": rotations, "phases": phases}
         density = {name: value for name, value in given.items() if value is not None}
-        order = BakeOrder(lidar, world, shapes, robot, budget, density, out)
+        order = BakeOrder(lidar, world, shapes, robot, budget, density, out, sensor_model)
         with _progress() as told:
             lines = run(order, told)
         for line in lines:

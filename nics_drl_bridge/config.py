@@ -152,6 +152,11 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
         known = _fields_at(schema, first["loc"][:-1])
         hint = nearest(str(first["loc"][-1]), known) if known else "remove it"
         return f"unknown key {key!r}; {hint}"
+    if first["type"] == "union_tag_invalid":
+        tag, known = first["ctx"]["tag"], re.findall("'([^']*)'", first["ctx"]["expected_tags"])
+        return f"key {key!r}: unknown kind {tag!r}; {nearest(tag, known)}"
+    if first["type"] == "union_tag_not_found":
+        return f"the key '{key}.kind' is missing; add it."
     if first["type"] == "missing":
         return f"the key {key!r} is missing; add it."
     message = first["msg"].removeprefix("Value error, ").rstrip(".")
@@ -161,23 +166,25 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
 def _fields_at(schema: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
     """The field names of the model that lies at `location` inside `schema`."""
     current: Any = schema
+    models: list[Any] = []
     for part in location:
         if isinstance(part, int):
             continue
         fields = getattr(current, "model_fields", {})
         if part in fields:
-            current = _inner_model(fields[part].annotation)
+            models = _inner_models(fields[part].annotation)
+            current = models[0] if models else None
+        else:  # which of several kinds
+            kinds = [m for m in models if "kind" in m.model_fields]
+            current = next((m for m in kinds if m.model_fields["kind"].default == part), current)
     return list(getattr(current, "model_fields", {}))
 
 
-def _inner_model(annotation: Any) -> Any:
+def _inner_models(annotation: Any) -> list[Any]:
+    """The models that a type is made of."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for argument in getattr(annotation, "__args__", ()):
-        inner = _inner_model(argument)
-        if inner is not None:
-            return inner
-    return None
+        return [annotation]
+    return [m for part in getattr(annotation, "__args__", ()) for m in _inner_models(part)]
 
 
 def read_text(path: Path) -> str:

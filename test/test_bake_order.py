@@ -93,3 +93,16 @@ def test_a_place_that_can_not_be_written_is_told_before_the_work(shapes, tmp_pat
             lambda *what: done.append(what),
         )
     assert not done
+
+
+def test_a_sensor_model_of_a_file_is_baked_in_place_of_the_lidars(shapes, tmp_path):
+    path, out = tmp_path / "dull.yaml", tmp_path / "table.npz"
+    path.write_text("sensor_model: [{kind: intensity, gain: 50, threshold: 4}]\n")
+    order = BakeOrder(shapes=shapes, density={"distances": 7}, out=out, sensor_model=path)
+    lines = run(order, lambda *what: None)
+    assert "sensor model    intensity 50 at 1 m, below 4 nothing, reflectivity 0.5" in lines
+    table = LidarTable.load(out)
+    assert table.sensor_model == order.spec().sensor_model
+    assert table.reflectance is not None
+    with pytest.raises(ConfigError, match=r"no\.yaml: no such file"):
+        BakeOrder(shapes=shapes, sensor_model=tmp_path / "no.yaml").spec()

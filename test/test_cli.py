@@ -170,6 +170,17 @@ def test_bake_writes_a_table_within_a_budget_and_no_bar_into_a_pipe(tmp_path):
     assert 0 < (tmp_path / "t.npz").stat().st_size <= 200_000
 
 
+def test_bake_takes_a_sensor_model(tmp_path):
+    (tmp_path / "dull.yaml").write_text("sensor_model: [{kind: intensity}]\n")
+    words = ("bake", "--world", "arena", "--distances", "5", "--sensor-model")
+    done = nics(*words, "dull.yaml", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "sensor model    intensity 1 at 1 m, reflectivity 0.5" in done.stdout
+    (tmp_path / "dull.yaml").write_text("sensor_model: [{kind: intense}]\n")
+    told = refused(nics(*words, "dull.yaml", cwd=tmp_path))
+    assert "dull.yaml: key 'sensor_model.0': unknown kind 'intense'; did you mean" in told
+
+
 def test_bake_without_shapes_or_with_nonsense_is_refused(tmp_path):
     assert "nothing to bake" in refused(nics("bake", cwd=tmp_path))
     wrong = ("bake", "--world", "arena", "--budget", "much")

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import bake_kernels
+from nics_drl_bridge.lidar.sensor_baking import apply_model
+from nics_drl_bridge.lidar.sensor_models import Function, SensorModel
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape, describe
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import Density, LidarTable, padding
@@ -24,8 +26,6 @@ COARSE = np.radians(2.0)
 MOST_NUMBERS = 2**31 - 2**20
 MISS = 0.02
 """An edge that two corners would miss by so many beams is looked for along the hull."""
-SensorModel = Callable[[NDArray[np.float32], NDArray[np.float64]], NDArray[np.float32]]
-"""Ranges (P,) [m] and angles of incidence (P,) [rad] to the ranges that the device reports."""
 Progress = Callable[[int, int], None]
 """Called with how many rotations are done, and of how many."""
 
@@ -51,7 +51,7 @@ def bake(
     spec: LidarSpec,
     shapes: Sequence[Shape],
     density: Density | None = None,
-    sensor_model: SensorModel | None = None,
+    sensor_model: Function | Sequence[SensorModel] | None = None,
     progress: Progress | None = None,
 ) -> LidarTable:
     """Scans shapes straight ahead, at a grid of distance and rotation, with the exact scanner.
@@ -60,8 +60,9 @@ def bake(
         spec: the lidar.
         shapes: H; equal ones are baked once.
         density: of the grid; by default `Density.for_beams`.
-        sensor_model: what the device makes of ranges and incidence, `inf` where it sees nothing;
-            it is baked in and costs nothing later. Such a beam goes through to what is behind.
+        sensor_model: by default that of the lidar; named models, see `sensor_models`, or a
+            function of ranges and incidence that gives `inf` where the device sees nothing. It is
+            baked in and costs nothing later. Such a beam goes through to what is behind.
         progress: told how far it is.
 
     Returns:
@@ -95,10 +96,8 @@ def bake(
             done += 1
             if progress is not None:
                 progress(done, total)
-    if sensor_model is not None:
-        _apply(sensor_model, rows, start, cells, spec, density.phases)
     about = [(g.distances[-1], len(g.turns), f) for g, f in zip(grids, first, strict=True)]
-    return LidarTable(
+    table = LidarTable(
         shapes,
         density,
         spec.angle_increment,
@@ -107,13 +106,15 @@ def bake(
         cells.astype(np.int16),
         rows,
     )
+    model = spec.sensor_model if sensor_model is None else sensor_model
+    return apply_model(table, grids, model) if callable(model) or model else table
 
 
 def with_shapes(spec: LidarSpec, table: LidarTable, shapes: Sequence[Shape]) -> LidarTable:
     """The table itself if it holds all of these shapes, or one of the same density that does."""
     if set(shapes) <= set(table.shapes):
         return table
-    return bake(spec, (*table.shapes, *shapes), table.density)
+    return bake(spec, (*table.shapes, *shapes), table.density, table.sensor_model)
 
 
 def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Grid:
@@ -254,34 +255,3 @@ def _rows_of_turn(
         spec.angle_increment,
         phases,
     )
-
-
-def _apply(
-    sensor_model: SensorModel,
-    rows: NDArray[np.float32],
-    start: NDArray[np.int64],
-    cells: NDArray[np.int64],
-    spec: LidarSpec,
-    phases: int,
-) -> None:
-    """Changes every row by the sensor model."""
-    for begin, width in zip(start, cells[:, 1], strict=True):
-        part = rows[begin : begin + width * phases]
-        fine = part.reshape(phases, width).T.ravel()
-        changed = sensor_model(fine, _incidence(fine, spec.angle_increment / phases))
-        part[:] = np.asarray(changed, np.float32).reshape(width, phases).T.ravel()
-
-
-def _incidence(fine: NDArray[np.float32], step: float) -> NDArray[np.float64]:
-    """(P,) angle between each ray and the normal of what it hits [rad], from r' / r.
-
-    Of the slopes to both neighbours the smaller counts, so that a jump to another side is none.
-    Beyond the edges, where a row goes on with its outermost range, it is that at the edge.
-    """
-    slope = np.abs(np.diff(fine.astype(np.float64))) / step
-    moves = np.flatnonzero(slope)
-    if len(moves):  # the outermost step ends at the edge, within a point: the next one counts
-        first, last = min(moves[0] + 1, moves[-1]), max(moves[-1] - 1, moves[0])
-        slope[:first], slope[last + 1 :] = slope[first], slope[last]
-    both = np.minimum(np.append(slope, np.inf), np.append(np.inf, slope))
-    return np.asarray(np.arctan2(both, fine))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError, ModelError, nearest
-from nics_drl_bridge.lidar import scan_kernels
+from nics_drl_bridge.lidar import intensity_kernels, scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import LANES, SINGLE, WHOLE, WIDE
 from nics_drl_bridge.lidar.baking import bake
-from nics_drl_bridge.lidar.maps_grid import GridMap
+from nics_drl_bridge.lidar.maps_grid import NO_MAP, GridMap
+from nics_drl_bridge.lidar.sensor_models import Intensity, intensity_of
 from nics_drl_bridge.lidar.shapes import BODY, SHAPE, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable
@@ -23,6 +24,7 @@ from nics_drl_bridge.lidar.table import LidarTable
 Renderer = Literal["auto", "baked", "exact"]
 RENDERERS: tuple[Renderer, ...] = ("auto", "baked", "exact")
 Room = tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.int32]]
+Array = NDArray[np.float64]
 NO_WALLS = np.zeros((0, 4))
 FEW_CORNERS = 16
 """A concave shape of so few corners is scanned exactly by `auto`."""
@@ -149,28 +151,10 @@ class Scanner:
             ConfigError: an array has another shape.
             ModelError: a body is of a shape that is not in the table.
         """
-        poses = np.atleast_2d(np.asarray(poses, dtype=np.float64))
-        shape = (len(poses), self.spec.beams)
-        bodies = np.asarray(bodies, dtype=np.float64)
-        if bodies.size == 0:
-            bodies = np.zeros((len(poses), 0, BODY))
-        elif bodies.ndim == 2:
-            bodies = bodies[None]
-        walls = np.atleast_2d(np.asarray(walls if np.size(walls) else NO_WALLS, dtype=np.float64))
-        out = np.empty(shape, np.float32) if out is None else out
-        if poses.shape[1:] != (3,) or bodies.shape != (len(poses), bodies.shape[1], BODY):
-            raise ConfigError(
-                f"poses {poses.shape} and bodies {bodies.shape} must be (N, 3) and (N, K, {BODY})."
-            )
-        if walls.shape != (len(walls), 4):
-            raise ConfigError(f"walls {walls.shape} must be (W, 4).")
-        self._require_known(bodies[..., SHAPE])
-        if out.shape != shape or out.dtype != np.float32:
-            raise ConfigError(f"out is {out.shape} {out.dtype}; it must be {shape} float32.")
-        if not (
-            out.flags.c_contiguous or out.strides[1] == out.itemsize
-        ):  # the kernels need beams one after the other
-            out[:] = self.scan(poses, bodies, walls)
+        poses, bodies, walls = self._scene(poses, bodies, walls)
+        out = self._result(len(poses), out)
+        if not (out.flags.c_contiguous or out.strides[1] == out.itemsize):
+            out[:] = self.scan(poses, bodies, walls)  # the kernels need beams one after the other
             return out
         worlds = np.arange(len(poses))
         room = self.room(bodies.shape[1])
@@ -182,6 +166,94 @@ class Scanner:
                 out[:, None], poses[:, None], worlds, self.arguments, self.grid.arrays,
                 self.renderer == "exact",
             )  # fmt: skip
+        return out
+
+    def intensities(
+        self,
+        ranges: ArrayLike,
+        poses: ArrayLike,
+        bodies: ArrayLike,
+        walls: ArrayLike = NO_WALLS,
+        out: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        """Intensities that belong to scans: of whatever is nearest, where there is a return.
+
+        They follow from the distances and angles of the scene, also where the ranges are noisy.
+
+        Args:
+            ranges: (N, B) what `scan` gave, or a device made of it [m].
+            poses: (N, 3) see `scan`.
+            bodies: (N, K, 7) see `scan`.
+            walls: (W, 4) see `scan`.
+            out: (N, B) where to write, a new array by default.
+
+        Returns:
+            (N, B) intensities [the unit of the model's gain], 0 where a range is not finite.
+
+        Raises:
+            ConfigError: an array has another shape.
+            ModelError: the table holds no intensities, or a body is of a shape that is not in it.
+        """
+        bright = intensity_of(self.table.sensor_model)
+        if bright is None:
+            raise ModelError(
+                f"the table of the lidar {self.spec.name!r} holds no intensities; bake it with a "
+                "sensor model of the kind `intensity`."
+            )
+        poses, bodies, walls = self._scene(poses, bodies, walls)
+        out = self._result(len(poses), out)
+        ranges = np.atleast_2d(np.asarray(ranges, np.float32))
+        if ranges.shape != out.shape:
+            raise ConfigError(f"ranges {ranges.shape} must be {out.shape}, as the scans are.")
+        count, beams = bodies.shape[1], self.spec.beams
+        intensity_kernels.intensities_of_worlds(
+            out[:, None], ranges[:, None], poses[:, None], np.arange(len(poses)), bodies, -1, walls,
+            (self.arguments, self._bright_arguments), self.room(count),
+            tuple(np.empty((3, beams), np.float32)),
+            (np.empty((count, 1, 3)), np.empty((count, 1, BODY))),
+            (*np.empty((2, count, 1, beams), np.float32), np.arange(count)),
+            self._reflectivities(bright), bright.device,
+            NO_MAP if self.grid is None else self.grid.arrays, self.renderer == "exact",
+        )  # fmt: skip
+        return out
+
+    @cached_property
+    def _bright_arguments(self) -> tuple[Any, ...]:
+        """As `arguments`, with the reflectances of the table in place of its ranges."""
+        mount, directions, beams, _, baked, outlines, _ = self.arguments
+        rows = self.table.rows if self.table.reflectance is None else self.table.reflectance
+        lookup = replace(self.table, rows=rows).lookup
+        return mount, directions, beams, np.array([-1.0, np.inf]), baked, outlines, lookup
+
+    def _reflectivities(self, bright: Intensity) -> NDArray[np.float64]:
+        """(H,) of each shape."""
+        own = [shape.reflectivity for shape in self.table.shapes]
+        return np.array([bright.reflectivity if one is None else one for one in own])
+
+    def _scene(self, poses: ArrayLike, bodies: ArrayLike, walls: ArrayLike) -> tuple[Array, ...]:
+        """Poses (N, 3), bodies (N, K, 7) and walls (W, 4). Raises what `scan` raises."""
+        poses = np.atleast_2d(np.asarray(poses, dtype=np.float64))
+        bodies = np.asarray(bodies, dtype=np.float64)
+        if bodies.size == 0:
+            bodies = np.zeros((len(poses), 0, BODY))
+        elif bodies.ndim == 2:
+            bodies = bodies[None]
+        walls = np.atleast_2d(np.asarray(walls if np.size(walls) else NO_WALLS, dtype=np.float64))
+        if poses.shape[1:] != (3,) or bodies.shape != (len(poses), bodies.shape[1], BODY):
+            raise ConfigError(
+                f"poses {poses.shape} and bodies {bodies.shape} must be (N, 3) and (N, K, {BODY})."
+            )
+        if walls.shape != (len(walls), 4):
+            raise ConfigError(f"walls {walls.shape} must be (W, 4).")
+        self._require_known(bodies[..., SHAPE])
+        return poses, bodies, walls
+
+    def _result(self, scans: int, out: NDArray[np.float32] | None) -> NDArray[np.float32]:
+        """(N, B) where to write. Raises ConfigError where `out` is another kind of array."""
+        shape = (scans, self.spec.beams)
+        out = np.empty(shape, np.float32) if out is None else out
+        if out.shape != shape or out.dtype != np.float32:
+            raise ConfigError(f"out is {out.shape} {out.dtype}; it must be {shape} float32.")
         return out
 
 

@@ -20,7 +20,18 @@ SAME_PLACE = 1e-9
 """Corners this near to each other, in parts of the shape's radius, coincide."""
 
 
-class Circle(Schema):
+class Surface(Schema):
+    """What the lidar may know of any shape beside its outline.
+
+    Attributes:
+        reflectivity: of its surface, for a lidar that yields intensities: 1 is a white diffuse
+            one, a retroreflector has more; by default that of the lidar's sensor model.
+    """
+
+    reflectivity: float | None = Field(default=None, gt=0.0)
+
+
+class Circle(Surface):
     """A disc around its own origin.
 
     Attributes:
@@ -36,7 +47,7 @@ class Circle(Schema):
         return np.zeros((0, 2))
 
 
-class Rectangle(Schema):
+class Rectangle(Surface):
     """A square, a box, a strip: around its own origin, along its own axes.
 
     Attributes:
@@ -64,7 +75,7 @@ class Rectangle(Schema):
         return _reach(self.outline)
 
 
-class Polygon(Schema):
+class Polygon(Surface):
     """Any outline of straight edges, convex or concave; the last corner joins the first.
 
     Attributes:
@@ -95,7 +106,7 @@ class Polygon(Schema):
         return _reach(self.outline)
 
 
-class Segment(Schema):
+class Segment(Surface):
     """A straight wall without thickness.
 
     Attributes:
@@ -270,6 +281,11 @@ class Outlines:
 
 def describe(shape: Shape) -> str:
     """A shape in a few words."""
+    surface = "" if shape.reflectivity is None else f", reflectivity {shape.reflectivity:g}"
+    return f"{_outline_in_words(shape)}{surface}"
+
+
+def _outline_in_words(shape: Shape) -> str:
     if isinstance(shape, Circle):
         return f"circle of radius {shape.radius:g} m"
     if isinstance(shape, Rectangle):

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.lidar.faults import SKEW, LidarFaults
+from nics_drl_bridge.lidar.sensor_models import SensorModels
 
 FULL_CIRCLE_TOLERANCE = 1e-6
 NoReturn = Literal["inf", "zero", "nan", "range_max"]
@@ -60,6 +61,7 @@ class LidarSpec(Schema):
         no_return: what the device puts on the wire where nothing came back: `inf` (REP-117),
             `zero`, `nan` or `range_max`. Inside the package it is `inf`; see `lidar.rep117`.
         faults: what else the device does to its ranges.
+        sensor_model: what it makes of the surfaces that it meets, baked into its tables.
     """
 
     name: str = "lidar"
@@ -74,6 +76,7 @@ class LidarSpec(Schema):
     frame: str = Field(default="laser", min_length=1)
     no_return: NoReturn = "inf"
     faults: LidarFaults = LidarFaults()
+    sensor_model: SensorModels = ()
 
     @model_validator(mode="after")
     def _consistent(self) -> LidarSpec:

@@ -30,6 +30,11 @@ from nics_drl_bridge.lidar.baked_kernels import (
     ROUND_RADIUS,
 )
 from nics_drl_bridge.lidar.block_kernels import BLOCK
+from nics_drl_bridge.lidar.sensor_models import (
+    SENSOR_MODELS,
+    SensorModel,
+    intensity_of,
+)
 from nics_drl_bridge.lidar.shapes import SHAPES, Circle, Outlines, Shape
 
 FORMAT = "nics_drl_bridge/lidar_table/2"
@@ -94,6 +99,9 @@ class LidarTable:
             other that can be it, or minus the stride with which to look around when there are
             more; the same two for the left edge.
         rows: (R,) float32 ranges [m]; longer than its rows by what one look-up can read.
+        sensor_model: named models that were baked in.
+        reflectance: (R,) float32 of the surface at each point of `rows`, reflectivity times a power
+            of the cosine of the angle of incidence; only where a model yields intensities.
     """
 
     shapes: tuple[Shape, ...]
@@ -103,6 +111,8 @@ class LidarTable:
     start: NDArray[np.int32]
     cell: NDArray[np.int16]
     rows: NDArray[np.float32]
+    sensor_model: tuple[SensorModel, ...] = ()
+    reflectance: NDArray[np.float32] | None = None
 
     @cached_property
     def outlines(self) -> Outlines:
@@ -149,32 +159,44 @@ class LidarTable:
     @property
     def memory(self) -> int:
         """Memory of the table [bytes]."""
-        return sum(a.nbytes for a in (self.grid, self.start, self.cell, self.rows))
+        return sum(array.nbytes for array in self._arrays.values())
 
-    def dump(self) -> bytes:
-        """The table as the content of an `.npz` file that can be mapped."""
+    @property
+    def _arrays(self) -> dict[str, NDArray[Any]]:
         arrays: dict[str, NDArray[Any]] = {
-            "about": np.frombuffer(self._about().encode(), np.uint8),
             "grid": self.grid,
             "start": self.start,
             "cell": self.cell,
             "rows": self.rows,
         }
-        return npz_bytes(arrays, packed=False)
+        return arrays if self.reflectance is None else arrays | {"reflectance": self.reflectance}
+
+    def cells_of_shapes(self) -> list[tuple[int, int]]:
+        """(H,) first cell of each shape, and the one after its last."""
+        counts = (self.grid[:, 1] * self.density.distances).astype(np.int64)
+        ends = np.cumsum(counts)
+        return list(zip((ends - counts).tolist(), ends.tolist(), strict=True))
+
+    def dump(self) -> bytes:
+        """The table as the content of an `.npz` file that can be mapped."""
+        about = np.frombuffer(self._about().encode(), np.uint8)
+        return npz_bytes({"about": about, **self._arrays}, packed=False)
 
     def _about(self) -> str:
-        about = {
+        about: dict[str, Any] = {
             "format": FORMAT,
-            "shapes": SHAPES.dump_python(self.shapes, mode="json"),
+            "shapes": SHAPES.dump_python(self.shapes, mode="json", exclude_none=True),
             "density": self.density.model_dump(),
             "beam_angle": self.beam_angle,
         }
+        if self.sensor_model:
+            about["sensor_model"] = SENSOR_MODELS.dump_python(self.sensor_model, mode="json")
         return json.dumps(about | {"crc32": self._crc32(json.dumps(about))})
 
     def _crc32(self, about: str) -> int:
         """Tells whether anything of the table was damaged."""
         crc = zlib.crc32(about.encode())
-        for array in (self.grid, self.start, self.cell, self.rows):
+        for array in self._arrays.values():
             crc = zlib.crc32(np.ascontiguousarray(array).data, crc)
         return crc
 
@@ -199,7 +221,9 @@ class LidarTable:
                 raise ValueError(f"its format is {about['format']!r}, not {FORMAT!r}")
             shapes = SHAPES.validate_python(about["shapes"])
             density = Density.model_validate(about["density"])
-            table = cls(shapes, density, float(about["beam_angle"]), **arrays)
+            model = SENSOR_MODELS.validate_python(about.get("sensor_model", ()))
+            angle = float(about["beam_angle"])
+            table = cls(shapes, density, angle, **arrays, sensor_model=model)
             table._check()
             if table._about() != json.dumps(about):
                 raise ValueError("its numbers were damaged")
@@ -238,6 +262,15 @@ class LidarTable:
         if cells and (self.start.min() < 0 or widths.min() < 1 or ends.max() > last):
             raise ValueError("a row lies outside of the table")
         self._check_corners(counts.astype(np.int64))
+        self._check_reflectance()
+
+    def _check_reflectance(self) -> None:
+        if (self.reflectance is None) != (intensity_of(self.sensor_model) is None):
+            raise ValueError("its reflectance does not belong to its sensor model")
+        if self.reflectance is not None and (
+            self.reflectance.shape != self.rows.shape or self.reflectance.dtype != np.float32
+        ):
+            raise ValueError("its reflectance does not fit its rows")
 
     def _check_corners(self, counts: NDArray[np.int64]) -> None:
         corners = np.repeat(np.diff(self.outlines.hull) // 2, counts)[:, None]

@@ -55,14 +55,23 @@ def twist_from_ros(message: Twist) -> Array:
 
 
 def scan_to_ros(
-    spec: LidarSpec, ranges: NDArray[np.float32], time_ns: int, frame: str
+    spec: LidarSpec,
+    ranges: NDArray[np.float32],
+    time_ns: int,
+    frame: str,
+    intensities: NDArray[np.float32] | None = None,
 ) -> LaserScan:
-    """Ranges (B,) as the LaserScan of the device; every header field follows from the spec."""
+    """Ranges (B,) as the LaserScan of the device; every header field follows from the spec.
+
+    Intensities (B,) are left out, as the message provides for, where there are none.
+    """
     message = LaserScan()
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
     for field, value in spec.header._asdict().items():
         setattr(message, field, value)
     message.ranges = array.array("f", to_device(ranges, spec).tobytes())
+    if intensities is not None:
+        message.intensities = array.array("f", np.asarray(intensities, np.float32).tobytes())
     return message
 
 

@@ -145,3 +145,16 @@ def test_errors_count_no_return_as_the_greatest_range(scenes):
 def polar(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance [m] and bearing [rad] of every obstacle."""
     return np.hypot(poses[..., 0], poses[..., 1]), np.arctan2(poses[..., 1], poses[..., 0])
+
+
+def test_sensor_models_are_compared_with_none_in_one_run():
+    result = result_of(
+        "lidar_sensor_models.py", "--scans", "64", "--repeats", "2", "--distances", "10",
+        "--rotations", "16",
+    )  # fmt: skip
+    tables = ["no model", "incidence dropout", "intensity", "both"]
+    assert list(result["scans_per_s"]) == [*tables, "both, with intensities"]
+    assert result["times_as_long"]["no model"] == 1.0
+    assert min(result["scans_per_s"].values()) > 0.0
+    assert result["table_bytes"]["no model"] == result["table_bytes"]["incidence dropout"]
+    assert result["table_bytes"]["no model"] < result["table_bytes"]["intensity"]

@@ -1,0 +1,102 @@
+"""Does a sensor model that is baked in slow rendering down, and what do intensities cost?
+
+The mixture of Table II, 720 beams to 3 m among ten obstacles, on one thread. Ranges are rendered
+from a table without a model, with each of some models, and with the intensities of each beam as
+well; all of them in turn, in one run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from measuring.rates import interleaved, medians, shortest
+from measuring.scenes import BATCH, SCENES, SPEC, random_batch
+
+from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.scanner import Scanner
+from nics_drl_bridge.lidar.sensor_models import IncidenceDropout, Intensity, SensorModel
+from nics_drl_bridge.lidar.table import Density
+
+DROPOUT, BRIGHT = IncidenceDropout(greatest_incidence=1.3), Intensity(threshold=0.02)
+MODELS: dict[str, tuple[SensorModel, ...]] = {
+    "no model": (),
+    "incidence dropout": (DROPOUT,),
+    "intensity": (BRIGHT,),
+    "both": (DROPOUT, BRIGHT),
+}
+SHAPES = SCENES["mixture"]
+BAR = 1.05
+
+
+def calls_of(
+    density: Density, scans: int
+) -> tuple[dict[str, Callable[[], object]], dict[str, int]]:
+    """What is timed, by name: ranges of each table, and both channels. And bytes of each table."""
+    batch, calls, sizes = random_batch(SHAPES, scans, 0), {}, {}
+    out, light = np.empty((2, scans, SPEC.beams), np.float32)
+    for name, model in MODELS.items():
+        scanner = Scanner(SPEC, bake(SPEC, SHAPES, density, model), "baked")
+        bodies = batch.bodies(scanner)
+        sizes[name] = scanner.table.memory
+        calls[name] = partial(scanner.scan, batch.lidar, bodies, out=out)
+    scan = calls["both"]
+
+    def ranges_and_intensities() -> None:
+        scan()
+        scanner.intensities(out, batch.lidar, bodies, out=light)
+
+    return calls | {"both, with intensities": ranges_and_intensities}, sizes
+
+
+def run(scans: int, repeats: int, density: Density) -> dict[str, Any]:
+    """All figures, see the head of this file."""
+    calls, sizes = calls_of(density, scans)
+    times = interleaved(calls, repeats, warm=True)
+    least, middle = shortest(times), medians(times)
+    plain = "no model"
+    return {
+        "scans_per_s": {name: scans / each for name, each in least.items()},
+        "times_as_long": {name: each / least[plain] for name, each in least.items()},
+        "times_as_long_median": {name: each / middle[plain] for name, each in middle.items()},
+        "table_bytes": sizes,
+        "bar_met": max(least[name] for name in MODELS) <= BAR * least[plain],
+    }
+
+
+def table_of(result: dict[str, Any]) -> str:
+    """The figures for people."""
+    row = "{:<24}{:>11}{:>16}{:>16}{:>11}\n"
+    text = row.format("", "scans/s", "times as long", "by the median", "table")
+    for name, rate in result["scans_per_s"].items():
+        ratios = (result["times_as_long"][name], result["times_as_long_median"][name])
+        size = result["table_bytes"].get(name)
+        text += row.format(
+            name, f"{rate:.2e}", *(f"{ratio:.3f}" for ratio in ratios),
+            "" if size is None else f"{size / 1e6:.1f} MB",
+        )  # fmt: skip
+    met = "met" if result["bar_met"] else "missed"
+    return text + f"ranges with any model, bar {BAR} times as long: {met}\n"
+
+
+def main() -> None:
+    """Prints a table, or one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--scans", type=int, default=BATCH, help="scans of a batch")
+    parser.add_argument("--repeats", type=int, default=200, help="timed batches")
+    parser.add_argument("--distances", type=int, default=100, help="grid distances of the table")
+    parser.add_argument("--rotations", type=int, default=240, help="grid rotations of the table")
+    given = parser.parse_args()
+    density = Density(distances=given.distances, rotations=given.rotations)
+    result = run(given.scans, given.repeats, density)
+    sys.stdout.write(json.dumps(result) + "\n" if given.json else table_of(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import lidar
+
+from nics_drl_bridge.errors import ModelError
+from nics_drl_bridge.files import npz_arrays, npz_bytes, write_bytes
+from nics_drl_bridge.lidar.baking import bake, with_shapes
+from nics_drl_bridge.lidar.budget import choose, expected_rmse, table_bytes
+from nics_drl_bridge.lidar.scanner import Scanner
+from nics_drl_bridge.lidar.sensor_models import IncidenceDropout, Intensity
+from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle
+from nics_drl_bridge.lidar.table import Density, LidarTable
+
+SPEC = lidar(beams=720, range_min=0.0)
+SMALL = Density(distances=12, rotations=16)
+BRIGHT = Intensity(gain=2.0, reflectivity=0.4)
+HERE = np.zeros((1, 3))
+
+
+def ahead(table, shape, distance, walls=()):
+    """The scan of one shape straight ahead."""
+    scanner = Scanner(SPEC, table, "baked")
+    return scanner.scan(HERE, scanner.place([shape], [[distance, 0.0, 0.0]]), walls)[0]
+
+
+@pytest.mark.parametrize("greatest", [0.5, 1.0, 1.4])
+def test_of_a_circle_that_part_returns_which_is_met_steeply_enough(greatest):
+    shape = Circle(radius=0.3)
+    table = bake(SPEC, [shape], sensor_model=[IncidenceDropout(greatest_incidence=greatest)])
+    for distance in (0.8, 1.23, 2.0):
+        seen = np.isfinite(ahead(table, shape, distance))
+        # A ray at angle a passes the centre at distance * sin(a) = radius * sin(incidence).
+        edge = np.arcsin(shape.radius * np.sin(greatest) / distance)
+        off = seen != (np.abs(SPEC.angles) < edge)
+        assert (np.abs(np.abs(SPEC.angles[off]) - edge) < 1.5 * SPEC.angle_increment).all()
+        assert seen.sum() > 10
+
+
+def test_a_dark_surface_returns_from_near_and_a_bright_one_from_afar():
+    model = Intensity(gain=1.0, threshold=0.1)
+    dark, bright = (Circle(radius=0.2, reflectivity=white) for white in (0.1, 0.8))
+    table = bake(SPEC, [dark, bright], sensor_model=[model])
+    behind = [[2.9, -2.0, 2.9, 2.0]]
+    middle = np.argmin(np.abs(SPEC.angles))
+    for shape, farthest in ((dark, 1.0), (bright, 8.0**0.5)):
+        for gap in (0.9, 1.1, 2.6, 2.85):
+            value = ahead(table, shape, gap + shape.radius, behind)[middle]
+            lost = gap > farthest
+            assert value == pytest.approx(2.9 if lost else gap, abs=0.01), (shape, gap)
+
+
+def test_two_models_together_lose_what_either_loses():
+    grazing, dim = IncidenceDropout(greatest_incidence=0.6), Intensity(threshold=0.1)
+    rows = [
+        bake(SPEC, [SQUARE], SMALL, model).rows
+        for model in ((), (grazing,), (dim,), (grazing, dim))
+    ]
+    lost = [np.isinf(each) for each in rows]
+    assert not lost[0].any()
+    assert 0 < lost[1].sum() < lost[3].sum()
+    assert 0 < lost[2].sum() < lost[3].sum()
+    assert np.array_equal(lost[1] | lost[2], lost[3])
+    assert np.array_equal(rows[3][~lost[3]], rows[0][~lost[3]])
+
+
+def test_a_function_and_a_named_model_that_say_the_same_bake_the_same_rows():
+    named = bake(SPEC, [STRIP], SMALL, [IncidenceDropout(greatest_incidence=1.0)])
+    free = bake(SPEC, [STRIP], SMALL, lambda r, incidence: np.where(incidence > 1.0, np.inf, r))
+    assert np.array_equal(named.rows, free.rows)
+    assert np.isinf(named.rows).any()
+
+
+def test_the_sensor_model_of_the_lidar_is_baked_unless_another_is_given():
+    spec = SPEC.model_copy(update={"sensor_model": (BRIGHT,)})
+    assert bake(spec, [SQUARE], SMALL).sensor_model == (BRIGHT,)
+    assert bake(spec, [SQUARE], SMALL).reflectance is not None
+    assert bake(spec, [SQUARE], SMALL, ()).reflectance is None
+
+
+def test_shapes_are_added_with_the_sensor_model_of_the_table():
+    table = bake(SPEC, [SQUARE], SMALL, [BRIGHT])
+    more = with_shapes(SPEC, table, [STRIP])
+    assert more.sensor_model == (BRIGHT,)
+    assert np.array_equal(
+        more.reflectance, bake(SPEC, (SQUARE, STRIP), SMALL, [BRIGHT]).reflectance
+    )
+
+
+@pytest.fixture
+def path(tmp_path):
+    table = bake(SPEC, (SQUARE, Circle(radius=0.2, reflectivity=0.9)), SMALL, [BRIGHT])
+    write_bytes(tmp_path / "table.npz", table.dump())
+    return tmp_path / "table.npz"
+
+
+def test_a_table_with_intensities_reads_back_to_the_same_bits_and_is_mapped(path):
+    table = bake(SPEC, (SQUARE, Circle(radius=0.2, reflectivity=0.9)), SMALL, [BRIGHT])
+    back = LidarTable.load(path)
+    assert back.shapes == table.shapes
+    assert back.sensor_model == (BRIGHT,)
+    assert np.array_equal(back.reflectance, table.reflectance)
+    assert back.dump() == table.dump()
+    base = back.reflectance
+    while not isinstance(base, np.memmap):
+        base = base.base
+    assert base.mode == "c"
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (lambda a: a.pop("reflectance"), "its reflectance does not belong to its sensor model"),
+        (lambda a: a.update(reflectance=a["reflectance"][:-1]), "does not fit its rows"),
+        (lambda a: a.update(reflectance=a["reflectance"].astype(float)), "does not fit its rows"),
+        (lambda a: a.update(reflectance=a["reflectance"] * np.float32(0.5)), "were damaged"),
+    ],
+)
+def test_a_damaged_reflectance_is_noticed(path, damage, reason):
+    arrays = dict(npz_arrays(path.read_bytes()))
+    damage(arrays)
+    write_bytes(path, npz_bytes(arrays, packed=False))
+    with pytest.raises(ModelError, match=reason):
+        LidarTable.load(path)
+
+
+def test_a_table_without_a_sensor_model_is_written_as_before():
+    table = bake(SPEC, [SQUARE], SMALL)
+    assert list(npz_arrays(table.dump())) == ["about", "grid", "start", "cell", "rows"]
+    assert "sensor_model" not in table._about()
+    assert "reflectivity" not in table._about()
+
+
+def test_a_budget_counts_intensities_and_the_error_is_that_of_the_geometry():
+    losing = (IncidenceDropout(greatest_incidence=0.5), BRIGHT)
+    spec = SPEC.model_copy(update={"sensor_model": losing})
+    assert table_bytes(spec, [SQUARE], SMALL) == bake(spec, [SQUARE], SMALL).memory
+    assert expected_rmse(spec, bake(spec, [SQUARE], SMALL)) == expected_rmse(
+        SPEC, bake(SPEC, [SQUARE], SMALL)
+    )
+    choice = choose(spec, [SQUARE], 300_000)
+    assert len(choice.table.dump()) <= 300_000
+    assert choice.table.sensor_model == losing
+    assert choice.rmse < 0.02
