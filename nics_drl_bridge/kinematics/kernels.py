@@ -62,7 +62,7 @@ def scratch(model: TaylorModel) -> tuple[Array, Array]:
     return x, np.zeros(len(model.dofs))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def rates(dq, x, terms):  # type: ignore[no-untyped-def]
     """dQ/dt (3 + S) of one robot."""
     dof, coefficient, factors, count = terms
@@ -74,7 +74,7 @@ def rates(dq, x, terms):  # type: ignore[no-untyped-def]
         dq[dof[k]] += product
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
     """Position and direction after the exact arc of a constant body twist.
 
@@ -96,13 +96,13 @@ def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
     return x, y, c - (c * versine + s * sine), s - (s * versine - c * sine)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def wrap(heading):  # type: ignore[no-untyped-def]
     """Brings a heading [rad] into [-pi, pi)."""
     return heading - 2.0 * math.pi * math.floor((heading + math.pi) / (2.0 * math.pi))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def advance(pose, twist, dt, series):  # type: ignore[no-untyped-def]
     """Moves a pose (3,) in place along the exact arc of a body twist (3,)."""
     turn = twist[2] * dt
@@ -123,7 +123,7 @@ def _own(value, lane):  # type: ignore[no-untyped-def]
     return lambda value, lane: value
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
     """Moves many robots by the same number of steps, each under a constant command.
 
@@ -145,7 +145,7 @@ def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
                 state[i] += dt * rate[i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
     dof, coefficient, factors, count = terms
     n = x.shape[1]
@@ -175,7 +175,7 @@ def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
                 rate[i] += own(value, i)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
     px, py, pc, ps, heading, length = pose[0], pose[1], pose[2], pose[3], pose[4], pose[5]
     vx, vy, wz = dq[0], dq[1], dq[2]
@@ -218,7 +218,7 @@ def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-unty
             poses[w, n + 1, 0], poses[w, n + 1, 1], poses[w, n + 1, 2] = px, py, heading
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def delayed(substep, delay, substeps, periods):  # type: ignore[no-untyped-def]
     """Which of the last `periods` commands, newest first, is in effect in a substep."""
     if delay <= substep:

@@ -19,12 +19,12 @@ from numba import njit
 X, Y, PER_METRE, RADIUS, MOVED = range(5)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def _clamp(place, side):  # type: ignore[no-untyped-def]
     return int(min(max(place, 0.0), side - 1.0))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def sort_bodies(bodies, n, cells):  # type: ignore[no-untyped-def]
     """Sorts the bodies of world n into cells; about two cells for a body."""
     begin, order, cell_of, frame = cells
@@ -39,7 +39,8 @@ def sort_bodies(bodies, n, cells):  # type: ignore[no-untyped-def]
     frame[X], frame[Y], frame[PER_METRE], frame[RADIUS], frame[MOVED] = (
         low_x, low_y, per_metre, 0.0, 0.0,
     )  # fmt: skip
-    begin[:] = 0
+    for cell in range(begin.shape[0]):
+        begin[cell] = 0
     for k in range(count):
         radius, cell = bodies[n, k, 5], side * side
         if radius * per_metre <= 1.0:
@@ -60,7 +61,7 @@ def sort_bodies(bodies, n, cells):  # type: ignore[no-untyped-def]
     begin[begin.shape[0] - 1] = count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def bodies_around(x, y, reach, cells, found):  # type: ignore[no-untyped-def]
     """Writes to `found` (K,) the bodies that may come within `reach` [m] of (x, y); how many."""
     begin, order, _, frame = cells

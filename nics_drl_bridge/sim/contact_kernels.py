@@ -27,7 +27,7 @@ SEVERAL = 32
 """So many bodies may be near a robot; where there are more, all are looked at."""
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def reaches(reach, bodies, velocity, way, n, period):  # type: ignore[no-untyped-def]
     """How far the circle of each body may come from where its centre is now [m].
 
@@ -57,7 +57,7 @@ def reaches(reach, bodies, velocity, way, n, period):  # type: ignore[no-untyped
     return longest, moving
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def find_near(near, m, reach, bodies, n, walls, grid, crowded, cells, found):  # type: ignore[no-untyped-def]
     """What robot m of world n may meet within the period.
 
@@ -99,7 +99,7 @@ def find_near(near, m, reach, bodies, n, walls, grid, crowded, cells, found):  #
     return meets
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def contact(body, m, meets, near, bodies, walls, grid, outlines, spare):  # type: ignore[no-untyped-def]
     """How deep a robot, put as `body` (7,), is in anything, as a clearance; 0 where it is free.
 
@@ -138,7 +138,7 @@ def contact(body, m, meets, near, bodies, walls, grid, outlines, spare):  # type
     return least, whom
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def move_obstacles(bodies, start, velocity, n, time):  # type: ignore[no-untyped-def]
     """Puts the obstacles of world n to where they are `time` after the start of the period.
 

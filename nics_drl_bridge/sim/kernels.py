@@ -33,13 +33,13 @@ class Packed(structref.StructRefProxy):  # type: ignore[misc]
 structref.define_proxy(Packed, PackedType, ["content"])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def pack(content):  # type: ignore[no-untyped-def]
     """Makes one argument of nested tuples of arrays."""
     return Packed(content)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def move_freely(begin, end, pose, state, history, coefficient, delay, lanes, motion):  # type: ignore[no-untyped-def]
     """Moves the robots of the worlds [begin, end) for one period as if nothing were in the way.
 
@@ -83,7 +83,7 @@ def move_freely(begin, end, pose, state, history, coefficient, delay, lanes, mot
         at = until
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def move_carefully(  # type: ignore[no-untyped-def]
     n, meets, near, state, history, coefficient, delay, bodies, velocity, moving, walls, grid,
     collided, pose, outlines, motion, room,
@@ -156,7 +156,7 @@ def move_carefully(  # type: ignore[no-untyped-def]
                 pose[n, m, i] = world[first + m, i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def move_world(  # type: ignore[no-untyped-def]
     n, skip, pose, state, history, coefficient, delay, bodies, velocity, walls, grid, collided,
     crowded, outlines, lanes, motion, cells, found, robot, room,
@@ -193,7 +193,9 @@ def move_world(  # type: ignore[no-untyped-def]
             for s in range(size):
                 state[n, m, s] = x[s, i]
     if moving:
-        start[:] = bodies[n, :first, :3]
+        for k in range(first):
+            for i in range(3):
+                start[k, i] = bodies[n, k, i]
     if tight:
         move_carefully(
             n, meets, near, state, history, coefficient, delay, bodies, velocity, moving, walls,
@@ -205,14 +207,14 @@ def move_world(  # type: ignore[no-untyped-def]
         pose[n, m, 2] = wrap(pose[n, m, 2])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def place_robot(bodies, n, k, pose):  # type: ignore[no-untyped-def]
     """Puts body k of world n to a robot's pose (3,)."""
     bodies[n, k, 0], bodies[n, k, 1], bodies[n, k, 2] = pose[0], pose[1], pose[2]
     bodies[n, k, 3], bodies[n, k, 4] = math.cos(pose[2]), math.sin(pose[2])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def _send(history, commands, begin):  # type: ignore[no-untyped-def]
     """Puts the commands (n, M, C) of the worlds from `begin` on in front of those sent before."""
     for i in range(commands.shape[0]):
@@ -224,7 +226,7 @@ def _send(history, commands, begin):  # type: ignore[no-untyped-def]
                 history[begin + i, m, 0, c] = commands[i, m, c]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def _note_ways(cells, before, skip, pose, n):  # type: ignore[no-untyped-def]
     """Tells the cells how far the robots of world n came, drift included."""
     for m in range(pose.shape[1]):
@@ -243,6 +245,12 @@ def step_worlds(packed, commands, begin):  # type: ignore[no-untyped-def]
         begin: the first world.
     """
     fields, scene, view, motion, room = packed.content
+    _step(fields, scene, view, motion, room, commands, begin)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[no-untyped-def]
+    """See `step_worlds`; no counting of references, which took longer than the step."""
     (
         pose, state, history, bodies, odom, twist, ranges, collided, steps, seeds, faults,
         coefficient, delay, age, noise, velocity, past,
@@ -290,10 +298,14 @@ def step_worlds(packed, commands, begin):  # type: ignore[no-untyped-def]
                 )  # fmt: skip
             if crowded:
                 _note_ways(cells, before, (n - low) * robots, pose, n)
-            together = sensing.look(
-                n, together, pose, bodies, ranges, steps, faults, age, velocity, past, walls,
-                crowded, view, sensors, crowding, dt, substeps,
-            )  # fmt: skip
+            if crowded or sensing.needs_own(n, age, faults):
+                sensing.look_alone(
+                    n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, crowded,
+                    view, sensors, crowding, dt, substeps,
+                )  # fmt: skip
+            else:
+                sensors[1][together] = n
+                together += 1
         sensing.look_together(together, pose, bodies, ranges, first, walls, view, sensors)
         sensing.distort(low, high, ranges, faults, steps, seeds, view)
 
@@ -302,22 +314,28 @@ def step_worlds(packed, commands, begin):  # type: ignore[no-untyped-def]
 def look(packed, chosen):  # type: ignore[no-untyped-def]
     """Scans of the worlds `chosen` (n,) as they stand; see `step_worlds`."""
     fields, scene, view, motion, room = packed.content
+    _look(fields, scene, view, motion, room, chosen)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _look(fields, scene, view, motion, room, chosen):  # type: ignore[no-untyped-def]
     (
         pose, _, _, bodies, _, _, ranges, _, steps, seeds, faults, _, _, age, _, velocity, past,
     ) = fields  # fmt: skip
     walls, sensors, (dt, substeps) = scene[0], room[4], motion[4]
     for n in chosen:
-        together = sensing.look(
-            n, 0, pose, bodies, ranges, steps, faults, age, velocity, past, walls, False, view,
-            sensors, room[3], dt, substeps,
-        )  # fmt: skip
-        sensing.look_together(
-            together, pose, bodies, ranges, velocity.shape[1], walls, view, sensors
-        )
+        if sensing.needs_own(n, age, faults):
+            sensing.look_alone(
+                n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, False, view,
+                sensors, room[3], dt, substeps,
+            )  # fmt: skip
+        else:
+            sensors[1][0] = n
+            sensing.look_together(1, pose, bodies, ranges, velocity.shape[1], walls, view, sensors)
         sensing.distort(n, n + 1, ranges, faults, steps, seeds, view)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def _rates_now(dq, x, state, history, n, m, delay, substeps, terms):  # type: ignore[no-untyped-def]
     """Rates at the end of a period, under the command that was in effect last."""
     row = delayed(substeps - 1, delay, substeps, history.shape[2])

@@ -23,7 +23,7 @@ POSE, TWIST, ODOM, MEASURED, PAST = 0, 3, 6, 9, 12
 """Columns of `past`."""
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def begin(past, n, m, pose, odom, twist):  # type: ignore[no-untyped-def]
     """Notes what is true of a robot at the beginning of an episode."""
     for i in range(3):
@@ -31,13 +31,13 @@ def begin(past, n, m, pose, odom, twist):  # type: ignore[no-untyped-def]
         past[n, m, 0, ODOM + i], past[n, m, 0, MEASURED + i] = odom[n, m, i], twist[n, m, i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def lag_of(age, steps, rows, substeps):  # type: ignore[no-untyped-def]
     """How old [substeps] that is which a robot is told: not from before the episode or the ring."""
     return max(min(age, min(steps, rows - 1) * substeps), 0)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def at_lag(past, n, m, column, lag, steps, substeps):  # type: ignore[no-untyped-def]
     """Three columns of `past` as they were `lag` substeps before the end of period `steps`."""
     rows = past.shape[2]
@@ -56,14 +56,14 @@ def at_lag(past, n, m, column, lag, steps, substeps):  # type: ignore[no-untyped
     return x, y, z
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def advanced(x, y, heading, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
     """The pose after the exact arc of a body twist; see `kinematics.kernels.move`."""
     x, y, _, _ = move(x, y, math.cos(heading), math.sin(heading), vx, vy, turn, dt, series)
     return x, y, wrap(heading + turn)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def measure(  # type: ignore[no-untyped-def]
     odom, twist, past, before, pose, n, m, now, std, steps, seed, counter, age, dt, substeps,
     series,
@@ -87,7 +87,8 @@ def measure(  # type: ignore[no-untyped-def]
         series: see `kinematics.kernels`.
     """
     rows = past.shape[2]
-    last, this = (steps - 1) % rows, steps % rows
+    this = steps % rows
+    last = this - 1 if this > 0 else rows - 1
     noise_x = noise_y = noise_turn = 0.0
     if std[n, m, 0] > 0.0:
         noise_x = std[n, m, 0] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter)
@@ -112,14 +113,18 @@ def measure(  # type: ignore[no-untyped-def]
     )  # fmt: skip
     for i in range(3):
         row[POSE + i], row[TWIST + i] = pose[n, m, i], now[i]
-    lag = lag_of(age, steps, rows, substeps)
+    lag = lag_of(age, steps, rows, substeps) if age > 0 else 0
+    if lag == 0:
+        for i in range(3):
+            odom[n, m, i], twist[n, m, i] = row[ODOM + i], row[MEASURED + i]
+        return
     x, y, heading = at_lag(past, n, m, ODOM, lag, steps, substeps)
     odom[n, m, 0], odom[n, m, 1], odom[n, m, 2] = x, y, heading
     x, y, heading = at_lag(past, n, m, MEASURED, lag, steps, substeps)
     twist[n, m, 0], twist[n, m, 1], twist[n, m, 2] = x, y, heading
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def disturb(pose, state, std, n, m, seed, counter, period, series):  # type: ignore[no-untyped-def]
     """Moves a robot by what its model does not explain, growing with the root of the time.
 
@@ -155,43 +160,41 @@ def disturb(pose, state, std, n, m, seed, counter, period, series):  # type: ign
         pose[n, m, 0], pose[n, m, 1], pose[n, m, 2] = x, y, heading
 
 
-@njit(cache=True, nogil=True)
-def look(  # type: ignore[no-untyped-def]
-    n, together, pose, bodies, ranges, steps, faults, age, velocity, past, walls, crowded, view,
-    sensors, crowding, dt, substeps,
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def needs_own(n, age, faults):  # type: ignore[no-untyped-def]
+    """Whether a robot of world n needs a scan that is not of its pose at the moment."""
+    for m in range(age.shape[1]):
+        if age[n, m] > 0 or faults[n, m, fault_kernels.SKEW] != 0.0:
+            return True
+    return False
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def look_alone(  # type: ignore[no-untyped-def]
+    n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, crowded, view, sensors,
+    crowding, dt, substeps,
 ):  # fmt: skip
-    """Scans world n at once if each robot needs a scan of its own; or puts it on the list.
+    """Scans of world n, each robot's from its own place and time.
 
     Args:
         n: which world.
-        together: how many worlds wait on the list to be scanned together.
         pose and others: fields of `worlds.Worlds`.
         walls: (W, 4).
         crowded: whether the bodies are in cells.
         view, sensors, crowding: see `worlds.arguments`.
         dt, substeps: [s], and substeps in a period.
-
-    Returns:
-        How many worlds wait now.
     """
-    alone = crowded
-    for m in range(pose.shape[1]):
-        alone = alone or age[n, m] > 0 or faults[n, m, fault_kernels.SKEW] != 0.0
-    if not alone:
-        sensors[1][together] = n
-        return together + 1
     for m in range(pose.shape[1]):
         lag = lag_of(age[n, m], steps[n], past.shape[2], substeps)
         _look_alone(
             n, m, lag, pose, bodies, ranges, steps, faults[n, m, fault_kernels.SKEW], velocity,
             past, walls, crowded, view, sensors, crowding, dt, substeps,
         )  # fmt: skip
-    return together
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def look_together(together, pose, bodies, ranges, first, walls, view, sensors):  # type: ignore[no-untyped-def]
-    """Scans the worlds on the list, as they stand; see `look`."""
+    """Scans the first `together` worlds of the list in `sensors`, as they stand."""
     chosen, scan_room = sensors[1][:together], sensors[8]
     sensor, map_arrays, exact = view[0], view[1], view[2]
     scan_kernels.scan_worlds(ranges, pose, chosen, bodies, first, walls, sensor, scan_room)
@@ -199,7 +202,7 @@ def look_together(together, pose, bodies, ranges, first, walls, view, sensors): 
         scan_kernels.add_map(ranges, pose, chosen, sensor, map_arrays, exact)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def distort(low, high, ranges, faults, steps, seeds, view):  # type: ignore[no-untyped-def]
     """Does to the scans of the worlds [low, high) what the device of each robot does to them."""
     limits, robots = view[4], ranges.shape[1]
@@ -209,12 +212,12 @@ def distort(low, high, ranges, faults, steps, seeds, view):  # type: ignore[no-u
             fault_kernels.distort(ranges[n, m], limits, faults[n, m], seeds[n], counter)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def _look_alone(  # type: ignore[no-untyped-def]
     n, m, lag, pose, bodies, ranges, steps, skew, velocity, past, walls, crowded, view, sensors,
     crowding, dt, substeps,
 ):  # fmt: skip
-    """Scan of one robot `lag` substeps ago, maybe skewed; see `look`."""
+    """Scan of one robot `lag` substeps ago, maybe skewed; see `look_alone`."""
     _, _, _, mount, limits, sweep_time = view
     spot, slices, part, drive, none = sensors[3], sensors[4], sensors[5], sensors[6], sensors[7]
     this, beams = steps[n] % past.shape[2], ranges.shape[2]
@@ -249,7 +252,7 @@ def _look_alone(  # type: ignore[no-untyped-def]
             scan[0, 0, i] = part[0, 0, i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def _render(scan, spot, none, seen, walls, view, scan_room):  # type: ignore[no-untyped-def]
     """One scan (1, 1, B) from a pose (1, 1, 3) among the bodies (1, k, 7)."""
     sensor, map_arrays, exact = view[0], view[1], view[2]
@@ -258,7 +261,7 @@ def _render(scan, spot, none, seen, walls, view, scan_room):  # type: ignore[no-
         scan_kernels.add_map(scan, spot, none, sensor, map_arrays, exact)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def _gather(  # type: ignore[no-untyped-def]
     n, m, lag, spot, reach, bodies, velocity, past, steps, crowded, seen, crowding, dt, substeps
 ):
