@@ -10,10 +10,10 @@ from pathlib import Path
 from nics_drl_bridge.config import validate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_above, write_bytes
+from nics_drl_bridge.generator import footprint_shape
 from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.budget import choose, expected_rmse, parse_size
-from nics_drl_bridge.generator import footprint_shape
 from nics_drl_bridge.lidar.shapes import Shape, describe, load_shapes
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import Density, LidarTable

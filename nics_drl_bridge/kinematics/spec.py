@@ -94,7 +94,11 @@ class RobotSpec(Schema):
     @model_validator(mode="before")
     @classmethod
     def _circumscribed(cls, data: Any) -> Any:
-        if not isinstance(data, dict) or data.get("footprint") is None or "footprint_radius" in data:
+        if (
+            not isinstance(data, dict)
+            or data.get("footprint") is None
+            or "footprint_radius" in data
+        ):
             return data
         try:
             corners = np.array(data["footprint"], dtype=np.float64)
@@ -204,7 +208,9 @@ def _edges_cross(corners: NDArray[np.float64]) -> bool:
     # An edge may not run back along the one before it.
     folded = side(stop)[index, (index + 1) % len(corners)] == 0.0
     ahead = ((stop - start) * (np.roll(stop - start, -1, axis=0))).sum(axis=1) > 0.0
-    return bool((boxes & (apart <= 0.0) & (apart.T <= 0.0) & distant).any() or (folded & ~ahead).any())
+    return bool(
+        (boxes & (apart <= 0.0) & (apart.T <= 0.0) & distant).any() or (folded & ~ahead).any()
+    )
 
 
 def load_robot(name: str) -> RobotSpec:

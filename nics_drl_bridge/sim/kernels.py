@@ -22,7 +22,7 @@ from nics_drl_bridge.sim import sensing_kernels as sensing
 
 
 @structref.register
-class PackedType(types.StructRef):
+class PackedType(types.StructRef):  # type: ignore[misc]
     """The type of `Packed`."""
 
 
@@ -269,7 +269,11 @@ def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[n
         for n in range(low, high):
             for m in range(robots):
                 i = (n - low) * robots + m
-                before[i, 0], before[i, 1], before[i, 2] = pose[n, m, 0], pose[n, m, 1], pose[n, m, 2]
+                before[i, 0], before[i, 1], before[i, 2] = (
+                    pose[n, m, 0],
+                    pose[n, m, 1],
+                    pose[n, m, 2],
+                )
                 if steps[n] == 0:
                     sensing.begin(past, n, m, pose, odom, twist)
         move_freely(low, high, pose, state, history, coefficient, delay, lanes, motion)

@@ -134,9 +134,7 @@ def test_the_clearance_to_a_map_is_that_of_shapely(index):
         shape = solid(SHAPES[index], pose)
         expected = min(shape.distance(square) for square in squares) - radius(SHAPES[index])
         there = body(index, pose)
-        found = kernels.map_gap(
-            there, known, OUTLINES.corners, OUTLINES.corner, np.inf, SPARE
-        )
+        found = kernels.map_gap(there, known, OUTLINES.corners, OUTLINES.corner, np.inf, SPARE)
         at_once = kernels.map_gap(there, known, OUTLINES.corners, OUTLINES.corner, 0.0, SPARE)
         assert kernels.map_bound(there, known) <= max(expected, 0.0) + 1e-6
         if expected > 0.0:

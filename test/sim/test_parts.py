@@ -52,7 +52,7 @@ def digests(worlds, threads=1, robots=2, steps=STEPS, parts=False):
         for n in range(worlds):
             for array in vars(simulator.data).values():
                 found[n].update(array[n].tobytes())
-    assert 0 < simulator.data.collided.sum()
+    assert simulator.data.collided.sum() > 0
     return [digest.hexdigest() for digest in found]
 
 
