@@ -227,8 +227,8 @@ def _in_grid(body, frame):  # type: ignore[no-untyped-def]
 def _bounds(x, y, distances, size):  # type: ignore[no-untyped-def]
     """Least and greatest distance that (x, y) can have to a solid cell, by the nearest cell [m]."""
     rows, columns = distances.shape
-    i = min(max(int(math.floor(y / size)), 0), rows - 1)
-    j = min(max(int(math.floor(x / size)), 0), columns - 1)
+    i = min(max(math.floor(y / size), 0), rows - 1)
+    j = min(max(math.floor(x / size), 0), columns - 1)
     # Seen from outside, the nearest place of the map is nearer to each of its cells.
     px, py = min(max(x, 0.0), columns * size), min(max(y, 0.0), rows * size)
     within = math.hypot(px - (j + 0.5) * size, py - (i + 0.5) * size)
@@ -262,12 +262,12 @@ def map_gap(body, grid, corners, corner, limit, spare):  # type: ignore[no-untyp
     begin, end = corner[int(body[6])], corner[int(body[6]) + 1]
     least = limit
     for i in range(
-        max(int(math.floor((y - far) / size)), 0),
-        min(int(math.floor((y + far) / size)), distances.shape[0] - 1) + 1,
+        max(math.floor((y - far) / size), 0),
+        min(math.floor((y + far) / size), distances.shape[0] - 1) + 1,
     ):
         for j in range(
-            max(int(math.floor((x - far) / size)), 0),
-            min(int(math.floor((x + far) / size)), distances.shape[1] - 1) + 1,
+            max(math.floor((x - far) / size), 0),
+            min(math.floor((x + far) / size), distances.shape[1] - 1) + 1,
         ):
             if distances[i, j] > 0.0:
                 continue

@@ -255,7 +255,7 @@ def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[n
         pose, state, history, bodies, odom, twist, ranges, collided, steps, seeds, faults,
         coefficient, delay, age, noise, velocity, past,
     ) = fields  # fmt: skip
-    walls, grid, outlines, crowded = scene
+    walls, grid, outlines, crowded, scattered = scene
     lanes, single, robot, crowding, sensors = room
     cells, found = crowding
     dof, factors, count, series, (dt, substeps) = motion
@@ -302,9 +302,9 @@ def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[n
                 )  # fmt: skip
             if crowded:
                 _note_ways(cells, before, (n - low) * robots, pose, n)
-            if crowded or sensing.needs_own(n, age, faults):
+            if scattered or sensing.needs_own(n, age, faults):
                 sensing.look_alone(
-                    n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, crowded,
+                    n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, scattered,
                     view, sensors, crowding, dt, substeps,
                 )  # fmt: skip
             else:

@@ -45,12 +45,12 @@ def at_lag(past, n, m, column, lag, steps, substeps):  # type: ignore[no-untyped
     if share > 0.0:
         old = (steps - lag // substeps - 1) % rows
         turn = past[n, m, old, column + 2] - z
-        if column == POSE or column == ODOM:
+        if column in (POSE, ODOM):
             turn = wrap(turn)
         x += share * (past[n, m, old, column] - x)
         y += share * (past[n, m, old, column + 1] - y)
         z += share * turn
-        if column == POSE or column == ODOM:
+        if column in (POSE, ODOM):
             z = wrap(z)
     return x, y, z
 
@@ -211,7 +211,7 @@ def distort(low, high, ranges, faults, steps, seeds, view):  # type: ignore[no-u
             fault_kernels.distort(ranges[n, m], limits, faults[n, m], seeds[n], counter)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
 def _look_alone(  # type: ignore[no-untyped-def]
     n, m, lag, pose, bodies, ranges, steps, skew, velocity, past, walls, crowded, view, sensors,
     crowding, dt, substeps,
@@ -251,7 +251,7 @@ def _look_alone(  # type: ignore[no-untyped-def]
             scan[0, 0, i] = part[0, 0, i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
 def _render(scan, spot, none, seen, walls, view, scan_room):  # type: ignore[no-untyped-def]
     """One scan (1, 1, B) from a pose (1, 1, 3) among the bodies (1, k, 7)."""
     sensor, map_arrays, exact = view[0], view[1], view[2]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,9 @@ CROWD = 4096
 """From so many pairs of a robot and a body on, the bodies of a world are sorted into cells."""
 FEWEST_OF_A_CROWD = 8
 """Robots: for fewer, to sort takes longer than to look at all bodies."""
+SCATTERED = 1024
+"""From so many bodies in cells on, each robot is scanned among those around it; for fewer, to
+look at all of them takes less than to begin a scan for each robot."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +104,11 @@ class Sizes:
         pairs = self.robots * (self.robots + self.obstacles)
         return self.robots >= FEWEST_OF_A_CROWD and pairs >= CROWD
 
+    @property
+    def scattered(self) -> bool:
+        """Whether it pays to scan each robot among the bodies around it only."""
+        return self.crowded and self.robots + self.obstacles >= SCATTERED
+
 
 def allocate(model: SimulatorModel, sizes: Sizes) -> Worlds:
     """The arrays of worlds before their first reset, with the parameters of the model."""
@@ -133,7 +142,7 @@ def allocate(model: SimulatorModel, sizes: Sizes) -> Worlds:
 def split(worlds: int, threads: int) -> tuple[slice, ...]:
     """Contiguous parts of N worlds, as equal as can be, one for each thread."""
     edges = np.arange(min(threads, worlds) + 1) * worlds // min(threads, worlds)
-    return tuple(slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True))
+    return tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(edges))
 
 
 def arguments(
@@ -148,8 +157,9 @@ def arguments(
 
     Returns:
         The fields of `data`; scene: walls, map (distances, frame), outlines, whether the bodies
-        are sorted; view: the lidar's arguments, its map, whether it scans exactly, mount, limits,
-        time of a sweep; motion, see `kernels.move_freely`; and scratch, see `_scratch`.
+        are sorted, and whether that serves the scans; view: the lidar's arguments, its map,
+        whether it scans exactly, mount, limits, time of a sweep; motion, see
+        `kernels.move_freely`; and scratch, see `_scratch`.
     """
     lidar, grid = model.lidar, scanner.grid
     dof, _, factors, count = term_arrays(model.kinematics)
@@ -162,7 +172,8 @@ def arguments(
         np.array([lidar.range_min, lidar.range_max], dtype=np.float64),
         float(lidar.sweep_time),
     )
-    scene = (walls, _collision_map(grid), scanner.table.outlines.arguments, sizes.crowded)
+    outlines = scanner.table.outlines.arguments
+    scene = (walls, _collision_map(grid), outlines, sizes.crowded, sizes.scattered)
     motion = (dof, factors, count, SERIES, (float(dt), int(substeps)))
     room = _scratch(model, scanner, sizes, part.stop - part.start)
     return tuple(vars(data).values()), scene, view, motion, room

@@ -13,6 +13,7 @@ from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.lidar.maps_grid import GridMap
 from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.sim import worlds as sizes
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
 
@@ -277,7 +278,8 @@ def test_a_robot_sees_and_touches_the_static_map(model):
     assert simulator.data.pose[0, 0, 0] < 0.6 - front + 0.02
 
 
-def test_the_robots_of_a_crowd_see_what_a_scanner_sees_among_all_bodies():
+def test_the_robots_of_a_crowd_see_what_a_scanner_sees_among_all_bodies(monkeypatch):
+    monkeypatch.setattr(sizes, "SCATTERED", 0)
     data = builtin_model("differential").lidar.model_dump() | {"mount": (0.5, 0.2, 0.3)}
     spec = LidarSpec.model_validate(data | {"beams": 72})
     model = direct_model(sensor=spec)

@@ -79,6 +79,9 @@ def test_a_crowd_in_cells_comes_to_the_bits_of_looking_at_all_bodies(monkeypatch
     monkeypatch.setattr(sizes, "CROWD", 0)
     assert sizes.Sizes(1, 12, 3, 0, 0).crowded
     assert digests(2, robots=12, steps=60) == plain
+    monkeypatch.setattr(sizes, "SCATTERED", 0)
+    assert sizes.Sizes(1, 12, 3, 0, 0).scattered
+    assert digests(2, robots=12, steps=60) == plain
 
 
 def test_the_parts_are_all_worlds_in_order():
