@@ -119,7 +119,7 @@ def test_the_clearance_to_a_straight_wall_is_that_of_shapely(index):
 @pytest.mark.parametrize("index", range(len(SHAPES) - 1))
 def test_the_clearance_to_a_map_is_that_of_shapely(index):
     rng = np.random.default_rng(index)
-    cells = np.where(rng.random((12, 15)) < 0.04, 100, 0).astype(np.int8)
+    cells = np.where(rng.random((12, 15)) < 0.12, 100, 0).astype(np.int8)
     grid = GridMap(cells, 0.3, (-1.0, -2.0, 0.4))
     squares = []
     for row, column in np.argwhere(cells > 0):
