@@ -24,7 +24,7 @@ from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
 from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.budget import choose
-from nics_drl_bridge.lidar.shapes import Circle, Shape
+from nics_drl_bridge.lidar.shapes import Circle, Polygon, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
 
@@ -160,7 +160,7 @@ def generate(
         The model, and all that was found out on the way.
     """
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
-    shapes = (*shapes, Circle(radius=robot.footprint_radius))
+    shapes = (*shapes, footprint_shape(robot))
     table = bake(lidar, shapes) if budget is None else choose(lidar, shapes, budget).table
     model = SimulatorModel(
         robot, identified.model, identified.calibration, lidar, table,
@@ -168,6 +168,13 @@ def generate(
         report=fit_report(recording.source, robot, identified),
     )  # fmt: skip
     return model, identified
+
+
+def footprint_shape(robot: RobotSpec) -> Circle | Polygon:
+    """What the robot fills, around its `base_link`."""
+    if robot.footprint is None:
+        return Circle(radius=robot.footprint_radius)
+    return Polygon(points=robot.footprint)
 
 
 @lru_cache(maxsize=8)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -9,7 +11,7 @@ from nics_drl_bridge.calibration.curves import timing_curves
 from nics_drl_bridge.calibration.identify import identify
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.kinematics.fit import fit
-from nics_drl_bridge.threads import one_blas_thread
+from nics_drl_bridge.threads import Crew, one_blas_thread
 
 
 def blas_threads() -> set[int]:
@@ -55,3 +57,30 @@ def test_whatever_solves_many_small_systems_is_limited(function):
     with pytest.raises(FitError, match="seen"):
         function(*[Given()] * (3 if function is timing_curves else 2))
     assert seen[0] == {1}
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_a_crew_gives_what_each_part_gave_in_their_order(threads):
+    crew = Crew(threads)
+    for _ in range(3):
+        assert crew.run(lambda part: part * part, range(7)) == [n * n for n in range(7)]
+
+
+@pytest.mark.parametrize("broken", [0, 1])
+def test_an_error_in_a_part_is_raised_after_all_have_ended(broken):
+    ended = []
+
+    def work(part: int) -> None:
+        if part == broken:
+            raise ValueError(f"part {part}")
+        ended.append(part)
+
+    with pytest.raises(ValueError, match=f"part {broken}"):
+        Crew(2).run(work, range(2))
+    assert ended == [1 - broken]
+
+
+def test_a_copied_crew_has_threads_of_its_own():
+    crew = Crew(2)
+    crew.run(str, range(2))
+    assert copy.deepcopy(crew).run(str, range(2)) == ["0", "1"]

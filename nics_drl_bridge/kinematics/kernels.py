@@ -12,9 +12,11 @@ entry of 1; `dq` are the rates; `series` is `SERIES` in the type of the other ar
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-from numba import njit
+from numba import njit, types
+from numba.extending import overload
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ModelError
@@ -60,7 +62,7 @@ def scratch(model: TaylorModel) -> tuple[Array, Array]:
     return x, np.zeros(len(model.dofs))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def rates(dq, x, terms):  # type: ignore[no-untyped-def]
     """dQ/dt (3 + S) of one robot."""
     dof, coefficient, factors, count = terms
@@ -72,7 +74,7 @@ def rates(dq, x, terms):  # type: ignore[no-untyped-def]
         dq[dof[k]] += product
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
     """Position and direction after the exact arc of a constant body twist.
 
@@ -94,13 +96,13 @@ def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
     return x, y, c - (c * versine + s * sine), s - (s * versine - c * sine)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def wrap(heading):  # type: ignore[no-untyped-def]
     """Brings a heading [rad] into [-pi, pi)."""
     return heading - 2.0 * math.pi * math.floor((heading + math.pi) / (2.0 * math.pi))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def advance(pose, twist, dt, series):  # type: ignore[no-untyped-def]
     """Moves a pose (3,) in place along the exact arc of a body twist (3,)."""
     turn = twist[2] * dt
@@ -109,7 +111,19 @@ def advance(pose, twist, dt, series):  # type: ignore[no-untyped-def]
     pose[2] = wrap(pose[2] + turn)
 
 
-@njit(cache=True)
+def own(value: Any, lane: int) -> Any:
+    """What a lane has of a value: its own of several, or the one that all share."""
+    return value[lane] if np.ndim(value) else value
+
+
+@overload(own)
+def _own(value, lane):  # type: ignore[no-untyped-def]
+    if isinstance(value, types.Array):
+        return lambda value, lane: value[lane]
+    return lambda value, lane: value
+
+
+@njit(cache=True, nogil=True, _nrt=False)
 def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
     """Moves many robots by the same number of steps, each under a constant command.
 
@@ -118,7 +132,7 @@ def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
             the length of the path [m], in place; the heading is not wrapped.
         x: (S + C + 1, n); the state in place.
         dq: (3 + S, n) scratch; holds the rates of the last step.
-        terms, series: see the module.
+        terms, series: see the module; coefficient may be (T, n), then each robot has its own.
         dt: length of a step [s].
         steps: how many.
     """
@@ -131,7 +145,7 @@ def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
                 state[i] += dt * rate[i]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
     dof, coefficient, factors, count = terms
     n = x.shape[1]
@@ -143,25 +157,25 @@ def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
         rate, value, one = dq[dof[k]], coefficient[k], x[factors[k, 0]]
         if count[k] == 1:
             for i in range(n):
-                rate[i] += value * one[i]
+                rate[i] += own(value, i) * one[i]
         elif count[k] == 2:
             other = x[factors[k, 1]]
             for i in range(n):
-                rate[i] += value * one[i] * other[i]
+                rate[i] += own(value, i) * one[i] * other[i]
         elif count[k] == 3:
             other, third = x[factors[k, 1]], x[factors[k, 2]]
             for i in range(n):
-                rate[i] += value * one[i] * other[i] * third[i]
+                rate[i] += own(value, i) * one[i] * other[i] * third[i]
         elif count[k] == 4:
             other, third, last = x[factors[k, 1]], x[factors[k, 2]], x[factors[k, 3]]
             for i in range(n):
-                rate[i] += value * one[i] * other[i] * third[i] * last[i]
+                rate[i] += own(value, i) * one[i] * other[i] * third[i] * last[i]
         else:  # the constant
             for i in range(n):
-                rate[i] += value
+                rate[i] += own(value, i)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
     px, py, pc, ps, heading, length = pose[0], pose[1], pose[2], pose[3], pose[4], pose[5]
     vx, vy, wz = dq[0], dq[1], dq[2]
@@ -174,7 +188,7 @@ def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
         length[i] += (abs(vx[i]) + abs(vy[i])) * dt
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-untyped-def]
     """Moves robots open-loop by the steps of their commands, one robot after the other.
 
@@ -204,7 +218,7 @@ def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-unty
             poses[w, n + 1, 0], poses[w, n + 1, 1], poses[w, n + 1, 2] = px, py, heading
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def delayed(substep, delay, substeps, periods):  # type: ignore[no-untyped-def]
     """Which of the last `periods` commands, newest first, is in effect in a substep."""
     if delay <= substep:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -73,7 +74,10 @@ class RobotSpec(Schema):
         textbook: the textbook kinematics that make its synthetic recordings, and whose
             structure may be assumed for what a drive did not show.
         parameters: of the textbook kinematics [m, s], see `kinematics.textbook`.
-        footprint_radius: radius of the circle around `base_link` that the robot fills [m].
+        footprint_radius: radius of the circle around `base_link` that the robot fills [m], or that
+            holds its `footprint`, then it may be left out.
+        footprint: corners of the outline that it fills instead, in `base_link` [m], either way
+            round; edges may not cross.
         state: S components, in the order of every state vector.
         command: C components, in the order of every command vector.
     """
@@ -83,8 +87,39 @@ class RobotSpec(Schema):
     textbook: Literal["ackermann", "differential", "mecanum"] | None = None
     parameters: dict[str, float] = Field(default_factory=dict)
     footprint_radius: float = Field(gt=0.0)
+    footprint: tuple[tuple[float, float], ...] | None = Field(default=None, min_length=3)
     state: tuple[StateVariable, ...] = ()
     command: tuple[CommandVariable, ...] = Field(min_length=1)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _circumscribed(cls, data: Any) -> Any:
+        if (
+            not isinstance(data, dict)
+            or data.get("footprint") is None
+            or "footprint_radius" in data
+        ):
+            return data
+        try:
+            corners = np.array(data["footprint"], dtype=np.float64)
+            return data | {"footprint_radius": float(np.hypot(*corners.T).max())}
+        except (TypeError, ValueError):
+            return data  # the field's own check says what is wrong with it
+
+    @model_validator(mode="after")
+    def _outlined(self) -> RobotSpec:
+        if self.footprint is None:
+            return self
+        corners = np.array(self.footprint)
+        if _edges_cross(corners):
+            raise ValueError("edges of footprint cross or touch; list its corners in order")
+        radius = float(np.hypot(*corners.T).max())
+        if not math.isclose(radius, self.footprint_radius, rel_tol=1e-6):
+            raise ValueError(
+                f"footprint reaches {radius:.6g} m from base_link, footprint_radius is "
+                f"{self.footprint_radius:.6g} m; leave footprint_radius out"
+            )
+        return self
 
     @model_validator(mode="after")
     def _unique(self) -> RobotSpec:
@@ -151,6 +186,31 @@ class RobotSpec(Schema):
     def from_cmd_vel(self, twist: ArrayLike) -> NDArray[np.float64]:
         """`cmd_vel` (..., 3) as command (..., C); fields the robot has no use for are dropped."""
         return np.asarray(twist, dtype=np.float64)[..., self._cmd_vel_index]
+
+
+def _edges_cross(corners: NDArray[np.float64]) -> bool:
+    """Whether two edges of an outline (V, 2) have a point in common that is no corner of both."""
+    start, stop = corners, np.roll(corners, -1, axis=0)
+    if (start == stop).all(axis=1).any():
+        return True
+
+    def side(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(V, V) on which side of each edge (rows) each point lies."""
+        along, to = (stop - start)[:, None], points[None] - start[:, None]
+        return np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
+
+    low, high = np.minimum(start, stop), np.maximum(start, stop)
+    boxes = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=-1)
+    apart = side(start) * side(stop)
+    index = np.arange(len(corners))
+    gap = (index[None] - index[:, None]) % len(corners)
+    distant = (gap > 1) & (gap < len(corners) - 1)
+    # An edge may not run back along the one before it.
+    folded = side(stop)[index, (index + 1) % len(corners)] == 0.0
+    ahead = ((stop - start) * (np.roll(stop - start, -1, axis=0))).sum(axis=1) > 0.0
+    return bool(
+        (boxes & (apart <= 0.0) & (apart.T <= 0.0) & distant).any() or (folded & ~ahead).any()
+    )
 
 
 def load_robot(name: str) -> RobotSpec:

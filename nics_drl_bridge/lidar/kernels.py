@@ -229,14 +229,34 @@ def to_sensor(poses, n, m, mount):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)
-def walls_into(out, directions, beams, sx, sy, c, s, walls):  # type: ignore[no-untyped-def]
-    """Fuses straight walls (W, 4), given in the world, into a scan from (sx, sy, c, s)."""
+def walls_into(out, directions, beams, sx, sy, c, s, walls, range_max):  # type: ignore[no-untyped-def]
+    """Fuses straight walls (W, 4), given in the world, into a scan from (sx, sy, c, s).
+
+    Only the beams that can meet the part of a wall within `range_max` are looked at.
+
+    Returns:
+        How many walls are within the range.
+    """
+    near = 0
     for w in range(walls.shape[0]):
         ax, ay = walls[w, 0] - sx, walls[w, 1] - sy
         bx, by = walls[w, 2] - sx, walls[w, 3] - sy
         ax, ay = c * ax + s * ay, c * ay - s * ax
         bx, by = c * bx + s * by, c * by - s * bx
-        segment(out, directions, beams, ax, ay, bx, by)
+        ex, ey = bx - ax, by - ay
+        length2, cross = ex * ex + ey * ey, ax * ey - ay * ex
+        chord2 = range_max * range_max * length2 - cross * cross
+        if chord2 < 0.0 or length2 == 0.0:
+            continue
+        # In parts of its length, the wall is nearest at `foot`, and within the range by `half`.
+        foot, half = -(ax * ex + ay * ey) / length2, math.sqrt(chord2) / length2 + ROUNDING
+        first, last = max(foot - half, 0.0), min(foot + half, 1.0)
+        if first <= last:
+            near += 1
+            one = arctan2(ay + first * ey, ax + first * ex)
+            other = arctan2(ay + last * ey, ax + last * ex)
+            edge(out, directions, beams, ax, ay, one, bx, by, other, False)
+    return near
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)

@@ -139,7 +139,7 @@ def exact_map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays):
             out[i] = value
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=True)
 def map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays):  # type: ignore[no-untyped-def]
     """Fuses a map into a scan (B,) float32 from (sx, sy, c, s), by jumps; see the module.
 

@@ -58,8 +58,9 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
                             out, directions, beams, sx, sy, c, s, bodies[n, k], corners, corner,
                             high,
                         )  # fmt: skip
-                kernels.walls_into(out, directions, beams, sx, sy, c, s, walls)
-                kernels.finish(out, limits[0], high)
+                near = kernels.walls_into(out, directions, beams, sx, sy, c, s, walls, high)
+                if near > 0 or missed > 0:
+                    kernels.finish(out, limits[0], high)
     fuse_kernels.look_up(found, ranges, beams, limits, lookup, room)
 
 

@@ -1,222 +1,351 @@
-"""Compiled inner loops of the simulator: motion, collision, and the step of all worlds.
+"""Compiled inner loops of the simulator: motion, and the step of some worlds.
 
-What one robot does is a scalar function; the batched loops call it. Shapes: N worlds, M
-robots, S state, C command, H periods of command history, K obstacles, W walls, B beams.
+What one robot does is a scalar function; the batched loops call it. Shapes: N worlds, n of them
+in one part, M robots, S state, C command, T kinematic terms, H periods of command history, K
+obstacles, W walls, B beams, L lanes.
+
+A world comes to the same bits in whatever batch, part or thread it is: nothing is summed over
+worlds, and what is drawn at random is drawn by the world's own seed and counter.
 """
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
-from numba import njit
+from numba import njit, types
+from numba.experimental import structref
 
 from nics_drl_bridge.kinematics.kernels import delayed, move, rates, run, wrap
+from nics_drl_bridge.sim import cell_kernels as crowd
+from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import sensing_kernels as sensing
-from nics_drl_bridge.sim.world import wall_distance
+
+
+@structref.register
+class PackedType(types.StructRef):  # type: ignore[misc]
+    """The type of `Packed`."""
+
+
+class Packed(structref.StructRefProxy):  # type: ignore[misc]
+    """All arrays of a part as one argument: to hand over a hundred took longer than a step."""
+
+
+structref.define_proxy(Packed, PackedType, ["content"])
 
 
 @njit(cache=True)
-def clearance(pose, me, footprint, bodies, walls):  # type: ignore[no-untyped-def]
-    """Free space [m] between the round footprint at a pose (3,) and the nearest wall or body."""
-    least = wall_distance(pose[0], pose[1], walls)
-    for k in range(bodies.shape[0]):
-        if k != me and bodies[k, 5] > 0.0:
-            away = np.hypot(pose[0] - bodies[k, 0], pose[1] - bodies[k, 1]) - bodies[k, 5]
-            least = min(least, away)
-    return least - footprint
+def pack(content):  # type: ignore[no-untyped-def]
+    """Makes one argument of nested tuples of arrays."""
+    return Packed(content)
 
 
-@njit(cache=True)
-def move_freely(pose, state, history, lanes, motion):  # type: ignore[no-untyped-def]
-    """Moves the robots of some worlds for one period as if nothing were in the way.
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def move_freely(begin, end, pose, state, history, coefficient, delay, lanes, motion):  # type: ignore[no-untyped-def]
+    """Moves the robots of the worlds [begin, end) for one period as if nothing were in the way.
 
     Args:
-        pose: (n, M, 3).
-        state: (n, M, S).
-        history: (n, M, H, C) commands, newest first.
-        lanes: pose (6, L), x (V + 1, L), dq (D, L) of `kinematics.kernels.run`, L >= n M; they
-            hold the result.
-        motion: terms, series, (step [s], substeps per period, delay of commands [substeps]).
+        begin, end: which worlds.
+        pose: (N, M, 3).
+        state: (N, M, S).
+        history: (N, M, H, C) commands, newest first.
+        coefficient: (N, M, T) of the kinematic terms.
+        delay: (N, M) of the commands [substeps].
+        lanes: pose (6, L), x (V + 1, L), dq (D, L) of `kinematics.kernels.run`, coefficient
+            (T, L) and late (L,), L >= n M; they hold the result.
+        motion: dof, factors, count of the terms, series, (step [s], substeps per period).
     """
-    where, x, dq = lanes
-    terms, series, (dt, substeps, delay) = motion
+    where, x, dq, own, late = lanes
+    dof, factors, count, series, (dt, substeps) = motion
     robots, size = pose.shape[1], state.shape[2]
-    for n in range(pose.shape[0]):
+    for n in range(begin, end):
         for m in range(robots):
-            i = n * robots + m
-            where[0, i], where[1, i], where[4, i] = pose[n, m]
+            i = (n - begin) * robots + m
+            where[0, i], where[1, i], where[4, i] = pose[n, m, 0], pose[n, m, 1], pose[n, m, 2]
             where[2, i], where[3, i] = math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2])
             where[5, i] = 0.0
-            x[:size, i] = state[n, m]
-    late = delay % substeps  # the command changes once in a period, after so many substeps
-    for first, last in ((0, late), (late, substeps)):
-        row = delayed(first, delay, substeps, history.shape[2])
-        for n in range(pose.shape[0]):
-            for m in range(robots):
-                x[size:-1, n * robots + m] = history[n, m, row]
-        if last > first:
-            run(where, x, dq, terms, series, dt, last - first)
+            for s in range(size):
+                x[s, i] = state[n, m, s]
+            for t in range(own.shape[0]):
+                own[t, i] = coefficient[n, m, t]
+            late[i] = delay[n, m] % substeps  # its command changes once, after so many substeps
+    at, used = 0, (end - begin) * robots
+    while at < substeps:
+        until = substeps
+        for i in range(used):
+            if late[i] > at:
+                until = min(until, late[i])
+            if late[i] == at or at == 0:
+                n, m = begin + i // robots, i % robots
+                row = delayed(at, delay[n, m], substeps, history.shape[2])
+                for c in range(history.shape[3]):
+                    x[size + c, i] = history[n, m, row, c]
+        run(where, x, dq, (dof, own, factors, count), series, dt, until - at)
+        at = until
 
 
-@njit(cache=True)
-def move_carefully(pose, state, history, bodies, walls, collided, footprint, motion, room):  # type: ignore[no-untyped-def]
-    """Moves the robots of one world for one period, looking for touches after each substep.
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def move_carefully(  # type: ignore[no-untyped-def]
+    n, meets, near, state, history, coefficient, delay, bodies, velocity, moving, walls, grid,
+    collided, pose, outlines, motion, room,
+):  # fmt: skip
+    """Moves robots of one world for one period, looking for touches after each substep.
 
     A robot that touches something is marked and gets no deeper into it; it may leave. A free
     one moves exactly as by `move_freely`.
 
     Args:
-        pose: (M, 3), in place.
-        state: (M, S), in place.
-        history: (M, H, C) commands, newest first.
-        bodies: (K + M, 7) obstacles, then robots, see `lidar.shapes.BODY`; robots in place.
+        n: which world.
+        meets: (M,) what each robot may meet; those that meet nothing are left alone.
+        near: see `contact_kernels.find_near`.
+        state, history, coefficient, delay, motion: see `move_freely`.
+        bodies: (N, K + M, 7) obstacles, then robots, see `lidar.shapes.BODY`; in place.
+        velocity, moving: of the obstacles, and whether any has one.
         walls: (W, 4).
-        collided: (M,) set to 1 by a touch.
-        footprint: radius [m].
-        motion: see `move_freely`.
-        room: x (V + 1,), dq (D,), direction (M, 2): scratch.
+        grid: see `collision_kernels`.
+        collided: (N, M) set to 1 by a touch.
+        pose: (N, M, 3), in place.
+        outlines: corners and where each outline begins.
+        room: x (V + 1,), dq (D,), trial (7,), spare (F, 2), start (K, 3): scratch.
     """
-    terms, series, (dt, substeps, delay) = motion
-    x, dq, direction = room
-    robots, size = pose.shape[0], state.shape[1]
-    first = bodies.shape[0] - robots
-    trial = np.empty(3)
-    for m in range(robots):
-        direction[m, 0], direction[m, 1] = math.cos(pose[m, 2]), math.sin(pose[m, 2])
+    x, dq, trial, spare, start = room
+    dof, factors, count, series, (dt, substeps) = motion
+    size, first = state.shape[2], velocity.shape[1]
+    world = bodies[n]
+    for m in range(meets.shape[0]):
+        if meets[m] != contacts.FREE:
+            place_robot(bodies, n, first + m, pose[n, m])
     for j in range(substeps):
-        row = delayed(j, delay, substeps, history.shape[1])
-        for m in range(robots):
-            x[:size], x[size:-1] = state[m], history[m, row]
-            rates(dq, x, terms)
+        if moving:
+            contacts.move_obstacles(bodies, start, velocity, n, (j + 1) * dt)
+        for m in range(meets.shape[0]):
+            if meets[m] == contacts.FREE:
+                continue
+            me = first + m
+            row = delayed(j, delay[n, m], substeps, history.shape[2])
+            for s in range(size):
+                x[s] = state[n, m, s]
+            for c in range(history.shape[3]):
+                x[size + c] = history[n, m, row, c]
+            rates(dq, x, (dof, coefficient[n, m], factors, count))
             turn = dq[2] * dt
-            trial[0], trial[1], c, s = move(
-                pose[m, 0],
-                pose[m, 1],
-                direction[m, 0],
-                direction[m, 1],
-                dq[0],
-                dq[1],
-                turn,
-                dt,
+            trial[0], trial[1], trial[3], trial[4] = move(
+                world[me, 0], world[me, 1], world[me, 3], world[me, 4], dq[0], dq[1], turn, dt,
                 series,
+            )  # fmt: skip
+            trial[2] = world[me, 2] + turn
+            trial[5], trial[6] = world[me, 5], world[me, 6]
+            for s in range(size):
+                state[n, m, s] += dt * dq[3 + s]
+            free, whom = contacts.contact(
+                trial, m, meets[m], near, world, walls, grid, outlines, spare
             )
-            trial[2] = pose[m, 2] + turn
-            for i in range(size):
-                state[m, i] += dt * dq[3 + i]
-            free = clearance(trial, first + m, footprint, bodies, walls)
             if free < 0.0:
-                collided[m] = 1
-            before = clearance(pose[m], first + m, footprint, bodies, walls)
-            if before >= 0.0 or free >= before:
-                pose[m] = trial
-                direction[m, 0], direction[m, 1] = c, s
-                bodies[first + m, 0], bodies[first + m, 1] = trial[0], trial[1]
+                collided[n, m] = 1
+                before, _ = contacts.contact(
+                    world[me], m, meets[m], near, world, walls, grid, outlines, spare
+                )
+                if before < 0.0 and free < before:
+                    continue
+                if whom >= first:
+                    collided[n, whom - first] = 1
+            for i in range(5):
+                world[me, i] = trial[i]
+    for m in range(meets.shape[0]):
+        if meets[m] != contacts.FREE:
+            for i in range(3):
+                pose[n, m, i] = world[first + m, i]
 
 
-@njit(cache=True)
-def move_block(pose, state, history, bodies, walls, collided, footprint, lanes, motion, room):  # type: ignore[no-untyped-def]
-    """Moves the robots of some worlds for one period: freely, and carefully where it is tight.
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def move_world(  # type: ignore[no-untyped-def]
+    n, skip, pose, state, history, coefficient, delay, bodies, velocity, walls, grid, collided,
+    crowded, outlines, lanes, motion, cells, found, robot, room,
+):  # fmt: skip
+    """Moves obstacles and robots of one world: freely, and carefully where it is tight.
 
-    The arguments are those of the two functions above, with worlds (n, ...) in front.
+    Args:
+        n: which world.
+        skip: the lane of its first robot.
+        crowded: whether its bodies are to be sorted into cells.
+        cells, found: see `cell_kernels`.
+        robot: near (M, 1 + SEVERAL), meets (M,), way (M,), reach (K + M,): scratch.
+        pose and others: see the functions above.
     """
-    move_freely(pose, state, history, lanes, motion)
-    where, x, _ = lanes
-    robots, size = pose.shape[1], state.shape[2]
-    first = bodies.shape[1] - robots
-    for n in range(pose.shape[0]):
-        longest = 0.0
-        for m in range(robots):
-            longest = max(longest, where[5, n * robots + m])
-        tight = False
-        for m in range(robots):
-            free = clearance(pose[n, m], first + m, footprint, bodies[n], walls)
-            tight = tight or free <= (2.0 if robots > 1 else 1.0) * longest
-        if tight:
-            move_carefully(
-                pose[n],
-                state[n],
-                history[n],
-                bodies[n],
-                walls,
-                collided[n],
-                footprint,
-                motion,
-                room,
-            )
-        else:
-            for m in range(robots):
-                i = n * robots + m
-                pose[n, m, 0], pose[n, m, 1], pose[n, m, 2] = where[0, i], where[1, i], where[4, i]
-                state[n, m] = x[:size, i]
-                bodies[n, first + m, :2] = pose[n, m, :2]
-        for m in range(robots):
-            pose[n, m, 2] = wrap(pose[n, m, 2])
+    where, x = lanes[0], lanes[1]
+    near, meets, way, reach = robot
+    start = room[4]
+    dt, substeps = motion[4]
+    robots, size, first = pose.shape[1], state.shape[2], velocity.shape[1]
+    for m in range(robots):
+        way[m] = where[5, skip + m]
+    longest, moving = contacts.reaches(reach, bodies, velocity, way, n, dt * substeps)
+    if crowded:
+        crowd.sort_bodies(bodies, n, cells)
+        cells[3][crowd.MOVED] = longest
+    tight = False
+    for m in range(robots):
+        meets[m] = contacts.find_near(near, m, reach, bodies, n, walls, grid, crowded, cells, found)
+        tight = tight or meets[m] != contacts.FREE
+    for m in range(robots):
+        if meets[m] == contacts.FREE:
+            i = skip + m
+            pose[n, m, 0], pose[n, m, 1], pose[n, m, 2] = where[0, i], where[1, i], where[4, i]
+            for s in range(size):
+                state[n, m, s] = x[s, i]
+    if moving:
+        for k in range(first):
+            for i in range(3):
+                start[k, i] = bodies[n, k, i]
+    if tight:
+        move_carefully(
+            n, meets, near, state, history, coefficient, delay, bodies, velocity, moving, walls,
+            grid, collided, pose, outlines, motion, room,
+        )  # fmt: skip
+    elif moving:
+        contacts.move_obstacles(bodies, start, velocity, n, substeps * dt)
+    for m in range(robots):
+        pose[n, m, 2] = wrap(pose[n, m, 2])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def place_robot(bodies, n, k, pose):  # type: ignore[no-untyped-def]
     """Puts body k of world n to a robot's pose (3,)."""
-    bodies[n, k, 0], bodies[n, k, 1], bodies[n, k, 2] = pose
+    bodies[n, k, 0], bodies[n, k, 1], bodies[n, k, 2] = pose[0], pose[1], pose[2]
     bodies[n, k, 3], bodies[n, k, 4] = math.cos(pose[2]), math.sin(pose[2])
 
 
-@njit(cache=True)
-def step_worlds(arrays, commands, walls, footprint, noise, sensor, lanes, motion, rooms):  # type: ignore[no-untyped-def]
-    """One control period of every world.
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _send(history, commands, begin):  # type: ignore[no-untyped-def]
+    """Puts the commands (n, M, C) of the worlds from `begin` on in front of those sent before."""
+    for i in range(commands.shape[0]):
+        for m in range(commands.shape[1]):
+            for h in range(history.shape[2] - 1, 0, -1):
+                for c in range(commands.shape[2]):
+                    history[begin + i, m, h, c] = history[begin + i, m, h - 1, c]
+            for c in range(commands.shape[2]):
+                history[begin + i, m, 0, c] = commands[i, m, c]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _note_ways(cells, before, skip, pose, n):  # type: ignore[no-untyped-def]
+    """Tells the cells how far the robots of world n came, drift included."""
+    for m in range(pose.shape[1]):
+        dx, dy = pose[n, m, 0] - before[skip + m, 0], pose[n, m, 1] - before[skip + m, 1]
+        cells[3][crowd.MOVED] = max(cells[3][crowd.MOVED], math.sqrt(dx * dx + dy * dy))
+
+
+@njit(cache=True, nogil=True)
+def step_worlds(packed, commands, begin):  # type: ignore[no-untyped-def]
+    """One control period of the worlds of a part.
 
     Args:
-        arrays: the fields of `simulator.Worlds`, in order; updated in place.
-        commands: (N, M, C).
-        walls: (W, 4).
-        footprint: radius [m].
-        noise: standard deviations of the odometry, linear [m/s] and angular [rad/s], and (3 + S)
-            of the drift after a second.
-        sensor: see `lidar.scanner.Scanner.arguments`.
-        lanes, motion: see the functions above.
-        rooms: scratch of the motion, see `move_carefully`, of the scans, see
-            `lidar.scanner.Scanner.room`, and of skewed ones, see `sensing_kernels.sense`.
+        packed: holds the fields of `worlds.Worlds` in order, updated in place, and what
+            `worlds.arguments` says.
+        commands: (n, M, C).
+        begin: the first world.
     """
-    pose, state, history, bodies, odom, twist, _, collided, steps, seeds, _ = arrays
-    room, scan_room, sweep = rooms
-    worlds, robots = pose.shape[0], pose.shape[1]
-    before = pose.copy()
-    for h in range(history.shape[2] - 1, 0, -1):
-        history[:, :, h] = history[:, :, h - 1]
-    history[:, :, 0] = commands
+    fields, scene, view, motion, room = packed.content
+    _step(fields, scene, view, motion, room, commands, begin)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[no-untyped-def]
+    """See `step_worlds`; no counting of references, which took longer than the step."""
+    (
+        pose, state, history, bodies, odom, twist, ranges, collided, steps, seeds, faults,
+        coefficient, delay, age, noise, velocity, past,
+    ) = fields  # fmt: skip
+    walls, grid, outlines, crowded, scattered = scene
+    lanes, single, robot, crowding, sensors = room
+    cells, found = crowding
+    dof, factors, count, series, (dt, substeps) = motion
+    x, dq, before = single[0], single[1], sensors[0]
+    robots, first, end = pose.shape[1], velocity.shape[1], begin + commands.shape[0]
+    # Moving obstacles are steered here, before the period: `velocity` of the worlds [begin, end).
+    _send(history, commands, begin)
     block = lanes[0].shape[1] // robots
-    for begin in range(0, worlds, block):
-        part = slice(begin, min(begin + block, worlds))
-        move_block(
-            pose[part], state[part], history[part], bodies[part], walls, collided[part],
-            footprint, lanes, motion, room,
-        )  # fmt: skip
-    x, dq, _ = room
-    terms, series, timing = motion
-    period = timing[0] * timing[1]
-    first, drifts, now = bodies.shape[1] - robots, noise[2:].any(), sweep[1]
-    for n in range(worlds):
-        steps[n] += 1
-        for m in range(robots):
-            counter = steps[n] * robots + m
-            if drifts and collided[n, m] == 0:
-                sensing.disturb(
-                    pose[n, m], state[n, m], noise[2:], seeds[n], counter, period, series
+    for low in range(begin, end, block):
+        high = min(low + block, end)
+        for n in range(low, high):
+            for m in range(robots):
+                i = (n - low) * robots + m
+                before[i, 0], before[i, 1], before[i, 2] = (
+                    pose[n, m, 0],
+                    pose[n, m, 1],
+                    pose[n, m, 2],
                 )
-            place_robot(bodies, n, first + m, pose[n, m])
-            _rates_now(dq, x, state[n, m], history[n, m], terms, timing)
-            now[n, m] = dq[:3]
-            sensing.measure(
-                odom[n, m], twist[n, m], before[n, m], pose[n, m], dq,
-                seeds[n], counter, noise[:2], period, series,
+                if steps[n] == 0:
+                    sensing.begin(past, n, m, pose, odom, twist)
+        move_freely(low, high, pose, state, history, coefficient, delay, lanes, motion)
+        together = 0
+        for n in range(low, high):
+            steps[n] += 1
+            move_world(
+                n, (n - low) * robots, pose, state, history, coefficient, delay, bodies, velocity,
+                walls, grid, collided, crowded, outlines, lanes, motion, cells, found, robot,
+                single,
             )  # fmt: skip
-    sensing.sense(arrays, np.arange(worlds), walls, sensor, scan_room, sweep)
+            for m in range(robots):
+                counter = steps[n] * robots + m
+                if collided[n, m] == 0:
+                    sensing.disturb(
+                        pose, state, noise, n, m, seeds[n], counter, dt * substeps, series
+                    )
+                place_robot(bodies, n, first + m, pose[n, m])
+                _rates_now(
+                    dq, x, state, history, n, m, delay[n, m], substeps,
+                    (dof, coefficient[n, m], factors, count),
+                )  # fmt: skip
+                sensing.measure(
+                    odom, twist, past, before[(n - low) * robots + m], pose, n, m, dq, noise,
+                    steps[n], seeds[n], counter, age[n, m], dt, substeps, series,
+                )  # fmt: skip
+            if crowded:
+                _note_ways(cells, before, (n - low) * robots, pose, n)
+            if scattered or sensing.needs_own(n, age, faults):
+                sensing.look_alone(
+                    n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, scattered,
+                    view, sensors, crowding, dt, substeps,
+                )  # fmt: skip
+            else:
+                sensors[1][together] = n
+                together += 1
+        sensing.look_together(together, pose, bodies, ranges, first, walls, view, sensors)
+        sensing.distort(low, high, ranges, faults, steps, seeds, view)
 
 
-@njit(cache=True)
-def _rates_now(dq, x, state, history, terms, timing):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True)
+def look(packed, chosen):  # type: ignore[no-untyped-def]
+    """Scans of the worlds `chosen` (n,) as they stand; see `step_worlds`."""
+    fields, scene, view, motion, room = packed.content
+    _look(fields, scene, view, motion, room, chosen)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _look(fields, scene, view, motion, room, chosen):  # type: ignore[no-untyped-def]
+    (
+        pose, _, _, bodies, _, _, ranges, _, steps, seeds, faults, _, _, age, _, velocity, past,
+    ) = fields  # fmt: skip
+    walls, sensors, (dt, substeps) = scene[0], room[4], motion[4]
+    for n in chosen:
+        if sensing.needs_own(n, age, faults):
+            sensing.look_alone(
+                n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, False, view,
+                sensors, room[3], dt, substeps,
+            )  # fmt: skip
+        else:
+            sensors[1][0] = n
+            sensing.look_together(1, pose, bodies, ranges, velocity.shape[1], walls, view, sensors)
+        sensing.distort(n, n + 1, ranges, faults, steps, seeds, view)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _rates_now(dq, x, state, history, n, m, delay, substeps, terms):  # type: ignore[no-untyped-def]
     """Rates at the end of a period, under the command that was in effect last."""
-    row = delayed(timing[1] - 1, timing[2], timing[1], history.shape[0])
-    size = state.shape[0]
-    x[:size], x[size:-1] = state, history[row]
+    row = delayed(substeps - 1, delay, substeps, history.shape[2])
+    size = state.shape[2]
+    for s in range(size):
+        x[s] = state[n, m, s]
+    for c in range(history.shape[3]):
+        x[size + c] = history[n, m, row, c]
     rates(dq, x, terms)

@@ -1,115 +1,296 @@
 """Compiled inner loops of the simulator: what moves and measures wrongly, and the scans.
 
-Shapes: N worlds, M robots, S state, W walls, B beams, G slices of a sweep.
+What a robot is told may be older than the moment: `past` (N, M, R, 12) is a ring of what was true
+at the ends of the last R periods, that of step i in row i % R: true pose, true twist, pose by
+odometry, measured twist. Between two of them everything is taken to change linearly.
+
+Shapes: N worlds, M robots, S state, K obstacles, W walls, B beams, G slices of a sweep, R periods.
 """
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit
 
 from nics_drl_bridge import random_kernels as random
-from nics_drl_bridge.kinematics.kernels import advance
+from nics_drl_bridge.kinematics.kernels import move, wrap
 from nics_drl_bridge.lidar import fault_kernels, scan_kernels
+from nics_drl_bridge.sim import cell_kernels as crowd
+
+POSE, TWIST, ODOM, MEASURED, PAST = 0, 3, 6, 9, 12
+"""Columns of `past`."""
 
 
-@njit(cache=True)
-def measure(odom, twist, before, after, now, seed, counter, std, period, series):  # type: ignore[no-untyped-def]
-    """What the wheels' odometry says of one period: a drifting pose and a noisy twist.
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def begin(past, n, m, pose, odom, twist):  # type: ignore[no-untyped-def]
+    """Notes what is true of a robot at the beginning of an episode."""
+    for i in range(3):
+        past[n, m, 0, POSE + i], past[n, m, 0, TWIST + i] = pose[n, m, i], 0.0
+        past[n, m, 0, ODOM + i], past[n, m, 0, MEASURED + i] = odom[n, m, i], twist[n, m, i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def lag_of(age, steps, rows, substeps):  # type: ignore[no-untyped-def]
+    """How old [substeps] that is which a robot is told: not from before the episode or the ring."""
+    return max(min(age, min(steps, rows - 1) * substeps), 0)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def at_lag(past, n, m, column, lag, steps, substeps):  # type: ignore[no-untyped-def]
+    """Three columns of `past` as they were `lag` substeps before the end of period `steps`."""
+    rows = past.shape[2]
+    new, share = (steps - lag // substeps) % rows, (lag % substeps) / substeps
+    x, y, z = past[n, m, new, column], past[n, m, new, column + 1], past[n, m, new, column + 2]
+    if share > 0.0:
+        old = (steps - lag // substeps - 1) % rows
+        turn = past[n, m, old, column + 2] - z
+        if column in (POSE, ODOM):
+            turn = wrap(turn)
+        x += share * (past[n, m, old, column] - x)
+        y += share * (past[n, m, old, column + 1] - y)
+        z += share * turn
+        if column in (POSE, ODOM):
+            z = wrap(z)
+    return x, y, z
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def advanced(x, y, heading, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
+    """The pose after the exact arc of a body twist; see `kinematics.kernels.move`."""
+    x, y, _, _ = move(x, y, math.cos(heading), math.sin(heading), vx, vy, turn, dt, series)
+    return x, y, wrap(heading + turn)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def measure(  # type: ignore[no-untyped-def]
+    odom, twist, past, before, pose, n, m, now, std, steps, seed, counter, age, dt, substeps,
+    series,
+):  # fmt: skip
+    """What a robot's wheels say of one period: a drifting pose and a noisy twist, maybe late.
 
     Args:
-        odom: (3,) odometry pose, in place.
-        twist: (3,) measured twist, result.
-        before, after: (3,) true poses around the period.
-        now: (3,) true twist at its end.
+        odom: (N, M, 3) odometry pose, result.
+        twist: (N, M, 3) measured twist, result.
+        past: the ring, see the module; gets the row of this period.
+        before: (3,) true pose at the start of the period.
+        pose: (N, M, 3) true poses at its end.
+        n, m: which world and robot.
+        now: (3 + S,) true rates at its end.
+        std: (N, M, 2 + 3 + S) standard deviation of the linear [m/s] and the angular twist
+            [rad/s], then of the drift.
+        steps: periods since the reset, this one included.
         seed, counter: of the random draws.
-        std: (2,) standard deviation of the linear [m/s] and the angular twist [rad/s].
-        period: [s].
+        age: of what is told [substeps].
+        dt, substeps: [s], and substeps in a period.
         series: see `kinematics.kernels`.
     """
-    noise = np.zeros(3)
-    for i in range(3):
-        if std[i // 2] > 0.0:
-            noise[i] = std[i // 2] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter + i)
-        twist[i] = now[i] + noise[i]
+    rows = past.shape[2]
+    this = steps % rows
+    last = this - 1 if this > 0 else rows - 1
+    noise_x = noise_y = noise_turn = 0.0
+    if std[n, m, 0] > 0.0:
+        noise_x = std[n, m, 0] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter)
+        noise_y = std[n, m, 0] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter + 1)
+    if std[n, m, 1] > 0.0:
+        noise_turn = std[n, m, 1] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter + 2)
     c, s = math.cos(before[2]), math.sin(before[2])
-    dx, dy = after[0] - before[0], after[1] - before[1]
-    x, y = c * dx + s * dy, c * dy - s * dx
-    turned = after[2] - before[2]
-    c, s = math.cos(odom[2]), math.sin(odom[2])
-    odom[0] += c * x - s * y
-    odom[1] += s * x + c * y
-    odom[2] += turned
-    advance(odom, noise, period, series)
+    dx, dy = pose[n, m, 0] - before[0], pose[n, m, 1] - before[1]
+    ahead, aside, turned = c * dx + s * dy, c * dy - s * dx, pose[n, m, 2] - before[2]
+    x, y, heading = past[n, m, last, ODOM], past[n, m, last, ODOM + 1], past[n, m, last, ODOM + 2]
+    c, s = math.cos(heading), math.sin(heading)
+    x, y, heading = x + (c * ahead - s * aside), y + (s * ahead + c * aside), heading + turned
+    period = dt * substeps
+    if noise_x != 0.0 or noise_y != 0.0 or noise_turn != 0.0:
+        x, y, heading = advanced(
+            x, y, heading, noise_x, noise_y, noise_turn * period, period, series
+        )
+    row = past[n, m, this]
+    row[ODOM], row[ODOM + 1], row[ODOM + 2] = x, y, wrap(heading)
+    row[MEASURED], row[MEASURED + 1], row[MEASURED + 2] = (
+        now[0] + noise_x, now[1] + noise_y, now[2] + noise_turn,
+    )  # fmt: skip
+    for i in range(3):
+        row[POSE + i], row[TWIST + i] = pose[n, m, i], now[i]
+    lag = lag_of(age, steps, rows, substeps) if age > 0 else 0
+    if lag == 0:
+        for i in range(3):
+            odom[n, m, i], twist[n, m, i] = row[ODOM + i], row[MEASURED + i]
+        return
+    x, y, heading = at_lag(past, n, m, ODOM, lag, steps, substeps)
+    odom[n, m, 0], odom[n, m, 1], odom[n, m, 2] = x, y, heading
+    x, y, heading = at_lag(past, n, m, MEASURED, lag, steps, substeps)
+    twist[n, m, 0], twist[n, m, 1], twist[n, m, 2] = x, y, heading
 
 
-@njit(cache=True)
-def disturb(pose, state, std, seed, counter, period, series):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def disturb(pose, state, std, n, m, seed, counter, period, series):  # type: ignore[no-untyped-def]
     """Moves a robot by what its model does not explain, growing with the root of the time.
 
     Args:
-        pose: (3,), in place.
-        state: (S,), in place.
-        std: (3 + S,) along x, y and heading of the body, and of the state, after a second.
+        pose: (N, M, 3), in place.
+        state: (N, M, S), in place.
+        std: (N, M, 2 + 3 + S) of the odometry, then along x, y and heading of the body, and of
+            the state, after a second.
+        n, m: which world and robot.
         seed, counter: of the random draws.
         period: [s].
         series: see `kinematics.kernels`.
     """
     # Uniform draws of this variance are cheap, and over some periods they add up to a normal one.
-    count, scale = std.shape[0], math.sqrt(12.0 * period)
-    aside = np.zeros(3)
+    count, scale = std.shape[2] - 2, math.sqrt(12.0 * period)
+    ahead = aside = turn = 0.0
     for i in range(count):
-        if std[i] > 0.0:
+        if std[n, m, 2 + i] > 0.0:
             share = random.uniform(seed, random.DRIFT_STREAM, counter * count + i) - 0.5
-            draw = scale * std[i] * share
-            if i < 3:
-                aside[i] = draw
+            draw = scale * std[n, m, 2 + i] * share
+            if i == 0:
+                ahead = draw
+            elif i == 1:
+                aside = draw
+            elif i == 2:
+                turn = draw
             else:
-                state[i - 3] += draw
-    advance(pose, aside, 1.0, series)
+                state[n, m, i - 3] += draw
+    if ahead != 0.0 or aside != 0.0 or turn != 0.0:
+        x, y, heading = advanced(
+            pose[n, m, 0], pose[n, m, 1], pose[n, m, 2], ahead, aside, turn, 1.0, series
+        )
+        pose[n, m, 0], pose[n, m, 1], pose[n, m, 2] = x, y, heading
 
 
-@njit(cache=True)
-def sense(arrays, chosen, walls, sensor, room, sweep):  # type: ignore[no-untyped-def]
-    """Scans of the worlds `chosen` (n,) as they stand, with the faults of each robot's device.
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def needs_own(n, age, faults):  # type: ignore[no-untyped-def]
+    """Whether a robot of world n needs a scan that is not of its pose at the moment."""
+    for m in range(age.shape[1]):
+        if age[n, m] > 0 or faults[n, m, fault_kernels.SKEW] != 0.0:
+            return True
+    return False
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def look_alone(  # type: ignore[no-untyped-def]
+    n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, crowded, view, sensors,
+    crowding, dt, substeps,
+):  # fmt: skip
+    """Scans of world n, each robot's from its own place and time.
 
     Args:
-        arrays: the fields of `simulator.Worlds`, in order.
-        chosen: (n,).
+        n: which world.
+        pose and others: fields of `worlds.Worlds`.
         walls: (W, 4).
-        sensor: see `lidar.scanner.Scanner.arguments`.
-        room: see `lidar.scanner.Scanner.room`.
-        sweep: time of a sweep [s], (N, M, 3) true twists, and scratch for skewed scans: poses
-            (N, M, 3), slices (G, 3), ranges (N, M, B); G is 0 where no device skews.
+        crowded: whether the bodies are in cells.
+        view, sensors, crowding: see `worlds.arguments`.
+        dt, substeps: [s], and substeps in a period.
     """
-    pose, _, _, bodies, _, _, ranges, _, steps, seeds, faults = arrays
-    robots = pose.shape[1]
-    first = bodies.shape[1] - robots
-    if sweep[3].shape[0] == 0:
-        scan_kernels.scan_worlds(ranges, pose, chosen, bodies, first, walls, sensor, room)
-    else:
-        _sweep(ranges, pose, chosen, bodies, first, walls, sensor, room, sweep, faults)
-    for n in chosen:
+    for m in range(pose.shape[1]):
+        lag = lag_of(age[n, m], steps[n], past.shape[2], substeps)
+        _look_alone(
+            n, m, lag, pose, bodies, ranges, steps, faults[n, m, fault_kernels.SKEW], velocity,
+            past, walls, crowded, view, sensors, crowding, dt, substeps,
+        )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def look_together(together, pose, bodies, ranges, first, walls, view, sensors):  # type: ignore[no-untyped-def]
+    """Scans the first `together` worlds of the list in `sensors`, as they stand."""
+    chosen, scan_room = sensors[1][:together], sensors[8]
+    sensor, map_arrays, exact = view[0], view[1], view[2]
+    scan_kernels.scan_worlds(ranges, pose, chosen, bodies, first, walls, sensor, scan_room)
+    if map_arrays[0].size > 0:
+        scan_kernels.add_map(ranges, pose, chosen, sensor, map_arrays, exact)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def distort(low, high, ranges, faults, steps, seeds, view):  # type: ignore[no-untyped-def]
+    """Does to the scans of the worlds [low, high) what the device of each robot does to them."""
+    limits, robots = view[4], ranges.shape[1]
+    for n in range(low, high):
         for m in range(robots):
             counter = steps[n] * robots + m
-            fault_kernels.distort(ranges[n, m], sensor[3], faults[n, m], seeds[n], counter)
+            fault_kernels.distort(ranges[n, m], limits, faults[n, m], seeds[n], counter)
 
 
-@njit(cache=True)
-def _sweep(ranges, pose, chosen, bodies, first, walls, sensor, room, sweep, faults):  # type: ignore[no-untyped-def]
-    """Scans group by group of beams, each from where its robot was at that time; see `sense`."""
-    time, twists, poses, slices, part = sweep
-    groups, beams = slices.shape[0], ranges.shape[2]
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
+def _look_alone(  # type: ignore[no-untyped-def]
+    n, m, lag, pose, bodies, ranges, steps, skew, velocity, past, walls, crowded, view, sensors,
+    crowding, dt, substeps,
+):  # fmt: skip
+    """Scan of one robot `lag` substeps ago, maybe skewed; see `look_alone`."""
+    _, _, _, mount, limits, sweep_time = view
+    spot, slices, part, drive, none = sensors[3], sensors[4], sensors[5], sensors[6], sensors[7]
+    this, beams = steps[n] % past.shape[2], ranges.shape[2]
+    for i in range(3):
+        spot[0, 0, i] = pose[n, m, i]
+        drive[i] = past[n, m, this, TWIST + i] if steps[n] > 0 else 0.0
+    if lag > 0:
+        x, y, heading = at_lag(past, n, m, POSE, lag, steps[n], substeps)
+        spot[0, 0, 0], spot[0, 0, 1], spot[0, 0, 2] = x, y, heading
+        x, y, heading = at_lag(past, n, m, TWIST, lag, steps[n], substeps)
+        drive[0], drive[1], drive[2] = x, y, heading
+    reach = limits[1] + math.hypot(mount[0], mount[1])
+    if skew != 0.0:
+        reach += math.hypot(drive[0], drive[1]) * sweep_time
+    count = _gather(
+        n, m, lag, spot[0, 0], reach, bodies, velocity, past, steps[n], crowded, sensors[2],
+        crowding, dt, substeps,
+    )  # fmt: skip
+    seen = sensors[2][: count * 7].reshape((1, count, 7))
+    begin = (n * ranges.shape[1] + m) * beams
+    scan = ranges.reshape(-1)[begin : begin + beams].reshape((1, 1, beams))
+    if skew == 0.0:
+        _render(scan, spot, none, seen, walls, view, sensors[8])
+        return
+    groups = slices.shape[0]
+    fault_kernels.slice_poses(slices, spot[0, 0], drive, sweep_time, skew)
     for g in range(groups):
-        for n in chosen:
-            for m in range(pose.shape[1]):
-                turns = faults[n, m, fault_kernels.SKEW]
-                fault_kernels.slice_poses(slices, pose[n, m], twists[n, m], time, turns)
-                poses[n, m] = slices[g]
-        scan_kernels.scan_worlds(part, poses, chosen, bodies, first, walls, sensor, room)
-        low, high = g * beams // groups, (g + 1) * beams // groups
-        for n in chosen:
-            for m in range(pose.shape[1]):
-                ranges[n, m, low:high] = part[n, m, low:high]
+        for i in range(3):
+            spot[0, 0, i] = slices[g, i]
+        _render(part, spot, none, seen, walls, view, sensors[8])
+        for i in range(g * beams // groups, (g + 1) * beams // groups):
+            scan[0, 0, i] = part[0, 0, i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
+def _render(scan, spot, none, seen, walls, view, scan_room):  # type: ignore[no-untyped-def]
+    """One scan (1, 1, B) from a pose (1, 1, 3) among the bodies (1, k, 7)."""
+    sensor, map_arrays, exact = view[0], view[1], view[2]
+    scan_kernels.scan_worlds(scan, spot, none, seen, -1, walls, sensor, scan_room)
+    if map_arrays[0].size > 0:
+        scan_kernels.add_map(scan, spot, none, sensor, map_arrays, exact)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _gather(  # type: ignore[no-untyped-def]
+    n, m, lag, spot, reach, bodies, velocity, past, steps, crowded, seen, crowding, dt, substeps
+):
+    """Copies to `seen` the bodies around a spot, where they were `lag` substeps ago; how many."""
+    cells, found = crowding
+    first = velocity.shape[1]
+    several, in_cells = bodies.shape[1], crowded and lag == 0  # the cells are of this period
+    if in_cells:
+        several = crowd.bodies_around(spot[0], spot[1], reach, cells, found)
+    count, ago = 0, lag * dt
+    for i in range(several):
+        k = found[i] if in_cells else i
+        radius = bodies[n, k, 5]
+        if k == first + m or radius <= 0.0:
+            continue
+        at = 7 * count
+        for j in range(7):
+            seen[at + j] = bodies[n, k, j]
+        turned = False
+        if lag > 0 and k >= first:
+            x, y, heading = at_lag(past, n, k - first, POSE, lag, steps, substeps)
+            seen[at], seen[at + 1], seen[at + 2], turned = x, y, heading, True
+        elif lag > 0:
+            seen[at] -= velocity[n, k, 0] * ago
+            seen[at + 1] -= velocity[n, k, 1] * ago
+            turned = velocity[n, k, 2] != 0.0
+            seen[at + 2] -= velocity[n, k, 2] * ago
+        if turned:
+            seen[at + 3], seen[at + 4] = math.cos(seen[at + 2]), math.sin(seen[at + 2])
+        dx, dy = seen[at] - spot[0], seen[at + 1] - spot[1]
+        if dx * dx + dy * dy <= (reach + radius) * (reach + radius):
+            count += 1
+    return count

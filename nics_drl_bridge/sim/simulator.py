@@ -2,66 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kinematics.kernels import SERIES, scratch, term_arrays
+from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.lidar.baking import with_shapes
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
-from nics_drl_bridge.lidar.shapes import BODY, Circle
-from nics_drl_bridge.sim import kernels, sensing_kernels
+from nics_drl_bridge.lidar.shapes import Circle
+from nics_drl_bridge.sim import kernels
 from nics_drl_bridge.sim.validity import CommandBox, OutsideValidityWarning
 from nics_drl_bridge.sim.world import Scene, World, sample_scene
+from nics_drl_bridge.sim.worlds import SLICES, Sizes, Worlds, allocate, arguments, split
+from nics_drl_bridge.threads import Crew
 
-__all__ = ["FastSimulator", "OutsideValidityWarning", "Worlds"]
+__all__ = ["SLICES", "FastSimulator", "OutsideValidityWarning", "Worlds"]
 
 Array = NDArray[np.float64]
-SLICES = 16
-"""A skewed scan is rendered in so many groups of beams."""
-LANES = 256
-"""So many robots move side by side: their arrays stay in the fastest cache."""
-
-
-@dataclass(frozen=True)
-class Worlds:
-    """All that changes in a simulation; the order is that of `kernels.step_worlds`.
-
-    Attributes:
-        pose: (N, M, 3) true pose of `base_link` in `map`.
-        state: (N, M, S) true state.
-        history: (N, M, H, C) commands, newest first.
-        bodies: (N, K + M, 7) obstacles, then robots, see `lidar.shapes.BODY`.
-        odom: (N, M, 3) pose by odometry, which drifts; it begins at the start pose.
-        twist: (N, M, 3) measured body twist.
-        ranges: (N, M, B) scan, float32, REP-117.
-        collided: (N, M) 1 once a robot has touched something.
-        steps: (N,) control periods since the reset.
-        seeds: (N,) of the episode.
-        faults: (N, M, P) faults of each robot's lidar, columns as in `lidar.fault_kernels`; those
-            of the model unless written to, as domain randomisation does. A reset keeps them.
-    """
-
-    pose: Array
-    state: Array
-    history: Array
-    bodies: Array
-    odom: Array
-    twist: Array
-    ranges: NDArray[np.float32]
-    collided: NDArray[np.uint8]
-    steps: NDArray[np.int64]
-    seeds: NDArray[np.int64]
-    faults: Array
+R = TypeVar("R")
 
 
 class FastSimulator:
     """The simulator that a SimulatorModel describes, in a world.
+
+    A world comes to the same bits in a batch of any size and with any number of threads.
 
     Args:
         model: the robot: motion, lidar, noise.
@@ -69,6 +37,15 @@ class FastSimulator:
         worlds: N.
         robots: M in each world. They see and touch each other.
         renderer: `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`.
+        threads: so many parts of the worlds are moved at the same time.
+        longest_delay: greatest latency of commands that `data.delay` may be given [substeps]; the
+            model's by default.
+        longest_age: greatest age of scan and odometry that `data.age` may be given [substeps].
+
+    Attributes:
+        data: all that changes, see `Worlds`.
+        goals: (N, M, 2) of the episodes [m].
+        parts: the worlds that each thread moves.
     """
 
     def __init__(
@@ -78,66 +55,42 @@ class FastSimulator:
         worlds: int = 1,
         robots: int = 1,
         renderer: Renderer = "auto",
+        threads: int = 1,
+        longest_delay: int | None = None,
+        longest_age: int = 0,
     ) -> None:
         if worlds < 1 or robots < 1:
             raise ConfigError(
                 f"a simulator needs at least 1 world and 1 robot, not {worlds} and {robots}."
             )
+        delay = model.timing[2] if longest_delay is None else longest_delay
+        if threads < 1 or delay < model.timing[2] or longest_age < 0:
+            raise ConfigError(
+                f"a simulator needs at least 1 thread, a longest_delay of at least the model's "
+                f"{model.timing[2]} substeps and a longest_age of at least 0, not {threads}, "
+                f"{delay} and {longest_age}."
+            )
         self.model, self.world = model, world
         self.goals: Array = np.zeros((worlds, robots, 2))
-        self._footprint = Circle(radius=model.robot.footprint_radius)
+        self._footprint = footprint_shape(model.robot)
         table = with_shapes(model.lidar, model.table, (*world.shapes, self._footprint))
-        self._scanner = Scanner(model.lidar, table, renderer)
-        self._walls = world.all_walls()
-        drift = model.noise.simulated_drift(model.robot)
-        self._noise = np.array([*model.noise.odometry, *drift])
-        self._sensor = self._scanner.arguments
-        self._motion = (term_arrays(model.kinematics), SERIES, model.timing)
-        bodies = world.obstacles.count + robots
-        self._rooms = (
-            (*scratch(model.kinematics), np.zeros((robots, 2))),
-            self._scanner.room(bodies),
-            self._make_sweep(worlds, robots),
-        )
-        self._lanes = self._make_lanes(worlds, robots)
-        self._box = CommandBox(model.kinematics, model.robot)
-        self.data = self._allocate(worlds, robots)
-        self._fields: tuple[Any, ...] = tuple(vars(self.data).values())
+        self._scanner = Scanner(model.lidar, table, renderer, world.grid)
+        self._sizes = Sizes(worlds, robots, world.obstacles.count, delay, longest_age)
+        self.data = allocate(model, self._sizes)
+        self.parts = split(worlds, threads)
+        self._boxes = {part.start: CommandBox(model.kinematics, model.robot) for part in self.parts}
+        self._crew = Crew(len(self.parts))
 
-    def _make_sweep(self, worlds: int, robots: int) -> tuple[Any, ...]:
-        """What skewed scans need, see `sensing_kernels.sense`."""
-        lidar, shape = self.model.lidar, (worlds, robots, 3)
-        slices = 0 if lidar.faults.skew == "none" else SLICES
-        part = (worlds, robots, lidar.beams if slices else 0)
-        twists, poses = np.zeros(shape), np.zeros(shape)
-        return lidar.sweep_time, twists, poses, np.zeros((slices, 3)), np.zeros(part, np.float32)
+    @cached_property
+    def _packed(self) -> dict[int, Any]:
+        """What the kernels take, by the first world of each part."""
+        walls = self.world.all_walls()
+        of = (self.data, self.model, self._scanner, walls, self._sizes)
+        return {part.start: kernels.pack(arguments(*of, part)) for part in self.parts}
 
-    def _make_lanes(self, worlds: int, robots: int) -> tuple[Array, Array, Array]:
-        """Room for the robots that move side by side: pose (6, L), x (V + 1, L), dq (D, L)."""
-        lanes = robots * min(worlds, max(1, LANES // robots))
-        kinematics = self.model.kinematics
-        x = np.ones((len(kinematics.variables) + 1, lanes))
-        return np.zeros((6, lanes)), x, np.zeros((len(kinematics.dofs), lanes))
-
-    def _allocate(self, worlds: int, robots: int) -> Worlds:
-        size, width = len(self.model.robot.state), len(self.model.robot.command)
-        _, substeps, delay = self.model.timing
-        periods = -(-delay // substeps) + 1
-        bodies = self.world.obstacles.count + robots
-        shape = (worlds, robots)
-        return Worlds(
-            pose=np.zeros((*shape, 3)),
-            state=np.zeros((*shape, size)),
-            history=np.zeros((*shape, periods, width)),
-            bodies=np.zeros((worlds, bodies, BODY)),
-            odom=np.zeros((*shape, 3)),
-            twist=np.zeros((*shape, 3)),
-            ranges=np.full((*shape, self.model.lidar.beams), np.inf, np.float32),
-            collided=np.zeros(shape, np.uint8),
-            steps=np.zeros(worlds, np.int64),
-            seeds=np.zeros(worlds, np.int64),
-            faults=np.tile(self.model.lidar.fault_parameters, (*shape, 1)),
-        )
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what a copy has to make anew."""
+        return {name: value for name, value in vars(self).items() if name != "_packed"}
 
     def reset(
         self,
@@ -164,10 +117,9 @@ class FastSimulator:
             start = scene.starts if starts is None else np.asarray(starts, dtype=np.float64)[row]
             self._place(int(n), int(seed), scene, start)
             scenes.append(scene)
-        self._box.begin()
-        _, room, sweep = self._rooms
-        sweep[1][chosen] = 0.0
-        sensing_kernels.sense(self._fields, chosen, self._walls, self._sensor, room, sweep)
+        for box in self._boxes.values():
+            box.begin()
+        kernels.look(self._packed[0], chosen)
         return scenes
 
     def _place(self, n: int, seed: int, scene: Scene, start: Array) -> None:
@@ -189,8 +141,38 @@ class FastSimulator:
             commands: (N, M, C) in the units and the order of the RobotSpec.
         """
         commands = np.ascontiguousarray(commands, dtype=np.float64)
-        self._box.check(commands)
-        kernels.step_worlds(
-            self._fields, commands, self._walls, self.model.robot.footprint_radius,
-            self._noise, self._sensor, self._lanes, self._motion, self._rooms,
-        )  # fmt: skip
+        self._check_shape(commands, len(self.data.steps))
+        self._boxes[0].check(commands)
+        if len(self.parts) == 1:
+            kernels.step_worlds(self._packed[0], commands, 0)
+        else:
+            self.run_parts(
+                lambda part: kernels.step_worlds(
+                    self._packed[part.start], commands[part], part.start
+                )
+            )
+
+    def run_parts(self, function: Callable[[slice], R]) -> list[R]:
+        """What a function gives for each of `parts`, each run by a thread of its own."""
+        return self._crew.run(function, self.parts)
+
+    def step_part(self, part: slice, commands: ArrayLike) -> None:
+        """Moves the worlds of one part by one control period, in the thread that calls.
+
+        Args:
+            part: one of `parts`; different ones may be moved at the same time.
+            commands: (n, M, C) of the worlds of the part.
+        """
+        commands = np.ascontiguousarray(commands, dtype=np.float64)
+        self._check_shape(commands, part.stop - part.start)
+        self._boxes[part.start].check(commands)
+        kernels.step_worlds(self._packed[part.start], commands, part.start)
+
+    def _check_shape(self, commands: Array, worlds: int) -> None:
+        """Raises ConfigError where the kernels would read beyond the commands."""
+        robots, _, width = self.data.history.shape[1:]
+        if commands.shape != (worlds, robots, width):
+            raise ConfigError(
+                f"commands are {commands.shape}; they must be {(worlds, robots, width)}: worlds, "
+                "robots, and a robot's commands."
+            )

@@ -13,6 +13,7 @@ from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
+from nics_drl_bridge.lidar.maps_grid import GridMap
 from nics_drl_bridge.lidar.shapes import Circle, Shape
 
 Array = NDArray[np.float64]
@@ -77,6 +78,11 @@ class World(Schema):
     def shapes(self) -> tuple[Shape, ...]:
         """Every shape that an obstacle may have."""
         return tuple(Circle(radius=radius) for radius in self.obstacles.radii)
+
+    @property
+    def grid(self) -> GridMap | None:
+        """The static map that stands in the field, if any."""
+        return None
 
     def all_walls(self) -> Array:
         """(W, 4) the four sides of the field, then the further walls [m]."""

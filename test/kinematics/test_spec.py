@@ -77,6 +77,12 @@ def test_fields_that_a_robot_has_no_use_for_are_dropped():
         ),
         ({"state": [{"name": "A b", "unit": "m", "min": 0, "max": 1}]}, "state.0.name"),
         ({"textbook": "tank"}, "key 'textbook'"),
+        ({"footprint": [[0.1, 0.0], [0.0, 0.1]]}, "at least 3 items"),
+        ({"footprint": [[0.1, 0.0], [0.0, "a"], [0.0, 0.0]]}, "footprint.1.1"),
+        ({"footprint": [[0.1, 0.1], [-0.1, -0.1], [0.1, -0.1], [-0.1, 0.1]]}, "cross or touch"),
+        ({"footprint": [[0.1, 0.0], [0.2, 0.0], [0.1, 0.0]]}, "cross or touch"),
+        ({"footprint": [[0.1, 0.0], [0.1, 0.0], [0.0, 0.1]]}, "cross or touch"),
+        ({"footprint": [[0.1, 0.1], [-0.1, 0.1], [0.0, -0.1]]}, "leave footprint_radius out"),
     ],
 )
 def test_a_robot_that_cant_be_is_refused_in_one_sentence(changes, sentence):
@@ -89,3 +95,24 @@ def test_a_robot_that_cant_be_is_refused_in_one_sentence(changes, sentence):
 def test_a_robot_without_textbook_is_told_so():
     with pytest.raises(ConfigError, match="robot 'cart' names no textbook kinematics"):
         require_textbook(RobotSpec.model_validate(data()))
+
+
+def test_a_footprint_gives_the_radius_of_the_circle_that_holds_it():
+    given = data(footprint=[[0.3, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.3, -0.1]])
+    del given["footprint_radius"]
+    robot = RobotSpec.model_validate(given)
+    assert robot.footprint_radius == pytest.approx(np.hypot(0.3, 0.1))
+    assert RobotSpec.model_validate(robot.model_dump(mode="json")) == robot
+
+
+def test_a_footprint_may_be_concave():
+    given = data(footprint=[[0.3, 0.2], [-0.2, 0.2], [-0.2, -0.2], [0.3, -0.2], [0.0, 0.0]])
+    del given["footprint_radius"]
+    assert len(RobotSpec.model_validate(given).footprint) == 5
+
+
+def test_a_robot_without_any_footprint_is_refused():
+    given = data()
+    del given["footprint_radius"]
+    with pytest.raises(ConfigError, match="footprint_radius"):
+        validate(given, RobotSpec, "cart.yaml")

@@ -1,0 +1,158 @@
+"""Compiled contacts: which robots may touch something within a period, and what they touch.
+
+A robot whose circle can't meet anything within the period moves freely. Of the others, `near`
+lists what they may meet, so that each substep only looks at that. Shapes: N worlds, M robots, K
+obstacles, bodies obstacles then robots.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from nics_drl_bridge.kinematics.kernels import wrap
+from nics_drl_bridge.sim.cell_kernels import bodies_around
+from nics_drl_bridge.sim.collision_kernels import (
+    body_gap,
+    map_bound,
+    map_gap,
+    segment_distance2,
+    wall_gap,
+)
+
+FREE, BODIES, WALLS, MAP = 0, 1, 2, 4
+"""What a robot may meet; a sum of them."""
+SEVERAL = 32
+"""So many bodies may be near a robot; where there are more, all are looked at."""
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def reaches(reach, bodies, velocity, way, n, period):  # type: ignore[no-untyped-def]
+    """How far the circle of each body may come from where its centre is now [m].
+
+    Args:
+        reach: (K + M,) result; 0 where there is no body.
+        bodies: (N, K + M, 7).
+        velocity: (N, K, 3) of the obstacles.
+        way: (M,) what bounds the length of each robot's path [m].
+        n: which world.
+        period: [s].
+
+    Returns:
+        The longest way of any [m], and whether an obstacle moves.
+    """
+    longest, moving = 0.0, False
+    obstacles = velocity.shape[1]
+    for k in range(obstacles):
+        reach[k] = bodies[n, k, 5]
+        vx, vy = velocity[n, k, 0], velocity[n, k, 1]
+        if (vx != 0.0 or vy != 0.0 or velocity[n, k, 2] != 0.0) and reach[k] > 0.0:
+            moved = math.sqrt(vx * vx + vy * vy) * period
+            reach[k] += moved
+            longest, moving = max(longest, moved), True
+    for m in range(way.shape[0]):
+        reach[obstacles + m] = bodies[n, obstacles + m, 5] + way[m]
+        longest = max(longest, way[m])
+    return longest, moving
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def find_near(near, m, reach, bodies, n, walls, grid, crowded, cells, found):  # type: ignore[no-untyped-def]
+    """What robot m of world n may meet within the period.
+
+    Args:
+        near: (M, 1 + SEVERAL) how many bodies, and which; result.
+        m: which robot.
+        reach: see `reaches`.
+        bodies: (N, K + M, 7).
+        n: which world.
+        walls: (W, 4).
+        grid: see `collision_kernels`.
+        crowded: whether the bodies are in cells.
+        cells, found: see `cell_kernels`.
+
+    Returns:
+        A sum of the constants of the module.
+    """
+    me = bodies.shape[1] - near.shape[0] + m
+    x, y, own = bodies[n, me, 0], bodies[n, me, 1], reach[me]
+    count, several = 0, bodies.shape[1]
+    if crowded:
+        several = bodies_around(x, y, own, cells, found)
+    for i in range(several):
+        k = found[i] if crowded else i
+        dx, dy, far = bodies[n, k, 0] - x, bodies[n, k, 1] - y, own + reach[k]
+        if dx * dx + dy * dy <= far * far and k != me and reach[k] > 0.0:
+            if count < SEVERAL:
+                near[m, 1 + count] = k
+            count += 1
+    near[m, 0] = count
+    meets = BODIES if count > 0 else FREE
+    for w in range(walls.shape[0]):
+        d2 = segment_distance2(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3])
+        if d2 <= own * own:
+            meets |= WALLS
+            break
+    if grid[0].size > 0 and map_bound(bodies[n, me], grid) <= own - bodies[n, me, 5]:
+        meets |= MAP
+    return meets
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def contact(body, m, meets, near, bodies, walls, grid, outlines, spare):  # type: ignore[no-untyped-def]
+    """How deep a robot, put as `body` (7,), is in anything, as a clearance; 0 where it is free.
+
+    Args:
+        body: the robot.
+        m, meets, near: see `find_near`.
+        bodies: (K + M, 7) of its world.
+        walls: (W, 4).
+        grid, spare: see `collision_kernels`.
+        outlines: corners and where each outline begins.
+
+    Returns:
+        The clearance, at most 0 [m], and the body that it is deepest in, or -1.
+    """
+    corners, corner = outlines
+    least, whom = 0.0, -1
+    if meets & BODIES:
+        me = bodies.shape[0] - near.shape[0] + m
+        listed = near[m, 0] <= SEVERAL
+        for i in range(near[m, 0] if listed else bodies.shape[0]):
+            k = near[m, 1 + i] if listed else i
+            if k == me or bodies[k, 5] <= 0.0:
+                continue
+            gap = body_gap(body, bodies[k], corners, corner, 0.0, spare)
+            if gap < least:
+                least, whom = gap, k
+    if meets & WALLS:
+        for w in range(walls.shape[0]):
+            gap = wall_gap(body, walls[w], corners, corner, 0.0, spare)
+            if gap < least:
+                least, whom = gap, -1
+    if meets & MAP:
+        gap = map_gap(body, grid, corners, corner, 0.0, spare)
+        if gap < least:
+            least, whom = gap, -1
+    return least, whom
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def move_obstacles(bodies, start, velocity, n, time):  # type: ignore[no-untyped-def]
+    """Puts the obstacles of world n to where they are `time` after the start of the period.
+
+    Args:
+        bodies: (N, K + M, 7), in place.
+        start: (K, 3) poses at the start of the period.
+        velocity: (N, K, 3) [m/s, m/s, rad/s] in `map`.
+        n: which world.
+        time: [s].
+    """
+    for k in range(velocity.shape[1]):
+        bodies[n, k, 0] = start[k, 0] + velocity[n, k, 0] * time
+        bodies[n, k, 1] = start[k, 1] + velocity[n, k, 1] * time
+        if velocity[n, k, 2] != 0.0:
+            heading = wrap(start[k, 2] + velocity[n, k, 2] * time)
+            bodies[n, k, 2] = heading
+            bodies[n, k, 3], bodies[n, k, 4] = math.cos(heading), math.sin(heading)

@@ -1,0 +1,295 @@
+"""Each robot by its own parameters: kinematics, latencies, noise, skew; and moving obstacles."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from robots import FOOTPRINT, RADIUS, direct_model, field, lidar
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.lidar.maps_grid import GridMap
+from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.sim import worlds as sizes
+from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world import World
+
+ORIGIN = np.zeros((1, 1, 3))
+SUBSTEPS, PERIOD = 10, 0.1
+
+
+def random_commands(worlds, steps, robots=1, seed=0):
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, (steps, worlds, robots, 3))
+
+
+def test_robots_side_by_side_keep_latencies_of_their_own():
+    latencies = [0, 1, 3, 9, 10, 11, 25, 40]
+    mixed = FastSimulator(direct_model(), field(), len(latencies), longest_delay=40)
+    mixed.data.delay[:, 0] = latencies
+    commands = random_commands(len(latencies), 12)
+    mixed.reset(range(len(latencies)))
+    alone = [FastSimulator(direct_model(0.01 * latency), field()) for latency in latencies]
+    for n, simulator in enumerate(alone):
+        simulator.reset([n])
+    for command in commands:
+        mixed.step(command)
+        for n, simulator in enumerate(alone):
+            simulator.step(command[n : n + 1])
+            for name in ("pose", "state", "twist", "ranges", "collided"):
+                assert np.array_equal(
+                    getattr(mixed.data, name)[n], getattr(simulator.data, name)[0]
+                ), (n, name)
+
+
+def test_a_robot_near_a_wall_keeps_its_latency_as_one_in_the_open():
+    near, far = (FastSimulator(direct_model(), field(size), 3, longest_delay=15) for size in (2, 9))
+    for simulator in (near, far):
+        simulator.data.delay[:, 0] = [0, 4, 13]
+        simulator.reset(range(3), starts=np.zeros((3, 1, 3)))
+    # Slow enough never to touch, near enough to look after each substep.
+    for command in random_commands(3, 12) * [0.3, 0.3, 2.0]:
+        near.step(command)
+        far.step(command)
+        assert np.array_equal(near.data.pose, far.data.pose)
+
+
+def test_a_coefficient_of_its_own_changes_how_a_robot_moves():
+    simulator = FastSimulator(direct_model(), field(20.0), 3)
+    simulator.data.coefficient[1] *= 1.5
+    starts = np.zeros((3, 1, 3))
+    for _ in range(2):  # a reset keeps it
+        simulator.reset(range(3), starts=starts)
+        for _ in range(5):
+            simulator.step(np.tile([1.0, 0.0, 0.0], (3, 1, 1)))
+        assert simulator.data.pose[:, 0, 0] == pytest.approx([0.5, 0.75, 0.5])
+
+
+def test_each_robot_drifts_by_its_own_noise():
+    simulator = FastSimulator(direct_model(), field(40.0), 400)
+    simulator.data.noise[:200, 0, 2:5] = 0.0, 0.05, 0.0
+    simulator.data.noise[200:, 0, 0] = 0.2
+    simulator.reset(range(400), starts=np.zeros((400, 1, 3)))
+    for _ in range(10):
+        simulator.step(np.zeros((400, 1, 3)))
+    data = simulator.data
+    assert data.pose[:200, 0, 1].std() == pytest.approx(0.05, rel=0.2)
+    assert not data.pose[200:].any()
+    assert data.twist[200:, 0, :2].std() == pytest.approx(0.2, rel=0.15)
+    assert not data.twist[:200].any()
+
+
+@pytest.mark.parametrize("age", [1, 5, 10, 17, 30])
+def test_what_a_robot_is_told_is_of_its_age(age):
+    model = direct_model(sensor=lidar(noise_std=0.0))
+    late = FastSimulator(model, field(4.0, 4), 1, 2, longest_age=30)
+    now = FastSimulator(model, field(4.0, 4), 1, 2)
+    late.data.age[:] = age
+    for simulator in (late, now):
+        simulator.reset([3])
+    poses, twists = [now.data.pose[0].copy()], [np.zeros((2, 3))]
+    command = np.array([[[0.5, 0.1, 0.4], [0.2, -0.3, -0.7]]])
+    for step in range(1, 8):
+        late.step(command)
+        now.step(command)
+        poses.append(now.data.pose[0].copy())
+        twists.append(now.data.twist[0].copy())
+        told = max(step - age / SUBSTEPS, 0.0)
+        low = int(told)
+        high = min(low + 1, step)
+        for m in range(2):
+            a, b = poses[low][m], poses[high][m]
+            expected = a + (told - low) * np.array([*(b - a)[:2], geometry.wrap_angle(b[2] - a[2])])
+            off = late.data.odom[0, m] - expected
+            assert np.abs([*off[:2], geometry.wrap_angle(off[2])]).max() < 1e-9
+            speed = twists[low][m] + (told - low) * (twists[high][m] - twists[low][m])
+            assert late.data.twist[0, m] == pytest.approx(speed)
+        bodies = now.data.bodies.copy()
+        for m in range(2):
+            a, b = poses[low][m], poses[high][m]
+            turn = geometry.wrap_angle(b[2] - a[2])
+            bodies[0, 4 + m, :3] = a + (told - low) * np.array([*(b - a)[:2], turn])
+        for m in range(2):
+            others = bodies.copy()
+            others[0, 4 + m, 5] = 0.0
+            seen = now._scanner.scan(bodies[0, 4 + m, :3], others, now.world.all_walls())[0]
+            both = np.isfinite(seen) & np.isfinite(late.data.ranges[0, m])
+            assert both.sum() > 20
+            off = np.abs(late.data.ranges[0, m][both] - seen[both])
+            assert np.quantile(off, 0.9) < 1e-4
+    assert np.array_equal(late.data.pose, now.data.pose)
+
+
+def test_what_is_older_than_the_episode_is_of_its_beginning():
+    simulator = FastSimulator(direct_model(), field(4.0), longest_age=30)
+    simulator.data.age[:] = 30
+    for _ in range(2):
+        simulator.reset([0], starts=ORIGIN)
+        first = simulator.data.ranges.copy()
+        for _ in range(3):
+            simulator.step([[[0.5, 0.0, 0.0]]])
+            assert not simulator.data.odom.any()
+            assert np.array_equal(simulator.data.ranges, first)
+        simulator.step([[[0.5, 0.0, 0.0]]])
+        assert simulator.data.odom[0, 0, 0] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("direction", [-1.0, 1.0])
+def test_the_scan_of_a_single_robot_may_be_skewed(direction):
+    skew = "counter_clockwise" if direction > 0.0 else "clockwise"
+    plain = FastSimulator(direct_model(sensor=lidar(beams=180)), field(4.0, 3), 2)
+    whole = FastSimulator(
+        direct_model(sensor=lidar(beams=180, faults={"skew": skew})), field(4.0, 3), 2
+    )
+    plain.data.faults[1, 0, -1] = direction
+    for simulator in (plain, whole):
+        simulator.reset([1, 1])
+        for _ in range(3):
+            simulator.step(np.tile([0.4, 0.0, 1.5], (2, 1, 1)))
+    assert np.array_equal(plain.data.ranges[1], whole.data.ranges[1])
+    assert not np.array_equal(plain.data.ranges[0], plain.data.ranges[1])
+
+
+def still(simulator, steps):
+    for _ in range(steps):
+        simulator.step(np.zeros_like(simulator.data.pose))
+
+
+def one_obstacle(worlds=1, **changes):
+    """Worlds with an obstacle 1 m in front of a robot at the origin."""
+    simulator = FastSimulator(direct_model(), field(9.0, 1), worlds, **changes)
+    simulator.reset(range(worlds), starts=np.zeros((worlds, 1, 3)))
+    simulator.data.bodies[:, 0, :2] = 1.0, 0.0
+    return simulator
+
+
+def test_a_moving_obstacle_is_where_its_velocity_takes_it_near_and_far_from_a_robot():
+    simulator = one_obstacle(3)
+    simulator.data.bodies[1:, 0, :2] = [[3.0, 3.0], [-0.6, 0.0]]
+    before = simulator.data.bodies[:, 0, :3].copy()
+    simulator.data.velocity[:, 0] = [[0.1, -0.2, 0.5], [0.3, 0.3, -1.0], [-0.01, 0.5, 2.0]]
+    still(simulator, 7)
+    after = simulator.data.bodies[:, 0]
+    expected = before + 7 * PERIOD * simulator.data.velocity[:, 0]
+    assert after[:, :3] == pytest.approx(expected)
+    assert after[:, 3] == pytest.approx(np.cos(after[:, 2]))
+
+
+def test_an_obstacle_that_meets_a_robot_marks_it():
+    simulator = one_obstacle()
+    simulator.data.velocity[0, 0, 0] = -1.0
+    free = 1.0 - FOOTPRINT - RADIUS
+    for step in range(1, 10):
+        still(simulator, 1)
+        if abs(step * PERIOD - free) > 0.02:
+            assert simulator.data.collided[0, 0] == (step * PERIOD > free)
+    assert not simulator.data.pose.any()
+
+
+def test_an_obstacle_that_passes_within_a_period_is_found():
+    simulator = one_obstacle()
+    simulator.data.bodies[0, 0, :2] = 0.0, 1.0
+    simulator.data.velocity[0, 0, 1] = -20.0
+    still(simulator, 1)
+    assert simulator.data.collided[0, 0] == 1
+    assert simulator.data.bodies[0, 0, 1] == pytest.approx(-1.0)
+
+
+def test_a_late_scan_shows_a_moving_obstacle_where_it_was():
+    simulator = one_obstacle(longest_age=20)
+    simulator.data.velocity[0, 0, 0] = 0.4
+    simulator.data.age[:] = 15
+    still(simulator, 4)
+    ahead = simulator.data.ranges[0, 0, 36]
+    assert ahead == pytest.approx(1.0 + 0.4 * (0.4 - 0.15) - RADIUS, abs=2e-3)
+
+
+def box_model(corners):
+    """The direct robot with an outline."""
+    model = direct_model()
+    data = model.robot.model_dump(exclude={"footprint_radius"}) | {"footprint": corners}
+    return dataclasses.replace(model, robot=RobotSpec.model_validate(data))
+
+
+BOX = ((0.3, 0.1), (-0.3, 0.1), (-0.3, -0.1), (0.3, -0.1))
+
+
+def test_a_long_robot_passes_a_gap_lengthwise_and_not_across():
+    walls = [(0.6, 0.15, 0.6, 2.0), (0.6, -2.0, 0.6, -0.15)]
+    world = field(8.0, walls=walls)
+    simulator = FastSimulator(box_model(BOX), world, 2)
+    simulator.reset([0, 0], starts=np.array([[[0.0, 0.0, 0.0]], [[0.0, 0.0, np.pi / 2.0]]]))
+    for _ in range(15):
+        simulator.step([[[1.0, 0.0, 0.0]], [[0.0, -1.0, 0.0]]])
+    assert simulator.data.pose[0, 0, 0] == pytest.approx(1.5)
+    assert simulator.data.collided[:, 0].tolist() == [0, 1]
+    assert 0.5 <= simulator.data.pose[1, 0, 0] <= 0.5101
+
+
+def test_a_long_robot_that_turns_touches_what_it_turns_into():
+    simulator = FastSimulator(box_model(BOX), field(8.0, walls=[(-2.0, 0.2, 2.0, 0.2)]))
+    simulator.reset([0], starts=ORIGIN)
+    for _ in range(10):
+        simulator.step([[[0.0, 0.0, 1.0]]])
+    assert simulator.data.collided[0, 0] == 1
+    # Its corner stands at 0.2 where 0.3 sin a + 0.1 cos a = 0.2.
+    assert 0.363 <= simulator.data.pose[0, 0, 2] <= 0.3731
+
+
+def test_two_long_robots_touch_by_their_outlines():
+    simulator = FastSimulator(box_model(BOX), field(8.0), 1, 2)
+    simulator.reset([0], starts=np.array([[[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]]]))
+    assert simulator.data.ranges[0, 0, 54] == pytest.approx(0.4, abs=1e-3)
+    for _ in range(5):
+        simulator.step([[[0.0, 0.5, 0.0], [0.0, 0.0, 0.0]]])
+    assert simulator.data.pose[0, 0, 1] == pytest.approx(0.25)
+    assert not simulator.data.collided.any()
+    for _ in range(5):
+        simulator.step([[[0.0, 0.5, 0.0], [0.0, 0.0, 0.0]]])
+    assert 0.3 <= simulator.data.pose[0, 0, 1] <= 0.3051
+    assert simulator.data.collided.all()
+
+
+class MappedWorld(World):
+    """A field with one solid square of 1 m, from (1, -0.5) on."""
+
+    @property
+    def grid(self) -> GridMap:
+        cells = np.zeros((10, 10), np.int8)
+        cells[3:5, 4:6] = 100
+        return GridMap(cells, 0.5, (-1.0, -2.0, 0.0))
+
+
+@pytest.mark.parametrize("model", [direct_model(), box_model(BOX)])
+def test_a_robot_sees_and_touches_the_static_map(model):
+    world = MappedWorld.model_validate(field(8.0).model_dump())
+    simulator = FastSimulator(model, world)
+    simulator.reset([0], starts=ORIGIN)
+    assert simulator.data.ranges[0, 0, 36] == pytest.approx(1.0, abs=1e-4)
+    for _ in range(15):
+        simulator.step([[[1.0, 0.0, 0.0]]])
+    front = FOOTPRINT if model.robot.footprint is None else 0.3
+    assert 1.0 - front <= simulator.data.pose[0, 0, 0] <= 1.0 - front + 0.0101
+    assert simulator.data.collided[0, 0] == 1
+    for _ in range(5):
+        simulator.step([[[-1.0, 0.0, 0.0]]])
+    assert simulator.data.pose[0, 0, 0] < 0.6 - front + 0.02
+
+
+def test_the_robots_of_a_crowd_see_what_a_scanner_sees_among_all_bodies(monkeypatch):
+    monkeypatch.setattr(sizes, "SCATTERED", 0)
+    data = builtin_model("differential").lidar.model_dump() | {"mount": (0.5, 0.2, 0.3)}
+    spec = LidarSpec.model_validate(data | {"beams": 72})
+    model = direct_model(sensor=spec)
+    crowd = FastSimulator(model, field(14.0, 20), 1, 70)
+    crowd.reset([1])
+    for command in random_commands(1, 5, 70):
+        crowd.step(command)
+    for m in (0, 33, 69):
+        others = crowd.data.bodies.copy()
+        others[0, 20 + m, 5] = 0.0
+        pose = crowd.data.pose[0, m]
+        seen = crowd._scanner.scan(pose, others, crowd.world.all_walls())[0]
+        assert np.array_equal(seen, crowd.data.ranges[0, m])
