@@ -15,8 +15,9 @@ from nics_drl_bridge.lidar.maps_grid import OCCUPIED, GridMap
 from nics_drl_bridge.sim import scene_kernels as kernels
 from nics_drl_bridge.sim.world import Goals, Starts, World
 
-CELL = 0.05
-"""Side of the cells of a field without a map [m]; a large one has larger cells."""
+CELL = 0.1
+"""Side of the cells of a field without a map [m]; a large one has larger, a small one smaller."""
+FEWEST_CELLS = 20
 MOST_CELLS = 4_000_000
 NO_MAP = (np.zeros((0, 0), np.float32), np.array([0.0, 0.0, 1.0, 0.0, 1.0]))
 
@@ -91,11 +92,14 @@ def _grid_of(world: World) -> tuple[NDArray[np.float32], NDArray[np.float64], An
         closed = np.pad(world.grid.cells, 1, constant_values=OCCUPIED)
         size = world.grid.resolution
         x, y = world.grid.cell_to_world([-1.5, -1.5])
-        whole = GridMap(closed, size, (x, y, world.grid.origin[2]), unknown_stops=True)
-        distance, frame = whole.distance_field, whole.arrays[1]
+        heading = world.grid.origin[2]
+        whole = GridMap(closed, size, (x, y, heading), unknown_stops=True)
+        distance = whole.distance_field
+        frame = np.array([x, y, math.cos(heading), math.sin(heading), size])
         return distance, frame, (distance, frame)
     x1, y1, x2, y2 = world.extent
-    size = max(CELL, math.sqrt((x2 - x1) * (y2 - y1) / MOST_CELLS))
+    size = min(CELL, min(x2 - x1, y2 - y1) / FEWEST_CELLS)
+    size = max(size, math.sqrt((x2 - x1) * (y2 - y1) / MOST_CELLS))
     shape = max(1, math.ceil((y2 - y1) / size)), max(1, math.ceil((x2 - x1) / size))
     frame = np.array([x1, y1, 1.0, 0.0, size])
     return np.full(shape, np.inf, np.float32), frame, NO_MAP

@@ -27,7 +27,7 @@ from nics_drl_bridge.sim.collision_kernels import body_gap, map_gap, wall_gap
 
 TRIES = 2000
 RESTARTS = 50
-DETOURS = 20
+DETOURS = 4
 """So many pairs of start and goal without a way between them, and the obstacles stand anew."""
 MARGIN = 1e-9
 """Obstacles keep this from walls and from each other at least [m]."""
@@ -61,14 +61,14 @@ def wall_distances(distance, frame, walls):  # type: ignore[no-untyped-def]
             distance[i, j] = min(distance[i, j], wall_distance(x, y, walls))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def place_in(row, column, frame):  # type: ignore[no-untyped-def]
     """x, y [m] of a place in the grid, in parts of cells."""
     u, v = column * frame[4], row * frame[4]
     return frame[0] + frame[2] * u - frame[3] * v, frame[1] + frame[3] * u + frame[2] * v
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def cell_of(x, y, frame):  # type: ignore[no-untyped-def]
     """Row and column of a point, and how far it is from the centre of that cell [m]."""
     dx, dy = x - frame[0], y - frame[1]
@@ -78,7 +78,7 @@ def cell_of(x, y, frame):  # type: ignore[no-untyped-def]
     return i, j, frame[4] * math.sqrt((u - j - 0.5) ** 2 + (v - i - 0.5) ** 2)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _within(x, y, static):  # type: ignore[no-untyped-def]
     """Whether a point lies in the field and in the grid; its distance to walls, less, and more."""
     distance, _, frame, bounds, _, _ = static
@@ -91,7 +91,7 @@ def _within(x, y, static):  # type: ignore[no-untyped-def]
     return True, middle * (1.0 - FLOAT32) - off, middle * (1.0 + FLOAT32) + off
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def clear_of_walls(body, room, static, outlines, spare):  # type: ignore[no-untyped-def]
     """Whether a body (7,) lies in the field and keeps `room` [m] to walls and map."""
     corners, corner, _ = outlines
@@ -113,7 +113,7 @@ def clear_of_walls(body, room, static, outlines, spare):  # type: ignore[no-unty
     return map_gap(body, static[5], corners, corner, room, spare) >= room
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def clear_of_bodies(body, room, bodies, gaps, outlines, spare):  # type: ignore[no-untyped-def]
     """Whether a body (7,) keeps `room` [m], or its gap if that is more, to each of (K, 7)."""
     corners, corner, _ = outlines
@@ -133,12 +133,12 @@ def clear_of_bodies(body, room, bodies, gaps, outlines, spare):  # type: ignore[
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _uniform(seed, counter):  # type: ignore[no-untyped-def]
     return random.uniform(seed, random.SCENE_STREAM, counter)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _point(seed, counter, cells, static):  # type: ignore[no-untyped-def]
     """A point in one of the cells, which are numbered along the rows; takes 3 counters."""
     distance, frame = static[0], static[2]
@@ -147,14 +147,14 @@ def _point(seed, counter, cells, static):  # type: ignore[no-untyped-def]
     return place_in(i + _uniform(seed, counter + 1), j + _uniform(seed, counter + 2), frame)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _put(body, x, y, heading, shape, outlines):  # type: ignore[no-untyped-def]
     body[0], body[1], body[2] = x, y, heading
     body[3], body[4] = math.cos(heading), math.sin(heading)
     body[5], body[6] = outlines[2][shape], shape
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _choose(seed, counter, wanted, size, plan, bodies, active):  # type: ignore[no-untyped-def]
     """Which obstacles there are, marked in `active` (K,), and the shape of each."""
     groups, slot, base, index, _ = plan
@@ -178,14 +178,14 @@ def _choose(seed, counter, wanted, size, plan, bodies, active):  # type: ignore[
             taken = base[first + int(_uniform(seed, counter) * shapes)]
             counter += 1
             active[k] = number < count
-            bodies[k, :] = 0.0
-            bodies[k, 3] = 1.0
+            for i in range(6):
+                bodies[k, i] = 1.0 if i == 3 else 0.0
             bodies[k, 6] = index[size, taken]
             k += 1
     return counter
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _place_obstacles(  # type: ignore[no-untyped-def]
     seed, counter, plan, static, cells, outlines, bodies, active, gaps, trial, spare
 ):
@@ -211,7 +211,7 @@ def _place_obstacles(  # type: ignore[no-untyped-def]
             if clear_of_bodies(trial, gaps[k], bodies, gaps, outlines, spare) and clear_of_walls(
                 trial, MARGIN, static, outlines, spare
             ):
-                bodies[k] = trial
+                _put(bodies[k], x, y, heading, shape, outlines)
                 placed = True
                 break
         if not placed:
@@ -219,7 +219,7 @@ def _place_obstacles(  # type: ignore[no-untyped-def]
     return counter, True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _spot(seed, counter, places, cells, static):  # type: ignore[no-untyped-def]
     """x, y, heading of a start or goal; takes 4 counters.
 
@@ -242,7 +242,7 @@ def _spot(seed, counter, places, cells, static):  # type: ignore[no-untyped-def]
     return x, y, places[p, 4] + turn * (places[p, 5] - places[p, 4])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _area(x, y, static):  # type: ignore[no-untyped-def]
     """The number of the area that a point lies in; 0 for none."""
     i, j, _ = cell_of(x, y, static[2])
@@ -252,7 +252,7 @@ def _area(x, y, static):  # type: ignore[no-untyped-def]
     return 0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _free(disc, x, y, rules, static, bodies, none, outlines, spare):  # type: ignore[no-untyped-def]
     """Whether a robot and the clearance around it have room at a point."""
     disc[0], disc[1] = x, y
@@ -261,56 +261,63 @@ def _free(disc, x, y, rules, static, bodies, none, outlines, spare):  # type: ig
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def joined(x, y, gx, gy, disc, room, still, static, bodies, none, outlines, search, spare):  # type: ignore[no-untyped-def]
     """Whether a disc can move from one point to another among obstacles, from cell to cell.
 
-    It looks in the direction of the goal first. The cells of both points count as free.
+    It looks from both ends, in the direction of the other first: where there is no way, one of them
+    is often shut in and soon done. The cells of both points count as free.
 
     Args:
         x, y, gx, gy: the points [m], in one area.
         disc: (7,) the robot, moved about.
         room: free space around it in the centre of a cell [m].
         still: (K,) 1 for the obstacles that count.
-        search: when each cell was seen last (rows * columns), a stack of as many, the number of
-            the latest search (1,).
+        search: in which search each cell was seen last (rows * columns), two stacks of as many,
+            the number of the latest search (1,).
     """
     label, frame = static[1], static[2]
     seen, stack, latest = search
-    columns = label.shape[1]
+    rows, columns = label.shape
     i, j, _ = cell_of(x, y, frame)
     gi, gj, _ = cell_of(gx, gy, frame)
-    area, goal = label[i, j], gi * columns + gj
-    latest[0] += 1
-    seen[i * columns + j] = latest[0]
-    stack[0], height = i * columns + j, 1
+    area, start, goal = label[i, j], i * columns + j, gi * columns + gj
+    if start == goal:
+        return True
+    latest[0] += 2
+    stack[0, 0], stack[1, 0] = start, goal
+    seen[start], seen[goal] = latest[0], latest[0] + 1
+    height, other = 1, 1  # of the stack of this side, and of that of the other one
+    side = 0
     while height > 0:
         height -= 1
-        cell = stack[height]
-        if cell == goal:
-            return True
+        cell = stack[side, height]
         i, j = cell // columns, cell % columns
-        up, right = (1 if gi >= i else -1), (1 if gj >= j else -1)
-        steep = abs(gi - i) >= abs(gj - j)
+        ti, tj = (gi, gj) if side == 0 else (start // columns, start % columns)
+        up, right = (1 if ti >= i else -1), (1 if tj >= j else -1)
+        steep = abs(ti - i) >= abs(tj - j)
         for way in range(4):  # the last one is looked at first
             toward = 1 if way > 1 else -1
             along = (way == 0 or way == 3) == steep
             row = i + (toward * up if along else 0)
             column = j + (0 if along else toward * right)
-            if not (0 <= row < label.shape[0] and 0 <= column < columns):
+            if not (0 <= row < rows and 0 <= column < columns):
                 continue
             new = row * columns + column
-            if label[row, column] != area or seen[new] == latest[0]:
+            if seen[new] == latest[0] + 1 - side:
+                return True
+            if label[row, column] != area or seen[new] == latest[0] + side:
                 continue
-            seen[new] = latest[0]
             disc[0], disc[1] = place_in(row + 0.5, column + 0.5, frame)
-            if new == goal or clear_of_still(disc, room, still, bodies, outlines, spare):
-                stack[height] = new
+            if clear_of_still(disc, room, still, bodies, outlines, spare):
+                seen[new] = latest[0] + side
+                stack[side, height] = new
                 height += 1
+        height, other, side = other, height, 1 - side
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def clear_of_still(disc, room, still, bodies, outlines, spare):  # type: ignore[no-untyped-def]
     """Whether a disc (7,) keeps `room` [m] to those of the bodies that count."""
     corners, corner, _ = outlines
@@ -327,7 +334,7 @@ def clear_of_still(disc, room, still, bodies, outlines, spare):  # type: ignore[
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _apart(x, y, others, m, least):  # type: ignore[no-untyped-def]
     """Whether a point is farther than `least` [m] from the first m of others (M, 2 or more)."""
     for other in range(m):
@@ -337,7 +344,7 @@ def _apart(x, y, others, m, least):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _place_robots(  # type: ignore[no-untyped-def]
     seed, counter, rules, where, still, static, outlines, bodies, none, starts, goals, disc,
     search, spare,

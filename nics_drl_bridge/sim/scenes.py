@@ -159,7 +159,7 @@ class SceneSampler:
     def _new_search(self) -> Search:
         """Scratch of one thread."""
         cells = self._static[1].size
-        return np.zeros(cells, np.int64), np.zeros(cells, np.int64), np.zeros(1, np.int64)
+        return np.zeros(cells, np.int64), np.zeros((2, cells), np.int64), np.zeros(1, np.int64)
 
     def _no_room(self, seed: int, why: int) -> str:
         world = self.world
