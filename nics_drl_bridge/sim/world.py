@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.files import sha256
@@ -40,6 +40,14 @@ class Obstacles(Schema):
     at: tuple[Pose, ...] = ()
     motion: Motion | None = None
 
+    @field_validator("count", mode="before")
+    @classmethod
+    def _numbers(cls, count: object) -> object:
+        several = count if isinstance(count, list | tuple) else (count, count)
+        if count is not None and not (len(several) == 2 and all(type(n) is int for n in several)):
+            raise ValueError("count must be a whole number, or [least, greatest]")
+        return count
+
     @model_validator(mode="after")
     def _consistent(self) -> Obstacles:
         if (self.count is None) == (not self.at):
@@ -47,7 +55,7 @@ class Obstacles(Schema):
         least, greatest = self.counts
         if not 0 <= least <= greatest <= MOST_OBSTACLES:
             raise ValueError(
-                f"count must be a number, or [least, greatest], from 0 to {MOST_OBSTACLES}"
+                f"count must be a whole number, or [least, greatest], from 0 to {MOST_OBSTACLES}"
             )
         return self
 
