@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from robots import direct_model, field
+from robots import circles, direct_model, field
 
 from nics_drl_bridge import generator
 from nics_drl_bridge.calibration.calibration import Calibration

@@ -95,9 +95,7 @@ def _patch(world: World, body: NDArray[np.float64]) -> Patch:
     return Outline(corners, closed=len(corners) > 2, facecolor=STANDING, edgecolor=STANDING, lw=2)
 
 
-def _panel(
-    axes: Axes, episodes: Mapping[str, Episode], world: World, footprint: float
-) -> None:
+def _panel(axes: Axes, episodes: Mapping[str, Episode], world: World, footprint: float) -> None:
     first = next(iter(episodes.values()))
     draw_world(axes, world, first.bodies)
     axes.add_patch(Circle(tuple(first.goal), 0.3, color="#f2c14e", alpha=0.7, label="goal"))

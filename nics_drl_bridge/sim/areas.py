@@ -156,5 +156,3 @@ def _nowhere(world: World, key: str, value: tuple[float, ...]) -> str:
         f"{world.source}: key {key!r}: a robot with {world.clearance:g} m around it does not fit "
         f"there, at {list(value)}; move it, or lower `clearance`."
     )
-
-

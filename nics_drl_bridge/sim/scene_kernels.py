@@ -74,7 +74,7 @@ def cell_of(x, y, frame):  # type: ignore[no-untyped-def]
     dx, dy = x - frame[0], y - frame[1]
     u = (frame[2] * dx + frame[3] * dy) / frame[4]
     v = (frame[2] * dy - frame[3] * dx) / frame[4]
-    i, j = int(math.floor(v)), int(math.floor(u))
+    i, j = math.floor(v), math.floor(u)
     return i, j, frame[4] * math.sqrt((u - j - 0.5) ** 2 + (v - i - 0.5) ** 2)
 
 
@@ -157,7 +157,7 @@ def _put(body, x, y, heading, shape, outlines):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _choose(seed, counter, wanted, size, plan, bodies, active):  # type: ignore[no-untyped-def]
     """Which obstacles there are, marked in `active` (K,), and the shape of each."""
-    groups, slot, base, index, _ = plan
+    groups, _, base, index, _ = plan
     total, before, k = 0, 0, 0
     for g in range(groups.shape[0]):
         if groups[g, FIXED] == 0.0:
@@ -435,9 +435,7 @@ def draw_scenes(  # type: ignore[no-untyped-def]
         still[k] = plan[0][plan[1][k], MOVING] == 0.0
     for n in range(seeds.shape[0]):
         state = NO_OBSTACLES
-        counter = _choose(
-            seeds[n], 0, wanted[n], sizes[n], plan, bodies[n], active
-        )
+        counter = _choose(seeds[n], 0, wanted[n], sizes[n], plan, bodies[n], active)
         for _ in range(RESTARTS):
             counter, placed = _place_obstacles(
                 seeds[n], counter, plan, static, where[3], outlines, bodies[n], active, gaps,

@@ -256,5 +256,3 @@ def _plan(world: World, slots: Sequence[int], sizes: int) -> tuple[Any, ...]:
     index = np.arange(sizes * len(world.shapes)).reshape(sizes, -1)
     slot, taken = np.array(slots, dtype=np.int64), np.array(base, dtype=np.int64)
     return groups, slot, taken, index, poses
-
-

@@ -180,7 +180,7 @@ class FastSimulator:
     def _place(
         self, chosen: NDArray[np.int64], seeds: NDArray[np.int64], scenes: Scenes, starts: Array
     ) -> None:
-        data, robots = self.data, self.data.pose.shape[1]
+        data = self.data
         data.pose[chosen], data.odom[chosen] = starts, starts
         for zeroed in (data.state, data.history, data.twist, data.collided, data.steps):
             zeroed[chosen] = 0

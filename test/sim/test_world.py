@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import shapely
-from robots import FOOTPRINT, circles, field
+from robots import circles, field
 
 from nics_drl_bridge.config import share_folder, validate
 from nics_drl_bridge.errors import ConfigError
