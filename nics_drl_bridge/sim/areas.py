@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.maps_grid import OCCUPIED, GridMap
-from nics_drl_bridge.sim import scene_kernels as kernels
+from nics_drl_bridge.sim import space_kernels as kernels
 from nics_drl_bridge.sim.world import Goals, Starts, World
 
 CELL = 0.1
@@ -27,7 +27,7 @@ class Areas:
     """The free space of a world for one size of robot.
 
     Attributes:
-        static: what stands in every scene, see `scene_kernels`.
+        static: what stands in every scene, see `space_kernels`.
         room: free space that the centre of a cell needs, so that a disc of footprint and
             clearance can move between the centres of neighbouring cells [m].
         for_robots: (C,) cells, numbered along the rows, where a robot may begin.
