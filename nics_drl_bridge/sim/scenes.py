@@ -146,7 +146,7 @@ class SceneSampler:
             np.zeros((n, self.robots, 3)),
             np.zeros((n, self.robots, 2)),
         )
-        search = self._searches.pop() if self._searches else self._new_search()
+        search = self._search()
         row, why = kernels.draw_scenes(
             numbers, wanted.astype(np.int64), sizes, self._plan, self._static, self._outlines,
             self._rules, self._where, scenes.bodies, scenes.starts, scenes.goals, search,
@@ -156,10 +156,15 @@ class SceneSampler:
             raise ConfigError(self._no_room(int(numbers[row]), why))
         return scenes
 
-    def _new_search(self) -> Search:
-        """Scratch of one thread."""
-        cells = self._static[1].size
-        return np.zeros(cells, np.int64), np.zeros((2, cells), np.int64), np.zeros(1, np.int64)
+    def _search(self) -> Search:
+        """Scratch for one call; threads may draw at the same time."""
+        try:
+            return self._searches.pop()
+        except IndexError:
+            cells = self._static[1].size
+            return (
+                np.zeros(cells, np.int64), np.zeros((2, cells), np.int64), np.zeros(1, np.int64),
+            )  # fmt: skip
 
     def _no_room(self, seed: int, why: int) -> str:
         world = self.world
