@@ -164,27 +164,36 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
 
 
 def _fields_at(schema: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """The field names of the model that lies at `location` inside `schema`."""
+    """The field names of the model that lies at `location` inside `schema`.
+
+    Where one of several models may stand, the location names the `kind` of the one that does.
+    """
     current: Any = schema
-    models: list[Any] = []
+    candidates: list[type[BaseModel]] = []
     for part in location:
-        if isinstance(part, int):
-            continue
         fields = getattr(current, "model_fields", {})
         if part in fields:
-            models = _inner_models(fields[part].annotation)
-            current = models[0] if models else None
-        else:  # which of several kinds
-            kinds = [m for m in models if "kind" in m.model_fields]
-            current = next((m for m in kinds if m.model_fields["kind"].default == part), current)
+            candidates = _inner_models(fields[part].annotation)
+            current = candidates[0] if candidates else None
+        else:
+            kinds = [c for c in candidates if _kind_of(c) == part]
+            current = kinds[0] if kinds else current
     return list(getattr(current, "model_fields", {}))
 
 
-def _inner_models(annotation: Any) -> list[Any]:
-    """The models that a type is made of."""
+def _kind_of(model: type[BaseModel]) -> Any:
+    kind = model.model_fields.get("kind")
+    return None if kind is None else kind.default
+
+
+def _inner_models(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [m for part in getattr(annotation, "__args__", ()) for m in _inner_models(part)]
+    return [
+        model
+        for argument in getattr(annotation, "__args__", ())
+        for model in _inner_models(argument)
+    ]
 
 
 def read_text(path: Path) -> str:

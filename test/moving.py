@@ -80,17 +80,17 @@ def watch(
     marks, velocity = np.zeros((1, count, MARK)), np.zeros((1, count, 3))
     walls = sides(half) if walls is None else np.concatenate([sides(half), walls])
     plans, seen = plan_arrays(motions), []
-    still = np.zeros((1, len(places) - count, 2))
+    still = np.zeros((len(places) - count, 2))
     kernels.begin(marks, 0, bodies, plans, half, seed)
     where, headings = [bodies[0, :, :2].copy()], [bodies[0, :count, 2].copy()]
     for t in range(steps):
-        speeds = still if robots is None else robots[t][None]
+        speeds = still if robots is None else robots[t]
         kernels.steer(
             velocity, marks, 0, bodies, count, speeds, plans, walls, half, seed, t, PERIOD,
             distances,
         )  # fmt: skip
         bodies[0, :count, :3] += velocity[0] * PERIOD
-        bodies[0, count:, :2] += speeds[0] * PERIOD
+        bodies[0, count:, :2] += speeds * PERIOD
         where.append(bodies[0, :, :2].copy())
         headings.append(bodies[0, :count, 2].copy())
         seen.append((velocity[0].copy(), marks[0].copy()))

@@ -13,7 +13,8 @@ from nics_drl_bridge.env.navigation import Navigation, Verdict
 from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend, RobotView, Start
-from nics_drl_bridge.sim.world import World, load_world, sample_scene
+from nics_drl_bridge.sim.scenes import sample_scene
+from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]
 
@@ -115,7 +116,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         start = np.asarray(options.get("start", scene.starts[0]), dtype=np.float64)
         self.goal = np.asarray(options.get("goal", scene.goals[0]), dtype=np.float64)
         self._view = self._backend.reset(Start(episode, start))
-        facts = {"episode_seed": episode, "start": start, "circles": scene.circles}
+        facts = {"episode_seed": episode, "start": start, "bodies": scene.bodies}
         return self.task.observe(self._view, self.goal), self._info(self._view, facts)
 
     def step(

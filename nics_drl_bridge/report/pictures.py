@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Patch
+from matplotlib.patches import Polygon as Outline
 from numpy.typing import NDArray
 
+from nics_drl_bridge.lidar.shapes import HEADING, RADIUS, SHAPE
 from nics_drl_bridge.policy.evaluation import Episode
+from nics_drl_bridge.sim.world import World
 
 LINES: tuple[dict[str, Any], ...] = (
     {"color": "#1f6fb2", "linewidth": 3.5, "alpha": 0.55},
@@ -20,16 +23,15 @@ LINES: tuple[dict[str, Any], ...] = (
     {"color": "#2f855a", "linewidth": 1.4, "linestyle": ":"},
 )
 LEAST_WIDTH = 5.5
+STANDING, WALL = "#8d99ae", "#333333"
 
 
-def trajectories(
-    runs: Mapping[str, Sequence[Episode]], walls: NDArray[np.float64], footprint: float
-) -> bytes:
+def trajectories(runs: Mapping[str, Sequence[Episode]], world: World, footprint: float) -> bytes:
     """One panel per episode, the paths of all runs in it (the paper's Fig. 7).
 
     Args:
         runs: name -> episodes, the same seeds in each.
-        walls: (W, 4) x1, y1, x2, y2 [m].
+        world: where they were driven.
         footprint: radius of the robot [m].
 
     Returns:
@@ -44,7 +46,7 @@ def trajectories(
     )
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, *episodes in zip(grid, *runs.values(), strict=False):
-        _panel(axes, dict(zip(names, episodes, strict=True)), walls, footprint)
+        _panel(axes, dict(zip(names, episodes, strict=True)), world, footprint)
     for axes in grid[count:]:
         axes.set_axis_off()
     handles, labels = grid[0].get_legend_handles_labels()
@@ -52,14 +54,50 @@ def trajectories(
     return _png(figure)
 
 
-def _panel(
-    axes: Axes, episodes: Mapping[str, Episode], walls: NDArray[np.float64], footprint: float
-) -> None:
+def draw_world(axes: Axes, world: World, bodies: NDArray[np.float64]) -> None:
+    """Draws map, walls and obstacles.
+
+    Args:
+        axes: to draw into; x and y in `map` [m].
+        world: map, walls and shapes.
+        bodies: (K, 7) see `sim.scenes.Scene`.
+    """
+    if world.grid is not None:
+        _draw_map(axes, world)
+    for x1, y1, x2, y2 in world.all_walls():
+        axes.plot([x1, x2], [y1, y2], color=WALL, linewidth=2)
+    for body in bodies:
+        if body[RADIUS] > 0.0:
+            axes.add_patch(_patch(world, body))
+
+
+def _draw_map(axes: Axes, world: World) -> None:
+    """Solid cells dark, unknown ones grey."""
+    grid = world.grid
+    if grid is None:
+        return
+    rows, columns = grid.cells.shape
+    i, j = np.indices((rows + 1, columns + 1)) - 0.5
+    corners = grid.cell_to_world(np.stack([i, j], axis=-1))
+    shade = np.where(grid.free, 1.0, np.where(grid.blocked, 0.2, 0.8))
+    axes.pcolormesh(
+        corners[..., 0], corners[..., 1], shade, cmap="gray", vmin=0.0, vmax=1.0, rasterized=True
+    )
+
+
+def _patch(world: World, body: NDArray[np.float64]) -> Patch:
+    shape = world.shapes[int(body[SHAPE]) % len(world.shapes)]
+    if not len(shape.outline):
+        return Circle((body[0], body[1]), body[RADIUS], color=STANDING)
+    outline = shape.outline * (body[RADIUS] / shape.radius)
+    c, s = np.cos(body[HEADING]), np.sin(body[HEADING])
+    corners = outline @ np.array([[c, s], [-s, c]]) + body[:2]
+    return Outline(corners, closed=len(corners) > 2, facecolor=STANDING, edgecolor=STANDING, lw=2)
+
+
+def _panel(axes: Axes, episodes: Mapping[str, Episode], world: World, footprint: float) -> None:
     first = next(iter(episodes.values()))
-    for x1, y1, x2, y2 in walls:
-        axes.plot([x1, x2], [y1, y2], color="#333333", linewidth=2)
-    for x, y, radius in first.circles:
-        axes.add_patch(Circle((x, y), radius, color="#8d99ae"))
+    draw_world(axes, world, first.bodies)
     axes.add_patch(Circle(tuple(first.goal), 0.3, color="#f2c14e", alpha=0.7, label="goal"))
     axes.add_patch(
         Circle(tuple(first.path[0, :2]), footprint, fill=False, color="#333333", label="start")

@@ -18,6 +18,7 @@ from numba.experimental import structref
 from nics_drl_bridge.kinematics.kernels import delayed, move, rates, run, wrap
 from nics_drl_bridge.sim import cell_kernels as crowd
 from nics_drl_bridge.sim import contact_kernels as contacts
+from nics_drl_bridge.sim import motion_kernels as obstacles
 from nics_drl_bridge.sim import sensing_kernels as sensing
 
 
@@ -168,11 +169,11 @@ def move_world(  # type: ignore[no-untyped-def]
         skip: the lane of its first robot.
         crowded: whether its bodies are to be sorted into cells.
         cells, found: see `cell_kernels`.
-        robot: near (M, 1 + SEVERAL), meets (M,), way (M,), reach (K + M,): scratch.
+        robot: near (M, 1 + SEVERAL), meets (M,), way (M,), reach (K + M,), and one more: scratch.
         pose and others: see the functions above.
     """
     where, x = lanes[0], lanes[1]
-    near, meets, way, reach = robot
+    near, meets, way, reach, _ = robot
     start = room[4]
     dt, substeps = motion[4]
     robots, size, first = pose.shape[1], state.shape[2], velocity.shape[1]
@@ -253,20 +254,24 @@ def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[n
     """See `step_worlds`; no counting of references, which took longer than the step."""
     (
         pose, state, history, bodies, odom, twist, ranges, collided, steps, seeds, faults,
-        coefficient, delay, age, noise, velocity, past,
+        coefficient, delay, age, noise, velocity, past, marks,
     ) = fields  # fmt: skip
-    walls, grid, outlines, crowded, scattered = scene
+    walls, grid, outlines, crowded, scattered, movers = scene
     lanes, single, robot, crowding, sensors = room
     cells, found = crowding
     dof, factors, count, series, (dt, substeps) = motion
     x, dq, before = single[0], single[1], sensors[0]
     robots, first, end = pose.shape[1], velocity.shape[1], begin + commands.shape[0]
-    # Moving obstacles are steered here, before the period: `velocity` of the worlds [begin, end).
     _send(history, commands, begin)
     block = lanes[0].shape[1] // robots
     for low in range(begin, end, block):
         high = min(low + block, end)
         for n in range(low, high):
+            if movers[0]:
+                _steer(
+                    n, velocity, marks, bodies, pose, past, steps[n], walls, movers, seeds[n],
+                    dt * substeps, robot[4],
+                )  # fmt: skip
             for m in range(robots):
                 i = (n - low) * robots + m
                 before[i, 0], before[i, 1], before[i, 2] = (
@@ -315,16 +320,47 @@ def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[n
 
 
 @njit(cache=True, nogil=True)
-def look(packed, chosen):  # type: ignore[no-untyped-def]
-    """Scans of the worlds `chosen` (n,) as they stand; see `step_worlds`."""
+def _steer(n, velocity, marks, bodies, pose, past, step, walls, movers, seed, period, speeds):  # type: ignore[no-untyped-def]  # noqa: E501
+    """Sets the velocities of the obstacles of world n for the period that begins.
+
+    Args:
+        movers: see `worlds.arguments`.
+        speeds: (M, 2) scratch.
+        velocity and others: the fields of `worlds.Worlds`.
+    """
+    _, plans, half, distances = movers
+    row = step % past.shape[2]
+    for m in range(pose.shape[1]):
+        vx = vy = 0.0
+        if step > 0:
+            vx, vy = past[n, m, row, sensing.TWIST], past[n, m, row, sensing.TWIST + 1]
+        c, s = math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2])
+        speeds[m, 0], speeds[m, 1] = c * vx - s * vy, s * vx + c * vy
+    obstacles.steer(
+        velocity, marks, n, bodies, velocity.shape[1], speeds, plans, walls, half, seed, step,
+        period, distances,
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def begin(packed, chosen):  # type: ignore[no-untyped-def]
+    """Begins episodes in the worlds `chosen` (n,), whose robots and obstacles are in place.
+
+    Their moving obstacles draw what they need, and the robots take their first scans.
+    """
     fields, scene, view, motion, room = packed.content
+    bodies, seeds, marks = fields[3], fields[9], fields[17]
+    moves, plans, half, _ = scene[5]
+    if moves:
+        for n in chosen:
+            obstacles.begin(marks, n, bodies, plans, half, seeds[n])
     _look(fields, scene, view, motion, room, chosen)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def _look(fields, scene, view, motion, room, chosen):  # type: ignore[no-untyped-def]
     (
-        pose, _, _, bodies, _, _, ranges, _, steps, seeds, faults, _, _, age, _, velocity, past,
+        pose, _, _, bodies, _, _, ranges, _, steps, seeds, faults, _, _, age, _, velocity, past, _,
     ) = fields  # fmt: skip
     walls, sensors, (dt, substeps) = scene[0], room[4], motion[4]
     for n in chosen:

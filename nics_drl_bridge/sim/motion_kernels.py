@@ -72,7 +72,7 @@ def steer(velocity, marks, n, bodies, first, speeds, plans, walls, half, seed, s
 
     Args:
         velocity: (N, K, 3) result [m/s, m/s, rad/s] in `map`; 0 of those that stand still.
-        speeds: (N, M, 2) velocity of the robots in `map` [m/s].
+        speeds: (M, 2) velocity of its robots in `map` [m/s].
         walls: (W, 4).
         half: (2,) half the size of the field [m].
         seed: of the episode.
@@ -88,7 +88,7 @@ def steer(velocity, marks, n, bodies, first, speeds, plans, walls, half, seed, s
         velocity[n, k, :] = 0.0
         if rows[k, at.KIND] == at.PEDESTRIAN and bodies[n, k, 5] > 0.0:
             velocity[n, k, 0], velocity[n, k, 1] = walk(
-                marks[n], k, scene, first, speeds[n], rows[k], seed, (draws + k) * DRAWS, step,
+                marks[n], k, scene, first, speeds, rows[k], seed, (draws + k) * DRAWS, step,
                 period,
             )  # fmt: skip
     for k in range(count):
@@ -101,7 +101,7 @@ def steer(velocity, marks, n, bodies, first, speeds, plans, walls, half, seed, s
         elif kind == at.PATROL:
             dx, dy = _follow(mark, bodies[n, k], rows[k], waypoints, period, False)
         wished_x, wished_y = dx, dy
-        dx, dy = restrain(dx, dy, k, scene, first, speeds[n], rows, period, kind != at.PATROL)
+        dx, dy = restrain(dx, dy, k, scene, first, speeds, rows, period, kind != at.PATROL)
         if kind == at.PATROL and dx == wished_x and dy == wished_y:
             _follow(mark, bodies[n, k], rows[k], waypoints, period, True)
         mark[at.VX], mark[at.VY] = dx / period, dy / period

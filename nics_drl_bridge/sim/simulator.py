@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -13,16 +13,20 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.lidar.baking import with_shapes
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
-from nics_drl_bridge.lidar.shapes import Circle
+from nics_drl_bridge.lidar.shapes import SHAPE, place
 from nics_drl_bridge.sim import kernels
+from nics_drl_bridge.sim.motion import distance_arrays, plan_arrays
+from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
+from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
 from nics_drl_bridge.sim.validity import CommandBox, OutsideValidityWarning
-from nics_drl_bridge.sim.world import Scene, World, sample_scene
+from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.worlds import SLICES, Sizes, Worlds, allocate, arguments, split
 from nics_drl_bridge.threads import Crew
 
 __all__ = ["SLICES", "FastSimulator", "OutsideValidityWarning", "Worlds"]
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 R = TypeVar("R")
 
 
@@ -38,14 +42,19 @@ class FastSimulator:
         robots: M in each world. They see and touch each other.
         renderer: `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`.
         threads: so many parts of the worlds are moved at the same time.
+        randomisation: what each episode draws anew, the name of a shipped one, or a YAML file.
         longest_delay: greatest latency of commands that `data.delay` may be given [substeps]; the
-            model's by default.
-        longest_age: greatest age of scan and odometry that `data.age` may be given [substeps].
+            model's by default, or what the randomisation may draw.
+        longest_age: greatest age of scan and odometry that `data.age` may be given [substeps];
+            by default 0, or what the randomisation may draw.
 
     Attributes:
         data: all that changes, see `Worlds`.
         goals: (N, M, 2) of the episodes [m].
         parts: the worlds that each thread moves.
+        sampler: draws the scenes.
+        drawn: name -> what the randomisation drew for the running episodes, (N, M) of each robot
+            or (N,) of a scene; empty without one.
     """
 
     def __init__(
@@ -56,36 +65,57 @@ class FastSimulator:
         robots: int = 1,
         renderer: Renderer = "auto",
         threads: int = 1,
+        randomisation: str | Randomisation | None = None,
         longest_delay: int | None = None,
-        longest_age: int = 0,
+        longest_age: int | None = None,
     ) -> None:
         if worlds < 1 or robots < 1:
             raise ConfigError(
                 f"a simulator needs at least 1 world and 1 robot, not {worlds} and {robots}."
             )
-        delay = model.timing[2] if longest_delay is None else longest_delay
-        if threads < 1 or delay < model.timing[2] or longest_age < 0:
+        if isinstance(randomisation, str):
+            randomisation = load_randomisation(randomisation)
+        self.model, self.world = model, world
+        self.randomisation = randomisation
+        self._draws = None if randomisation is None else Sampler(randomisation, model, robots)
+        delay, age = self._latencies(longest_delay, longest_age)
+        if threads < 1 or delay < model.timing[2] or age < 0:
             raise ConfigError(
                 f"a simulator needs at least 1 thread, a longest_delay of at least the model's "
                 f"{model.timing[2]} substeps and a longest_age of at least 0, not {threads}, "
-                f"{delay} and {longest_age}."
+                f"{delay} and {age}."
             )
-        self.model, self.world = model, world
         self.goals: Array = np.zeros((worlds, robots, 2))
+        self.drawn: dict[str, NDArray[Any]] = {}
         self._footprint = footprint_shape(model.robot)
-        table = with_shapes(model.lidar, model.table, (*world.shapes, self._footprint))
+        sizes = (1.0,) if randomisation is None else randomisation.sizes
+        self.sampler = SceneSampler(world, self._footprint.radius, robots, sizes)
+        shapes = (*self.sampler.shapes, self._footprint)
+        table = with_shapes(model.lidar, model.table, shapes)
+        self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
         self._scanner = Scanner(model.lidar, table, renderer, world.grid)
-        self._sizes = Sizes(worlds, robots, world.obstacles.count, delay, longest_age)
+        self._sizes = Sizes(worlds, robots, self.sampler.count, delay, age)
         self.data = allocate(model, self._sizes)
         self.parts = split(worlds, threads)
         self._boxes = {part.start: CommandBox(model.kinematics, model.robot) for part in self.parts}
         self._crew = Crew(len(self.parts))
 
+    def _latencies(self, delay: int | None, age: int | None) -> tuple[int, int]:
+        """The longest ones that are to be stored [substeps]."""
+        drawn = (0, 0) if self._draws is None else (self._draws.longest_delay, self._draws.longest_age)
+        if delay is None:
+            delay = max(self.model.timing[2], drawn[0])
+        return max(delay, drawn[0]), max(0 if age is None else age, drawn[1])
+
     @cached_property
     def _packed(self) -> dict[int, Any]:
         """What the kernels take, by the first world of each part."""
-        walls = self.world.all_walls()
-        of = (self.data, self.model, self._scanner, walls, self._sizes)
+        walls, motions = self.world.all_walls(), self.sampler.motions
+        moves = any(motion is not None for motion in motions)
+        low_x, low_y, high_x, high_y = self.world.extent
+        half = np.array([max(-low_x, high_x), max(-low_y, high_y)])
+        movers = (moves, plan_arrays(motions), half, distance_arrays(self.world.grid))
+        of = (self.data, self.model, self._scanner, walls, movers, self._sizes)
         return {part.start: kernels.pack(arguments(*of, part)) for part in self.parts}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -94,45 +124,69 @@ class FastSimulator:
 
     def reset(
         self,
-        seeds: Sequence[int],
-        worlds: Sequence[int] | None = None,
+        seeds: ArrayLike,
+        worlds: ArrayLike | None = None,
         starts: ArrayLike | None = None,
-    ) -> list[Scene]:
+    ) -> Scenes:
         """Begins episodes.
 
         Args:
-            seeds: of each episode (n,); a seed fixes scene, start, goal and noise.
+            seeds: of each episode (n,); a seed fixes scene, start, goal, noise and randomisation.
             worlds: which worlds begin anew (n,), all by default.
             starts: (n, M, 3) poses to begin at instead of the scene's.
 
         Returns:
             The scene of each.
+
+        Raises:
+            ConfigError: the seeds or starts do not fit, or the world has no room for a scene.
         """
         chosen = np.arange(len(self.data.steps)) if worlds is None else np.asarray(worlds, np.int64)
-        scenes = []
-        for row, (n, seed) in enumerate(zip(chosen, seeds, strict=True)):
-            scene = sample_scene(
-                self.world, self.model.robot.footprint_radius, int(seed), self.data.pose.shape[1]
+        draws = None if self._draws is None else self._draws.draw(seeds)
+        scenes = (
+            self.sampler.draw(seeds)
+            if draws is None
+            else self.sampler.draw(seeds, draws.count, draws.size)
+        )
+        begin = scenes.starts if starts is None else np.asarray(starts, dtype=np.float64)
+        if len(scenes) != len(chosen) or begin.shape != scenes.starts.shape:
+            raise ConfigError(
+                f"{len(scenes)} seeds and starts {begin.shape} must be of {len(chosen)} worlds "
+                f"with {self.data.pose.shape[1]} robots each."
             )
-            start = scene.starts if starts is None else np.asarray(starts, dtype=np.float64)[row]
-            self._place(int(n), int(seed), scene, start)
-            scenes.append(scene)
+        self._place(chosen, np.asarray(seeds, dtype=np.int64), scenes, begin)
+        if draws is not None:
+            self._assign(chosen, draws)
         for box in self._boxes.values():
             box.begin()
-        kernels.look(self._packed[0], chosen)
+        kernels.begin(self._packed[0], chosen)
         return scenes
 
-    def _place(self, n: int, seed: int, scene: Scene, start: Array) -> None:
-        data, robots = self.data, self.data.pose.shape[1]
-        data.pose[n], data.odom[n] = start, start
-        for zeroed in (data.state, data.history, data.twist, data.collided, data.steps):
-            zeroed[n] = 0
-        data.seeds[n] = seed
-        discs = [Circle(radius=float(radius)) for radius in scene.circles[:, 2]]
-        still = np.concatenate([scene.circles[:, :2], np.zeros((len(discs), 1))], axis=1)
-        data.bodies[n, :-robots] = self._scanner.place(discs, still)
-        data.bodies[n, -robots:] = self._scanner.place([self._footprint] * robots, start)
-        self.goals[n] = scene.goals
+    def _place(self, chosen: Indices, seeds: Indices, scenes: Scenes, starts: Array) -> None:
+        data = self.data
+        data.pose[chosen], data.odom[chosen] = starts, starts
+        for zeroed in (
+            data.state, data.history, data.twist, data.collided, data.steps, data.velocity,
+        ):  # fmt: skip
+            zeroed[chosen] = 0
+        data.seeds[chosen] = seeds
+        bodies = scenes.bodies.copy()
+        bodies[..., SHAPE] = self._in_table[bodies[..., SHAPE].astype(np.int64)]
+        footprints = place(starts, self._footprint.radius, self._in_table[-1])
+        data.bodies[chosen] = np.concatenate([bodies, footprints], axis=1)
+        self.goals[chosen] = scenes.goals
+
+    def _assign(self, chosen: Indices, draws: Draws) -> None:
+        """Gives the robots of some worlds what was drawn for them."""
+        data = self.data
+        data.coefficient[chosen], data.noise[chosen] = draws.coefficient, draws.noise
+        data.delay[chosen], data.age[chosen] = draws.delay, draws.age
+        data.faults[chosen] = draws.faults
+        for name, values in draws.named().items():
+            if name not in self.drawn:
+                shape = (len(data.steps), *values.shape[1:])
+                self.drawn[name] = np.zeros(shape, values.dtype)
+            self.drawn[name][chosen] = values
 
     def step(self, commands: ArrayLike) -> None:
         """Moves every world by one control period; the results are in `data`.

@@ -15,6 +15,7 @@ from nics_drl_bridge.lidar.maps_grid import NO_MAP, GridMap
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.sim.contact_kernels import SEVERAL
+from nics_drl_bridge.sim.motion_layout import MARK
 from nics_drl_bridge.sim.sensing_kernels import PAST
 
 Array = NDArray[np.float64]
@@ -59,6 +60,7 @@ class Worlds:
             [rad/s]; and, after a second, of the drift along x, y [m], heading [rad], and state.
         velocity: (N, K, 3) of the obstacles in `map`, constant for a period [m/s, m/s, rad/s].
         past: (N, M, R, 12) of the last periods, see `sensing_kernels`.
+        marks: (N, K, F) what moving obstacles remember, see `motion_layout`.
     """
 
     pose: Array
@@ -78,6 +80,7 @@ class Worlds:
     noise: Array
     velocity: Array
     past: Array
+    marks: Array
 
 
 @dataclass(frozen=True)
@@ -136,6 +139,7 @@ def allocate(model: SimulatorModel, sizes: Sizes) -> Worlds:
         noise=np.tile(noise, (*shape, 1)),
         velocity=np.zeros((sizes.worlds, sizes.obstacles, 3)),
         past=np.zeros((*shape, rows, PAST)),
+        marks=np.zeros((sizes.worlds, sizes.obstacles, MARK)),
     )
 
 
@@ -150,6 +154,7 @@ def arguments(
     model: SimulatorModel,
     scanner: Scanner,
     walls: Array,
+    movers: tuple[Any, ...],
     sizes: Sizes,
     part: slice,
 ) -> tuple[Any, ...]:
@@ -157,7 +162,8 @@ def arguments(
 
     Returns:
         The fields of `data`; scene: walls, map (distances, frame), outlines, whether the bodies
-        are sorted, and whether that serves the scans; view: the lidar's arguments, its map,
+        are sorted, whether that serves the scans, and `movers`: whether any obstacle moves, and
+        plans, half size and distances of `motion_kernels`; view: the lidar's arguments, its map,
         whether it scans exactly, mount, limits, time of a sweep; motion, see
         `kernels.move_freely`; and scratch, see `_scratch`.
     """
@@ -173,7 +179,7 @@ def arguments(
         float(lidar.sweep_time),
     )
     outlines = scanner.table.outlines.arguments
-    scene = (walls, _collision_map(grid), outlines, sizes.crowded, sizes.scattered)
+    scene = (walls, _collision_map(grid), outlines, sizes.crowded, sizes.scattered, movers)
     motion = (dof, factors, count, SERIES, (float(dt), int(substeps)))
     room = _scratch(model, scanner, sizes, part.stop - part.start)
     return tuple(vars(data).values()), scene, view, motion, room
@@ -211,7 +217,7 @@ def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int)
         ),
         (
             np.zeros((robots, 1 + SEVERAL), np.int64), np.zeros(robots, np.int64),
-            np.zeros(robots), np.zeros(bodies),
+            np.zeros(robots), np.zeros(bodies), np.zeros((robots, 2)),
         ),
         (
             (

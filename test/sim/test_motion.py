@@ -197,7 +197,7 @@ def walk_on(marks, places, radii, half, seed, steps=120):
     goal = marks[0, 0, at.GOAL_X].copy()
     for t in range(steps):
         kernels.steer(
-            velocity, marks, 0, bodies, 1, np.zeros((1, 1, 2)), plans, walls, half, seed, t + 1,
+            velocity, marks, 0, bodies, 1, np.zeros((1, 2)), plans, walls, half, seed, t + 1,
             PERIOD, NO_DISTANCES,
         )  # fmt: skip
         if marks[0, 0, at.GOAL_X] != goal:
@@ -222,7 +222,7 @@ def in_batch(seeds, motions=tuple(MIXED), steps=200):
     poses = np.tile(np.concatenate([places, np.zeros((count + 1, 1))], 1), (worlds, 1, 1))
     bodies = place(poses, radii, np.zeros_like(radii))
     marks, velocity = np.full((worlds, count, MARK), 7.0), np.full((worlds, count, 3), 9.0)
-    plans, still = plan_arrays(motions), np.zeros((worlds, 1, 2))
+    plans, still = plan_arrays(motions), np.zeros((1, 2))
     for n, seed in enumerate(seeds):
         kernels.begin(marks, n, bodies, plans, half, seed)
     for t in range(steps):
