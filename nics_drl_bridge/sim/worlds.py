@@ -27,7 +27,7 @@ CROWD = 4096
 """From so many pairs of a robot and a body on, the bodies of a world are sorted into cells."""
 FEWEST_OF_A_CROWD = 8
 """Robots: for fewer, to sort takes longer than to look at all bodies."""
-SCATTERED = 1024
+SCATTERED = 64
 """From so many bodies in cells on, each robot is scanned among those around it; for fewer, to
 look at all of them takes less than to begin a scan for each robot."""
 
