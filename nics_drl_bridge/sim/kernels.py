@@ -320,7 +320,7 @@ def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[n
 
 
 @njit(cache=True, nogil=True)
-def _steer(n, velocity, marks, bodies, pose, past, step, walls, movers, seed, period, speeds):  # type: ignore[no-untyped-def]  # noqa: E501
+def _steer(n, velocity, marks, bodies, pose, past, step, walls, movers, seed, period, speeds):  # type: ignore[no-untyped-def]
     """Sets the velocities of the obstacles of world n for the period that begins.
 
     Args:

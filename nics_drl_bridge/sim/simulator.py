@@ -102,7 +102,9 @@ class FastSimulator:
 
     def _latencies(self, delay: int | None, age: int | None) -> tuple[int, int]:
         """The longest ones that are to be stored [substeps]."""
-        drawn = (0, 0) if self._draws is None else (self._draws.longest_delay, self._draws.longest_age)
+        drawn = (
+            (0, 0) if self._draws is None else (self._draws.longest_delay, self._draws.longest_age)
+        )
         if delay is None:
             delay = max(self.model.timing[2], drawn[0])
         return max(delay, drawn[0]), max(0 if age is None else age, drawn[1])
