@@ -131,6 +131,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self.scene: Scene | None = None
         self.ended: NDArray[np.bool_] = np.zeros(self.robots, np.bool_)
         self.view: RobotView | None = None
+        self._true_pose: Array = np.zeros((self.robots, 3))
         self._still = still(self.model.robot)
         self._seed, self._episode = 0, -1
         self._picture: Any = None
@@ -179,7 +180,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         goals = self.scene.goals[None]
         self.memory = self.task.reset(Episodes(np.array([episode]), starts[None], goals))
         override(self.memory, options)
-        self.ended[:] = False
+        self.ended, self._true_pose = np.zeros(self.robots, np.bool_), starts
         facts = {
             "episode_seed": episode,
             "start": self._row(starts),
@@ -213,8 +214,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if self.view is None:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         command = self.task.command(check_action(action, self.action_space, "action"))
-        if self.ended.any():
-            command = np.where(self.ended[:, None], self._still, command.reshape(self.robots, -1))
+        waiting = self.robots > 1 and bool(self.ended.any())
+        if waiting:
+            command = np.where(self.ended[:, None], self._still, command)
         # After an error in the backend, only a reset leads back.
         before, self.view = self.view, None
         view, facts = self._backend.step(command)
@@ -222,10 +224,10 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         out = np.empty((1, self.robots, shape[-1]), np.float32)
         outcome = self.task.step_into(out, self._lifted(before), self._lifted(view), self.memory)
         terms = {name: term[0] for name, term in outcome.terms.items()}
-        if self.ended.any():
+        if waiting:
             terms = {name: np.where(self.ended, 0.0, term) for name, term in terms.items()}
-        self.ended = self.ended | outcome.ended[0]
-        self.view = view
+        self.ended = (self.ended & waiting) | outcome.ended[0]
+        self.view, self._true_pose = view, facts.get("true_pose", view.pose)
         return out[0], terms, self._info(view, facts) | self._judged(outcome)
 
     def _lifted(self, view: RobotView) -> RobotView:
@@ -270,7 +272,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if self._picture is None:
             drawing = import_module("nics_drl_bridge.env.rendering")
             self._picture = drawing.Picture(self.model, self.world, self.render_mode, RENDER_FPS)
-        return self._picture.draw(self._lifted(self.view), self.scene, self.memory)
+        view = self._lifted(self.view)
+        poses = np.reshape(self._true_pose, (self.robots, 3))
+        return self._picture.draw(poses, view.ranges[0], self.scene, self.memory)
 
     def close(self) -> None:
         """Leaves the robot with a zero command."""

@@ -143,6 +143,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = _chosen(options, self.num_envs)
         self._seed(seed, chosen)
+        if self.memory and not chosen.all():  # the others see what they saw
+            self.task.observe_into(self._out, self._view(slice(None)), self.memory)
         self._begin(np.flatnonzero(chosen), self._out, options)
         infos: dict[str, Any] = {}
         vector_info.put(infos, self._known() | self._beginnings(), chosen)
@@ -329,10 +331,10 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             ]
         circles, drawn = self._beginnings()["circles"], []
         for n, picture in enumerate(self._pictures):
-            row = np.array([n])
-            memory = {name: rows[row] for name, rows in self.memory.items()}
+            memory = {name: rows[n : n + 1] for name, rows in self.memory.items()}
             scene = Scene(circles[n], self._starts[n], self.simulator.goals[n])
-            drawn.append(picture.draw(self._view(row), scene, memory))
+            data = self.simulator.data
+            drawn.append(picture.draw(data.pose[n], data.ranges[n], scene, memory))
         return tuple(drawn)
 
     def close_extras(self, **kwargs: Any) -> None:

@@ -1,0 +1,135 @@
+"""Pictures of a world from above, for `render_mode` `rgb_array` and `human`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle as Disc
+from matplotlib.patches import Patch, PathPatch
+from matplotlib.path import Path
+from matplotlib.transforms import Affine2D
+from numpy.typing import NDArray
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.shapes import Circle, Shape
+from nics_drl_bridge.sim.world import Scene, World
+
+Array = NDArray[np.float64]
+SIZE_IN, DPI, MARGIN = 5.0, 100, 0.05
+WALL, BODY, GOAL, SCAN = "#333333", "#8d99ae", "#f2c14e", "#d1495b"
+ROBOTS = ("#1f6fb2", "#2f855a", "#7a4fa3", "#b7791f", "#0f766e", "#9d174d")
+
+
+class Picture:
+    """Walls, bodies, goals, robots and their scans, drawn again at every step.
+
+    Args:
+        model: gives the footprint and the lidar.
+        world: gives the walls.
+        mode: `rgb_array` or `human`, which shows a window where there is a display.
+        fps: pictures per second that `human` keeps to at most.
+    """
+
+    def __init__(self, model: SimulatorModel, world: World, mode: str, fps: int) -> None:
+        self._model, self._world = model, world
+        self._human, self._pause_s = mode == "human", 1.0 / fps
+        width, depth = world.size
+        scale = SIZE_IN / max(width, depth)
+        size = (scale * width, scale * depth)
+        if self._human:
+            self._figure = plt.figure(figsize=size, dpi=DPI)
+        else:
+            self._figure = Figure(figsize=size, dpi=DPI)
+            FigureCanvasAgg(self._figure)
+        self._axes = self._figure.add_axes((0.0, 0.0, 1.0, 1.0))
+
+    def draw(
+        self,
+        poses: Array,
+        ranges: NDArray[np.float32],
+        scene: Scene,
+        memory: dict[str, NDArray[Any]],
+    ) -> NDArray[np.uint8] | None:
+        """Draws a world.
+
+        Args:
+            poses: (M, 3) of the robots.
+            ranges: (M, B) their scans [m].
+            scene: gives the bodies.
+            memory: of the task, with a leading 1; `goal` (1, M, 2) is drawn.
+
+        Returns:
+            (H, W, 3) pixels; None when they are shown in a window.
+        """
+        axes = self._axes
+        axes.clear()
+        axes.set_axis_off()
+        axes.set_aspect("equal")
+        half = (0.5 + MARGIN) * np.array(self._world.size)
+        axes.set_xlim(-half[0], half[0])
+        axes.set_ylim(-half[1], half[1])
+        walls = self._world.all_walls().reshape(-1, 2, 2)
+        axes.add_collection(LineCollection(list(walls), colors=WALL, linewidths=2.0))
+        for shape, pose in placed(scene):
+            axes.add_patch(outline(shape, pose))
+        for goal in np.reshape(memory.get("goal", np.zeros((0, 2))), (-1, 2)):
+            axes.plot(*goal, marker="*", color=GOAL, markersize=16, markeredgecolor=WALL)
+        for m, (pose, scan) in enumerate(zip(poses, ranges, strict=True)):
+            self._robot(axes, pose, scan, ROBOTS[m % len(ROBOTS)])
+        return self._shown()
+
+    def _robot(self, axes: Axes, pose: Array, ranges: NDArray[np.float32], colour: str) -> None:
+        """The footprint, where it looks, and what it sees."""
+        lidar, radius = self._model.lidar, self._model.robot.footprint_radius
+        mount = geometry.compose(pose, lidar.mount)
+        there = np.isfinite(ranges)
+        angles = mount[2] + lidar.angles[there]
+        hits = mount[:2] + ranges[there, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        axes.plot(hits[:, 0], hits[:, 1], ".", color=SCAN, markersize=2.0)
+        axes.add_patch(Disc((pose[0], pose[1]), radius, color=colour))
+        front = pose[:2] + radius * np.array([np.cos(pose[2]), np.sin(pose[2])])
+        axes.plot([pose[0], front[0]], [pose[1], front[1]], color="white", linewidth=2.0)
+
+    def _shown(self) -> NDArray[np.uint8] | None:
+        canvas: Any = self._figure.canvas
+        if not self._human:
+            canvas.draw()
+            return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        if canvas.required_interactive_framework is None:  # no display: drawn, but not shown
+            canvas.draw()
+        else:
+            canvas.manager.show()
+            canvas.draw_idle()
+            canvas.start_event_loop(self._pause_s)
+        return None
+
+    def close(self) -> None:
+        """Closes the window."""
+        if self._human:
+            plt.close(self._figure)
+
+
+def placed(scene: Scene) -> Sequence[tuple[Shape, Array]]:
+    """The bodies of a scene: shape and pose (3,) of each."""
+    return [
+        (Circle(radius=float(radius)), np.array([x, y, 0.0])) for x, y, radius in scene.circles
+    ]
+
+
+def outline(shape: Shape, pose: Array) -> Patch:
+    """A shape at a pose (3,) as a patch; a segment is a line."""
+    if isinstance(shape, Circle):
+        return Disc((pose[0], pose[1]), shape.radius, color=BODY)
+    turn = Affine2D().rotate(pose[2]).translate(pose[0], pose[1])
+    closed = len(shape.outline) > 2
+    path = Path(shape.outline, closed=False).transformed(turn)
+    corners = np.concatenate([path.vertices, path.vertices[:1]]) if closed else path.vertices
+    return PathPatch(Path(corners, closed=closed), color=BODY, fill=closed, linewidth=2.0)
