@@ -67,3 +67,22 @@ def scaled(action: ArrayLike, robot: RobotSpec) -> Array:
         out.reshape(-1, width), given.reshape(-1, width), robot.command_low, robot.command_high
     )
     return out
+
+
+def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray[Any]:
+    """An action as an array of its space's shape.
+
+    Raises:
+        gymnasium.error.InvalidAction: of another shape, NaN, inf, or no action of that number.
+    """
+    given = np.asarray(action)
+    if given.shape != space.shape:
+        raise gymnasium.error.InvalidAction(
+            f"{name} of shape {given.shape}: must be of shape {space.shape}."
+        )
+    if isinstance(space, gymnasium.spaces.Box) and space.dtype == np.float32:
+        if not kernels.finite(given.reshape(1, -1)):
+            raise gymnasium.error.InvalidAction(f"{name} {given!r}: holds NaN or inf.")
+    elif not space.contains(given):
+        raise gymnasium.error.InvalidAction(f"{name} {given!r}: is not in {space}.")
+    return given

@@ -9,9 +9,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env.actions import still, team_space
-from nics_drl_bridge.env.kernels import finite
-from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, override
+from nics_drl_bridge.env.actions import check_action, still, team_space
+from nics_drl_bridge.env.task import Episodes, Memory, Task, override
 from nics_drl_bridge.env.tasks import make_task
 from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
@@ -130,8 +129,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self.memory: Memory = {}
         self.scene: Scene | None = None
         self.ended: NDArray[np.bool_] = np.zeros(self.robots, np.bool_)
-        self.view: RobotView | None = None
+        self._view: RobotView | None = None  # always as the batch of one that a task expects
         self._true_pose: Array = np.zeros((self.robots, 3))
+        self._shape = (1, self.robots, self.task.observation_space.shape[0])
         self._still = still(self.model.robot)
         self._seed, self._episode = 0, -1
         self._picture: Any = None
@@ -176,7 +176,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self.scene = sample_scene(self.world, footprint, episode, self.robots)
         starts = np.array(self.scene.starts)
         starts[...] = (options or {}).get("start", starts)
-        self.view = self._backend.reset(Start(episode, self._row(starts)))
+        self._view = self._lifted(self._backend.reset(Start(episode, self._row(starts))))
         goals = self.scene.goals[None]
         self.memory = self.task.reset(Episodes(np.array([episode]), starts[None], goals))
         override(self.memory, options)
@@ -186,22 +186,28 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             "start": self._row(starts),
             "circles": self.scene.circles,
         }
-        observation = self.task.observation(self._lifted(self.view), self.memory)[0]
+        observation = self.task.observation(self._view, self.memory)[0]
         if self.render_mode == "human":
             self.render()
-        return self._row(observation), self._info(self.view, facts)
+        return self._row(observation), self._info(self._view, facts)
 
     def step(
         self, action: NDArray[Any]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Applies an action for one control period; see Gymnasium."""
-        observation, terms, facts = self.advance(action)
-        reward = sum(terms.values(), np.zeros(self.robots))
-        total = float(sum(reward.tolist()))
-        info = facts | {"reward_terms": {n: self._fact(term) for n, term in terms.items()}}
+        observation, terms, info = self.advance(action)
+        values = {name: term.tolist() for name, term in terms.items()}
+        each = [0.0] * self.robots
+        for term in values.values():  # one after the other, as the vector env adds them
+            each = [one + another for one, another in zip(each, term, strict=True)]
+        reward = each[0]
+        for one in each[1:]:
+            reward += one
+        alone = self.robots == 1
+        info["reward_terms"] = {name: v[0] for name, v in values.items()} if alone else terms
         if self.render_mode == "human":
             self.render()
-        return self._row(observation), total, bool(self.ended.all()), False, info
+        return self._row(observation), reward, bool(self.ended.all()), False, info
 
     def advance(
         self, action: NDArray[Any]
@@ -211,31 +217,32 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         `ended` (M,) says for which robots the episode is over; they get a zero command and no
         further reward.
         """
-        if self.view is None:
+        if self._view is None:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         command = self.task.command(check_action(action, self.action_space, "action"))
         waiting = self.robots > 1 and bool(self.ended.any())
         if waiting:
             command = np.where(self.ended[:, None], self._still, command)
         # After an error in the backend, only a reset leads back.
-        before, self.view = self.view, None
-        view, facts = self._backend.step(command)
-        shape = self.observation_space.shape or ()
-        out = np.empty((1, self.robots, shape[-1]), np.float32)
-        outcome = self.task.step_into(out, self._lifted(before), self._lifted(view), self.memory)
+        before, self._view = self._view, None
+        seen, facts = self._backend.step(command)
+        view, out = self._lifted(seen), np.empty(self._shape, np.float32)
+        outcome = self.task.step_into(out, before, view, self.memory)
         terms = {name: term[0] for name, term in outcome.terms.items()}
         if waiting:
             terms = {name: np.where(self.ended, 0.0, term) for name, term in terms.items()}
         self.ended = (self.ended & waiting) | outcome.ended[0]
-        self.view, self._true_pose = view, facts.get("true_pose", view.pose)
-        return out[0], terms, self._info(view, facts) | self._judged(outcome)
+        self._view, self._true_pose = view, facts.get("true_pose", seen.pose)
+        for name, values in outcome.info.items():
+            facts[name] = self._fact(values[0])
+        return out[0], terms, self._info(view, facts)
 
     def _lifted(self, view: RobotView) -> RobotView:
         """A view as the batch of one that the task expects: leading (1, M)."""
-        lead = (1, self.robots)
+        lead = (1, self.robots, -1)
         return RobotView(
-            view.pose.reshape(*lead, -1), view.twist.reshape(*lead, -1),
-            view.ranges.reshape(*lead, -1), view.stamp_s, view.scan_age_s, view.odom_age_s,
+            view.pose.reshape(lead), view.twist.reshape(lead), view.ranges.reshape(lead),
+            view.stamp_s, view.scan_age_s, view.odom_age_s,
         )  # fmt: skip
 
     def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
@@ -246,35 +253,24 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         row = self._row(values)
         return row.item() if row.ndim == 0 else row
 
-    def _judged(self, outcome: Outcome) -> dict[str, Any]:
-        return {name: self._fact(values[0]) for name, values in outcome.info.items()}
-
     def _info(self, view: RobotView, facts: dict[str, Any]) -> dict[str, Any]:
-        known = {name: self._row(rows[0]).copy() for name, rows in self._shown().items()}
-        return {
-            **known,
-            "pose": view.pose,
-            "scan_age_s": view.scan_age_s,
-            "odom_age_s": view.odom_age_s,
-            **facts,
-        }
-
-    def _shown(self) -> Memory:
-        """Of the memory, what every task of this kind shows: the goals."""
-        return {name: rows for name, rows in self.memory.items() if name == "goal"}
+        info = {name: self._row(self.memory[name][0]).copy() for name in self.task.shown}
+        info["pose"] = self._row(view.pose[0]).copy()
+        info["scan_age_s"], info["odom_age_s"] = view.scan_age_s, view.odom_age_s
+        info.update(facts)
+        return info
 
     def render(self) -> Any:
         """The world as it is, drawn from above; see Gymnasium."""
         if self.render_mode is None:
             return None
-        if self.view is None or self.scene is None:
+        if self._view is None or self.scene is None:
             raise gymnasium.error.ResetNeeded("call reset() before render().")
         if self._picture is None:
             drawing = import_module("nics_drl_bridge.env.rendering")
             self._picture = drawing.Picture(self.model, self.world, self.render_mode, RENDER_FPS)
-        view = self._lifted(self.view)
         poses = np.reshape(self._true_pose, (self.robots, 3))
-        return self._picture.draw(poses, view.ranges[0], self.scene, self.memory)
+        return self._picture.draw(poses, self._view.ranges[0], self.scene, self.memory)
 
     def close(self) -> None:
         """Leaves the robot with a zero command."""
@@ -289,27 +285,6 @@ def check_render_mode(mode: str | None, metadata: dict[str, Any]) -> None:
     known = metadata["render_modes"]
     if mode is not None and mode not in known:
         raise ConfigError(f"unknown render_mode {mode!r}; {nearest(mode, known)}")
-
-
-def check_action(
-    action: Any, space: gymnasium.Space[Any], name: str
-) -> NDArray[np.float32] | NDArray[np.int64]:
-    """An action as an array of its space's shape.
-
-    Raises:
-        gymnasium.error.InvalidAction: of another shape, NaN, inf, or no action of that number.
-    """
-    given = np.asarray(action)
-    if given.shape != space.shape:
-        raise gymnasium.error.InvalidAction(
-            f"{name} of shape {given.shape}: must be of shape {space.shape}."
-        )
-    if isinstance(space, gymnasium.spaces.Box) and space.dtype == np.float32:
-        if not finite(given.reshape(1, -1)):
-            raise gymnasium.error.InvalidAction(f"{name} {given!r}: holds NaN or inf.")
-    elif not space.contains(given):
-        raise gymnasium.error.InvalidAction(f"{name} {given!r}: is not in {space}.")
-    return given
 
 
 def make_backend(name: str, model: SimulatorModel, world: World, **options: Any) -> Backend:

@@ -67,6 +67,7 @@ class CooperativeReaching(Task):
     """
 
     keeps_last_scan: ClassVar[bool] = False
+    shown: ClassVar[tuple[str, ...]] = ("goal",)
 
     robots: int = 3
     goal_radius: float = 0.3

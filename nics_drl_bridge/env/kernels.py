@@ -94,22 +94,27 @@ def looks(shares, touched, ranges, per_metre, leaves):  # type: ignore[no-untype
 
 
 @njit(cache=True, nogil=True)
-def navigate(out, reached, touched, pose, twist, ranges, goals, per_metre, leaves, radius):  # type: ignore[no-untyped-def]
-    """Observations (R, O) of the navigation task, whether a goal is reached or something touched.
+def navigate(out, approach, reached, touched, before, pose, twist, ranges, goals, sensor, radius):  # type: ignore[no-untyped-def]
+    """Observations of the navigation task, and what the robots came to.
 
     Args:
         out: (R, B + 6) float32, result, see `navigation.Navigation`.
-        reached, touched: (R,) bool, results.
+        approach: (R,) by how much nearer the goal is than before [m], result.
+        reached, touched: (R,) bool, whether a robot is at its goal, or at something; results.
+        before: (R, 3) poses before the step.
         pose, twist: (R, 3).
         ranges: (R, B) float32.
         goals: (R, 2) [m].
-        per_metre, leaves: see `look`.
+        sensor: per_metre and leaves of `look`.
         radius: of a goal [m].
     """
+    per_metre, leaves = sensor
     beams = ranges.shape[1]
     for i in range(out.shape[0]):
         touched[i] = look(out[i, :beams], ranges[i], per_metre, leaves)
         distance, c, s = bearing(pose[i], goals[i, 0], goals[i, 1])
+        dx, dy = goals[i, 0] - before[i, 0], goals[i, 1] - before[i, 1]
+        approach[i] = math.sqrt(dx * dx + dy * dy) - distance
         reached[i] = distance < radius
         out[i, beams] = min(distance, LIMIT)
         out[i, beams + 1], out[i, beams + 2] = c, s

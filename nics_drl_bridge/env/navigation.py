@@ -76,6 +76,7 @@ class Navigation(Task):
     """
 
     keeps_last_scan: ClassVar[bool] = False
+    shown: ClassVar[tuple[str, ...]] = ("goal",)
 
     goal_radius: float = 0.3
     success_reward: float = 10.0
@@ -98,12 +99,12 @@ class Navigation(Task):
         """The observation (..., B + 6) of a view, for goals (..., 2) in `map`."""
         width = self.lidar.beams + GOAL_PARTS + TWIST_PARTS
         out = np.empty((*view.pose.shape[:-1], width), np.float32)
-        self._see(out, view, memory)
+        self._see(out, view.pose, view, memory)
         return out
 
     def observe_into(self, out: Observation, view: RobotView, memory: Memory) -> None:
         """Writes the observation into (..., B + 6), which is contiguous."""
-        self._see(out, view, memory)
+        self._see(out, view.pose, view, memory)
 
     def judge(self, view: RobotView, memory: Memory) -> Verdict:
         """Whether robots are at their goals, and whether they touch something."""
@@ -112,7 +113,8 @@ class Navigation(Task):
 
     def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
         """The terms (...,) of the reward for a step; their sum is the reward."""
-        return self._terms(before, after, memory, self.judge(after, memory))
+        approach = distance(before.pose, memory["goal"]) - distance(after.pose, memory["goal"])
+        return self._terms(approach, self.judge(after, memory))
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
         """Whether a robot is at its goal or touches something."""
@@ -127,29 +129,36 @@ class Navigation(Task):
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
     ) -> Outcome:
         """All of the above in one pass over each scan; `out` is contiguous."""
-        verdict = self._see(out, after, memory)
-        terms = self._terms(before, after, memory, verdict)
+        approach, verdict = self._see(out, before.pose, after, memory)
+        terms = self._terms(approach, verdict)
         return Outcome(terms, verdict.reached | verdict.touched, self._facts(verdict))
 
-    def _see(self, out: Observation, view: RobotView, memory: Memory) -> Verdict:
+    def _see(
+        self, out: Observation, before: Array, view: RobotView, memory: Memory
+    ) -> tuple[Array, Verdict]:
+        """Writes what robots see; by how much nearer their goals are, and how they stand."""
         lead = view.pose.shape[:-1]
-        rows = int(np.prod(lead))
+        approach = np.empty(lead)
         reached, touched = np.empty(lead, np.bool_), np.empty(lead, np.bool_)
         kernels.navigate(
-            out.reshape(rows, -1), reached.reshape(rows), touched.reshape(rows),
-            view.pose.reshape(rows, 3), view.twist.reshape(rows, 3), view.ranges.reshape(rows, -1),
-            np.asarray(memory["goal"], np.float64).reshape(rows, 2),
-            self.per_metre, self.contact_ranges, self.goal_radius,
+            out.reshape(-1, out.shape[-1]),
+            approach.reshape(-1), reached.reshape(-1), touched.reshape(-1), before.reshape(-1, 3),
+            view.pose.reshape(-1, 3), view.twist.reshape(-1, 3),
+            view.ranges.reshape(-1, view.ranges.shape[-1]), memory["goal"].reshape(-1, 2),
+            self._sensor, self.goal_radius,
         )  # fmt: skip
-        return Verdict(reached, touched)
+        return approach, Verdict(reached, touched)
 
-    def _terms(
-        self, before: RobotView, after: RobotView, memory: Memory, verdict: Verdict
-    ) -> dict[str, Array]:
-        approach = distance(before.pose, memory["goal"]) - distance(after.pose, memory["goal"])
+    @cached_property
+    def _sensor(self) -> tuple[np.float32, NDArray[np.float32]]:
+        return self.per_metre, self.contact_ranges
+
+    def _terms(self, approach: Array, verdict: Verdict) -> dict[str, Array]:
+        time = np.empty_like(approach)
+        time.fill(self.time_reward)
         return {
             "progress": self.progress_reward * approach,
-            "time": np.full(approach.shape, self.time_reward),
+            "time": time,
             "success": self.success_reward * (verdict.reached & ~verdict.touched),
             "collision": self.collision_reward * verdict.touched,
         }

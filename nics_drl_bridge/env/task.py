@@ -75,9 +75,11 @@ class Task(ABC):
         contact_margin: a return this close to the footprint counts as a touch [m].
         keeps_last_scan: whether `before.ranges` is wanted in `reward`, `update` or `step_into`;
             without it they are the new ones, which spares a copy.
+        shown: names of the memory that `info` always holds.
     """
 
     keeps_last_scan: ClassVar[bool] = True
+    shown: ClassVar[tuple[str, ...]] = ()
 
     robot: RobotSpec
     lidar: LidarSpec

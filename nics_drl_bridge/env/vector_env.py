@@ -13,8 +13,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.env import vector_info
-from nics_drl_bridge.env.actions import still, team_space
-from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_action, check_render_mode
+from nics_drl_bridge.env.actions import check_action, still, team_space
+from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
 from nics_drl_bridge.env.kernels import episode_seeds
 from nics_drl_bridge.env.sim_backend import NANO
 from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task
@@ -95,7 +95,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     ) -> None:
         check_render_mode(render_mode, self.metadata)
         self.num_envs, self.render_mode = num_envs, render_mode
-        self._limit, self._copy = max_episode_steps, copy
+        self._limit, self.copy = max_episode_steps, copy
         self._mode = _mode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.model = open_model(model) if isinstance(model, str) else model
@@ -148,7 +148,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._begin(np.flatnonzero(chosen), self._out, options)
         infos: dict[str, Any] = {}
         vector_info.put(infos, self._known() | self._beginnings(), chosen)
-        return self._row(self._out.copy() if self._copy else self._out), infos
+        return self._row(self._out.copy() if self.copy else self._out), infos
 
     def _seed(self, seed: int | Sequence[int | None] | None, chosen: Flags) -> None:
         """Names the next episode of the chosen worlds."""
@@ -213,7 +213,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         if not self.memory:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         given = check_action(actions, self.action_space, "actions")
-        out = np.empty_like(self._out) if self._copy else self._out
+        out = np.empty_like(self._out) if self.copy else self._out
         begun = self._over.copy()  # these ignore their action and begin anew
         outcome = self._all_parts(lambda part: self._advance(part, given[part], out))
         terminated = self.ended.all(axis=1) & ~begun
@@ -288,10 +288,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     def _known(self) -> dict[str, Any]:
         """What `info` tells at any time."""
-        known = {"goal": self.memory["goal"]} if "goal" in self.memory else {}
         ages = np.zeros(self.num_envs)
         pose = self._row(self.simulator.data.odom).copy()
-        shown = {name: self._row(rows).copy() for name, rows in known.items()}
+        shown = {name: self._row(self.memory[name]).copy() for name in self.task.shown}
         return {**shown, "pose": pose, "scan_age_s": ages, "odom_age_s": ages.copy()}
 
     def _beginnings(self) -> dict[str, Any]:
