@@ -38,12 +38,14 @@ def discrete_commands(robot: RobotSpec) -> Array:
         drives = (*DRIVES, *SIDEWAYS) if "linear.y" in fields else DRIVES
         signs = robot.from_cmd_vel(np.array(drives))
     limits = np.where(signs > 0, robot.command_high, robot.command_low)
-    return np.where(signs == 0, still(robot), limits)
+    commands: Array = np.where(signs == 0, still(robot), limits)
+    return commands
 
 
 def still(robot: RobotSpec) -> Array:
     """(C,) the command nearest to zero: a robot that is told it comes to rest."""
-    return np.clip(0.0, robot.command_low, robot.command_high)
+    nearest: Array = np.clip(0.0, robot.command_low, robot.command_high)
+    return nearest
 
 
 def action_space(robot: RobotSpec, actions: Actions) -> gymnasium.Space[Any]:

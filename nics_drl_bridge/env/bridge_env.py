@@ -254,7 +254,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         return row.item() if row.ndim == 0 else row
 
     def _info(self, view: RobotView, facts: dict[str, Any]) -> dict[str, Any]:
-        info = {name: self._row(self.memory[name][0]).copy() for name in self.task.shown}
+        info: dict[str, Any] = {
+            name: self._row(self.memory[name][0]).copy() for name in self.task.shown
+        }
         info["pose"] = self._row(view.pose[0]).copy()
         info["scan_age_s"], info["odom_age_s"] = view.scan_age_s, view.odom_age_s
         info.update(facts)

@@ -130,20 +130,19 @@ class CooperativeReaching(Task):
                 self.progress_reward * share * total(approach)[..., None], lead
             ).copy(),
             "time": np.full(lead, self.time_reward),
-            "reached": np.broadcast_to(
-                self.reached_reward * share * newly[..., None], lead
-            ).copy(),
+            "reached": np.broadcast_to(self.reached_reward * share * newly[..., None], lead).copy(),
             "collision": self.collision_reward * self.touches(after.ranges),
         }
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
         """Whether a robot touches something, or all goals are reached."""
-        done = memory["reached"].all(axis=-1)[..., None]
+        done = np.asarray(memory["reached"].all(axis=-1))[..., None]
         return np.asarray(self.touches(view.ranges) | done)
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
         """Success of the team, touches, and which goals have been reached (..., M)."""
-        done = np.broadcast_to(memory["reached"].all(axis=-1)[..., None], view.pose.shape[:-1])
+        all_reached = np.asarray(memory["reached"].all(axis=-1))[..., None]
+        done = np.broadcast_to(all_reached, view.pose.shape[:-1])
         return {
             "is_success": done.copy(),
             "collision": self.touches(view.ranges),

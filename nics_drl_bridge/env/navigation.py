@@ -159,8 +159,8 @@ class Navigation(Task):
         return {
             "progress": self.progress_reward * approach,
             "time": time,
-            "success": self.success_reward * (verdict.reached & ~verdict.touched),
-            "collision": self.collision_reward * verdict.touched,
+            "success": np.multiply(self.success_reward, verdict.reached & ~verdict.touched),
+            "collision": np.multiply(self.collision_reward, verdict.touched),
         }
 
     @staticmethod

@@ -76,7 +76,9 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         self.agents: list[str] = []
         of = self.env.task
         # One space for each agent: a space has a generator of its own.
-        self.observation_spaces = {name: deepcopy(of.observation_space) for name in self.possible_agents}
+        self.observation_spaces = {
+            name: deepcopy(of.observation_space) for name in self.possible_agents
+        }
         self.action_spaces = {name: deepcopy(of.action_space) for name in self.possible_agents}
 
     def observation_space(self, agent: str) -> gymnasium.Space[Any]:
@@ -135,7 +137,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
 
     def _told(self, info: dict[str, Any], m: int) -> dict[str, Any]:
         """What concerns robot m of the env's `info`."""
-        told = {}
+        told: dict[str, Any] = {}
         for name, value in info.items():
             if isinstance(value, dict):
                 told[name] = {key: float(term[m]) for key, term in value.items()}

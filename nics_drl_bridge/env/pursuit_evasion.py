@@ -139,7 +139,7 @@ class PursuitEvasion(Task):
         out = np.broadcast_to(memory["out"][..., None, :], (*lead, self.robots))
         places = seen(view.pose, view.pose[..., :2])
         known = np.concatenate([places, mates[..., None], out[..., None]], axis=-1)
-        parts = [
+        parts: list[NDArray[Any]] = [
             self.free_share(view.ranges),
             others(known).reshape(*lead, -1),
             np.broadcast_to(self.pursues[:, None], (*lead, 1)),
@@ -161,7 +161,7 @@ class PursuitEvasion(Task):
             "pursuit": self.pursuit_reward * side * nearer,
             "capture": self.capture_reward * newly,
             "time": np.broadcast_to(self.time_reward * side, nearer.shape).copy(),
-            "collision": self.collision_reward * self._collided(after, memory),
+            "collision": np.multiply(self.collision_reward, self._collided(after, memory)),
         }
 
     def _collided(self, view: RobotView, memory: Memory) -> Flags:
@@ -171,11 +171,11 @@ class PursuitEvasion(Task):
         """Who is out; all are when one side has nobody left."""
         out = memory["out"]
         over = out[..., self.pursues].all(axis=-1) | out[..., ~self.pursues].all(axis=-1)
-        return np.asarray(out | over[..., None])
+        return np.asarray(out | np.asarray(over)[..., None])
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
         """Whether every evader is caught, as each robot would see it; touches; captures."""
-        won = memory["caught"][..., ~self.pursues].all(axis=-1)[..., None]
+        won = np.asarray(memory["caught"][..., ~self.pursues].all(axis=-1))[..., None]
         return {
             "is_success": np.asarray(won == self.pursues),
             "collision": self._collided(view, memory),

@@ -119,9 +119,7 @@ class Picture:
 
 def placed(scene: Scene) -> Sequence[tuple[Shape, Array]]:
     """The bodies of a scene: shape and pose (3,) of each."""
-    return [
-        (Circle(radius=float(radius)), np.array([x, y, 0.0])) for x, y, radius in scene.circles
-    ]
+    return [(Circle(radius=float(radius)), np.array([x, y, 0.0])) for x, y, radius in scene.circles]
 
 
 def outline(shape: Shape, pose: Array) -> Patch:
@@ -130,6 +128,7 @@ def outline(shape: Shape, pose: Array) -> Patch:
         return Disc((pose[0], pose[1]), shape.radius, color=BODY)
     turn = Affine2D().rotate(pose[2]).translate(pose[0], pose[1])
     closed = len(shape.outline) > 2
-    path = Path(shape.outline, closed=False).transformed(turn)
-    corners = np.concatenate([path.vertices, path.vertices[:1]]) if closed else path.vertices
+    corners = turn.transform(shape.outline)
+    if closed:
+        corners = np.concatenate([corners, corners[:1]])
     return PathPatch(Path(corners, closed=closed), color=BODY, fill=closed, linewidth=2.0)

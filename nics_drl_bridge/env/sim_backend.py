@@ -45,9 +45,7 @@ class SimBackend:
         **simulation: Any,
     ) -> None:
         self._robot = model.robot
-        self.simulator = FastSimulator(
-            model, world, robots=robots, renderer=renderer, **simulation
-        )
+        self.simulator = FastSimulator(model, world, robots=robots, renderer=renderer, **simulation)
         self._middleware = Middleware(model) if estimator else None
         self._period_ns = round(model.control_period * NANO)
         self._row: Any = (0, 0) if robots == 1 else 0

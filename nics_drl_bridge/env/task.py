@@ -126,7 +126,7 @@ class Task(ABC):
         """Facts for `info`; `is_success` and `collision` are what an evaluation reads."""
         return {}
 
-    def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:
+    def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:  # noqa: B027
         """Brings the memory up to date after a step, in place, before anything is judged."""
 
     def command(self, action: ArrayLike) -> Array:

@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 def seen(pose: Array, points: Array) -> Array:
-    """Points (..., P, 2) as each robot (..., M, 3) sees them: (..., M, P, 3), see `task.bearing`."""
+    """Points (..., P, 2) as each robot (..., M, 3) sees them, (..., M, P, 3); see `bearing`."""
     return bearing(pose[..., :, None, :], points[..., None, :, :])
 
 
@@ -21,7 +21,7 @@ def distances(pose: Array, points: Array) -> Array:
 
 
 def others(of_all: Array) -> Array:
-    """Without the diagonal: of (..., M, M, F), each robot's row of the others (..., M, M - 1, F)."""
+    """Each robot's row of the others, (..., M, M - 1, F) of (..., M, M, F): no diagonal."""
     count = of_all.shape[-2]
     index = [[k for k in range(count) if k != m] for m in range(count)]
     return np.asarray(of_all[..., np.arange(count)[:, None], np.array(index), :])

@@ -189,9 +189,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self.simulator.reset(seeds, worlds, starts)  # type: ignore[arg-type]
         data = self.simulator.data
         self._starts[worlds] = data.pose[worlds]
-        fresh = self.task.reset(
-            Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds])
-        )
+        fresh = self.task.reset(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))
         for name, rows in fresh.items():
             if options and name in options:
                 rows[...] = options[name]

@@ -85,7 +85,9 @@ class TrainVecEnv(VecEnv):
         result = getattr(self.env, method_name)(*method_args, **method_kwargs)
         return [result] * len(list(self._get_indices(indices)))
 
-    def env_is_wrapped(self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None) -> list[bool]:
+    def env_is_wrapped(
+        self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None
+    ) -> list[bool]:
         """No world is."""
         return [False] * len(list(self._get_indices(indices)))
 
@@ -98,7 +100,7 @@ class TrainVecEnv(VecEnv):
         self.env.close()
 
 
-def _results(final: dict[str, Any], n: int) -> dict[str, Any]:
+def _results(final: dict[str, Any], n: np.intp) -> dict[str, Any]:
     """How the episode of world n ended, as far as its task says."""
     known = {name: final[name][n] for name in ("is_success", "collision") if name in final}
     return {name: bool(np.all(value)) for name, value in known.items()}

@@ -69,9 +69,7 @@ def test_nothing_is_drawn_without_a_mode_and_nothing_before_a_reset():
 
 
 def test_a_vector_env_draws_what_its_single_envs_draw():
-    vector = BridgeVectorEnv(
-        2, model=direct_model(), world=field(count=2), render_mode="rgb_array"
-    )
+    vector = BridgeVectorEnv(2, model=direct_model(), world=field(count=2), render_mode="rgb_array")
     vector.reset(seed=3)
     pictures = vector.render()
     for n in range(2):
