@@ -83,7 +83,7 @@ class Patrol(Task):
 
 
 if __name__ == "__main__":
-    env = gymnasium.make("NicsBridge/Task-v0", task=Patrol, world="empty")
+    env = gymnasium.make("NicsBridge/Task-v0", task=Patrol, model="differential", world="empty")
     observation, info = env.reset(seed=1)
     total, ended = 0.0, False
     while not ended:
@@ -92,7 +92,9 @@ if __name__ == "__main__":
         total, ended = total + reward, terminated or truncated
     print(f"{info['arrivals']} arrivals, reward {total:.2f}: {info['reward_terms']}")
 
-    envs = gymnasium.make_vec("NicsBridge/Task-v0", num_envs=64, task=Patrol, world="empty")
+    envs = gymnasium.make_vec(
+        "NicsBridge/Task-v0", num_envs=64, task=Patrol, model="differential", world="empty"
+    )
     envs.reset(seed=1)
     for _ in range(100):
         _, rewards, *_ = envs.step(envs.action_space.sample())
