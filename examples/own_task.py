@@ -87,8 +87,10 @@ if __name__ == "__main__":
     observation, info = env.reset(seed=1)
     total, ended = 0.0, False
     while not ended:
-        left = observation[-4]  # sine of the target's bearing: steer towards it
-        observation, reward, terminated, truncated, info = env.step(np.array([0.0, left], "f4"))
+        ahead, left = observation[-5:-3]  # cosine and sine of the target's bearing
+        turn = left if ahead > 0.0 else np.sign(left)
+        action = np.array([max(ahead, 0.0) - 1.0, turn], np.float32)
+        observation, reward, terminated, truncated, info = env.step(action)
         total, ended = total + reward, terminated or truncated
     print(f"{info['arrivals']} arrivals, reward {total:.2f}: {info['reward_terms']}")
 
