@@ -251,7 +251,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     def _fact(self, values: NDArray[Any]) -> Any:
         row = self._row(values)
-        return row.item() if row.ndim == 0 else row
+        return row.item() if row.ndim == 0 else row.copy()
 
     def _info(self, view: RobotView, facts: dict[str, Any]) -> dict[str, Any]:
         info: dict[str, Any] = {

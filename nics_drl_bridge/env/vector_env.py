@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Rows = slice | NDArray[np.intp]
+EVERY = slice(None)
 MODES = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
 
 
@@ -145,9 +146,11 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._seed(seed, chosen)
         if self.memory and not chosen.all():  # the others see what they saw
             self.task.observe_into(self._out, self._view(slice(None)), self.memory)
-        self._begin(np.flatnonzero(chosen), self._out, options)
+        rows = np.flatnonzero(chosen)
+        self._begin(rows, self._out, options)
         infos: dict[str, Any] = {}
-        vector_info.put(infos, self._known() | self._beginnings(), chosen)
+        facts = self._known(rows) | self._beginnings(rows)
+        vector_info.put_rows(infos, facts, rows, self.num_envs)
         return self._row(self._out.copy() if self.copy else self._out), infos
 
     def _seed(self, seed: int | Sequence[int | None] | None, chosen: Flags) -> None:
@@ -268,49 +271,54 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self, out: Observation, over: Flags, facts: dict[str, Any], infos: dict[str, Any]
     ) -> None:
         """SAME_STEP: the worlds that ended begin anew; what they ended with goes into `infos`."""
-        if over.any():
-            infos.update(vector_info.finals(self._row(out), over))
+        rows = np.flatnonzero(over)
+        if len(rows):
+            infos.update(vector_info.finals(self._row(out), rows))
             final: dict[str, Any] = {}
-            vector_info.put(final, self._known() | facts, over)
+            known = self._known(rows) | vector_info.rows_of(facts, rows)
+            vector_info.put_rows(final, known, rows, self.num_envs)
             infos["final_info"], infos["_final_info"] = final, over.copy()
-            self._begin(np.flatnonzero(over), out)
+            self._begin(rows, out)
         self._tell(infos, facts, over)
 
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
         """Puts into `infos` what is known of every world, and how those in `begun` began."""
-        vector_info.put(infos, self._known(), np.ones(self.num_envs, np.bool_))
-        if not begun.all():
-            vector_info.put(infos, facts, ~begun)
-        if begun.any():
-            vector_info.put(infos, self._beginnings(), begun)
+        vector_info.put_all(infos, self._known(), np.zeros_like(begun))
+        rows = np.flatnonzero(begun)
+        if len(rows) < self.num_envs:
+            vector_info.put_all(infos, facts, begun)
+        if len(rows):
+            vector_info.put_rows(infos, self._beginnings(rows), rows, self.num_envs)
 
-    def _known(self) -> dict[str, Any]:
-        """What `info` tells at any time."""
-        ages = np.zeros(self.num_envs)
-        pose = self._row(self.simulator.data.odom).copy()
-        shown = {name: self._row(self.memory[name]).copy() for name in self.task.shown}
+    def _known(self, rows: Rows = EVERY) -> dict[str, Any]:
+        """What `info` tells at any time, of some worlds, in arrays of its own."""
+        pose = self._own(self.simulator.data.odom[rows])
+        shown = {name: self._own(self.memory[name][rows]) for name in self.task.shown}
+        ages = np.zeros(len(pose))
         return {**shown, "pose": pose, "scan_age_s": ages, "odom_age_s": ages.copy()}
 
-    def _beginnings(self) -> dict[str, Any]:
-        """What `info` tells of an episode that begins."""
+    def _beginnings(self, rows: Rows) -> dict[str, Any]:
+        """What `info` tells of episodes that begin."""
         data = self.simulator.data
-        circles = data.bodies[:, : -self.robots, (X, Y, RADIUS)]
         return {
-            "episode_seed": data.seeds.copy(),
-            "start": self._row(self._starts).copy(),
-            "circles": circles,
+            "episode_seed": data.seeds[rows],
+            "start": self._row(self._starts[rows]),
+            "circles": data.bodies[rows][:, : -self.robots, (X, Y, RADIUS)],
         }
 
     def _facts(self, outcome: Outcome) -> dict[str, Any]:
-        """What `info` tells of a step."""
+        """What `info` tells of a step, of every world, in arrays of its own."""
         data = self.simulator.data
         return {
             "stamp_ns": data.steps * self._period_ns,
-            "true_pose": self._row(data.pose).copy(),
+            "true_pose": self._own(data.pose),
             "true_collision": self._row(data.collided).astype(np.bool_),
-            **{name: self._row(values) for name, values in outcome.info.items()},
-            "reward_terms": {name: self._row(term) for name, term in outcome.terms.items()},
+            **{name: self._own(values) for name, values in outcome.info.items()},
+            "reward_terms": {name: self._own(term) for name, term in outcome.terms.items()},
         }
+
+    def _own(self, rows: NDArray[Any]) -> NDArray[Any]:
+        return self._row(rows).copy()
 
     def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
         """(N, ...) of the one robot of each world, or (N, M, ...) of teams."""
@@ -326,7 +334,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
                 drawing.Picture(self.model, self.world, self.render_mode, RENDER_FPS)
                 for _ in range(self.num_envs)
             ]
-        circles, drawn = self._beginnings()["circles"], []
+        circles, drawn = self._beginnings(EVERY)["circles"], []
         for n, picture in enumerate(self._pictures):
             memory = {name: rows[n : n + 1] for name, rows in self.memory.items()}
             scene = Scene(circles[n], self._starts[n], self.simulator.goals[n])
