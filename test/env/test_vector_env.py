@@ -16,6 +16,7 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.registration import ENVIRONMENTS, NAVIGATION, TASK
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.sim.simulator import FastSimulator
 
 MODES = ("NextStep", "SameStep")
 TASKS = (
@@ -26,6 +27,7 @@ TASKS = (
 )
 IDS = ("navigation", "navigation-discrete", "cooperative", "pursuit-discrete")
 LIMIT = 25
+THREADS = (1, 2) if hasattr(FastSimulator, "step_part") else (1, 1)
 
 
 def model():
@@ -111,7 +113,7 @@ COURSE = """
 import hashlib, sys
 import numpy as np
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-env = BridgeVectorEnv(4, model="differential")
+env = BridgeVectorEnv(4, model="differential", threads=int(sys.argv[1]))
 env.action_space.seed(0)
 found = hashlib.sha256(env.reset(seed=1)[0].tobytes())
 for _ in range(2000):
@@ -122,13 +124,29 @@ print(found.hexdigest())
 
 
 @pytest.mark.timeout(300)  # a cold start compiles
-def test_2000_steps_give_the_same_digest_in_fresh_processes():
-    found = [
-        subprocess.run([sys.executable, "-c", COURSE], capture_output=True, text=True, check=True)
-        for _ in range(2)
-    ]
-    assert len({done.stdout for done in found}) == 1
-    assert len(found[0].stdout.strip()) == 64
+def test_2000_steps_give_the_same_digest_in_fresh_processes_with_any_number_of_threads():
+    found = []
+    for threads in THREADS:
+        command = [sys.executable, "-c", COURSE, str(threads)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        found.append(done.stdout.strip())
+    assert len(set(found)) == 1
+    assert len(found[0]) == 64
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("task", TASKS, ids=IDS)
+def test_threads_change_no_bit(task, mode):
+    envs = [vector(5, threads=threads, autoreset_mode=mode, **task) for threads in THREADS]
+    firsts = [env.reset(seed=6) for env in envs]
+    for other in firsts[1:]:
+        assert np.array_equal(firsts[0][0], other[0])
+    for action in actions_of(envs[0], 60):
+        one, *others = [env.step(action) for env in envs]
+        for other in others:
+            for a, b in zip(one[:4], other[:4], strict=True):
+                assert np.array_equal(a, b)
+            assert_alike(one[4], other[4])
 
 
 @pytest.mark.parametrize("mode", MODES)
