@@ -27,7 +27,8 @@ from measuring.environments import NotInstalledError, python_with, run
 from nics_drl_bridge.env.registration import NAVIGATION, register_envs
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.sim.world import World, sample_scene
+from nics_drl_bridge.sim.scenes import sample_scene
+from nics_drl_bridge.sim.world import World
 
 SCRIPT = Path(__file__).resolve().parent / "measuring" / "irsim_steps.py"
 MODEL = open_model("differential")
@@ -36,7 +37,9 @@ WORLD = World.model_validate(
     {
         "name": "ten circles",
         "size": [6.0, 6.0],
-        "obstacles": {"count": CIRCLES, "radii": [RADIUS], "gap": 0.3},
+        "obstacles": [
+            {"shapes": [{"kind": "circle", "radius": RADIUS}], "count": CIRCLES, "gap": 0.3}
+        ],
         "clearance": 0.3,
         "goal_distance": [2.0, 4.0],
     }
@@ -108,7 +111,7 @@ def theirs(name: str, scenes: int, repeats: int) -> float:
     footprint = MODEL.robot.footprint_radius
     drawn = [sample_scene(WORLD, footprint, seed) for seed in range(scenes)]
     # Seen from the start, since their robot begins at the origin.
-    circles = [(one.circles[:, :2] - one.starts[0, :2]).tolist() for one in drawn]
+    circles = [(one.bodies[:, :2] - one.starts[0, :2]).tolist() for one in drawn]
     about = {
         "beams": MODEL.lidar.beams,
         "angle_range": float(MODEL.lidar.angles[-1] - MODEL.lidar.angles[0]),

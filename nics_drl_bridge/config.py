@@ -159,25 +159,36 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
 
 
 def _fields_at(schema: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """The field names of the model that lies at `location` inside `schema`."""
+    """The field names of the model that lies at `location` inside `schema`.
+
+    Where one of several models may stand, the location names the `kind` of the one that does.
+    """
     current: Any = schema
+    candidates: list[type[BaseModel]] = []
     for part in location:
-        if isinstance(part, int):
-            continue
         fields = getattr(current, "model_fields", {})
         if part in fields:
-            current = _inner_model(fields[part].annotation)
+            candidates = _inner_models(fields[part].annotation)
+            current = candidates[0] if candidates else None
+        else:
+            kinds = [c for c in candidates if _kind_of(c) == part]
+            current = kinds[0] if kinds else current
     return list(getattr(current, "model_fields", {}))
 
 
-def _inner_model(annotation: Any) -> Any:
+def _kind_of(model: type[BaseModel]) -> Any:
+    kind = model.model_fields.get("kind")
+    return None if kind is None else kind.default
+
+
+def _inner_models(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for argument in getattr(annotation, "__args__", ()):
-        inner = _inner_model(argument)
-        if inner is not None:
-            return inner
-    return None
+        return [annotation]
+    return [
+        model
+        for argument in getattr(annotation, "__args__", ())
+        for model in _inner_models(argument)
+    ]
 
 
 def read_text(path: Path) -> str:

@@ -29,7 +29,8 @@ from nics_drl_bridge.report.calibration_pictures import CAPTIONS, calibration_pi
 from nics_drl_bridge.report.fit_pictures import accuracy
 from nics_drl_bridge.report.page import Block, Code, Picture, Table, page
 from nics_drl_bridge.report.pictures import trajectories
-from nics_drl_bridge.sim.world import load_world, sample_scene
+from nics_drl_bridge.sim.scenes import sample_scene
+from nics_drl_bridge.sim.world import load_world
 
 RECORDING_SEED = 1
 POLICY = "go_to_goal"
@@ -224,7 +225,7 @@ def _drive_live(plan: Plan, model: SimulatorModel, say: Say) -> Live:
         path = witness.path
     say(f"  the deployed nodes {'reached' if arrived else 'did not reach'} the goal of seed 0")
     result = "success" if arrived else "time-out"
-    return Live(arrived, Episode(0, result, path, path, scene.goals[0], scene.circles, 0.0))
+    return Live(arrived, Episode(0, result, path, path, scene.goals[0], scene.bodies, 0.0))
 
 
 def _report(
@@ -235,7 +236,7 @@ def _report(
     there: list[Episode],
     live: Live,
 ) -> str:
-    walls = load_world(plan.world).all_walls()
+    world = load_world(plan.world)
     footprint = model.robot.footprint_radius
     rows = [
         (
@@ -245,7 +246,7 @@ def _report(
         for a, b in zip(here, there, strict=True)
     ]  # fmt: skip
     head = ("seed", IN_PROCESS, "steps", "path [m]", OVER_DDS, "steps", "path [m]", "deviation [m]")
-    both = trajectories({IN_PROCESS: here, OVER_DDS: there}, walls, footprint)
+    both = trajectories({IN_PROCESS: here, OVER_DDS: there}, world, footprint)
     sections: list[tuple[str, Sequence[Block]]] = [
         (
             "The model",
@@ -280,7 +281,7 @@ def _report(
                 f"{'reached' if live.arrived else 'did not reach'} its goal.",
                 Picture(
                     trajectories(
-                        {"in process": here[:1], "deployed": [live.path]}, walls, footprint
+                        {"in process": here[:1], "deployed": [live.path]}, world, footprint
                     ),
                     "The true path of the deployed robot beside the lock-step one.",
                 ),

@@ -73,12 +73,18 @@ def direct_model(
     )
 
 
+def circles(count: int, radii: tuple[float, ...] = (RADIUS,), gap: float = 0.3) -> dict:
+    """A group of round obstacles."""
+    shapes = [{"kind": "circle", "radius": radius} for radius in radii]
+    return {"shapes": shapes, "count": count, "gap": gap}
+
+
 def field(size: float = 6.0, count: int = 0, **changes) -> World:
     """A square field with `count` obstacles."""
     data = {
         "name": "field",
         "size": [size, size],
-        "obstacles": {"count": count, "radii": [RADIUS], "gap": 0.3},
+        "obstacles": [circles(count)],
         "clearance": 0.1,
         "goal_distance": [1.0, 3.0],
     }

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from robots import direct_model, field
+from robots import circles, direct_model, field
 
 from nics_drl_bridge import generator
 from nics_drl_bridge.calibration.calibration import Calibration
@@ -67,7 +67,7 @@ def test_a_saved_model_is_the_same_to_the_bit(robot, tmp_path):
 
 
 def one_radius(model):
-    return {"count": 2, "radii": [model.table.shapes[0].radius], "gap": 0.3}
+    return [circles(2, (model.table.shapes[0].radius,))]
 
 
 def test_saving_twice_gives_the_same_bytes(saved, tmp_path):

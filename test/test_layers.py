@@ -41,7 +41,7 @@ HOMES = {
     "yaml": ("config.py",),
     "typer": ("cli.py",),
     "gymnasium": ("env/*", "policy/*", "demo.py"),
-    "numba": ("*kernels.py", "sim/world.py", "lidar/scanner.py"),
+    "numba": ("*kernels.py", "lidar/scanner.py"),
     "PIL": ("lidar/maps.py",),
     "llvmlite": ("*kernels.py",),
     "mujoco": ("highfidelity/*",),

@@ -16,7 +16,8 @@ from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend, RobotView, Start
 from nics_drl_bridge.random_kernels import episode_seed
-from nics_drl_bridge.sim.world import Scene, World, load_world, sample_scene
+from nics_drl_bridge.sim.scenes import Scene, sample_scene
+from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]
 
@@ -184,7 +185,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         facts = {
             "episode_seed": episode,
             "start": self._row(starts),
-            "circles": self.scene.circles,
+            "bodies": self.scene.bodies.copy(),
         }
         observation = self.task.observation(self._view, self.memory)[0]
         if self.render_mode == "human":
@@ -272,7 +273,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             drawing = import_module("nics_drl_bridge.env.rendering")
             self._picture = drawing.Picture(self.model, self.world, self.render_mode, RENDER_FPS)
         poses = np.reshape(self._true_pose, (self.robots, 3))
-        return self._picture.draw(poses, self._view.ranges[0], self.scene, self.memory)
+        return self._picture.draw(poses, self._view.ranges[0], self.scene.bodies, self.memory)
 
     def close(self) -> None:
         """Leaves the robot with a zero command."""

@@ -141,7 +141,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         for name, value in info.items():
             if isinstance(value, dict):
                 told[name] = {key: float(term[m]) for key, term in value.items()}
-            elif name in ("goal", "circles") or not isinstance(value, np.ndarray):
+            elif name in ("goal", "bodies") or not isinstance(value, np.ndarray):
                 told[name] = value
             else:
                 told[name] = value if self.env.robots == 1 else value[m]

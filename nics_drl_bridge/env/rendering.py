@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle as Disc
-from matplotlib.patches import Patch, PathPatch
-from matplotlib.path import Path
-from matplotlib.transforms import Affine2D
+from matplotlib.patches import Patch
+from matplotlib.patches import Polygon as Outline
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.lidar.shapes import Circle, Shape
-from nics_drl_bridge.sim.world import Scene, World
+from nics_drl_bridge.lidar.shapes import HEADING, RADIUS, SHAPE
+from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
 SIZE_IN, DPI, MARGIN = 5.0, 100, 0.05
-WALL, BODY, GOAL, SCAN = "#333333", "#8d99ae", "#f2c14e", "#d1495b"
+WALL, STANDING, GOAL, SCAN = "#333333", "#8d99ae", "#f2c14e", "#d1495b"
 ROBOTS = ("#1f6fb2", "#2f855a", "#7a4fa3", "#b7791f", "#0f766e", "#9d174d")
 
 
@@ -45,6 +41,8 @@ class Picture:
         scale = SIZE_IN / max(width, depth)
         size = (scale * width, scale * depth)
         if self._human:
+            import matplotlib.pyplot as plt  # it looks for a display, which pictures do not need
+
             self._figure = plt.figure(figsize=size, dpi=DPI)
         else:
             self._figure = Figure(figsize=size, dpi=DPI)
@@ -55,7 +53,7 @@ class Picture:
         self,
         poses: Array,
         ranges: NDArray[np.float32],
-        scene: Scene,
+        bodies: Array,
         memory: dict[str, NDArray[Any]],
     ) -> NDArray[np.uint8] | None:
         """Draws a world.
@@ -63,7 +61,7 @@ class Picture:
         Args:
             poses: (M, 3) of the robots.
             ranges: (M, B) their scans [m].
-            scene: gives the bodies.
+            bodies: (K, 7) see `sim.scenes.Scene`.
             memory: of the task, with a leading 1; `goal` (1, M, 2) is drawn.
 
         Returns:
@@ -76,10 +74,7 @@ class Picture:
         half = (0.5 + MARGIN) * np.array(self._world.size)
         axes.set_xlim(-half[0], half[0])
         axes.set_ylim(-half[1], half[1])
-        walls = self._world.all_walls().reshape(-1, 2, 2)
-        axes.add_collection(LineCollection(list(walls), colors=WALL, linewidths=2.0))
-        for shape, pose in placed(scene):
-            axes.add_patch(outline(shape, pose))
+        draw_world(axes, self._world, bodies)
         for goal in np.reshape(memory.get("goal", np.zeros((0, 2))), (-1, 2)):
             axes.plot(*goal, marker="*", color=GOAL, markersize=16, markeredgecolor=WALL)
         for m, (pose, scan) in enumerate(zip(poses, ranges, strict=True)):
@@ -114,21 +109,47 @@ class Picture:
     def close(self) -> None:
         """Closes the window."""
         if self._human:
+            import matplotlib.pyplot as plt
+
             plt.close(self._figure)
 
 
-def placed(scene: Scene) -> Sequence[tuple[Shape, Array]]:
-    """The bodies of a scene: shape and pose (3,) of each."""
-    return [(Circle(radius=float(radius)), np.array([x, y, 0.0])) for x, y, radius in scene.circles]
+def draw_world(axes: Axes, world: World, bodies: NDArray[np.float64]) -> None:
+    """Draws map, walls and obstacles.
+
+    Args:
+        axes: to draw into; x and y in `map` [m].
+        world: map, walls and shapes.
+        bodies: (K, 7) see `sim.scenes.Scene`.
+    """
+    if world.grid is not None:
+        _draw_map(axes, world)
+    for x1, y1, x2, y2 in world.all_walls():
+        axes.plot([x1, x2], [y1, y2], color=WALL, linewidth=2)
+    for body in bodies:
+        if body[RADIUS] > 0.0:
+            axes.add_patch(_patch(world, body))
 
 
-def outline(shape: Shape, pose: Array) -> Patch:
-    """A shape at a pose (3,) as a patch; a segment is a line."""
-    if isinstance(shape, Circle):
-        return Disc((pose[0], pose[1]), shape.radius, color=BODY)
-    turn = Affine2D().rotate(pose[2]).translate(pose[0], pose[1])
-    closed = len(shape.outline) > 2
-    corners = turn.transform(shape.outline)
-    if closed:
-        corners = np.concatenate([corners, corners[:1]])
-    return PathPatch(Path(corners, closed=closed), color=BODY, fill=closed, linewidth=2.0)
+def _draw_map(axes: Axes, world: World) -> None:
+    """Solid cells dark, unknown ones grey."""
+    grid = world.grid
+    if grid is None:
+        return
+    rows, columns = grid.cells.shape
+    i, j = np.indices((rows + 1, columns + 1)) - 0.5
+    corners = grid.cell_to_world(np.stack([i, j], axis=-1))
+    shade = np.where(grid.free, 1.0, np.where(grid.blocked, 0.2, 0.8))
+    axes.pcolormesh(
+        corners[..., 0], corners[..., 1], shade, cmap="gray", vmin=0.0, vmax=1.0, rasterized=True
+    )
+
+
+def _patch(world: World, body: NDArray[np.float64]) -> Patch:
+    shape = world.shapes[int(body[SHAPE]) % len(world.shapes)]
+    if not len(shape.outline):
+        return Disc((body[0], body[1]), body[RADIUS], color=STANDING)
+    outline = shape.outline * (body[RADIUS] / shape.radius)
+    c, s = np.cos(body[HEADING]), np.sin(body[HEADING])
+    corners = outline @ np.array([[c, s], [-s, c]]) + body[:2]
+    return Outline(corners, closed=len(corners) > 2, facecolor=STANDING, edgecolor=STANDING, lw=2)

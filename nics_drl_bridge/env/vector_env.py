@@ -23,9 +23,9 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.lidar.scanner import Renderer
-from nics_drl_bridge.lidar.shapes import RADIUS, X, Y
+from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import Scene, World, load_world
+from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
@@ -127,6 +127,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._first: NDArray[np.int64] = np.zeros(count, np.int64)
         self._episode: NDArray[np.int64] = np.full(count, -1)
         self._starts: Array = np.zeros((count, robots, 3))
+        self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
         self._pictures: list[Any] = []
         self.memory: Memory = {}
 
@@ -189,7 +190,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         if options and "start" in options:
             starts = np.empty((len(worlds), self.robots, 3))
             starts[...] = options["start"]
-        self.simulator.reset(seeds, worlds, starts)  # type: ignore[arg-type]
+        scenes = self.simulator.reset(seeds, worlds, starts)  # type: ignore[arg-type]
+        self._bodies[worlds] = scenes.bodies
         data = self.simulator.data
         self._starts[worlds] = data.pose[worlds]
         fresh = self.task.reset(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))
@@ -303,7 +305,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         return {
             "episode_seed": data.seeds[rows],
             "start": self._row(self._starts[rows]),
-            "circles": data.bodies[rows][:, : -self.robots, (X, Y, RADIUS)],
+            "bodies": self._bodies[rows],
         }
 
     def _facts(self, outcome: Outcome) -> dict[str, Any]:
@@ -334,12 +336,12 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
                 drawing.Picture(self.model, self.world, self.render_mode, RENDER_FPS)
                 for _ in range(self.num_envs)
             ]
-        circles, drawn = self._beginnings(EVERY)["circles"], []
+        drawn = []
         for n, picture in enumerate(self._pictures):
             memory = {name: rows[n : n + 1] for name, rows in self.memory.items()}
-            scene = Scene(circles[n], self._starts[n], self.simulator.goals[n])
             data = self.simulator.data
-            drawn.append(picture.draw(data.pose[n], data.ranges[n], scene, memory))
+            bodies = self._bodies[n]
+            drawn.append(picture.draw(data.pose[n], data.ranges[n], bodies, memory))
         return tuple(drawn)
 
     def close_extras(self, **kwargs: Any) -> None:

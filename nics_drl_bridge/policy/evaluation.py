@@ -25,7 +25,7 @@ class Episode:
         path: (T, 3) true pose where the backend knows it, else the estimate, after each step.
         estimate: (T, 3) what the robot believed.
         goal: (2,) [m].
-        circles: (K, 3) obstacles: x, y, radius [m].
+        bodies: (K, 7) obstacles as they stood at the start, see `sim.scenes.Scene`.
         reward: sum over the episode.
     """
 
@@ -34,7 +34,7 @@ class Episode:
     path: Array
     estimate: Array
     goal: Array
-    circles: Array
+    bodies: Array
     reward: float
 
     @property
@@ -51,7 +51,7 @@ class Episode:
 def drive(env: gymnasium.Env[Any, Any], policy: Policy, seed: int) -> Episode:
     """Drives one episode to its end."""
     observation, info = env.reset(seed=seed)
-    goal, circles = info["goal"], info["circles"]
+    goal, bodies = info["goal"], info["bodies"]
     paths, estimates, total = [info["start"]], [info["pose"]], 0.0
     while True:
         observation, reward, terminated, truncated, info = env.step(policy.act(observation))
@@ -62,7 +62,7 @@ def drive(env: gymnasium.Env[Any, Any], policy: Policy, seed: int) -> Episode:
             break
     reached, touched = np.all(info["is_success"]), np.any(info["collision"])
     result = "success" if reached else "collision" if touched else "time-out"
-    return Episode(seed, result, np.array(paths), np.array(estimates), goal, circles, total)
+    return Episode(seed, result, np.array(paths), np.array(estimates), goal, bodies, total)
 
 
 def drive_all(

@@ -6,13 +6,13 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from numpy.typing import NDArray
 
+from nics_drl_bridge.env.rendering import draw_world
 from nics_drl_bridge.policy.evaluation import Episode
+from nics_drl_bridge.sim.world import World
 
 LINES: tuple[dict[str, Any], ...] = (
     {"color": "#1f6fb2", "linewidth": 3.5, "alpha": 0.55},
@@ -22,14 +22,12 @@ LINES: tuple[dict[str, Any], ...] = (
 LEAST_WIDTH = 5.5
 
 
-def trajectories(
-    runs: Mapping[str, Sequence[Episode]], walls: NDArray[np.float64], footprint: float
-) -> bytes:
+def trajectories(runs: Mapping[str, Sequence[Episode]], world: World, footprint: float) -> bytes:
     """One panel per episode, the paths of all runs in it (the paper's Fig. 7).
 
     Args:
         runs: name -> episodes, the same seeds in each.
-        walls: (W, 4) x1, y1, x2, y2 [m].
+        world: where they were driven.
         footprint: radius of the robot [m].
 
     Returns:
@@ -44,7 +42,7 @@ def trajectories(
     )
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, *episodes in zip(grid, *runs.values(), strict=False):
-        _panel(axes, dict(zip(names, episodes, strict=True)), walls, footprint)
+        _panel(axes, dict(zip(names, episodes, strict=True)), world, footprint)
     for axes in grid[count:]:
         axes.set_axis_off()
     handles, labels = grid[0].get_legend_handles_labels()
@@ -52,14 +50,9 @@ def trajectories(
     return _png(figure)
 
 
-def _panel(
-    axes: Axes, episodes: Mapping[str, Episode], walls: NDArray[np.float64], footprint: float
-) -> None:
+def _panel(axes: Axes, episodes: Mapping[str, Episode], world: World, footprint: float) -> None:
     first = next(iter(episodes.values()))
-    for x1, y1, x2, y2 in walls:
-        axes.plot([x1, x2], [y1, y2], color="#333333", linewidth=2)
-    for x, y, radius in first.circles:
-        axes.add_patch(Circle((x, y), radius, color="#8d99ae"))
+    draw_world(axes, world, first.bodies)
     axes.add_patch(Circle(tuple(first.goal), 0.3, color="#f2c14e", alpha=0.7, label="goal"))
     axes.add_patch(
         Circle(tuple(first.path[0, :2]), footprint, fill=False, color="#333333", label="start")

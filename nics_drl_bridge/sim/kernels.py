@@ -13,7 +13,7 @@ from numba import njit
 
 from nics_drl_bridge.kinematics.kernels import delayed, move, rates, run, wrap
 from nics_drl_bridge.sim import sensing_kernels as sensing
-from nics_drl_bridge.sim.world import wall_distance
+from nics_drl_bridge.sim.space_kernels import wall_distance
 
 
 @njit(cache=True)

@@ -14,10 +14,11 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.kinematics.kernels import SERIES, scratch, term_arrays
 from nics_drl_bridge.lidar.baking import with_shapes
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
-from nics_drl_bridge.lidar.shapes import BODY, Circle
+from nics_drl_bridge.lidar.shapes import BODY, SHAPE, Circle, place
 from nics_drl_bridge.sim import kernels, sensing_kernels
+from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
 from nics_drl_bridge.sim.validity import CommandBox, OutsideValidityWarning
-from nics_drl_bridge.sim.world import Scene, World, sample_scene
+from nics_drl_bridge.sim.world import World
 
 __all__ = ["FastSimulator", "OutsideValidityWarning", "Worlds"]
 
@@ -86,14 +87,17 @@ class FastSimulator:
         self.model, self.world = model, world
         self.goals: Array = np.zeros((worlds, robots, 2))
         self._footprint = Circle(radius=model.robot.footprint_radius)
-        table = with_shapes(model.lidar, model.table, (*world.shapes, self._footprint))
+        self.sampler = SceneSampler(world, self._footprint.radius, robots)
+        shapes = (*self.sampler.shapes, self._footprint)
+        table = with_shapes(model.lidar, model.table, shapes)
+        self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
         self._scanner = Scanner(model.lidar, table, renderer)
         self._walls = world.all_walls()
         drift = model.noise.simulated_drift(model.robot)
         self._noise = np.array([*model.noise.odometry, *drift])
         self._sensor = self._scanner.arguments
         self._motion = (term_arrays(model.kinematics), SERIES, model.timing)
-        bodies = world.obstacles.count + robots
+        bodies = self.sampler.count + robots
         self._rooms = (
             (*scratch(model.kinematics), np.zeros((robots, 2))),
             self._scanner.room(bodies),
@@ -123,7 +127,7 @@ class FastSimulator:
         size, width = len(self.model.robot.state), len(self.model.robot.command)
         _, substeps, delay = self.model.timing
         periods = -(-delay // substeps) + 1
-        bodies = self.world.obstacles.count + robots
+        bodies = self.sampler.count + robots
         shape = (worlds, robots)
         return Worlds(
             pose=np.zeros((*shape, 3)),
@@ -144,43 +148,48 @@ class FastSimulator:
         seeds: Sequence[int],
         worlds: Sequence[int] | None = None,
         starts: ArrayLike | None = None,
-    ) -> list[Scene]:
+    ) -> Scenes:
         """Begins episodes.
 
         Args:
             seeds: of each episode (n,); a seed fixes scene, start, goal and noise.
             worlds: which worlds begin anew (n,), all by default.
-            starts: (n, M, 3) poses to begin at instead of the scene's.
+            starts: (n, M, 3) poses to begin at instead of the scenes'.
 
         Returns:
             The scene of each.
+
+        Raises:
+            ConfigError: the seeds or starts do not fit, or the world has no room for a scene.
         """
         chosen = np.arange(len(self.data.steps)) if worlds is None else np.asarray(worlds, np.int64)
-        scenes = []
-        for row, (n, seed) in enumerate(zip(chosen, seeds, strict=True)):
-            scene = sample_scene(
-                self.world, self.model.robot.footprint_radius, int(seed), self.data.pose.shape[1]
+        scenes = self.sampler.draw(seeds)
+        begin = scenes.starts if starts is None else np.asarray(starts, dtype=np.float64)
+        if len(scenes) != len(chosen) or begin.shape != scenes.starts.shape:
+            raise ConfigError(
+                f"{len(scenes)} seeds and starts {begin.shape} must be of {len(chosen)} worlds "
+                f"with {self.data.pose.shape[1]} robots each."
             )
-            start = scene.starts if starts is None else np.asarray(starts, dtype=np.float64)[row]
-            self._place(int(n), int(seed), scene, start)
-            scenes.append(scene)
+        self._place(chosen, np.asarray(seeds, dtype=np.int64), scenes, begin)
         self._box.begin()
         _, room, sweep = self._rooms
         sweep[1][chosen] = 0.0
         sensing_kernels.sense(self._fields, chosen, self._walls, self._sensor, room, sweep)
         return scenes
 
-    def _place(self, n: int, seed: int, scene: Scene, start: Array) -> None:
-        data, robots = self.data, self.data.pose.shape[1]
-        data.pose[n], data.odom[n] = start, start
+    def _place(
+        self, chosen: NDArray[np.int64], seeds: NDArray[np.int64], scenes: Scenes, starts: Array
+    ) -> None:
+        data = self.data
+        data.pose[chosen], data.odom[chosen] = starts, starts
         for zeroed in (data.state, data.history, data.twist, data.collided, data.steps):
-            zeroed[n] = 0
-        data.seeds[n] = seed
-        discs = [Circle(radius=float(radius)) for radius in scene.circles[:, 2]]
-        still = np.concatenate([scene.circles[:, :2], np.zeros((len(discs), 1))], axis=1)
-        data.bodies[n, :-robots] = self._scanner.place(discs, still)
-        data.bodies[n, -robots:] = self._scanner.place([self._footprint] * robots, start)
-        self.goals[n] = scene.goals
+            zeroed[chosen] = 0
+        data.seeds[chosen] = seeds
+        bodies = scenes.bodies.copy()
+        bodies[..., SHAPE] = self._in_table[bodies[..., SHAPE].astype(np.int64)]
+        footprints = place(starts, self._footprint.radius, self._in_table[-1])
+        data.bodies[chosen] = np.concatenate([bodies, footprints], axis=1)
+        self.goals[chosen] = scenes.goals
 
     def step(self, commands: ArrayLike) -> None:
         """Moves every world by one control period; the results are in `data`.

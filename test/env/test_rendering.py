@@ -8,10 +8,8 @@ import pytest
 from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.rendering import outline
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.lidar.shapes import STRIP, Circle, Polygon, Segment
 
 BLUE = np.array([0x1F, 0x6F, 0xB2])
 
@@ -76,18 +74,3 @@ def test_a_vector_env_draws_what_its_single_envs_draw():
         alone = env("rgb_array")
         alone.reset(seed=3 + n)
         assert np.array_equal(pictures[n], alone.render())
-
-
-@pytest.mark.parametrize(
-    "shape",
-    [
-        Circle(radius=0.3),
-        STRIP,
-        Polygon(points=((0, 0), (1, 0), (0, 1))),
-        Segment(ends=((0, 0), (1, 1))),
-    ],
-)
-def test_every_shape_has_an_outline_that_reaches_as_far_as_it(shape):
-    box = outline(shape, np.array([1.0, 2.0, 0.7])).get_extents()
-    corners = np.array([[box.x0, box.y0], [box.x1, box.y1]]) - [1.0, 2.0]
-    assert 0.5 * shape.radius < np.abs(corners).max() <= shape.radius + 1e-9

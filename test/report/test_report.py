@@ -7,13 +7,32 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
+from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.report.page import Code, Picture, Table, page
-from nics_drl_bridge.report.pictures import trajectories
+from nics_drl_bridge.report.pictures import draw_world, trajectories
+from nics_drl_bridge.sim.world import World, load_world
 
-WALLS = np.array([[-3.0, -3.0, 3.0, -3.0]])
+WORLD = World.model_validate(
+    {
+        "name": "shapes",
+        "size": [6.0, 6.0],
+        "goal_distance": [1.0, 2.0],
+        "obstacles": [
+            {
+                "shapes": [
+                    {"kind": "circle", "radius": 0.25},
+                    {"kind": "rectangle", "size": [0.6, 0.3]},
+                    {"kind": "segment", "ends": [[-0.5, 0.0], [0.5, 0.0]]},
+                ],
+                "count": 3,
+            }
+        ],
+    }
+)
 VOID = {"meta", "img", "br"}
 
 
@@ -47,8 +66,8 @@ def parsed(html):
 def episode(seed=0, result="success", steps=20):
     t = np.linspace(0.0, 1.0, steps + 1)
     path = np.stack([t, t**2 * (seed + 1), t], axis=1)
-    circles = np.array([[1.0, 1.0, 0.25]])
-    return Episode(seed, result, path, path, np.array([1.0, 1.0]), circles, 3.0)
+    bodies = place([[1.0, 1.0, 0.0]], [0.25], [0])
+    return Episode(seed, result, path, path, np.array([1.0, 1.0]), bodies, 3.0)
 
 
 def test_a_page_is_well_formed_and_holds_what_it_was_given():
@@ -88,17 +107,54 @@ def decoded(png):
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
 def test_there_is_one_panel_per_episode(count):
     episodes = [episode(seed) for seed in range(count)]
-    image = decoded(trajectories({"one": episodes, "two": episodes}, WALLS, 0.2))
+    image = decoded(trajectories({"one": episodes, "two": episodes}, WORLD, 0.2))
     assert image.shape[0] > 400 * -(-count // 3)
     assert image.std() > 5.0
 
 
 def test_another_path_gives_another_picture():
-    pictures = [trajectories({"run": [episode(seed)]}, WALLS, 0.2) for seed in (0, 0, 1)]
+    pictures = [trajectories({"run": [episode(seed)]}, WORLD, 0.2) for seed in (0, 0, 1)]
     assert np.array_equal(decoded(pictures[0]), decoded(pictures[1]))
     assert not np.array_equal(decoded(pictures[0]), decoded(pictures[2]))
 
 
 def test_a_run_that_ended_early_is_drawn_as_far_as_it_went():
     runs = {"all": [episode(0), episode(1)], "short": [episode(0)]}
-    decoded(trajectories(runs, WALLS, 0.2))
+    decoded(trajectories(runs, WORLD, 0.2))
+
+
+def drawn(world, bodies):
+    figure = Figure(figsize=(6.0, 6.0), dpi=100)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    draw_world(axes, world, bodies)
+    x1, y1, x2, y2 = world.extent
+    axes.set(xlim=(x1, x2), ylim=(y1, y2))
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    image = decoded(buffer.getvalue())
+    rows, columns = image.shape[:2]
+
+    def dark(x, y):
+        row, column = (y2 - y) / (y2 - y1) * rows, (x - x1) / (x2 - x1) * columns
+        return image[int(row), int(column)].max() < 230
+
+    return dark
+
+
+def test_every_shape_is_drawn_where_it_stands():
+    poses, radii = [[1.0, 1.0, 0.0], [-1.0, 0.0, np.pi / 2], [0.0, -2.0, 0.0]], [0.25, 0.0, 0.5]
+    radii[1] = WORLD.shapes[1].radius
+    dark = drawn(WORLD, place(poses, radii, [0, 1, 2]))
+    for x, y in ((1.2, 1.0), (-1.0, 0.28), (-1.13, 0.0), (0.45, -2.0), (-0.45, -2.0)):
+        assert dark(x, y)
+    for x, y in ((1.3, 1.0), (-1.25, 0.0), (-1.0, 0.4), (0.6, -2.0), (0.0, -1.9)):
+        assert not dark(x, y)
+
+
+def test_a_map_is_drawn_where_it_lies():
+    world = load_world("room")
+    dark = drawn(world, np.zeros((0, 7)))
+    cells = np.argwhere(world.grid.free | world.grid.blocked)[::97]
+    middle = world.grid.cell_to_world(cells)
+    solid = world.grid.blocked[tuple(cells.T)]
+    assert [dark(x, y) for x, y in middle] == solid.tolist()

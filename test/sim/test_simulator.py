@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from robots import FOOTPRINT, RADIUS, direct_model, field, lidar
+from robots import FOOTPRINT, RADIUS, circles, direct_model, field, lidar
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
@@ -63,8 +63,8 @@ def test_the_same_seeds_give_the_same_bits_in_another_simulator(renderer):
 @pytest.mark.parametrize("batch", [4, 16, 300])
 def test_a_world_gives_the_same_bits_in_a_batch_of_any_size(robot, batch):
     model = noisy_model() if robot == "direct" else builtin_model(robot)
-    radii = [RADIUS] if robot == "direct" else [model.robot.footprint_radius]
-    world = field(5.0, obstacles={"count": 3, "radii": radii, "gap": 0.3})
+    radius = RADIUS if robot == "direct" else model.robot.footprint_radius
+    world = field(4.0, obstacles=[circles(3, (radius,))])
     commands = random_commands(model, 25, batch, 1)
     together = drive(FastSimulator(model, world, batch), range(batch), commands)
     single = FastSimulator(model, world)
@@ -155,7 +155,7 @@ def test_no_robot_ever_enters_anything_by_more_than_two_steps():
         pose = simulator.data.pose
         assert (np.abs(pose[..., :2]) <= 2.0 - FOOTPRINT + 2.0 * step).all()
         for n, scene in enumerate(scenes):
-            away = np.linalg.norm(pose[n, :, None, :2] - scene.circles[:, :2], axis=-1)
+            away = np.linalg.norm(pose[n, :, None, :2] - scene.bodies[:, :2], axis=-1)
             assert (away >= FOOTPRINT + RADIUS - 2.0 * step).all()
             others = np.linalg.norm(pose[n, :, None, :2] - pose[n, None, :, :2], axis=-1)
             assert (others + np.eye(3) >= 2.0 * FOOTPRINT - 2.0 * step).all()

@@ -1,80 +1,24 @@
 from __future__ import annotations
 
+import re
+import shutil
+
 import numpy as np
 import pytest
 import shapely
-from robots import FOOTPRINT, RADIUS, field
+from robots import circles, field
 
-from nics_drl_bridge.config import validate
+from nics_drl_bridge.config import share_folder, validate
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.sim.world import World, load_world, sample_scene, wall_distance
+from nics_drl_bridge.lidar.maps import load_map
+from nics_drl_bridge.sim.space_kernels import wall_distance
+from nics_drl_bridge.sim.world import World, load_world
 
-SEEDS = range(40)
-
-
-@pytest.fixture(scope="module")
-def world():
-    return field(6.0, count=5, walls=[[-1.0, -1.0, 1.0, 0.5]])
-
-
-@pytest.fixture(scope="module")
-def scenes(world):
-    return [sample_scene(world, FOOTPRINT, seed, robots=2) for seed in SEEDS]
+CIRCLE = {"kind": "circle", "radius": 0.2}
 
 
 def walls_of(world):
     return shapely.multilinestrings(world.all_walls().reshape(-1, 2, 2))
-
-
-def test_obstacles_stand_inside_the_field_and_apart(world, scenes):
-    for scene in scenes:
-        discs = [shapely.Point(x, y) for x, y, _ in scene.circles]
-        for i, disc in enumerate(discs):
-            assert np.abs(scene.circles[i, :2]).max() < 3.0
-            assert shapely.distance(disc, walls_of(world)) > RADIUS
-            for other in discs[:i]:
-                assert shapely.distance(disc, other) >= 2.0 * RADIUS + 0.3
-        assert np.array_equal(scene.circles[:, 2], np.full(5, RADIUS))
-
-
-def test_starts_and_goals_are_free_and_as_far_apart_as_asked(world, scenes):
-    for scene in scenes:
-        places = np.concatenate([scene.starts[:, :2], scene.goals])
-        for place in places:
-            assert shapely.distance(shapely.Point(place), walls_of(world)) >= FOOTPRINT + 0.1
-            gaps = np.linalg.norm(scene.circles[:, :2] - place, axis=1)
-            assert gaps.min() >= RADIUS + FOOTPRINT + 0.1
-        distance = np.linalg.norm(scene.goals - scene.starts[:, :2], axis=1)
-        assert ((distance >= 1.0) & (distance <= 3.0)).all()
-        assert np.linalg.norm(scene.starts[0, :2] - scene.starts[1, :2]) > 2.0 * FOOTPRINT
-        assert (np.abs(scene.starts[:, 2]) <= np.pi).all()
-
-
-def test_a_seed_fixes_the_scene_and_another_seed_gives_another(world, scenes):
-    for seed, scene in zip(SEEDS, scenes, strict=True):
-        again = sample_scene(world, FOOTPRINT, seed, robots=2)
-        for name, array in vars(scene).items():
-            assert np.array_equal(getattr(again, name), array)
-    assert len({scene.circles.tobytes() for scene in scenes}) == len(SEEDS)
-
-
-def test_the_scene_of_one_robot_is_the_beginning_of_that_of_two(world, scenes):
-    alone = sample_scene(world, FOOTPRINT, 0)
-    assert np.array_equal(alone.circles, scenes[0].circles)
-    assert np.array_equal(alone.starts, scenes[0].starts[:1])
-
-
-def test_several_radii_all_occur():
-    world = field(8.0, obstacles={"count": 8, "radii": [0.1, 0.3], "gap": 0.1})
-    radii = np.concatenate([sample_scene(world, 0.1, seed).circles[:, 2] for seed in range(10)])
-    assert set(radii) == {0.1, 0.3}
-    assert 0.25 < (radii == 0.1).mean() < 0.75
-
-
-def test_a_world_that_is_too_full_is_refused_with_what_to_change():
-    with pytest.raises(ConfigError, match="no free place for 200 obstacles") as caught:
-        sample_scene(field(2.0, count=200), FOOTPRINT, 0)
-    assert "enlarge `size`" in str(caught.value)
 
 
 def test_the_field_is_closed_by_its_walls():
@@ -84,7 +28,15 @@ def test_the_field_is_closed_by_its_walls():
     assert shapely.area(ring) == pytest.approx(16.0)
 
 
-def test_wall_distance_is_that_of_plane_geometry(world):
+def test_a_world_of_a_map_alone_has_no_other_walls_and_the_extent_of_the_map():
+    world = World(name="map", map="room", goal_distance=(1.0, 2.0))
+    assert world.all_walls().shape == (0, 4)
+    assert world.extent == pytest.approx((-3.0, -4.0, 7.0, 4.0))
+    assert np.array_equal(world.grid.cells, load_map("room").cells)
+
+
+def test_wall_distance_is_that_of_plane_geometry():
+    world = field(6.0, walls=[[-1.0, -1.0, 1.0, 0.5]])
     walls = world.all_walls()
     for x, y in np.random.default_rng(0).uniform(-3.0, 3.0, (200, 2)):
         expected = shapely.distance(shapely.Point(x, y), walls_of(world))
@@ -93,22 +45,80 @@ def test_wall_distance_is_that_of_plane_geometry(world):
     assert wall_distance(3.0, 4.0, np.zeros((1, 4))) == 5.0
 
 
-@pytest.mark.parametrize("name", ["arena", "empty"])
-def test_shipped_worlds_have_room(name):
-    world = load_world(name)
-    for seed in range(30):
-        sample_scene(world, 0.17, seed)
+def test_worlds_of_equal_content_share_a_fingerprint_and_others_do_not():
+    assert field().fingerprint == field().fingerprint
+    others = [field(5.0), field(count=1), field(walls=[[0.0, 0.0, 1.0, 0.0]]), load_world("room")]
+    assert len({world.fingerprint for world in (field(), *others)}) == 5
+
+
+@pytest.fixture
+def own_world(tmp_path):
+    """A world file with a copy of the shipped map beside it."""
+    folder = share_folder() / "config" / "maps"
+    (tmp_path / "maps").mkdir()
+    for name in ("room.yaml", "room.pgm"):
+        shutil.copy(folder / name, tmp_path / "maps" / name)
+    file = tmp_path / "own.yaml"
+    file.write_text("name: room\nmap: maps/room.yaml\ngoal_distance: [1.0, 2.0]\n")
+    return file
+
+
+def test_a_map_is_looked_for_from_the_folder_of_the_world_file(own_world):
+    assert np.array_equal(load_world(str(own_world)).grid.cells, load_map("room").cells)
+
+
+def test_the_fingerprint_changes_with_the_content_of_the_map_but_not_with_its_path(own_world):
+    before = load_world(str(own_world)).fingerprint
+    named = World(name="room", map="room", goal_distance=(1.0, 2.0))
+    assert before == named.fingerprint
+    picture = own_world.parent / "maps" / "room.pgm"
+    data = bytearray(picture.read_bytes())
+    data[-1] = 254 if data[-1] == 0 else 0
+    picture.write_bytes(bytes(data))
+    assert load_world(str(own_world)).fingerprint != before
+
+
+def test_a_missing_map_is_refused_when_the_world_is_loaded(own_world):
+    own_world.write_text("name: room\nmap: maps/rooom.yaml\ngoal_distance: [1.0, 2.0]\n")
+    with pytest.raises(ConfigError, match=r"rooom.yaml: no such file"):
+        load_world(str(own_world))
+    own_world.write_text("name: room\nmap: rom\ngoal_distance: [1.0, 2.0]\n")
+    with pytest.raises(ConfigError, match="did you mean 'room'"):
+        load_world(str(own_world))
+
+
+def test_an_unknown_key_is_named_with_the_file_and_the_nearest_key(tmp_path):
+    file = tmp_path / "own.yaml"
+    file.write_text("name: own\nsize: [3.0, 3.0]\ngoal_distanze: [1.0, 2.0]\n")
+    with pytest.raises(ConfigError) as caught:
+        load_world(str(file))
+    assert str(file) in str(caught.value)
+    assert "did you mean 'goal_distance'?" in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
         ({"size": [0.0, 3.0]}, "size must be greater than 0"),
+        ({"size": None}, "needs a `size`, a `map`, or both"),
         ({"goal_distance": [3.0, 1.0]}, "goal_distance must be"),
-        ({"obstacles": {"count": 1, "radii": [0.0]}}, "radii must be greater than 0"),
-        ({"obstacles": {"count": 1, "radii": []}}, "key 'obstacles.radii'"),
-        ({"obstacles": {"count": -1, "radii": [0.1]}}, "key 'obstacles.count'"),
+        ({"obstacles": [circles(1, (0.0,))]}, "key 'obstacles.0.shapes.0.circle.radius'"),
+        ({"obstacles": [circles(1, ())]}, "key 'obstacles.0.shapes'"),
+        ({"obstacles": [circles(-1)]}, "count must be a whole number, or [least, greatest]"),
+        ({"obstacles": [circles([3, 1])]}, "count must be a whole number, or [least, greatest]"),
+        ({"obstacles": [circles("many")]}, "key 'obstacles.0.count': count must be a whole number"),
+        ({"obstacles": [circles(9_000), circles(9_000)]}, "together may have 10000"),
+        ({"obstacles": [circles(1) | {"at": [[0.0, 0.0, 0.0]]}]}, "either `count` or `at`"),
+        ({"obstacles": [{"shapes": [CIRCLE]}]}, "either `count` or `at`"),
+        ({"obstacles": [circles(1) | {"gab": 0.1}]}, "did you mean 'gap'"),
+        (
+            {"obstacles": [{"shapes": [{"kind": "rectangle", "sise": [1, 1]}], "count": 1}]},
+            "did you mean 'size'",
+        ),
+        ({"obstacles": [circles(1) | {"motion": {"kind": "fly"}}]}, "key 'obstacles.0.motion'"),
         ({"walls": [[0.0, 1.0]]}, "key 'walls.0"),
+        ({"starts": {}}, "either `regions` or `at`"),
+        ({"goals": {"at": [[0.0, 0.0, 0.0]]}}, "key 'goals.at.0"),
         ({"clearanze": 0.1}, "did you mean 'clearance'"),
     ],
 )
@@ -116,4 +126,6 @@ def test_a_world_that_cant_be_is_refused_in_one_sentence(changes, sentence):
     with pytest.raises(ConfigError) as caught:
         validate(field().model_dump(mode="json") | changes, World, "world.yaml")
     assert sentence in str(caught.value)
+    assert str(caught.value).startswith("world.yaml: ")
     assert "\n" not in str(caught.value)
+    assert not re.search(r"\.\S*\. ", str(caught.value))

@@ -1,0 +1,263 @@
+"""The scenes that are drawn from worlds: obstacles, starts and goals of each seed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.shapes import BODY, Circle, Outlines, Polygon, Rectangle, Segment, Shape
+from nics_drl_bridge.sim import scene_kernels as kernels
+from nics_drl_bridge.sim.areas import Areas, areas_of
+from nics_drl_bridge.sim.motion import Motion
+from nics_drl_bridge.sim.world import Goals, Starts, World
+
+__all__ = ["Scene", "SceneSampler", "Scenes", "sample_scene", "scaled"]
+
+Array = NDArray[np.float64]
+Search = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
+GREATEST_SEED = 2**63 - 1
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What one seed gives in a world.
+
+    Attributes:
+        bodies: (K, 7) obstacles as in `lidar.shapes.BODY`; the index of the shape is that in
+            `SceneSampler.shapes`, the radius is 0 where there is none.
+        starts: (M, 3) pose of each robot.
+        goals: (M, 2) position of each goal [m].
+    """
+
+    bodies: Array
+    starts: Array
+    goals: Array
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """What n seeds give in a world; `scenes[i]` is the Scene of one.
+
+    Attributes:
+        bodies: (n, K, 7) see `Scene`.
+        starts: (n, M, 3).
+        goals: (n, M, 2).
+    """
+
+    bodies: Array
+    starts: Array
+    goals: Array
+
+    def __len__(self) -> int:
+        """Number of scenes."""
+        return len(self.bodies)
+
+    def __getitem__(self, row: int) -> Scene:
+        """One of them."""
+        return Scene(self.bodies[row], self.starts[row], self.goals[row])
+
+    def __iter__(self) -> Iterator[Scene]:
+        """One after the other."""
+        return (self[row] for row in range(len(self)))
+
+
+class SceneSampler:
+    """Draws scenes of a world.
+
+    A start and its goal are free, with the clearance of the world around the robot, and a robot
+    that keeps this clearance can move from one to the other, among walls, map and all obstacles
+    that do not move. Obstacles overlap neither each other nor walls nor map, and keep their gaps.
+
+    Args:
+        world: where.
+        footprint_radius: of a robot [m].
+        robots: M.
+        sizes: factors that obstacles may be larger by.
+
+    Attributes:
+        shapes: every shape that can occur: those of the world in the first size, then in the next.
+        count: K, the most obstacles.
+        motions: (K) how each obstacle moves, None for not at all; obstacle k belongs to the same
+            group in every scene.
+
+    Raises:
+        ConfigError: the world has no free space for such a robot.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        footprint_radius: float,
+        robots: int = 1,
+        sizes: Sequence[float] = (1.0,),
+    ) -> None:
+        self.world, self.robots = world, robots
+        self.shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
+        self._sizes = len(sizes)
+        slots = [g for g, group in enumerate(world.obstacles) for _ in range(group.counts[1])]
+        self.count = len(slots)
+        self.motions: tuple[Motion | None, ...] = tuple(world.obstacles[g].motion for g in slots)
+        outlines = Outlines.of((*self.shapes, Circle(radius=1.0)))
+        self._outlines = (*outlines.arguments, outlines.radii)
+        areas = areas_of(world, footprint_radius)
+        self._static = areas.static
+        self._rules = _rules(world, footprint_radius, areas)
+        self._where = (
+            _places(world.starts), _places(world.goals), areas.for_robots, areas.for_anything,
+        )  # fmt: skip
+        self._plan = _plan(world, slots, len(sizes))
+        self._footprint = footprint_radius
+        self._searches: list[Search] = []
+
+    def draw(
+        self,
+        seeds: ArrayLike,
+        count: ArrayLike | None = None,
+        size: ArrayLike | None = None,
+    ) -> Scenes:
+        """Draws the scenes that belong to seeds; the same in every process and batch.
+
+        Args:
+            seeds: (n,).
+            count: (n,) how many random obstacles each has, at most what the world allows; by
+                default as the world says.
+            size: (n,) which of the sizes all obstacles of a scene have; the first by default.
+
+        Raises:
+            ConfigError: a seed is out of range, or the world has no room for a scene.
+        """
+        numbers = _seeds(seeds)
+        n = len(numbers)
+        wanted = np.full(n, -1) if count is None else np.maximum(np.asarray(count), 0)
+        sizes = np.zeros(n, np.int64) if size is None else np.asarray(size, dtype=np.int64)
+        if wanted.shape != (n,) or sizes.shape != (n,):
+            raise ConfigError(f"count {wanted.shape} and size {sizes.shape} must be ({n},).")
+        if n and not 0 <= sizes.min() <= sizes.max() < self._sizes:
+            raise ConfigError(f"size must be from 0 to {self._sizes - 1}.")
+        scenes = Scenes(
+            np.zeros((n, self.count, BODY)),
+            np.zeros((n, self.robots, 3)),
+            np.zeros((n, self.robots, 2)),
+        )
+        search = self._search()
+        row, why = kernels.draw_scenes(
+            numbers, wanted.astype(np.int64), sizes, self._plan, self._static, self._outlines,
+            self._rules, self._where, scenes.bodies, scenes.starts, scenes.goals, search,
+        )  # fmt: skip
+        self._searches.append(search)
+        if row < n:
+            raise ConfigError(self._no_room(int(numbers[row]), why))
+        return scenes
+
+    def _search(self) -> Search:
+        """Scratch for one call; threads may draw at the same time."""
+        try:
+            return self._searches.pop()
+        except IndexError:
+            cells = self._static[1].size
+            return (
+                np.zeros(cells, np.int64), np.zeros((2, cells), np.int64), np.zeros(1, np.int64),
+            )  # fmt: skip
+
+    def _no_room(self, seed: int, why: int) -> str:
+        world = self.world
+        if why == kernels.NO_OBSTACLES:
+            return (
+                f"{world.source}: key 'obstacles': no free place for {self.count} obstacles in "
+                f"the scene of seed {seed}; lower `count` or `gap`, or enlarge `size`."
+            )
+        others = f" among {self.count} obstacles" if self.count else ""
+        return (
+            f"{world.source}: key 'goal_distance': no free places for {self.robots} start(s) and "
+            f"goal(s) of robots of radius {self._footprint:g} m, {world.goal_distance[0]:g} to "
+            f"{world.goal_distance[1]:g} m apart with a way between{others}, in the scene of seed "
+            f"{seed}; change `goal_distance`, lower `clearance` or `obstacles`, or enlarge `size`."
+        )
+
+
+def sample_scene(world: World, footprint: float, seed: int, robots: int = 1) -> Scene:
+    """Draws the scene that belongs to a seed; the same in every process.
+
+    Args:
+        world: where.
+        footprint: radius of a robot [m].
+        seed: of the episode.
+        robots: M.
+
+    Raises:
+        ConfigError: the world has no room for it.
+    """
+    return _sampler(world, footprint, robots).draw([seed])[0]
+
+
+@lru_cache(maxsize=16)
+def _sampler(world: World, footprint: float, robots: int) -> SceneSampler:
+    return SceneSampler(world, footprint, robots)
+
+
+def scaled(shape: Shape, factor: float) -> Shape:
+    """A shape, larger by a factor."""
+    if factor == 1.0:
+        return shape
+    if isinstance(shape, Circle):
+        return Circle(radius=shape.radius * factor)
+    if isinstance(shape, Rectangle):
+        return Rectangle(size=(shape.size[0] * factor, shape.size[1] * factor))
+    if isinstance(shape, Segment):
+        (x1, y1), (x2, y2) = shape.ends
+        return Segment(ends=((x1 * factor, y1 * factor), (x2 * factor, y2 * factor)))
+    return Polygon(points=tuple((x * factor, y * factor) for x, y in shape.points))
+
+
+def _seeds(seeds: ArrayLike) -> NDArray[np.int64]:
+    for seed in np.atleast_1d(np.asarray(seeds, dtype=object)):
+        if not (isinstance(seed, int | np.integer) and 0 <= seed <= GREATEST_SEED):
+            raise ConfigError(f"seed {seed}: must be a whole number from 0 to {GREATEST_SEED}.")
+    return np.atleast_1d(np.asarray(seeds, dtype=np.int64))
+
+
+def _rules(world: World, footprint: float, areas: Areas) -> tuple[float, ...]:
+    """What `scene_kernels.draw_scenes` takes as `rules`."""
+    least, greatest = world.goal_distance
+    cell = areas.static[2][4]
+    ring = math.pi * (greatest * greatest - least * least)
+    around = world.goals is None and ring < len(areas.for_robots) * cell * cell
+    return footprint, world.clearance, least, greatest, areas.room, float(around)
+
+
+def _places(places: Starts | Goals | None) -> Array:
+    """(P, 7) see `scene_kernels.draw_scenes`."""
+    if places is None:
+        return np.zeros((0, 7))
+    rows = np.zeros((len(places.at) + len(places.regions), 7))
+    for row, at in zip(rows, places.at, strict=False):
+        row[:2], row[2:4], row[4:6] = at[:2], at[:2], at[2] if len(at) > 2 else 0.0
+    for row, (x1, y1, x2, y2) in zip(rows, places.regions, strict=False):
+        row[:6] = min(x1, x2), min(y1, y2), max(x1, x2), max(y1, y2), -math.pi, math.pi
+    sizes = (rows[:, 2] - rows[:, 0]) * (rows[:, 3] - rows[:, 1])
+    shares = sizes if sizes.all() else np.ones(len(rows))
+    rows[:, 6] = np.cumsum(shares) / shares.sum()
+    return rows
+
+
+def _plan(world: World, slots: Sequence[int], sizes: int) -> tuple[Any, ...]:
+    """What `scene_kernels.draw_scenes` takes as `plan`."""
+    groups = np.zeros((len(world.obstacles), 7))
+    base: list[int] = []
+    poses = np.zeros((len(slots), 3))
+    for g, group in enumerate(world.obstacles):
+        fixed, moving = float(bool(group.at)), float(group.motion is not None)
+        groups[g] = *group.counts, group.gap, len(base), len(group.shapes), fixed, moving
+        base += [world.shapes.index(shape) for shape in group.shapes]
+        if group.at:
+            poses[np.flatnonzero(np.equal(slots, g))] = group.at
+    index = np.arange(sizes * len(world.shapes)).reshape(sizes, -1)
+    slot, taken = np.array(slots, dtype=np.int64), np.array(base, dtype=np.int64)
+    return groups, slot, taken, index, poses
