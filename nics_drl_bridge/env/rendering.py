@@ -37,7 +37,10 @@ class Picture:
     def __init__(self, model: SimulatorModel, world: World, mode: str, fps: int) -> None:
         self._model, self._world = model, world
         self._human, self._pause_s = mode == "human", 1.0 / fps
-        width, depth = world.size
+        x1, y1, x2, y2 = world.extent
+        width, depth = x2 - x1, y2 - y1
+        edge = (MARGIN * width, MARGIN * depth)
+        self._shown_x, self._shown_y = (x1 - edge[0], x2 + edge[0]), (y1 - edge[1], y2 + edge[1])
         scale = SIZE_IN / max(width, depth)
         size = (scale * width, scale * depth)
         if self._human:
@@ -71,9 +74,8 @@ class Picture:
         axes.clear()
         axes.set_axis_off()
         axes.set_aspect("equal")
-        half = (0.5 + MARGIN) * np.array(self._world.size)
-        axes.set_xlim(-half[0], half[0])
-        axes.set_ylim(-half[1], half[1])
+        axes.set_xlim(*self._shown_x)
+        axes.set_ylim(*self._shown_y)
         draw_world(axes, self._world, bodies)
         for goal in np.reshape(memory.get("goal", np.zeros((0, 2))), (-1, 2)):
             axes.plot(*goal, marker="*", color=GOAL, markersize=16, markeredgecolor=WALL)

@@ -74,3 +74,12 @@ def test_a_vector_env_draws_what_its_single_envs_draw():
         alone = env("rgb_array")
         alone.reset(seed=3 + n)
         assert np.array_equal(pictures[n], alone.render())
+
+
+def test_a_world_that_is_a_map_is_drawn_to_its_edges():
+    shown = BridgeEnv(world="room", render_mode="rgb_array")
+    shown.reset(seed=0)
+    picture = shown.render()
+    assert max(picture.shape) == 500
+    dark = (picture.max(axis=-1) < 80).sum()
+    assert dark > 500  # the walls of the map
