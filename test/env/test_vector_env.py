@@ -94,7 +94,7 @@ def test_a_world_does_not_depend_on_how_many_others_there_are(task):
     def course(count):
         env = vector(count, **task)
         seen = [env.reset(seed=10)[0][:1]]
-        for action in actions_of(vector(1, **task), 60):
+        for action in actions_of(vector(1, **task), 2000):
             step = env.step(np.repeat(action, count, axis=0))
             seen += [part[:1].copy() for part in step[:4]]
         return digest(seen)
