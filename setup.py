@@ -35,6 +35,9 @@ EXTRAS = {
     ],
     "bags": ["rosbags>=0.11,<0.12"],
     "mujoco": ["mujoco>=3.3"],
+    "multi": ["pettingzoo>=1.25,<1.28"],
+    # Of torch's releases for Linux only some are small, as this one is: no CUDA packages.
+    "train": ["stable-baselines3>=2.7,<2.10", "torch>=2.3,<2.14"],
     "test": [
         "build",
         "colcon-bash",

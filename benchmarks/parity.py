@@ -30,7 +30,7 @@ def measure(robot: str, world: str, steps: int, seed: int) -> dict[str, float]:
         tempfile.TemporaryDirectory() as folder,
         NodeProcess("simulator_node", Path(folder), parameters, domain_id),
     ):
-        here = gymnasium.make(NAVIGATION, backend="sim", model=robot, world=world)
+        here = gymnasium.make(NAVIGATION, backend="sim", model=robot, world=world, estimator=True)
         there = gymnasium.make(
             NAVIGATION,
             backend="dds",

@@ -129,7 +129,12 @@ def _drive(
 ) -> list[Episode]:
     register_envs()
     env = gymnasium.make(
-        NAVIGATION, backend=backend, model=model, world=plan.world, backend_options=options
+        NAVIGATION,
+        backend=backend,
+        model=model,
+        world=plan.world,
+        estimator=True,
+        backend_options=options,
     )
     try:
         policy = make_policy(POLICY, Navigation(model.robot, model.lidar))

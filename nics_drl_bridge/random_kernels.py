@@ -18,8 +18,9 @@ RANGE_STREAM = 3
 DRIFT_STREAM = 4
 DROPOUT_STREAM = 5
 GHOST_STREAM = 6
-RANDOMISATION_STREAM = 10
-MOTION_STREAM = 11
+RANDOMISATION_STREAM = 7
+MOTION_STREAM = 8
+EPISODE_STREAM = 9
 
 
 @njit(cache=True)
@@ -44,3 +45,11 @@ def normal(seed, stream, counter):  # type: ignore[no-untyped-def]
     """A draw from the standard normal distribution."""
     radius = math.sqrt(-2.0 * math.log(1.0 - uniform(seed, stream, 2 * counter)))
     return radius * math.cos(2.0 * math.pi * uniform(seed, stream, 2 * counter + 1))
+
+
+@njit(cache=True)
+def episode_seed(seed, number):  # type: ignore[no-untyped-def]
+    """The seed of an env's episode: the first is the env's own seed, the others below 2**53."""
+    if number == 0:
+        return np.int64(seed)
+    return np.int64(uniform(seed, EPISODE_STREAM, number) * 9007199254740992.0)

@@ -37,7 +37,7 @@ HOMES = {
     "builtin_interfaces": ("nodes/*",),
     "ament_index_python": ("nodes/*",),
     "filterpy": ("middleware/ekf.py",),
-    "matplotlib": ("report/*",),
+    "matplotlib": ("report/*", "env/rendering.py"),
     "yaml": ("config.py",),
     "typer": ("cli.py",),
     "gymnasium": ("env/*", "policy/*", "demo.py"),
@@ -49,7 +49,7 @@ HOMES = {
     "stable_baselines3": ("policy/train*.py",),
     "onnx": ("policy/*",),
     "onnxruntime": ("policy/*",),
-    "pettingzoo": ("env/*",),
+    "pettingzoo": ("env/pettingzoo_env.py",),
     "rosbags": ("kinematics/*",),
     "threadpoolctl": ("threads.py",),
 }

@@ -9,11 +9,14 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env.navigation import Navigation, Verdict
+from nics_drl_bridge.env.actions import check_action, still, team_space
+from nics_drl_bridge.env.task import Episodes, Memory, Task, override
+from nics_drl_bridge.env.tasks import make_task
 from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend, RobotView, Start
-from nics_drl_bridge.sim.scenes import sample_scene
+from nics_drl_bridge.random_kernels import episode_seed
+from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]
@@ -23,50 +26,61 @@ BACKENDS = {
     "dds": "nics_drl_bridge.nodes.dds_backend:DdsBackend",
 }
 """Where each backend lives. Named as text, so that an env in process never imports ROS 2."""
+RENDER_FPS = 10
 
 
-class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """Drive a robot to a goal by lidar, in the fast simulator or over ROS 2.
+class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
+    """A task for a robot, or a team, in the fast simulator or over ROS 2.
 
     ## Description
 
-    A robot stands in a walled field among round obstacles and has to reach a goal without
-    touching anything: the navigation task of the paper. The robot is either simulated in this
-    process (`backend="sim"`) or whatever is behind the ROS 2 topics `cmd_vel`, `scan` and
-    `odom` (`backend="dds"`): a simulator node or the vehicle. Task, spaces and numbers are the
-    same.
+    A robot with a lidar stands in a walled field among obstacles and has a task: to reach a goal
+    (`NicsBridge/Navigation-v0`), to reach several goals as a team
+    (`NicsBridge/CooperativeReaching-v0`), to catch others or escape them
+    (`NicsBridge/PursuitEvasion-v0`), or a task of your own (`NicsBridge/Task-v0`). The robot is
+    either simulated in this process (`backend="sim"`) or whatever is behind the ROS 2 topics
+    `cmd_vel`, `scan` and `odom` (`backend="dds"`): a simulator node or the vehicle. Task, spaces
+    and numbers are the same.
 
     ## Action Space
 
-    `Box(-1, 1, (C,), float32)`: each command of the robot, scaled between its limits. For the
-    Ackermann robot: speed and steering angle.
+    Of one robot, `Box(-1, 1, (C,), float32)`: each command of the robot, scaled between its
+    limits, for the Ackermann robot speed [m/s] and steering angle [rad]; or `Discrete` with
+    `task_options={"actions": "discrete"}`, see `env.actions.DRIVES`. Of M robots,
+    `Box(-1, 1, (M, C), float32)` or `MultiDiscrete`.
 
     ## Observation Space
 
-    `Box((B + 6,), float32)`, B beams:
+    `Box((O,), float32)`, or `Box((M, O), float32)` of a team; the docstring of the task's class
+    (`Navigation`, `CooperativeReaching`, `PursuitEvasion`) has the parts with their units. Those
+    of the navigation task, B beams:
 
     | Num | Observation | Min | Max | Unit |
     |---|---|---|---|---|
     | 0 to B - 1 | range in shares of the greatest; 1 free, 0 too close or unknown | 0 | 1 | - |
-    | B | distance to the goal | 0 | inf | m |
+    | B | distance to the goal | 0 | 1000 | m |
     | B + 1, B + 2 | cosine, sine of the bearing of the goal | -1 | 1 | - |
-    | B + 3, B + 4 | estimated velocity forward, left | -inf | inf | m/s |
-    | B + 5 | estimated turn rate | -inf | inf | rad/s |
+    | B + 3, B + 4 | estimated velocity forward, left | -1000 | 1000 | m/s |
+    | B + 5 | estimated turn rate | -1000 | 1000 | rad/s |
 
     ## Rewards
 
-    `info["reward_terms"]` holds the terms: `progress`, 1 per metre of approach; `time`, -0.01
-    per step; `success`, 10 at the goal; `collision`, -10 at a touch.
+    The sum of the terms in `info["reward_terms"]`, and over the robots of a team, whose terms are
+    arrays (M,). Navigation: `progress`, 1 per metre of approach; `time`, -0.01 per step;
+    `success`, 10 at the goal; `collision`, -10 at a touch.
 
     ## Starting State
 
-    The seed fixes obstacles, start pose, goal and noise; the robot stands still. `reset`
-    takes `options={"start": (x, y, heading), "goal": (x, y)}` to override them.
+    The seed fixes obstacles, start poses, goals and noise; the robots stand still. `reset` takes
+    `options={"start": (x, y, heading), "goal": (x, y)}` to override them, and any other name of
+    the task's memory.
 
     ## Episode End
 
-    Terminated when the goal is nearer than 0.3 m or something touches the footprint, both
-    judged by what the robot itself knows; truncated after 300 steps.
+    Terminated when the task has ended for every robot: navigation ends when the goal is nearer
+    than 0.3 m or something touches the footprint, both judged by what the robot itself knows.
+    A robot of a team that ended earlier stands still. Truncated after 300 steps, unless
+    `gymnasium.make` is given another `max_episode_steps`.
 
     ## Arguments
 
@@ -74,89 +88,206 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         backend: `sim`, `dds`, or an object of your own with `reset`, `step` and `close`.
         model: a SimulatorModel, its folder, or the name of a shipped robot.
         world: a World, its YAML file, or the name of a shipped one.
+        task: a name, `path/to/file.py:ClassName`, a class, or a Task; see `env.tasks.make_task`.
+        task_options: further arguments of the task's class.
+        estimator: whether the robot's middleware (cache and EKF) stands between the simulator and
+            the task. Without it, the default of `sim`, pose and twist are those of odometry: the
+            same bits as in the vector env. With it, one robot in process and one over `dds`,
+            which always has it, give the same numbers.
         backend_options: passed to the backend, see `SimBackend` and `DdsBackend`.
-        render_mode: none yet.
+        randomisation: domain randomisation of the simulator, see `FastSimulator`.
+        render_mode: `rgb_array`, `human` or None.
 
     Raises:
         ConfigError, ModelError: an unknown name or a wrong file.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own declaration
+    metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own declaration
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": RENDER_FPS,
+    }
 
     def __init__(
         self,
         backend: str | Backend = "sim",
         model: str | SimulatorModel = "ackermann",
         world: str | World = "arena",
+        task: str | type[Task] | Task = "navigation",
+        task_options: dict[str, Any] | None = None,
+        estimator: bool | None = None,
         backend_options: dict[str, Any] | None = None,
+        randomisation: Any = None,
         render_mode: str | None = None,
     ) -> None:
+        check_render_mode(render_mode, self.metadata)
         self.render_mode = render_mode
         self.model = open_model(model) if isinstance(model, str) else model
         self.world = load_world(world) if isinstance(world, str) else world
-        self.task = Navigation(self.model.robot, self.model.lidar)
-        self.observation_space = self.task.observation_space
-        self.action_space = self.task.action_space
-        self.goal: Array = np.zeros(2)
-        self._view: RobotView | None = None
-        self._backend = (
-            make_backend(backend, self.model, self.world, **(backend_options or {}))
-            if isinstance(backend, str)
-            else backend
-        )
+        self.task = make_task(task, self.model, task_options)
+        self.robots = self.task.robots
+        self.observation_space = team_space(self.task.observation_space, self.robots)
+        self.action_space = team_space(self.task.action_space, self.robots)
+        self.memory: Memory = {}
+        self.scene: Scene | None = None
+        self.ended: NDArray[np.bool_] = np.zeros(self.robots, np.bool_)
+        self._view: RobotView | None = None  # always as the batch of one that a task expects
+        self._true_pose: Array = np.zeros((self.robots, 3))
+        self._shape = (1, self.robots, self.task.observation_space.shape[0])
+        self._still = still(self.model.robot)
+        self._seed, self._episode = 0, -1
+        self._picture: Any = None
+        if isinstance(backend, str):
+            options = dict(backend_options or {})
+            options |= self._backend_arguments(backend, estimator, randomisation)
+            self._backend = make_backend(backend, self.model, self.world, **options)
+        else:
+            self._backend = backend
+
+    def _backend_arguments(
+        self, backend: str, estimator: bool | None, randomisation: Any
+    ) -> dict[str, Any]:
+        """What a backend by name is told beside the user's own options."""
+        if self.robots > 1 and (backend != "sim" or estimator):
+            raise ConfigError(
+                f"task {type(self.task).__name__!r} has {self.robots} robots; only backend='sim' "
+                "without estimator drives several."
+            )
+        if backend != "sim":
+            if estimator is False or randomisation is not None:
+                raise ConfigError(
+                    f"backend {backend!r} always estimates and is never randomised; leave out "
+                    "`estimator` and `randomisation`."
+                )
+            return {}
+        chosen = {"estimator": bool(estimator), "robots": self.robots}
+        return chosen if randomisation is None else {**chosen, "randomisation": randomisation}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begins an episode; see Gymnasium."""
         super().reset(seed=seed)
-        episode = int(self.np_random.integers(2**31)) if seed is None else int(seed)
-        scene = sample_scene(self.world, self.model.robot.footprint_radius, episode)
-        options = options or {}
-        start = np.asarray(options.get("start", scene.starts[0]), dtype=np.float64)
-        self.goal = np.asarray(options.get("goal", scene.goals[0]), dtype=np.float64)
-        self._view = self._backend.reset(Start(episode, start))
-        facts = {"episode_seed": episode, "start": start, "bodies": scene.bodies}
-        return self.task.observe(self._view, self.goal), self._info(self._view, facts)
+        if seed is not None or self._episode < 0:
+            self._seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
+            self._episode = 0
+        else:
+            self._episode += 1
+        episode = int(episode_seed(self._seed, self._episode))
+        footprint = self.model.robot.footprint_radius
+        self.scene = sample_scene(self.world, footprint, episode, self.robots)
+        starts = np.array(self.scene.starts)
+        starts[...] = (options or {}).get("start", starts)
+        self._view = self._lifted(self._backend.reset(Start(episode, self._row(starts))))
+        goals = self.scene.goals[None]
+        self.memory = self.task.reset(Episodes(np.array([episode]), starts[None], goals))
+        override(self.memory, options)
+        self.ended, self._true_pose = np.zeros(self.robots, np.bool_), starts
+        facts = {
+            "episode_seed": episode,
+            "start": self._row(starts),
+            "bodies": self.scene.bodies.copy(),
+        }
+        observation = self.task.observation(self._view, self.memory)[0]
+        if self.render_mode == "human":
+            self.render()
+        return self._row(observation), self._info(self._view, facts)
 
     def step(
-        self, action: NDArray[np.float32]
+        self, action: NDArray[Any]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Applies an action for one control period; see Gymnasium."""
+        observation, terms, info = self.advance(action)
+        values = {name: term.tolist() for name, term in terms.items()}
+        each = [0.0] * self.robots
+        for term in values.values():  # one after the other, as the vector env adds them
+            each = [one + another for one, another in zip(each, term, strict=True)]
+        reward = each[0]
+        for one in each[1:]:
+            reward += one
+        alone = self.robots == 1
+        info["reward_terms"] = {name: v[0] for name, v in values.items()} if alone else terms
+        if self.render_mode == "human":
+            self.render()
+        return self._row(observation), reward, bool(self.ended.all()), False, info
+
+    def advance(
+        self, action: NDArray[Any]
+    ) -> tuple[NDArray[np.float32], dict[str, Array], dict[str, Any]]:
+        """One control period: observations (M, O), reward terms (M,) by name, and `info`.
+
+        `ended` (M,) says for which robots the episode is over; they get a zero command and no
+        further reward.
+        """
         if self._view is None:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
-        if not np.isfinite(action).all():
-            raise gymnasium.error.InvalidAction(f"action {action!r}: holds NaN or inf.")
+        command = self.task.command(check_action(action, self.action_space, "action"))
+        waiting = self.robots > 1 and bool(self.ended.any())
+        if waiting:
+            command = np.where(self.ended[:, None], self._still, command)
         # After an error in the backend, only a reset leads back.
         before, self._view = self._view, None
-        self._view, facts = self._backend.step(self.task.command(action))
-        verdict = self.task.judge(self._view, self.goal)
-        terms = self.task.reward(before, self._view, self.goal, verdict)
-        info = self._info(self._view, facts) | _ending(verdict, terms)
-        ended = bool(verdict.reached | verdict.touched)
-        reward = float(sum(terms.values()))
-        return self.task.observe(self._view, self.goal), reward, ended, False, info
+        seen, facts = self._backend.step(command)
+        view, out = self._lifted(seen), np.empty(self._shape, np.float32)
+        outcome = self.task.step_into(out, before, view, self.memory)
+        terms = {name: term[0] for name, term in outcome.terms.items()}
+        if waiting:
+            terms = {name: np.where(self.ended, 0.0, term) for name, term in terms.items()}
+        self.ended = (self.ended & waiting) | outcome.ended[0]
+        self._view, self._true_pose = view, facts.get("true_pose", seen.pose)
+        for name, values in outcome.info.items():
+            facts[name] = self._fact(values[0])
+        return out[0], terms, self._info(view, facts)
+
+    def _lifted(self, view: RobotView) -> RobotView:
+        """A view as the batch of one that the task expects: leading (1, M)."""
+        lead = (1, self.robots, -1)
+        return RobotView(
+            view.pose.reshape(lead), view.twist.reshape(lead), view.ranges.reshape(lead),
+            view.stamp_s, view.scan_age_s, view.odom_age_s,
+        )  # fmt: skip
+
+    def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
+        """That of the one robot, or (M, ...) of a team."""
+        return rows[0] if self.robots == 1 else rows
+
+    def _fact(self, values: NDArray[Any]) -> Any:
+        row = self._row(values)
+        return row.item() if row.ndim == 0 else row.copy()
 
     def _info(self, view: RobotView, facts: dict[str, Any]) -> dict[str, Any]:
-        return {
-            "goal": self.goal.copy(),
-            "pose": view.pose,
-            "scan_age_s": view.scan_age_s,
-            "odom_age_s": view.odom_age_s,
-            **facts,
+        info: dict[str, Any] = {
+            name: self._row(self.memory[name][0]).copy() for name in self.task.shown
         }
+        info["pose"] = self._row(view.pose[0]).copy()
+        info["scan_age_s"], info["odom_age_s"] = view.scan_age_s, view.odom_age_s
+        info.update(facts)
+        return info
+
+    def render(self) -> Any:
+        """The world as it is, drawn from above; see Gymnasium."""
+        if self.render_mode is None:
+            return None
+        if self._view is None or self.scene is None:
+            raise gymnasium.error.ResetNeeded("call reset() before render().")
+        if self._picture is None:
+            drawing = import_module("nics_drl_bridge.env.rendering")
+            self._picture = drawing.Picture(self.model, self.world, self.render_mode, RENDER_FPS)
+        poses = np.reshape(self._true_pose, (self.robots, 3))
+        return self._picture.draw(poses, self._view.ranges[0], self.scene.bodies, self.memory)
 
     def close(self) -> None:
         """Leaves the robot with a zero command."""
         self._backend.close()
+        if self._picture is not None:
+            self._picture.close()
+            self._picture = None
 
 
-def _ending(verdict: Verdict, terms: dict[str, Array]) -> dict[str, Any]:
-    return {
-        "is_success": bool(verdict.reached & ~verdict.touched),
-        "collision": bool(verdict.touched),
-        "reward_terms": {name: float(value) for name, value in terms.items()},
-    }
+def check_render_mode(mode: str | None, metadata: dict[str, Any]) -> None:
+    """Raises ConfigError for a mode that the env does not have."""
+    known = metadata["render_modes"]
+    if mode is not None and mode not in known:
+        raise ConfigError(f"unknown render_mode {mode!r}; {nearest(mode, known)}")
 
 
 def make_backend(name: str, model: SimulatorModel, world: World, **options: Any) -> Backend:

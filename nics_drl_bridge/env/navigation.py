@@ -1,22 +1,19 @@
-"""The paper's task: navigate to a goal by lidar, without touching anything (Sec. VI-B).
-
-Written once, over `...` leading dimensions: the same functions serve one robot over ROS 2 and
-thousands in the vector simulator. Nothing here asks where the robot lives.
-"""
+"""The paper's task: navigate to a goal by lidar, without touching anything (Sec. VI-B)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from nics_drl_bridge import geometry
+from nics_drl_bridge.env import kernels
+from nics_drl_bridge.env.kernels import LIMIT
+from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Outcome, Task, distance
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.lidar.spec import LidarSpec
 
 Array = NDArray[np.float64]
 GOAL_PARTS = 3
@@ -32,112 +29,140 @@ class Verdict:
         touched: the scan says that something is within the footprint.
     """
 
-    reached: NDArray[np.bool_]
-    touched: NDArray[np.bool_]
+    reached: Flags
+    touched: Flags
 
 
 @dataclass(frozen=True)
-class Navigation:
-    """Observation, action, reward and end of the navigation task.
+class Navigation(Task):
+    """A robot in a walled field among obstacles has to reach a goal without touching anything.
 
-    Observation (..., B + 6), float32: the scan in shares of its range, counter-clockwise, 1 is
-    free and 0 too close or unknown; distance to the goal [m]; cosine and sine of its bearing;
-    twist vx, vy [m/s], wz [rad/s].
+    ## Observation Space
 
-    Action (..., C), float32 in [-1, 1]: each command between its limits.
+    `Box((B + 6,), float32)`, B beams, counter-clockwise:
+
+    | Num | Observation | Min | Max | Unit |
+    |---|---|---|---|---|
+    | 0 to B - 1 | range in shares of the greatest; 1 free, 0 too close or unknown | 0 | 1 | - |
+    | B | distance to the goal | 0 | 1000 | m |
+    | B + 1, B + 2 | cosine, sine of the bearing of the goal | -1 | 1 | - |
+    | B + 3, B + 4 | estimated velocity forward, left | -1000 | 1000 | m/s |
+    | B + 5 | estimated turn rate | -1000 | 1000 | rad/s |
+
+    ## Action Space
+
+    `Box(-1, 1, (C,), float32)`: each command between its limits; or `Discrete(7)`, the paper's
+    drives (`actions.DRIVES`; 9 for a robot that moves sideways).
+
+    ## Rewards
+
+    `progress`, 1 per metre of approach; `time`, -0.01 per step; `success`, 10 at the goal;
+    `collision`, -10 at a touch.
+
+    ## Starting State
+
+    Obstacles, start and goal are drawn by the world. Memory: `goal` (2,) [m].
+
+    ## Episode End
+
+    The goal is nearer than 0.3 m, or something touches the footprint, both judged by what the
+    robot itself knows. A touch at the goal is no success.
 
     Attributes:
-        robot: gives commands, their limits, and the footprint.
-        lidar: gives the scan's layout.
         goal_radius: how near is there [m].
-        contact_margin: a return this close to the footprint counts as a touch [m].
         success_reward, collision_reward: for ending that way.
         progress_reward: per metre of approach.
         time_reward: per step.
     """
 
-    robot: RobotSpec
-    lidar: LidarSpec
+    keeps_last_scan: ClassVar[bool] = False
+    shown: ClassVar[tuple[str, ...]] = ("goal",)
+
     goal_radius: float = 0.3
-    contact_margin: float = 0.02
     success_reward: float = 10.0
     collision_reward: float = -10.0
     progress_reward: float = 1.0
     time_reward: float = -0.01
 
-    @property
-    def observation_space(self) -> gymnasium.Space[NDArray[np.float32]]:
+    @cached_property
+    def observation_space(self) -> gymnasium.spaces.Box:
         """Box of one robot's observation."""
-        beams = self.lidar.beams
-        low = np.full(beams + GOAL_PARTS + TWIST_PARTS, -np.inf, np.float32)
-        high = np.full_like(low, np.inf)
-        low[:beams], high[:beams] = 0.0, 1.0
-        low[beams : beams + GOAL_PARTS] = 0.0, -1.0, -1.0
-        high[beams + 1 : beams + GOAL_PARTS] = 1.0
-        return gymnasium.spaces.Box(low, high, dtype=np.float32)
+        return self.box(
+            [0.0, -1.0, -1.0, -LIMIT, -LIMIT, -LIMIT], [LIMIT, 1.0, 1.0, LIMIT, LIMIT, LIMIT]
+        )
 
-    @property
-    def action_space(self) -> gymnasium.Space[NDArray[np.float32]]:
-        """Box of one robot's action."""
-        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.robot.command),), np.float32)
+    def reset(self, episodes: Episodes) -> Memory:
+        """The goal is the one that the world drew."""
+        return {"goal": episodes.goals.copy()}
 
-    def command(self, action: ArrayLike) -> Array:
-        """The command (..., C) of an action (..., C), clipped to the robot's limits."""
-        share = (np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0) + 1.0) / 2.0
-        low, high = self.robot.command_low, self.robot.command_high
-        return low + share * (high - low)
-
-    def observe(self, view: RobotView, goal: ArrayLike) -> NDArray[np.float32]:
+    def observation(self, view: RobotView, memory: Memory) -> Observation:
         """The observation (..., B + 6) of a view, for goals (..., 2) in `map`."""
-        relative = self._relative(view, goal)
-        distance = np.hypot(relative[..., 0], relative[..., 1])
-        bearing = np.arctan2(relative[..., 1], relative[..., 0])
-        parts = [
-            self.free_share(view.ranges),
-            np.stack([distance, np.cos(bearing), np.sin(bearing)], axis=-1),
-            view.twist,
-        ]
-        return np.concatenate(parts, axis=-1, dtype=np.float32, casting="same_kind")
+        width = self.lidar.beams + GOAL_PARTS + TWIST_PARTS
+        out = np.empty((*view.pose.shape[:-1], width), np.float32)
+        self._see(out, view.pose, view, memory)
+        return out
 
-    def free_share(self, ranges: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Ranges (..., B) in shares of the greatest: 1 no return, 0 too close or unknown."""
-        share = np.clip(ranges / np.float32(self.lidar.range_max), 0.0, 1.0)
-        return np.where(np.isnan(ranges), np.float32(0.0), share).astype(np.float32)
+    def observe_into(self, out: Observation, view: RobotView, memory: Memory) -> None:
+        """Writes the observation into (..., B + 6), which is contiguous."""
+        self._see(out, view.pose, view, memory)
 
-    def judge(self, view: RobotView, goal: ArrayLike) -> Verdict:
+    def judge(self, view: RobotView, memory: Memory) -> Verdict:
         """Whether robots are at their goals, and whether they touch something."""
-        distance = np.linalg.norm(self._relative(view, goal), axis=-1)
-        # Comparing with NaN, which is unknown, is False; -inf, too close, is nearer than all.
-        touched = (view.ranges < self._contact_ranges).any(axis=-1)
-        return Verdict(np.asarray(distance < self.goal_radius), np.asarray(touched))
+        near = distance(view.pose, memory["goal"])
+        return Verdict(np.asarray(near < self.goal_radius), self.touches(view.ranges))
+
+    def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
+        """The terms (...,) of the reward for a step; their sum is the reward."""
+        approach = distance(before.pose, memory["goal"]) - distance(after.pose, memory["goal"])
+        return self._terms(approach, self.judge(after, memory))
+
+    def end(self, view: RobotView, memory: Memory) -> Flags:
+        """Whether a robot is at its goal or touches something."""
+        verdict = self.judge(view, memory)
+        return np.asarray(verdict.reached | verdict.touched)
+
+    def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
+        """Whether an episode ended at the goal, or at a touch."""
+        return self._facts(self.judge(view, memory))
+
+    def step_into(
+        self, out: Observation, before: RobotView, after: RobotView, memory: Memory
+    ) -> Outcome:
+        """All of the above in one pass over each scan; `out` is contiguous."""
+        approach, verdict = self._see(out, before.pose, after, memory)
+        terms = self._terms(approach, verdict)
+        return Outcome(terms, verdict.reached | verdict.touched, self._facts(verdict))
+
+    def _see(
+        self, out: Observation, before: Array, view: RobotView, memory: Memory
+    ) -> tuple[Array, Verdict]:
+        """Writes what robots see; by how much nearer their goals are, and how they stand."""
+        lead = view.pose.shape[:-1]
+        approach = np.empty(lead)
+        reached, touched = np.empty(lead, np.bool_), np.empty(lead, np.bool_)
+        kernels.navigate(
+            out.reshape(-1, out.shape[-1]),
+            approach.reshape(-1), reached.reshape(-1), touched.reshape(-1), before.reshape(-1, 3),
+            view.pose.reshape(-1, 3), view.twist.reshape(-1, 3),
+            view.ranges.reshape(-1, view.ranges.shape[-1]), memory["goal"].reshape(-1, 2),
+            self._sensor, self.goal_radius,
+        )  # fmt: skip
+        return approach, Verdict(reached, touched)
 
     @cached_property
-    def _contact_ranges(self) -> NDArray[np.float32]:
-        """(B,) range at which each beam leaves the footprint and its margin [m]."""
-        x, y, heading = self.lidar.mount
-        angles = self.lidar.angles + heading
-        limit = self.robot.footprint_radius + self.contact_margin
-        along = x * np.cos(angles) + y * np.sin(angles)
-        rest = limit * limit - x * x - y * y + along * along
-        leaves = np.where(rest >= 0.0, np.sqrt(np.maximum(rest, 0.0)) - along, -np.inf)
-        return leaves.astype(np.float32)
+    def _sensor(self) -> tuple[np.float32, NDArray[np.float32]]:
+        return self.per_metre, self.contact_ranges
 
-    def reward(
-        self, before: RobotView, after: RobotView, goal: ArrayLike, verdict: Verdict
-    ) -> dict[str, Array]:
-        """The terms (...,) of the reward for a step; their sum is the reward."""
-        approach = np.linalg.norm(self._relative(before, goal), axis=-1) - np.linalg.norm(
-            self._relative(after, goal), axis=-1
-        )
+    def _terms(self, approach: Array, verdict: Verdict) -> dict[str, Array]:
+        time = np.empty_like(approach)
+        time.fill(self.time_reward)
         return {
             "progress": self.progress_reward * approach,
-            "time": np.full_like(approach, self.time_reward),
-            "success": self.success_reward * (verdict.reached & ~verdict.touched),
-            "collision": self.collision_reward * verdict.touched,
+            "time": time,
+            "success": np.multiply(self.success_reward, verdict.reached & ~verdict.touched),
+            "collision": np.multiply(self.collision_reward, verdict.touched),
         }
 
     @staticmethod
-    def _relative(view: RobotView, goal: ArrayLike) -> Array:
-        """Goals (..., 2) as seen from the robots."""
-        offset = np.asarray(goal, dtype=np.float64) - view.pose[..., :2]
-        return geometry.rotate(offset, -view.pose[..., 2])
+    def _facts(verdict: Verdict) -> dict[str, NDArray[Any]]:
+        return {"is_success": verdict.reached & ~verdict.touched, "collision": verdict.touched}

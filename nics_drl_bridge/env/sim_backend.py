@@ -1,4 +1,4 @@
-"""SimBackend: the fast simulator behind the same middleware as the robot's topics."""
+"""SimBackend: the fast simulator in this process, with the robot's middleware or without."""
 
 from __future__ import annotations
 
@@ -19,51 +19,72 @@ NANO = 1_000_000_000
 
 
 class SimBackend:
-    """One robot in the fast simulator, in this process.
+    """One world of the fast simulator, in this process.
 
-    Its scan and odometry pass through the middleware as those of the nodes do, so that this
-    backend and the one over DDS give the same numbers for the same seed and commands.
+    With `estimator`, scan and odometry of its one robot pass through the middleware as those of
+    the nodes do, so that this backend and the one over DDS give the same numbers for the same seed
+    and commands. Without, the pose is what the wheels' odometry says: the same bits as a world of
+    the vector env, and several times faster.
 
     Args:
         model: the robot.
         world: the field.
         renderer: `baked` or `exact` lidar.
+        estimator: whether the middleware stands between simulator and env.
+        robots: M; views and commands have a leading (M,) when there are several.
+        simulation: further arguments of the FastSimulator.
     """
 
-    def __init__(self, model: SimulatorModel, world: World, renderer: Renderer = "baked") -> None:
+    def __init__(
+        self,
+        model: SimulatorModel,
+        world: World,
+        renderer: Renderer = "baked",
+        estimator: bool = False,
+        robots: int = 1,
+        **simulation: Any,
+    ) -> None:
         self._robot = model.robot
-        self._simulator = FastSimulator(model, world, renderer=renderer)
-        self._middleware = Middleware(model)
+        self.simulator = FastSimulator(model, world, robots=robots, renderer=renderer, **simulation)
+        self._middleware = Middleware(model) if estimator else None
         self._period_ns = round(model.control_period * NANO)
+        self._row: Any = (0, 0) if robots == 1 else 0
         self._now_ns = 0
 
     def reset(self, start: Start) -> RobotView:
         """Begins the episode of a seed; see `interface.Backend`."""
-        self._simulator.reset([start.seed], starts=start.pose[None, None])
+        robots = self.simulator.data.pose.shape[1]
+        self.simulator.reset([start.seed], starts=start.pose.reshape(1, robots, 3))
         self._now_ns = 0
-        self._middleware.reset(self._now_ns, start.pose)
+        if self._middleware is not None:
+            self._middleware.reset(self._now_ns, start.pose)
         return self._measure()
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
-        """Moves the robot by one control period; see `interface.Backend`."""
-        # By way of cmd_vel, as over ROS 2, so that both round alike.
-        command = self._robot.from_cmd_vel(self._robot.to_cmd_vel(command))
-        self._middleware.command(self._now_ns, command)
-        self._simulator.step(command[None, None])
+        """Moves the robots by one control period; see `interface.Backend`."""
+        if self._middleware is not None:
+            # By way of cmd_vel, as over ROS 2, so that both round alike.
+            command = self._robot.from_cmd_vel(self._robot.to_cmd_vel(command))
+            self._middleware.command(self._now_ns, command)
+        data = self.simulator.data
+        self.simulator.step(command.reshape(1, data.pose.shape[1], -1))
         self._now_ns += self._period_ns
         view = self._measure()
-        data = self._simulator.data
+        collided = data.collided[self._row]
         facts = {
             "stamp_ns": self._now_ns,
-            "true_pose": data.pose[0, 0].copy(),
-            "true_collision": bool(data.collided[0, 0]),
+            "true_pose": data.pose[self._row].copy(),
+            "true_collision": bool(collided) if collided.ndim == 0 else collided.astype(np.bool_),
         }
         return view, facts
 
     def _measure(self) -> RobotView:
-        data, now = self._simulator.data, self._now_ns
-        self._middleware.odometry(now, now, data.odom[0, 0].copy(), data.twist[0, 0].copy())
-        self._middleware.scan(now, now, data.ranges[0, 0].copy())
+        data, now, row = self.simulator.data, self._now_ns, self._row
+        odom, twist, ranges = data.odom[row].copy(), data.twist[row].copy(), data.ranges[row].copy()
+        if self._middleware is None:
+            return RobotView(odom, twist, ranges, now * 1e-9, 0.0, 0.0)
+        self._middleware.odometry(now, now, odom, twist)
+        self._middleware.scan(now, now, ranges)
         return self._middleware.view(now)
 
     def close(self) -> None:

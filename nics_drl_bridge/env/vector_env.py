@@ -2,42 +2,81 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from importlib import import_module
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env import vector_info
+from nics_drl_bridge.env.actions import check_action, still, team_space
+from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
+from nics_drl_bridge.env.kernels import episode_seeds
+from nics_drl_bridge.env.sim_backend import NANO
+from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task
+from nics_drl_bridge.env.tasks import make_task
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.lidar.scanner import Renderer
+from nics_drl_bridge.lidar.shapes import BODY
+from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World, load_world
 
+Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
+Rows = slice | NDArray[np.intp]
+EVERY = slice(None)
+MODES = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
 
 
-class NavigationVectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, NDArray[Any]]):
-    """The navigation task in `num_envs` worlds at once, for training.
+class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
+    """A task in `num_envs` worlds at once, for training.
 
-    Task, spaces and rewards are those of `BridgeEnv`. The robot's pose is what its odometry
-    says, which drifts as the estimate of the single env does. A world that ended begins a new
-    episode in the next step (`AutoresetMode.NEXT_STEP`).
+    ## Description
+
+    Task, spaces, rewards and ends are those of `BridgeEnv` with `backend="sim"`, and so are the
+    numbers: world i of `reset(seed=s)` goes through the same bits as the single env of
+    `reset(seed=s + i)`, in its later episodes too, at any `num_envs` and number of threads.
+
+    ## Spaces, Rewards, Starting State, Episode End
+
+    Those of `BridgeEnv` with a leading (N,). `info` is what Gymnasium's `SyncVectorEnv` makes of
+    the single envs: each entry an array (N, ...) beside its mask `_name`. `reset` takes
+    `options={"start": ..., "goal": ...}` for all worlds that it resets, and with
+    `options={"reset_mask": (N,) bool}` it resets those only.
+
+    ## Arguments
 
     Args:
         num_envs: N.
         model: a SimulatorModel, its folder, or the name of a shipped robot.
         world: a World, its YAML file, or the name of a shipped one.
+        task: a name, `path/to/file.py:ClassName`, a class, or a Task.
+        task_options: further arguments of the task's class.
         max_episode_steps: after so many steps an episode is truncated.
+        autoreset_mode: `NextStep` (an ended world begins anew in the next step, whose action it
+            ignores) or `SameStep` (at once; the last observation is in `info["final_obs"]`).
+        copy: whether what `step` returns is the caller's own. False reuses the observation's
+            array in the next step.
         renderer: `baked` or `exact` lidar.
+        threads: of the simulator; the numbers do not depend on it.
+        randomisation: domain randomisation of the simulator, see `FastSimulator`.
+        render_mode: `rgb_array`, of every world, or None.
+
+    Raises:
+        ConfigError, ModelError: an unknown name or a wrong file.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own declaration
-        "render_modes": [],
+        "render_modes": ["rgb_array"],
+        "render_fps": RENDER_FPS,
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
@@ -46,66 +85,292 @@ class NavigationVectorEnv(gymnasium.vector.VectorEnv[Observation, Observation, N
         num_envs: int = 1,
         model: str | SimulatorModel = "ackermann",
         world: str | World = "arena",
+        task: str | type[Task] | Task = "navigation",
+        task_options: dict[str, Any] | None = None,
         max_episode_steps: int = 300,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        copy: bool = True,
         renderer: Renderer = "baked",
+        threads: int = 1,
+        randomisation: str | Randomisation | None = None,
+        render_mode: str | None = None,
     ) -> None:
-        self.num_envs, self._limit = num_envs, max_episode_steps
+        check_render_mode(render_mode, self.metadata)
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self._limit, self.copy = max_episode_steps, copy
+        self._mode = _mode(autoreset_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.model = open_model(model) if isinstance(model, str) else model
         self.world = load_world(world) if isinstance(world, str) else world
-        self.task = Navigation(self.model.robot, self.model.lidar)
-        self.single_observation_space = self.task.observation_space
-        self.single_action_space = self.task.action_space
+        self.task = make_task(task, self.model, task_options)
+        self.robots = self.task.robots
+        self.single_observation_space = team_space(self.task.observation_space, self.robots)
+        self.single_action_space = team_space(self.task.action_space, self.robots)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.simulator = FastSimulator(self.model, self.world, num_envs, renderer=renderer)
-        self._ended: Flags = np.zeros(num_envs, dtype=np.bool_)
+        self.simulator = FastSimulator(
+            self.model, self.world, num_envs, self.robots, renderer, threads, randomisation
+        )
+        self._still = still(self.model.robot)
+        self._period_ns = round(self.model.control_period * NANO)
+        self._allocate()
+
+    def _allocate(self) -> None:
+        count, robots = self.num_envs, self.robots
+        parts = self.task.observation_space.shape[0]
+        self._out: Observation = np.zeros((count, robots, parts), np.float32)
+        self._reward: Array = np.zeros((count, robots))
+        self.ended: Flags = np.zeros((count, robots), np.bool_)
+        self._over: Flags = np.zeros(count, np.bool_)
+        self._first: NDArray[np.int64] = np.zeros(count, np.int64)
+        self._episode: NDArray[np.int64] = np.full(count, -1)
+        self._starts: Array = np.zeros((count, robots, 3))
+        self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
+        self._pictures: list[Any] = []
+        self.memory: Memory = {}
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begins an episode in every world; world i takes its seeds from `seed + i`."""
-        super().reset(seed=seed)
-        if seed is not None or not hasattr(self, "_generators"):
-            first = int(self.np_random.integers(2**31)) if seed is None else seed
-            self._generators = [np.random.default_rng(first + n) for n in range(self.num_envs)]
-        self._begin(np.arange(self.num_envs))
-        self._ended[:] = False
-        view = self._view()
-        return self.task.observe(view, self._goals), {}
+        """Begins an episode in every world; world i takes its seeds from `seed + i`.
 
-    def _begin(self, worlds: NDArray[np.intp]) -> None:
-        seeds = [int(self._generators[n].integers(2**31)) for n in worlds]
-        self.simulator.reset(seeds, worlds)  # type: ignore[arg-type]
+        Raises:
+            ConfigError: wrong number of seeds, or a wrong mask.
+        """
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        chosen = _chosen(options, self.num_envs)
+        self._seed(seed, chosen)
+        if self.memory and not chosen.all():  # the others see what they saw
+            self.task.observe_into(self._out, self._view(slice(None)), self.memory)
+        rows = np.flatnonzero(chosen)
+        self._begin(rows, self._out, options)
+        infos: dict[str, Any] = {}
+        facts = self._known(rows) | self._beginnings(rows)
+        vector_info.put_rows(infos, facts, rows, self.num_envs)
+        return self._row(self._out.copy() if self.copy else self._out), infos
 
-    @property
-    def _goals(self) -> NDArray[np.float64]:
-        return self.simulator.goals[:, 0]
+    def _seed(self, seed: int | Sequence[int | None] | None, chosen: Flags) -> None:
+        """Names the next episode of the chosen worlds."""
+        if isinstance(seed, Sequence | np.ndarray):
+            if len(seed) != self.num_envs:
+                raise ConfigError(f"{len(seed)} seeds for {self.num_envs} worlds; give one each.")
+            given = chosen & np.array([one is not None for one in seed])
+            seeds = np.array([0 if one is None else one for one in seed], np.int64)
+        else:
+            given = chosen & (seed is not None)
+            seeds = (seed or 0) + np.arange(self.num_envs, dtype=np.int64)
+        new = chosen & (self._episode < 0) & ~given
+        if new.any():
+            seeds = np.where(
+                new, int(self.np_random.integers(2**31)) + np.arange(self.num_envs), seeds
+            )
+        fresh = given | new
+        self._first[fresh], self._episode[fresh] = seeds[fresh], -1
+        if (self._first[chosen] < 0).any():
+            raise ConfigError("a seed must not be negative.")
 
-    def _view(self) -> RobotView:
-        """The robots (N,) as they know themselves, in arrays of their own."""
+    def _begin(
+        self,
+        worlds: NDArray[np.intp],
+        out: Observation,
+        options: dict[str, Any] | None = None,
+    ) -> None:
+        """Begins the next episode in some worlds and writes what they see into their rows."""
+        if not len(worlds):
+            return
+        self._episode[worlds] += 1
+        seeds = np.empty(len(worlds), np.int64)
+        episode_seeds(self._first[worlds], self._episode[worlds], seeds)
+        starts = None
+        if options and "start" in options:
+            starts = np.empty((len(worlds), self.robots, 3))
+            starts[...] = options["start"]
+        scenes = self.simulator.reset(seeds, worlds, starts)  # type: ignore[arg-type]
+        self._bodies[worlds] = scenes.bodies
         data = self.simulator.data
-        return RobotView(data.odom[:, 0].copy(), data.twist[:, 0], data.ranges[:, 0], 0.0, 0.0, 0.0)
+        self._starts[worlds] = data.pose[worlds]
+        fresh = self.task.reset(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))
+        for name, rows in fresh.items():
+            if options and name in options:
+                rows[...] = options[name]
+            if name not in self.memory:
+                self.memory[name] = np.zeros((self.num_envs, *rows.shape[1:]), rows.dtype)
+            self.memory[name][worlds] = rows
+        self.ended[worlds], self._over[worlds] = False, False
+        out[worlds] = self.task.observation(self._view(worlds), fresh)
+
+    def _view(self, rows: Rows) -> RobotView:
+        """The robots (n, M) of some worlds as their odometry knows them."""
+        data = self.simulator.data
+        return RobotView(data.odom[rows], data.twist[rows], data.ranges[rows], 0.0, 0.0, 0.0)
 
     def step(
-        self, actions: Observation
-    ) -> tuple[Observation, NDArray[np.float64], Flags, Flags, dict[str, Any]]:
+        self, actions: NDArray[Any]
+    ) -> tuple[Observation, Array, Flags, Flags, dict[str, Any]]:
         """One control period in every world; see Gymnasium."""
-        if not np.isfinite(actions).all():
-            raise gymnasium.error.InvalidAction("actions hold NaN or inf.")
-        before = self._view()
-        self.simulator.step(self.task.command(actions)[:, None])
-        fresh = np.flatnonzero(self._ended)
-        if len(fresh):
-            self._begin(fresh)
-        after = self._view()
-        verdict = self.task.judge(after, self._goals)
-        terms = self.task.reward(before, after, self._goals, verdict)
-        reward = np.where(self._ended, 0.0, sum(terms.values()))
-        terminated = (verdict.reached | verdict.touched) & ~self._ended
-        truncated = (self.simulator.data.steps >= self._limit) & ~terminated & ~self._ended
-        info = {
-            "is_success": verdict.reached & ~verdict.touched & terminated,
-            "collision": verdict.touched & terminated,
+        if not self.memory:
+            raise gymnasium.error.ResetNeeded("call reset() before step().")
+        given = check_action(actions, self.action_space, "actions")
+        out = np.empty_like(self._out) if self.copy else self._out
+        begun = self._over.copy()  # these ignore their action and begin anew
+        outcome = self._all_parts(lambda part: self._advance(part, given[part], out))
+        terminated = self.ended.all(axis=1) & ~begun
+        truncated = (self.simulator.data.steps >= self._limit) & ~begun
+        reward = np.where(begun, 0.0, _over_robots(self._reward))
+        over = terminated | truncated
+        infos: dict[str, Any] = {}
+        facts = self._facts(outcome)
+        if self._mode is AutoresetMode.SAME_STEP:
+            self._end_at_once(out, over, facts, infos)
+        else:
+            self._begin(np.flatnonzero(begun), out)
+            self._over = over
+            self._tell(infos, facts, begun)
+        return self._row(out), reward, terminated, truncated, infos
+
+    def _all_parts(self, advance: Callable[[slice], Outcome]) -> Outcome:
+        """Runs every part of the simulator's worlds and puts what they came to together."""
+        done = self.simulator.run_parts(advance)
+        return done[0] if len(done) == 1 else _joined(done)
+
+    def _advance(self, part: slice, actions: NDArray[Any], out: Observation) -> Outcome:
+        """One control period of the worlds of a part; what they see goes into their rows."""
+        data, count = self.simulator.data, part.stop - part.start
+        ended = self.ended[part]
+        command = self.task.command(actions).reshape(count, self.robots, -1)
+        if self.robots > 1 and ended.any():
+            command = np.where(ended[..., None], self._still, command)
+        ranges = data.ranges[part]
+        before = RobotView(
+            data.odom[part].copy(), data.twist[part].copy(),
+            ranges.copy() if self.task.keeps_last_scan else ranges, 0.0, 0.0, 0.0,
+        )  # fmt: skip
+        self.simulator.step_part(part, command)
+        memory = {name: rows[part] for name, rows in self.memory.items()}
+        outcome = self.task.step_into(out[part], before, self._view(part), memory)
+        terms = outcome.terms
+        if self.robots > 1 and ended.any():
+            terms = {name: np.where(ended, 0.0, term) for name, term in terms.items()}
+        self._reward[part] = sum(terms.values(), np.zeros(ended.shape))
+        self.ended[part] = ended | outcome.ended
+        return Outcome(terms, outcome.ended, outcome.info)
+
+    def _end_at_once(
+        self, out: Observation, over: Flags, facts: dict[str, Any], infos: dict[str, Any]
+    ) -> None:
+        """SAME_STEP: the worlds that ended begin anew; what they ended with goes into `infos`."""
+        rows = np.flatnonzero(over)
+        if len(rows):
+            infos.update(vector_info.finals(self._row(out), rows))
+            final: dict[str, Any] = {}
+            known = self._known(rows) | vector_info.rows_of(facts, rows)
+            vector_info.put_rows(final, known, rows, self.num_envs)
+            infos["final_info"], infos["_final_info"] = final, over.copy()
+            self._begin(rows, out)
+        self._tell(infos, facts, over)
+
+    def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
+        """Puts into `infos` what is known of every world, and how those in `begun` began."""
+        vector_info.put_all(infos, self._known(), np.zeros_like(begun))
+        rows = np.flatnonzero(begun)
+        if len(rows) < self.num_envs:
+            vector_info.put_all(infos, facts, begun)
+        if len(rows):
+            vector_info.put_rows(infos, self._beginnings(rows), rows, self.num_envs)
+
+    def _known(self, rows: Rows = EVERY) -> dict[str, Any]:
+        """What `info` tells at any time, of some worlds, in arrays of its own."""
+        pose = self._own(self.simulator.data.odom[rows])
+        shown = {name: self._own(self.memory[name][rows]) for name in self.task.shown}
+        ages = np.zeros(len(pose))
+        return {**shown, "pose": pose, "scan_age_s": ages, "odom_age_s": ages.copy()}
+
+    def _beginnings(self, rows: Rows) -> dict[str, Any]:
+        """What `info` tells of episodes that begin."""
+        data = self.simulator.data
+        return {
+            "episode_seed": data.seeds[rows],
+            "start": self._row(self._starts[rows]),
+            "bodies": self._bodies[rows],
         }
-        self._ended = terminated | truncated
-        return self.task.observe(after, self._goals), reward, terminated, truncated, info
+
+    def _facts(self, outcome: Outcome) -> dict[str, Any]:
+        """What `info` tells of a step, of every world, in arrays of its own."""
+        data = self.simulator.data
+        return {
+            "stamp_ns": data.steps * self._period_ns,
+            "true_pose": self._own(data.pose),
+            "true_collision": self._row(data.collided).astype(np.bool_),
+            **{name: self._own(values) for name, values in outcome.info.items()},
+            "reward_terms": {name: self._own(term) for name, term in outcome.terms.items()},
+        }
+
+    def _own(self, rows: NDArray[Any]) -> NDArray[Any]:
+        return self._row(rows).copy()
+
+    def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
+        """(N, ...) of the one robot of each world, or (N, M, ...) of teams."""
+        return rows[:, 0] if self.robots == 1 else rows
+
+    def render(self) -> tuple[Any, ...] | None:
+        """A picture of every world; see Gymnasium."""
+        if self.render_mode is None:
+            return None
+        if not self._pictures:
+            drawing = import_module("nics_drl_bridge.env.rendering")
+            self._pictures = [
+                drawing.Picture(self.model, self.world, self.render_mode, RENDER_FPS)
+                for _ in range(self.num_envs)
+            ]
+        drawn = []
+        for n, picture in enumerate(self._pictures):
+            memory = {name: rows[n : n + 1] for name, rows in self.memory.items()}
+            data = self.simulator.data
+            bodies = self._bodies[n]
+            drawn.append(picture.draw(data.pose[n], data.ranges[n], bodies, memory))
+        return tuple(drawn)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Closes the pictures."""
+        for picture in self._pictures:
+            picture.close()
+
+
+def _over_robots(rewards: Array) -> Array:
+    """(N,) sums of rewards (N, M), robot by robot as a single env does."""
+    total = rewards[:, 0].copy()
+    for m in range(1, rewards.shape[1]):
+        total += rewards[:, m]
+    return total
+
+
+def _joined(parts: Sequence[Outcome]) -> Outcome:
+    def join(one: Callable[[Outcome], dict[str, Any]]) -> dict[str, Any]:
+        return {name: np.concatenate([one(part)[name] for part in parts]) for name in one(parts[0])}
+
+    ended = np.concatenate([part.ended for part in parts])
+    return Outcome(join(lambda part: part.terms), ended, join(lambda part: part.info))
+
+
+def _mode(mode: str | AutoresetMode) -> AutoresetMode:
+    value = mode.value if isinstance(mode, AutoresetMode) else mode
+    if value not in MODES:
+        raise ConfigError(f"autoreset_mode {value!r}: must be one of {', '.join(MODES)}.")
+    return MODES[value]
+
+
+def _chosen(options: dict[str, Any] | None, count: int) -> Flags:
+    """(N,) which worlds a reset is for."""
+    if not options or "reset_mask" not in options:
+        return np.ones(count, np.bool_)
+    mask: ArrayLike = options["reset_mask"]
+    chosen = np.asarray(mask)
+    if chosen.shape != (count,) or chosen.dtype != np.bool_ or not chosen.any():
+        raise ConfigError(
+            f"options['reset_mask'] of shape {chosen.shape}, {chosen.dtype}: must be ({count},) "
+            "bool with at least one True."
+        )
+    return chosen.copy()

@@ -70,12 +70,13 @@ class PolicyNode(Node):
         if not np.isfinite(self._goal).all():
             return np.zeros(3)
         view = self._topics.view()
-        verdict = self._task.judge(view, self._goal)
+        memory = {"goal": self._goal}
+        verdict = self._task.judge(view, memory)
         if verdict.reached or verdict.touched:
             why = "touching something, stopped" if verdict.touched else "goal reached"
             self.get_logger().info(why, throttle_duration_sec=5.0)
             return np.zeros(3)
-        action = self._policy.act(self._task.observe(view, self._goal))
+        action = self._policy.act(self._task.observation(view, memory))
         return self._task.robot.to_cmd_vel(self._task.command(action))
 
     def _message(self, twist: NDArray[np.float64], stamp_ns: int) -> TwistStamped:

@@ -60,7 +60,8 @@ def drive(env: gymnasium.Env[Any, Any], policy: Policy, seed: int) -> Episode:
         total += float(reward)
         if terminated or truncated:
             break
-    result = "success" if info["is_success"] else "collision" if info["collision"] else "time-out"
+    reached, touched = np.all(info["is_success"]), np.any(info["collision"])
+    result = "success" if reached else "collision" if touched else "time-out"
     return Episode(seed, result, np.array(paths), np.array(estimates), goal, bodies, total)
 
 

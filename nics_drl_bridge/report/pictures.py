@@ -6,14 +6,11 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Patch
-from matplotlib.patches import Polygon as Outline
-from numpy.typing import NDArray
+from matplotlib.patches import Circle
 
-from nics_drl_bridge.lidar.shapes import HEADING, RADIUS, SHAPE
+from nics_drl_bridge.env.rendering import draw_world
 from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.sim.world import World
 
@@ -23,7 +20,6 @@ LINES: tuple[dict[str, Any], ...] = (
     {"color": "#2f855a", "linewidth": 1.4, "linestyle": ":"},
 )
 LEAST_WIDTH = 5.5
-STANDING, WALL = "#8d99ae", "#333333"
 
 
 def trajectories(runs: Mapping[str, Sequence[Episode]], world: World, footprint: float) -> bytes:
@@ -52,47 +48,6 @@ def trajectories(runs: Mapping[str, Sequence[Episode]], world: World, footprint:
     handles, labels = grid[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
     return _png(figure)
-
-
-def draw_world(axes: Axes, world: World, bodies: NDArray[np.float64]) -> None:
-    """Draws map, walls and obstacles.
-
-    Args:
-        axes: to draw into; x and y in `map` [m].
-        world: map, walls and shapes.
-        bodies: (K, 7) see `sim.scenes.Scene`.
-    """
-    if world.grid is not None:
-        _draw_map(axes, world)
-    for x1, y1, x2, y2 in world.all_walls():
-        axes.plot([x1, x2], [y1, y2], color=WALL, linewidth=2)
-    for body in bodies:
-        if body[RADIUS] > 0.0:
-            axes.add_patch(_patch(world, body))
-
-
-def _draw_map(axes: Axes, world: World) -> None:
-    """Solid cells dark, unknown ones grey."""
-    grid = world.grid
-    if grid is None:
-        return
-    rows, columns = grid.cells.shape
-    i, j = np.indices((rows + 1, columns + 1)) - 0.5
-    corners = grid.cell_to_world(np.stack([i, j], axis=-1))
-    shade = np.where(grid.free, 1.0, np.where(grid.blocked, 0.2, 0.8))
-    axes.pcolormesh(
-        corners[..., 0], corners[..., 1], shade, cmap="gray", vmin=0.0, vmax=1.0, rasterized=True
-    )
-
-
-def _patch(world: World, body: NDArray[np.float64]) -> Patch:
-    shape = world.shapes[int(body[SHAPE]) % len(world.shapes)]
-    if not len(shape.outline):
-        return Circle((body[0], body[1]), body[RADIUS], color=STANDING)
-    outline = shape.outline * (body[RADIUS] / shape.radius)
-    c, s = np.cos(body[HEADING]), np.sin(body[HEADING])
-    corners = outline @ np.array([[c, s], [-s, c]]) + body[:2]
-    return Outline(corners, closed=len(corners) > 2, facecolor=STANDING, edgecolor=STANDING, lw=2)
 
 
 def _panel(axes: Axes, episodes: Mapping[str, Episode], world: World, footprint: float) -> None:

@@ -53,9 +53,6 @@ def random_actions(env, count, seed=0):
 def test_gymnasiums_checker_finds_nothing_to_warn_of(robot):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # Distance and twist have no limits: a finite one would have to cut observations.
-        for side in ("minimum value is -infinity", "maximum value is infinity"):
-            warnings.filterwarnings("ignore", f".*A Box observation space {side}")
         env = made(backend="sim", model=robot)
         check_env(env.unwrapped)
         env.close()
@@ -231,3 +228,24 @@ def test_the_exact_renderer_sees_nearly_the_same():
         one, other = (env.reset(seed=seed)[0] for env in (baked, exact))
         assert np.array_equal(one[720:], other[720:])
         assert np.sqrt(((one - other) ** 2).mean()) < 0.01
+
+
+def test_the_pose_is_that_of_odometry_unless_an_estimator_is_asked_for():
+    model = direct_model(odometry=(0.1, 0.1))
+    plain = BridgeEnv(model=model, world=field())
+    estimated = BridgeEnv(model=model, world=field(), estimator=True)
+    ahead = np.array([0.2, 0.0, 0.1], np.float32)
+    starts = {"start": (0.0, 0.0, 0.0), "goal": (2.0, 2.0)}
+    paths = []
+    for env in (plain, estimated):
+        env.reset(seed=4, options=starts)
+        infos = [env.step(ahead)[4] for _ in range(10)]
+        odometry = env._backend.simulator.data.odom[0, 0]
+        assert np.array_equal(infos[-1]["pose"], odometry) == (env is plain)
+        paths.append([info["true_pose"] for info in infos])
+    assert np.array_equal(*paths)
+
+
+def test_what_the_topics_need_is_refused_where_there_are_none():
+    with pytest.raises(ConfigError, match="'dds' always estimates and is never randomised"):
+        BridgeEnv("dds", direct_model(), field(), estimator=False)

@@ -21,9 +21,17 @@ def view(pose=(0.0, 0.0, 0.0), twist=(0.0, 0.0, 0.0), ranges=None):
     return RobotView(np.array(pose, float), np.array(twist, float), ranges, 0.0, 0.0, 0.0)
 
 
+def observe(task, view, goal):
+    return task.observation(view, {"goal": np.array(goal)})
+
+
+def judge(task, view, goal):
+    return task.judge(view, {"goal": np.array(goal)})
+
+
 def test_the_observation_is_laid_out_as_documented(task):
     ranges = np.full(B, 1.5, np.float32)
-    observation = task.observe(view([1.0, 1.0, np.pi / 2], [0.1, 0.2, 0.3], ranges), [1.0, 3.0])
+    observation = observe(task, view([1.0, 1.0, np.pi / 2], [0.1, 0.2, 0.3], ranges), [1.0, 3.0])
     assert observation.dtype == np.float32
     assert observation.shape == (B + 6,)
     assert observation[:B] == pytest.approx(0.5)
@@ -31,7 +39,7 @@ def test_the_observation_is_laid_out_as_documented(task):
 
 
 def test_the_bearing_is_seen_from_the_robot_counter_clockwise(task):
-    observation = task.observe(view([0.0, 0.0, np.pi]), [0.0, 1.0])
+    observation = observe(task, view([0.0, 0.0, np.pi]), [0.0, 1.0])
     assert observation[B : B + 3] == pytest.approx([1.0, 0.0, -1.0], abs=1e-6)
 
 
@@ -48,10 +56,10 @@ def test_every_observation_lies_in_its_space(task):
         ranges = rng.uniform(0.0, 4.0, B).astype(np.float32)
         ranges[rng.random(B) < 0.2] = rng.choice([np.nan, np.inf, -np.inf])
         pose = rng.normal(size=3) * 5.0
-        observation = task.observe(view(pose, rng.normal(size=3), ranges), rng.normal(size=2))
+        observation = observe(task, view(pose, rng.normal(size=3), ranges), rng.normal(size=2))
         assert task.observation_space.contains(observation)
         assert np.isfinite(observation).all()
-    assert task.observation_space.contains(task.observe(view(), [0.0, 0.0]))
+    assert task.observation_space.contains(observe(task, view(), [0.0, 0.0]))
 
 
 @pytest.mark.parametrize("robot", ["ackermann", "differential", "mecanum"])
@@ -68,7 +76,7 @@ def test_actions_span_the_commands_between_their_limits(robot):
 
 @pytest.mark.parametrize(("distance", "reached"), [(0.299, True), (0.301, False)])
 def test_the_goal_is_reached_within_its_radius(task, distance, reached):
-    verdict = task.judge(view([1.0, 2.0, 0.3]), [1.0 + distance, 2.0])
+    verdict = judge(task, view([1.0, 2.0, 0.3]), [1.0 + distance, 2.0])
     assert verdict.reached == reached
     assert not verdict.touched
 
@@ -89,19 +97,19 @@ def test_a_touch_is_judged_from_the_footprint_wherever_the_lidar_sits(mount):
             rest = mount[0] ** 2 + mount[1] ** 2 - distance**2
             ranges = np.full(B, np.inf)
             ranges[beam] = -along + np.sqrt(along**2 - rest)
-            assert task.judge(view(ranges=ranges), [5.0, 5.0]).touched == touched
+            assert judge(task, view(ranges=ranges), [5.0, 5.0]).touched == touched
 
 
 def test_too_close_to_measure_is_a_touch_and_unknown_is_not(task):
     ranges = np.full(B, np.nan)
-    assert not task.judge(view(ranges=ranges), [5.0, 5.0]).touched
+    assert not judge(task, view(ranges=ranges), [5.0, 5.0]).touched
     ranges[7] = -np.inf
-    assert task.judge(view(ranges=ranges), [5.0, 5.0]).touched
+    assert judge(task, view(ranges=ranges), [5.0, 5.0]).touched
 
 
 def reward(task, before, after, goal, ranges=None):
     one, other = view(before), view(after, ranges=ranges)
-    return task.reward(one, other, goal, task.judge(other, goal))
+    return task.reward(one, other, {"goal": np.array(goal)})
 
 
 def test_a_step_is_paid_by_the_metre_of_approach_less_the_time(task):
@@ -129,17 +137,17 @@ def test_a_batch_gives_what_its_robots_give_one_by_one(task):
     ranges = rng.uniform(0.0, 4.0, (4, 3, B)).astype(np.float32)
     goal = rng.normal(size=(4, 3, 2)) * 0.3
     batch = RobotView(pose, twist, ranges, 0.0, 0.0, 0.0)
-    observation, verdict = task.observe(batch, goal), task.judge(batch, goal)
-    terms = task.reward(batch, batch, goal, verdict)
+    observation, verdict = observe(task, batch, goal), judge(task, batch, goal)
+    terms = task.reward(batch, batch, {"goal": goal})
     assert observation.shape == (4, 3, B + 6)
     for n in range(4):
         for m in range(3):
             alone = view(pose[n, m], twist[n, m], ranges[n, m])
-            assert np.array_equal(observation[n, m], task.observe(alone, goal[n, m]))
-            single = task.judge(alone, goal[n, m])
+            assert np.array_equal(observation[n, m], observe(task, alone, goal[n, m]))
+            single = judge(task, alone, goal[n, m])
             assert verdict.reached[n, m] == single.reached
             assert verdict.touched[n, m] == single.touched
-            expected = task.reward(alone, alone, goal[n, m], single)
+            expected = task.reward(alone, alone, {"goal": goal[n, m]})
             assert {name: float(term[n, m]) for name, term in terms.items()} == pytest.approx(
                 {name: float(term) for name, term in expected.items()}
             )

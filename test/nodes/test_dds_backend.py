@@ -117,7 +117,7 @@ def complaint(backend):
 def test_it_gives_the_numbers_of_the_simulator_in_process(simulator, model, arena):
     options = {"domain_id": simulator[0], "truth": True, "timeout_s": TIMEOUT_S}
     seeds, steps = (7, 8, 7, 2**31 - 1), 30
-    here = BridgeEnv("sim", model, arena)
+    here = BridgeEnv("sim", model, arena, estimator=True)
     there = BridgeEnv("dds", model, arena, backend_options=options)
     try:
         told_here = episodes(here, seeds, steps, np.random.default_rng(0))
@@ -280,7 +280,7 @@ def test_two_backends_in_two_domains_do_not_hear_each_other(connect, launch, mod
         launch("simulator_node", other_domain, mode="lockstep")
         one = connect()
         two = connect(domain_id=other_domain)
-        alone = SimBackend(model, arena)
+        alone = SimBackend(model, arena, estimator=True)
         for backend in (one, two, alone):
             backend.reset(START)
         for k in range(10):

@@ -20,7 +20,8 @@ ROBOTS = ("ackermann", "differential", "mecanum")
 def observe(task, bearing, distance=2.0, ranges=None):
     free = np.full(task.lidar.beams, np.inf, np.float32) if ranges is None else ranges
     view = RobotView(np.zeros(3), np.zeros(3), free, 0.0, 0.0, 0.0)
-    return task.observe(view, [distance * np.cos(bearing), distance * np.sin(bearing)])
+    goal = np.array([distance * np.cos(bearing), distance * np.sin(bearing)])
+    return task.observation(view, {"goal": goal})
 
 
 def turn_of(task, action):

@@ -1,0 +1,90 @@
+"""Actions: from what a policy says to what a robot is told."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nics_drl_bridge.env import kernels
+from nics_drl_bridge.kinematics.spec import RobotSpec
+
+Array = NDArray[np.float64]
+Actions = Literal["continuous", "discrete"]
+
+DRIVES = ((0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 0, -1), (-1, 0, 0), (-1, 0, 1), (-1, 0, -1))
+"""The seven drives of the paper's cars: stop; ahead, ahead to the left, to the right; and back.
+
+They are those of the authors' code (efc-robot/MultiVehicleEnv), as signs of `cmd_vel`: linear.x,
+linear.y, angular.z. A robot that can't reverse stands, and turns if it can do so on the spot.
+"""
+SIDEWAYS = ((0, 1, 0), (0, -1, 0))
+"""Two more for a robot that moves sideways."""
+
+
+def discrete_commands(robot: RobotSpec) -> Array:
+    """(A, C) the commands that discrete actions stand for: `DRIVES` at the commands' limits.
+
+    A robot whose commands do not name fields of `cmd_vel` gets a stop, and each command alone at
+    its greatest and its least.
+    """
+    fields = [command.cmd_vel for command in robot.command]
+    if None in fields:
+        each = np.eye(len(fields), dtype=np.int64)
+        signs = np.concatenate([0 * each[:1], each, -each])
+    else:
+        drives = (*DRIVES, *SIDEWAYS) if "linear.y" in fields else DRIVES
+        signs = robot.from_cmd_vel(np.array(drives))
+    limits = np.where(signs > 0, robot.command_high, robot.command_low)
+    commands: Array = np.where(signs == 0, still(robot), limits)
+    return commands
+
+
+def still(robot: RobotSpec) -> Array:
+    """(C,) the command nearest to zero: a robot that is told it comes to rest."""
+    nearest: Array = np.clip(0.0, robot.command_low, robot.command_high)
+    return nearest
+
+
+def action_space(robot: RobotSpec, actions: Actions) -> gymnasium.Space[Any]:
+    """Of one robot: Box [-1, 1] of its commands, or Discrete."""
+    if actions == "discrete":
+        return gymnasium.spaces.Discrete(len(discrete_commands(robot)))
+    return gymnasium.spaces.Box(-1.0, 1.0, (len(robot.command),), np.float32)
+
+
+def team_space(space: gymnasium.Space[Any], robots: int) -> gymnasium.Space[Any]:
+    """A space of M robots side by side; that of one robot as it is."""
+    return space if robots == 1 else gymnasium.vector.utils.batch_space(space, robots)
+
+
+def scaled(action: ArrayLike, robot: RobotSpec) -> Array:
+    """Commands (..., C) for continuous actions (..., C), cut to [-1, 1]."""
+    given = np.ascontiguousarray(action)
+    out = np.empty(given.shape)
+    width = given.shape[-1]
+    kernels.commands(
+        out.reshape(-1, width), given.reshape(-1, width), robot.command_low, robot.command_high
+    )
+    return out
+
+
+def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray[Any]:
+    """An action as an array of its space's shape.
+
+    Raises:
+        gymnasium.error.InvalidAction: of another shape, NaN, inf, or no action of that number.
+    """
+    given = np.asarray(action)
+    if given.shape != space.shape:
+        raise gymnasium.error.InvalidAction(
+            f"{name} of shape {given.shape}: must be of shape {space.shape}."
+        )
+    if isinstance(space, gymnasium.spaces.Box) and space.dtype == np.float32:
+        if not kernels.finite(given.reshape(1, -1)):
+            raise gymnasium.error.InvalidAction(f"{name} {given!r}: holds NaN or inf.")
+    elif not space.contains(given):
+        raise gymnasium.error.InvalidAction(f"{name} {given!r}: is not in {space}.")
+    return given

@@ -1,0 +1,130 @@
+"""Compiled inner loops of the tasks: actions, what a robot sees, and the navigation task.
+
+What one robot does is a scalar function; the batched loops call it, so that a robot alone and
+one of thousands get the same bits. Shapes: R robots of any worlds, B beams, C commands, O parts
+of an observation. numpy's functions over a batch round its remainder differently from its body
+where they are vectorised, so that angles are turned here.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from nics_drl_bridge.random_kernels import episode_seed
+
+LIMIT = 1000.0
+"""Greatest distance [m], speed [m/s] and turn rate [rad/s] in an observation."""
+
+
+@njit(cache=True, nogil=True)
+def episode_seeds(seeds, numbers, out):  # type: ignore[no-untyped-def]
+    """Seeds (n,) of the episodes with these numbers (n,) in envs with these seeds (n,)."""
+    for i in range(seeds.shape[0]):
+        out[i] = episode_seed(seeds[i], numbers[i])
+
+
+@njit(cache=True, nogil=True)
+def commands(out, actions, low, high):  # type: ignore[no-untyped-def]
+    """Commands (R, C) between their limits (C,) for actions (R, C) float32, cut to [-1, 1]."""
+    for i in range(out.shape[0]):
+        for c in range(out.shape[1]):
+            share = (min(max(float(actions[i, c]), -1.0), 1.0) + 1.0) / 2.0
+            out[i, c] = low[c] + share * (high[c] - low[c])
+
+
+@njit(cache=True, nogil=True)
+def finite(values):  # type: ignore[no-untyped-def]
+    """Whether all values (R, C) are."""
+    for i in range(values.shape[0]):
+        for c in range(values.shape[1]):
+            if not math.isfinite(values[i, c]):
+                return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def look(shares, ranges, per_metre, leaves):  # type: ignore[no-untyped-def]
+    """Writes a scan in shares of the greatest range; says whether something is too near.
+
+    Args:
+        shares: (B,) float32, result: 1 no return, 0 too close or unknown.
+        ranges: (B,) float32 [m], REP-117.
+        per_metre: 1 / greatest range [1/m], float32.
+        leaves: (B,) float32 range at which each beam leaves the footprint [m].
+    """
+    zero, one = np.float32(0.0), np.float32(1.0)
+    hits = np.int32(0)
+    for b in range(shares.shape[0]):
+        # Comparing with NaN, which is unknown, is False; -inf, too close, is nearer than all.
+        share = ranges[b] * per_metre
+        share = share if share > zero else zero
+        shares[b] = share if share < one else one
+        hits |= np.int32(ranges[b] < leaves[b])
+    return hits != 0
+
+
+@njit(cache=True, nogil=True)
+def bearing(pose, x, y):  # type: ignore[no-untyped-def]
+    """Distance [m] from a pose (3,) to a point, and cosine and sine of its bearing."""
+    dx, dy = x - pose[0], y - pose[1]
+    distance = math.sqrt(dx * dx + dy * dy)
+    if distance == 0.0:
+        return 0.0, 1.0, 0.0
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    forward, left = (c * dx + s * dy) / distance, (c * dy - s * dx) / distance
+    return distance, min(max(forward, -1.0), 1.0), min(max(left, -1.0), 1.0)
+
+
+@njit(cache=True, nogil=True)
+def bearings(out, poses, points):  # type: ignore[no-untyped-def]
+    """Distance [m], cosine and sine (R, 3) of points (R, 2) as seen from poses (R, 3)."""
+    for i in range(out.shape[0]):
+        distance, out[i, 1], out[i, 2] = bearing(poses[i], points[i, 0], points[i, 1])
+        out[i, 0] = min(distance, LIMIT)
+
+
+@njit(cache=True, nogil=True)
+def looks(shares, touched, ranges, per_metre, leaves):  # type: ignore[no-untyped-def]
+    """Scans of R robots: `look` for each; touched (R,) is the answer."""
+    for i in range(ranges.shape[0]):
+        touched[i] = look(shares[i], ranges[i], per_metre, leaves)
+
+
+@njit(cache=True, nogil=True)
+def navigate(out, approach, reached, touched, before, pose, twist, ranges, goals, sensor, radius):  # type: ignore[no-untyped-def]
+    """Observations of the navigation task, and what the robots came to.
+
+    Args:
+        out: (R, B + 6) float32, result, see `navigation.Navigation`.
+        approach: (R,) by how much nearer the goal is than before [m], result.
+        reached, touched: (R,) bool, whether a robot is at its goal, or at something; results.
+        before: (R, 3) poses before the step.
+        pose, twist: (R, 3).
+        ranges: (R, B) float32.
+        goals: (R, 2) [m].
+        sensor: per_metre and leaves of `look`.
+        radius: of a goal [m].
+    """
+    per_metre, leaves = sensor
+    beams = ranges.shape[1]
+    for i in range(out.shape[0]):
+        touched[i] = look(out[i, :beams], ranges[i], per_metre, leaves)
+        distance, c, s = bearing(pose[i], goals[i, 0], goals[i, 1])
+        dx, dy = goals[i, 0] - before[i, 0], goals[i, 1] - before[i, 1]
+        approach[i] = math.sqrt(dx * dx + dy * dy) - distance
+        reached[i] = distance < radius
+        out[i, beams] = min(distance, LIMIT)
+        out[i, beams + 1], out[i, beams + 2] = c, s
+        for k in range(3):
+            out[i, beams + 3 + k] = min(max(twist[i, k], -LIMIT), LIMIT)
+
+
+@njit(cache=True, nogil=True)
+def distances(out, poses, points):  # type: ignore[no-untyped-def]
+    """Distances (R,) [m] from poses (R, 3) to points (R, 2)."""
+    for i in range(out.shape[0]):
+        dx, dy = points[i, 0] - poses[i, 0], points[i, 1] - poses[i, 1]
+        out[i] = math.sqrt(dx * dx + dy * dy)

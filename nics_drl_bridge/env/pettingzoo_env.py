@@ -1,0 +1,156 @@
+"""BridgeParallelEnv: a task of several robots, each an agent, as a PettingZoo environment."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+
+from nics_drl_bridge.env.bridge_env import RENDER_FPS, BridgeEnv
+from nics_drl_bridge.env.registration import MAX_EPISODE_STEPS
+from nics_drl_bridge.env.task import Task
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.sim.world import World
+
+Observations = dict[str, NDArray[np.float32]]
+
+
+class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
+    """A task of a team in the fast simulator, each robot an agent of its own.
+
+    ## Description
+
+    The agents are `robot_0` to `robot_<M - 1>`; the numbers are those of `BridgeEnv` with the
+    same arguments. An agent whose episode is over leaves `agents`; its robot comes to rest and
+    stands as one more obstacle.
+
+    ## Spaces, Rewards, Starting State, Episode End
+
+    Those of one robot in the docstring of the task's class, see `CooperativeReaching` and
+    `PursuitEvasion`. `infos[agent]` holds its `reward_terms`, `pose`, `is_success`, `collision`.
+    `truncations` are all True after `max_episode_steps`.
+
+    ## Arguments
+
+    Args:
+        model: a SimulatorModel, its folder, or the name of a shipped robot.
+        world: a World, its YAML file, or the name of a shipped one.
+        task: a name, `path/to/file.py:ClassName`, a class, or a Task.
+        task_options: further arguments of the task's class.
+        max_episode_steps: after so many steps an episode is truncated.
+        randomisation: domain randomisation of the simulator, see `FastSimulator`.
+        render_mode: `rgb_array`, `human` or None.
+
+    Raises:
+        ConfigError, ModelError: an unknown name or a wrong file.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo's own declaration
+        "name": "nics_bridge_v0",
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": RENDER_FPS,
+        "is_parallelizable": True,
+    }
+
+    def __init__(
+        self,
+        model: str | SimulatorModel = "ackermann",
+        world: str | World = "arena",
+        task: str | type[Task] | Task = "cooperative_reaching",
+        task_options: dict[str, Any] | None = None,
+        max_episode_steps: int = MAX_EPISODE_STEPS,
+        randomisation: Any = None,
+        render_mode: str | None = None,
+    ) -> None:
+        self.env = BridgeEnv(
+            "sim", model, world, task, task_options,
+            randomisation=randomisation, render_mode=render_mode,
+        )  # fmt: skip
+        self.render_mode, self._limit, self._steps = render_mode, max_episode_steps, 0
+        self.possible_agents = [f"robot_{m}" for m in range(self.env.robots)]
+        self.agents: list[str] = []
+        of = self.env.task
+        # One space for each agent: a space has a generator of its own.
+        self.observation_spaces = {
+            name: deepcopy(of.observation_space) for name in self.possible_agents
+        }
+        self.action_spaces = {name: deepcopy(of.action_space) for name in self.possible_agents}
+
+    def observation_space(self, agent: str) -> gymnasium.Space[Any]:
+        """Of an agent, always the same object."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> gymnasium.Space[Any]:
+        """Of an agent, always the same object."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, dict[str, Any]]]:
+        """Begins an episode with all agents; see PettingZoo."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self.agents, self._steps = list(self.possible_agents), 0
+        seen = dict(zip(self.agents, self._rows(observation), strict=True))
+        return seen, {name: self._told(info, m) for m, name in enumerate(self.agents)}
+
+    def step(
+        self, actions: dict[str, NDArray[Any]]
+    ) -> tuple[
+        Observations, dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
+    ]:
+        """One control period; `actions` are those of the agents that are left; see PettingZoo.
+
+        Raises:
+            ConfigError: an agent that is left has no action.
+        """
+        missing = sorted(set(self.agents) - set(actions))
+        if missing:
+            raise ConfigError(f"no action for {', '.join(missing)}; each agent that is left acts.")
+        space = self.env.task.action_space
+        rest: Any = np.zeros(space.shape or (), space.dtype)
+        # Those who left are told to stand still, whatever stands here.
+        joint = [actions[n] if n in self.agents else rest for n in self.possible_agents]
+        if self.env.robots == 1:
+            observation, terms, info = self.env.advance(joint[0])
+        else:
+            observation, terms, info = self.env.advance(np.array(joint, space.dtype))
+        if self.render_mode == "human":
+            self.env.render()
+        self._steps += 1
+        late = self._steps >= self._limit
+        index = {name: self.possible_agents.index(name) for name in self.agents}
+        told = {name: self._told(info | {"reward_terms": terms}, m) for name, m in index.items()}
+        rewards = {name: sum(one["reward_terms"].values()) for name, one in told.items()}
+        ended = {name: bool(self.env.ended[m]) for name, m in index.items()}
+        cut = dict.fromkeys(self.agents, late)
+        seen = {name: observation[m] for name, m in index.items()}
+        self.agents = [] if late else [name for name in self.agents if not ended[name]]
+        return seen, rewards, ended, cut, told
+
+    def _rows(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        return observation[None] if self.env.robots == 1 else observation
+
+    def _told(self, info: dict[str, Any], m: int) -> dict[str, Any]:
+        """What concerns robot m of the env's `info`."""
+        told: dict[str, Any] = {}
+        for name, value in info.items():
+            if isinstance(value, dict):
+                told[name] = {key: float(term[m]) for key, term in value.items()}
+            elif name in ("goal", "bodies") or not isinstance(value, np.ndarray):
+                told[name] = value
+            else:
+                told[name] = value if self.env.robots == 1 else value[m]
+        return told
+
+    def render(self) -> Any:
+        """The world as it is, drawn from above."""
+        return self.env.render()
+
+    def close(self) -> None:
+        """Closes the window."""
+        self.env.close()

@@ -1,0 +1,183 @@
+"""Pursuit and evasion: some robots have to catch others, who have to escape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.env.kernels import LIMIT
+from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Task, limited
+from nics_drl_bridge.env.teams import distances, others, seen
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.interface import RobotView
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PursuitEvasion(Task):
+    """P pursuers have to come near to E evaders, who have to keep away; all are of one kind.
+
+    Of the M = P + E robots the first P pursue.
+
+    ## Observation Space
+
+    Of one robot, `Box((B + 5 (M - 1) + 1 + 3,), float32)`, B beams. All robots are in sight of
+    each other.
+
+    | Num | Observation | Min | Max | Unit |
+    |---|---|---|---|---|
+    | 0 to B - 1 | range in shares of the greatest; 1 free, 0 too close or unknown | 0 | 1 | - |
+    | 5 for each other robot, in order | distance | 0 | 1000 | m |
+    | | cosine, sine of the bearing | -1 | 1 | - |
+    | | whether it is on the same side | 0 | 1 | - |
+    | | whether it is out: caught, or touched something | 0 | 1 | - |
+    | then 1 | whether the robot itself pursues | 0 | 1 | - |
+    | the last 3 | estimated velocity forward, left; turn rate | -1000 | 1000 | m/s, rad/s |
+
+    ## Action Space
+
+    Of one robot as in navigation: `Box(-1, 1, (C,), float32)`, or `Discrete`.
+
+    ## Rewards
+
+    `pursuit`: of a pursuer, 1 per metre by which it came nearer to the nearest evader that is not
+    out; of an evader, 1 per metre by which the nearest pursuer fell behind. `capture`: of every
+    pursuer 10 for each evader that is caught, of the evader -10. `time`: -0.01 per step of a
+    pursuer, 0.01 of an evader. `collision`: -10 for whoever touches something otherwise. Whoever
+    learns one side takes that side's rewards, from `info["reward_terms"]` or from the PettingZoo
+    env; the reward of the Gymnasium env is the sum over all.
+
+    ## Starting State
+
+    Obstacles and starts are drawn by the world. Memory: `out` (M,), `caught` (M,), `newly` (M,).
+
+    ## Episode End
+
+    For an evader when a pursuer's middle is nearer than the capture distance; for any robot when
+    it touches something otherwise; it then stands still as one more obstacle. For all when all
+    evaders, or all pursuers, are out. A team of pursuers succeeds when it caught every evader.
+
+    Attributes:
+        pursuers, evaders: P and E.
+        capture_gap: free space between two footprints at which an evader is caught [m].
+        capture_reward: for each capture.
+        collision_reward: for a touch.
+        pursuit_reward: per metre.
+        time_reward: per step, of a pursuer; the opposite of an evader.
+    """
+
+    keeps_last_scan: ClassVar[bool] = False
+
+    pursuers: int = 2
+    evaders: int = 1
+    capture_gap: float = 0.15
+    capture_reward: float = 10.0
+    collision_reward: float = -10.0
+    pursuit_reward: float = 1.0
+    time_reward: float = -0.01
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if min(self.pursuers, self.evaders) < 1:
+            raise ConfigError(
+                f"task options pursuers={self.pursuers}, evaders={self.evaders}: at least 1 each."
+            )
+
+    @property
+    def robots(self) -> int:
+        """M = P + E."""
+        return self.pursuers + self.evaders
+
+    @cached_property
+    def pursues(self) -> Flags:
+        """(M,) which robots do."""
+        return np.arange(self.robots) < self.pursuers
+
+    @cached_property
+    def observation_space(self) -> gymnasium.spaces.Box:
+        """Box of one robot's observation."""
+        other = self.robots - 1
+        return self.box(
+            [*[0.0, -1.0, -1.0, 0.0, 0.0] * other, 0.0, *[-LIMIT] * 3],
+            [*[LIMIT, 1.0, 1.0, 1.0, 1.0] * other, 1.0, *[LIMIT] * 3],
+        )
+
+    def reset(self, episodes: Episodes) -> Memory:
+        """Nobody is out; `newly` is who was caught in the last step."""
+        none = np.zeros(episodes.starts.shape[:-1], np.bool_)
+        return {"out": none, "caught": none.copy(), "newly": none.copy()}
+
+    def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:
+        """Marks who is caught and who is out."""
+        chased = self._gaps(after, memory)
+        reach = 2.0 * self.robot.footprint_radius + self.capture_gap
+        caught = ~self.pursues & (chased < reach) & ~memory["out"]
+        memory["newly"][...] = caught
+        memory["caught"] |= caught
+        memory["out"] |= caught | self._touches(after, memory)
+
+    def _gaps(self, view: RobotView, memory: Memory) -> Array:
+        """(..., M) [m] to the nearest robot of the other side that is not out; inf: none is."""
+        between = distances(view.pose, view.pose[..., :2])
+        foe = (self.pursues[:, None] != self.pursues) & ~memory["out"][..., None, :]
+        return np.asarray(np.where(foe, between, np.inf).min(axis=-1))
+
+    def _touches(self, view: RobotView, memory: Memory) -> Flags:
+        """A touch that is no capture, of a robot whose episode goes on."""
+        return self.touches(view.ranges) & ~memory["newly"] & ~memory["out"]
+
+    def observation(self, view: RobotView, memory: Memory) -> Observation:
+        """The observation (..., M, O) of views (..., M)."""
+        lead = view.pose.shape[:-1]
+        mates = np.broadcast_to(self.pursues[:, None] == self.pursues, (*lead, self.robots))
+        out = np.broadcast_to(memory["out"][..., None, :], (*lead, self.robots))
+        places = seen(view.pose, view.pose[..., :2])
+        known = np.concatenate([places, mates[..., None], out[..., None]], axis=-1)
+        parts: list[NDArray[Any]] = [
+            self.free_share(view.ranges),
+            others(known).reshape(*lead, -1),
+            np.broadcast_to(self.pursues[:, None], (*lead, 1)),
+            limited(view.twist),
+        ]
+        return np.concatenate(parts, axis=-1, dtype=np.float32, casting="same_kind")
+
+    def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
+        """The terms (..., M)."""
+        # Who was caught in this step still counts for this step.
+        known = {**memory, "out": memory["out"] & ~memory["newly"]}
+        gap = [self._gaps(view, known) for view in (before, after)]
+        free = np.isfinite(gap[0]) & np.isfinite(gap[1])
+        nearer = np.where(free, np.where(free, gap[0], 0.0) - np.where(free, gap[1], 0.0), 0.0)
+        side = np.where(self.pursues, 1.0, -1.0)
+        captures = memory["newly"].sum(axis=-1)[..., None]
+        newly = np.where(self.pursues, captures, -1.0 * memory["newly"])
+        return {
+            "pursuit": self.pursuit_reward * side * nearer,
+            "capture": self.capture_reward * newly,
+            "time": np.broadcast_to(self.time_reward * side, nearer.shape).copy(),
+            "collision": np.multiply(self.collision_reward, self._collided(after, memory)),
+        }
+
+    def _collided(self, view: RobotView, memory: Memory) -> Flags:
+        return np.asarray(self.touches(view.ranges) & ~memory["newly"])
+
+    def end(self, view: RobotView, memory: Memory) -> Flags:
+        """Who is out; all are when one side has nobody left."""
+        out = memory["out"]
+        over = out[..., self.pursues].all(axis=-1) | out[..., ~self.pursues].all(axis=-1)
+        return np.asarray(out | np.asarray(over)[..., None])
+
+    def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
+        """Whether every evader is caught, as each robot would see it; touches; captures."""
+        won = np.asarray(memory["caught"][..., ~self.pursues].all(axis=-1))[..., None]
+        return {
+            "is_success": np.asarray(won == self.pursues),
+            "collision": self._collided(view, memory),
+            "caught": memory["caught"].copy(),
+        }

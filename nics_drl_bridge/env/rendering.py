@@ -1,0 +1,157 @@
+"""Pictures of a world from above, for `render_mode` `rgb_array` and `human`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle as Disc
+from matplotlib.patches import Patch
+from matplotlib.patches import Polygon as Outline
+from numpy.typing import NDArray
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.shapes import HEADING, RADIUS, SHAPE
+from nics_drl_bridge.sim.world import World
+
+Array = NDArray[np.float64]
+SIZE_IN, DPI, MARGIN = 5.0, 100, 0.05
+WALL, STANDING, GOAL, SCAN = "#333333", "#8d99ae", "#f2c14e", "#d1495b"
+ROBOTS = ("#1f6fb2", "#2f855a", "#7a4fa3", "#b7791f", "#0f766e", "#9d174d")
+
+
+class Picture:
+    """Walls, bodies, goals, robots and their scans, drawn again at every step.
+
+    Args:
+        model: gives the footprint and the lidar.
+        world: gives the walls.
+        mode: `rgb_array` or `human`, which shows a window where there is a display.
+        fps: pictures per second that `human` keeps to at most.
+    """
+
+    def __init__(self, model: SimulatorModel, world: World, mode: str, fps: int) -> None:
+        self._model, self._world = model, world
+        self._human, self._pause_s = mode == "human", 1.0 / fps
+        x1, y1, x2, y2 = world.extent
+        width, depth = x2 - x1, y2 - y1
+        edge = (MARGIN * width, MARGIN * depth)
+        self._shown_x, self._shown_y = (x1 - edge[0], x2 + edge[0]), (y1 - edge[1], y2 + edge[1])
+        scale = SIZE_IN / max(width, depth)
+        size = (scale * width, scale * depth)
+        if self._human:
+            import matplotlib.pyplot as plt  # it looks for a display, which pictures do not need
+
+            self._figure = plt.figure(figsize=size, dpi=DPI)
+        else:
+            self._figure = Figure(figsize=size, dpi=DPI)
+            FigureCanvasAgg(self._figure)
+        self._axes = self._figure.add_axes((0.0, 0.0, 1.0, 1.0))
+
+    def draw(
+        self,
+        poses: Array,
+        ranges: NDArray[np.float32],
+        bodies: Array,
+        memory: dict[str, NDArray[Any]],
+    ) -> NDArray[np.uint8] | None:
+        """Draws a world.
+
+        Args:
+            poses: (M, 3) of the robots.
+            ranges: (M, B) their scans [m].
+            bodies: (K, 7) see `sim.scenes.Scene`.
+            memory: of the task, with a leading 1; `goal` (1, M, 2) is drawn.
+
+        Returns:
+            (H, W, 3) pixels; None when they are shown in a window.
+        """
+        axes = self._axes
+        axes.clear()
+        axes.set_axis_off()
+        axes.set_aspect("equal")
+        axes.set_xlim(*self._shown_x)
+        axes.set_ylim(*self._shown_y)
+        draw_world(axes, self._world, bodies)
+        for goal in np.reshape(memory.get("goal", np.zeros((0, 2))), (-1, 2)):
+            axes.plot(*goal, marker="*", color=GOAL, markersize=16, markeredgecolor=WALL)
+        for m, (pose, scan) in enumerate(zip(poses, ranges, strict=True)):
+            self._robot(axes, pose, scan, ROBOTS[m % len(ROBOTS)])
+        return self._shown()
+
+    def _robot(self, axes: Axes, pose: Array, ranges: NDArray[np.float32], colour: str) -> None:
+        """The footprint, where it looks, and what it sees."""
+        lidar, radius = self._model.lidar, self._model.robot.footprint_radius
+        mount = geometry.compose(pose, lidar.mount)
+        there = np.isfinite(ranges)
+        angles = mount[2] + lidar.angles[there]
+        hits = mount[:2] + ranges[there, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        axes.plot(hits[:, 0], hits[:, 1], ".", color=SCAN, markersize=2.0)
+        axes.add_patch(Disc((pose[0], pose[1]), radius, color=colour))
+        front = pose[:2] + radius * np.array([np.cos(pose[2]), np.sin(pose[2])])
+        axes.plot([pose[0], front[0]], [pose[1], front[1]], color="white", linewidth=2.0)
+
+    def _shown(self) -> NDArray[np.uint8] | None:
+        canvas: Any = self._figure.canvas
+        if not self._human:
+            canvas.draw()
+            return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        if canvas.required_interactive_framework is None:  # no display: drawn, but not shown
+            canvas.draw()
+        else:
+            canvas.manager.show()
+            canvas.draw_idle()
+            canvas.start_event_loop(self._pause_s)
+        return None
+
+    def close(self) -> None:
+        """Closes the window."""
+        if self._human:
+            import matplotlib.pyplot as plt
+
+            plt.close(self._figure)
+
+
+def draw_world(axes: Axes, world: World, bodies: NDArray[np.float64]) -> None:
+    """Draws map, walls and obstacles.
+
+    Args:
+        axes: to draw into; x and y in `map` [m].
+        world: map, walls and shapes.
+        bodies: (K, 7) see `sim.scenes.Scene`.
+    """
+    if world.grid is not None:
+        _draw_map(axes, world)
+    for x1, y1, x2, y2 in world.all_walls():
+        axes.plot([x1, x2], [y1, y2], color=WALL, linewidth=2)
+    for body in bodies:
+        if body[RADIUS] > 0.0:
+            axes.add_patch(_patch(world, body))
+
+
+def _draw_map(axes: Axes, world: World) -> None:
+    """Solid cells dark, unknown ones grey."""
+    grid = world.grid
+    if grid is None:
+        return
+    rows, columns = grid.cells.shape
+    i, j = np.indices((rows + 1, columns + 1)) - 0.5
+    corners = grid.cell_to_world(np.stack([i, j], axis=-1))
+    shade = np.where(grid.free, 1.0, np.where(grid.blocked, 0.2, 0.8))
+    axes.pcolormesh(
+        corners[..., 0], corners[..., 1], shade, cmap="gray", vmin=0.0, vmax=1.0, rasterized=True
+    )
+
+
+def _patch(world: World, body: NDArray[np.float64]) -> Patch:
+    shape = world.shapes[int(body[SHAPE]) % len(world.shapes)]
+    if not len(shape.outline):
+        return Disc((body[0], body[1]), body[RADIUS], color=STANDING)
+    outline = shape.outline * (body[RADIUS] / shape.radius)
+    c, s = np.cos(body[HEADING]), np.sin(body[HEADING])
+    corners = outline @ np.array([[c, s], [-s, c]]) + body[:2]
+    return Outline(corners, closed=len(corners) > 2, facecolor=STANDING, edgecolor=STANDING, lw=2)

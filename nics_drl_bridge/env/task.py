@@ -1,0 +1,245 @@
+"""Task: what a robot is to do, written once for one robot over ROS 2 and thousands in arrays."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nics_drl_bridge.env import kernels
+from nics_drl_bridge.env.actions import Actions, action_space, discrete_commands, scaled
+from nics_drl_bridge.env.kernels import LIMIT
+from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.lidar.spec import LidarSpec
+
+Array = NDArray[np.float64]
+Observation = NDArray[np.float32]
+Flags = NDArray[np.bool_]
+Memory = dict[str, NDArray[Any]]
+"""What a task remembers of an episode: name -> array with leading (n, M), or (n,) of the world."""
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Episodes as they begin, of n worlds with M robots.
+
+    Attributes:
+        seeds: (n,) of each episode. All that a task draws must follow from them, see
+            `random_kernels.uniform`.
+        starts: (n, M, 3) where the robots stand: x [m], y [m], heading [rad] in `map`.
+        goals: (n, M, 2) free places that the world drew, one for each robot [m].
+    """
+
+    seeds: NDArray[np.int64]
+    starts: Array
+    goals: Array
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a step came to. All arrays have the leading dimensions of the view.
+
+    Attributes:
+        terms: name -> term of the reward; their sum is the reward.
+        ended: whether the episode has ended for a robot.
+        info: further facts by name, for `info`.
+    """
+
+    terms: dict[str, Array]
+    ended: Flags
+    info: dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Task(ABC):
+    """Observation, action, reward and end of a task: pure functions over leading dimensions.
+
+    Subclass it as a frozen dataclass and write `observation_space`, `reset`, `observation`,
+    `reward` and `end`; `docs/tasks.md` leads through one. Every view has the leading dimensions
+    (n, M): n worlds of M robots. A task of one robot that works element by element also serves
+    the view () of a robot over ROS 2. Whatever is computed per element must not depend on n:
+    use `bearing` and `distance` instead of numpy's functions of angles.
+
+    Attributes:
+        robot: gives commands, their limits, and the footprint.
+        lidar: gives the scan's layout.
+        actions: `continuous` (Box) or `discrete` (the paper's drives, see `actions.DRIVES`).
+        contact_margin: a return this close to the footprint counts as a touch [m].
+        keeps_last_scan: whether `before.ranges` is wanted in `reward`, `update` or `step_into`;
+            without it they are the new ones, which spares a copy.
+        shown: names of the memory that `info` always holds.
+    """
+
+    keeps_last_scan: ClassVar[bool] = True
+    shown: ClassVar[tuple[str, ...]] = ()
+
+    robot: RobotSpec
+    lidar: LidarSpec
+    actions: Actions = "continuous"
+    contact_margin: float = 0.02
+
+    def __post_init__(self) -> None:
+        if self.actions not in ("continuous", "discrete"):
+            known = nearest(str(self.actions), ("continuous", "discrete"))
+            raise ConfigError(f"task option actions={self.actions!r}: no such actions; {known}")
+
+    @property
+    def robots(self) -> int:
+        """M, robots in each world."""
+        return 1
+
+    @property
+    @abstractmethod
+    def observation_space(self) -> gymnasium.spaces.Box:
+        """Of one robot, float32 and finite; see `box`."""
+
+    @cached_property
+    def action_space(self) -> gymnasium.Space[Any]:
+        """Of one robot."""
+        return action_space(self.robot, self.actions)
+
+    @abstractmethod
+    def reset(self, episodes: Episodes) -> Memory:
+        """What is to be remembered of episodes that begin; the arrays become the env's own."""
+
+    @abstractmethod
+    def observation(self, view: RobotView, memory: Memory) -> Observation:
+        """What each robot sees, (..., O) float32."""
+
+    @abstractmethod
+    def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
+        """The terms (...) of the reward for a step."""
+
+    @abstractmethod
+    def end(self, view: RobotView, memory: Memory) -> Flags:
+        """Whether the episode is over for each robot, (...). A team ends with its last one."""
+
+    def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
+        """Facts for `info`; `is_success` and `collision` are what an evaluation reads."""
+        return {}
+
+    def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:  # noqa: B027
+        """Brings the memory up to date after a step, in place, before anything is judged."""
+
+    def command(self, action: ArrayLike) -> Array:
+        """The command (..., C) of an action: (..., C) continuous, or (...) discrete."""
+        if self.actions == "discrete":
+            return np.asarray(self._commands[np.asarray(action)])
+        return scaled(action, self.robot)
+
+    def observe_into(self, out: Observation, view: RobotView, memory: Memory) -> None:
+        """Writes the observation into (..., O)."""
+        out[...] = self.observation(view, memory)
+
+    def step_into(
+        self, out: Observation, before: RobotView, after: RobotView, memory: Memory
+    ) -> Outcome:
+        """All that a step comes to, the observation written into `out`.
+
+        A task overrides it where one pass over the scan gives several of them.
+        """
+        self.update(before, after, memory)
+        self.observe_into(out, after, memory)
+        terms = self.reward(before, after, memory)
+        return Outcome(terms, self.end(after, memory), self.info(after, memory))
+
+    @cached_property
+    def _commands(self) -> Array:
+        return discrete_commands(self.robot)
+
+    # What tasks are made of.
+
+    def box(self, low: ArrayLike, high: ArrayLike) -> gymnasium.spaces.Box:
+        """The space of a scan in shares (B parts), then of parts with these limits."""
+        beams = self.lidar.beams
+        low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
+        return gymnasium.spaces.Box(
+            np.concatenate([np.zeros(beams, np.float32), low]),
+            np.concatenate([np.ones(beams, np.float32), high]),
+            dtype=np.float32,
+        )
+
+    def free_share(self, ranges: NDArray[np.float32]) -> Observation:
+        """Ranges (..., B) in shares of the greatest: 1 no return, 0 too close or unknown."""
+        return self._look(ranges)[0]
+
+    def touches(self, ranges: NDArray[np.float32]) -> Flags:
+        """Whether a scan (..., B) says that something is within the footprint, (...)."""
+        return self._look(ranges)[1]
+
+    def _look(self, ranges: NDArray[np.float32]) -> tuple[Observation, Flags]:
+        ranges = np.ascontiguousarray(ranges, np.float32)
+        rows = ranges.reshape(-1, ranges.shape[-1])
+        shares, touched = np.empty_like(rows), np.empty(len(rows), np.bool_)
+        kernels.looks(shares, touched, rows, self.per_metre, self.contact_ranges)
+        return shares.reshape(ranges.shape), touched.reshape(ranges.shape[:-1])
+
+    @cached_property
+    def per_metre(self) -> np.float32:
+        """1 / greatest range of the lidar [1/m]."""
+        return np.float32(1.0 / self.lidar.range_max)
+
+    @cached_property
+    def contact_ranges(self) -> NDArray[np.float32]:
+        """(B,) range at which each beam leaves the footprint and its margin [m]."""
+        x, y, heading = self.lidar.mount
+        angles = self.lidar.angles + heading
+        limit = self.robot.footprint_radius + self.contact_margin
+        along = x * np.cos(angles) + y * np.sin(angles)
+        rest = limit * limit - x * x - y * y + along * along
+        leaves = np.where(rest >= 0.0, np.sqrt(np.maximum(rest, 0.0)) - along, -np.inf)
+        return leaves.astype(np.float32)
+
+
+def bearing(pose: ArrayLike, points: ArrayLike) -> Array:
+    """Points (..., 2) as seen from poses (..., 3): distance [m], cosine, sine of the bearing.
+
+    The leading dimensions are broadcast. A point where the robot stands lies straight ahead; a
+    distance is cut at `kernels.LIMIT`.
+    """
+    poses, places, shape = _rows(pose, points)
+    out = np.empty((len(poses), 3))
+    kernels.bearings(out, poses, places)
+    return out.reshape(*shape, 3)
+
+
+def distance(pose: ArrayLike, points: ArrayLike) -> Array:
+    """Distances (...) [m] from poses (..., 2 or 3) to points (..., 2); leads are broadcast."""
+    poses, places, shape = _rows(pose, points)
+    out = np.empty(len(poses))
+    kernels.distances(out, poses, places)
+    return out.reshape(shape)
+
+
+def _rows(pose: ArrayLike, points: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
+    poses, places = np.asarray(pose, np.float64), np.asarray(points, np.float64)
+    shape = poses.shape[:-1]
+    if places.shape[:-1] != shape:
+        shape = np.broadcast_shapes(shape, places.shape[:-1])
+        poses = np.broadcast_to(poses, (*shape, poses.shape[-1]))
+        places = np.broadcast_to(places, (*shape, 2))
+    return (
+        np.ascontiguousarray(poses).reshape(-1, poses.shape[-1]),
+        np.ascontiguousarray(places).reshape(-1, 2),
+        shape,
+    )
+
+
+def limited(twist: Array) -> Array:
+    """A twist (..., 3) cut at `kernels.LIMIT`, so that observations stay in their space."""
+    return np.minimum(np.maximum(twist, -LIMIT), LIMIT)
+
+
+def override(memory: Memory, options: Mapping[str, Any] | None) -> None:
+    """Puts what `reset(options=...)` gives for a memory's name into all of its rows."""
+    for name, rows in memory.items():
+        if options and name in options:
+            rows[...] = options[name]

@@ -1,0 +1,97 @@
+"""Tasks by name, and a user's own by the path of its file."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
+
+from nics_drl_bridge.env.task import Task
+from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.files import sha256
+from nics_drl_bridge.generator import SimulatorModel
+
+TASKS = {
+    "navigation": "nics_drl_bridge.env.navigation:Navigation",
+    "cooperative_reaching": "nics_drl_bridge.env.cooperative_reaching:CooperativeReaching",
+    "pursuit_evasion": "nics_drl_bridge.env.pursuit_evasion:PursuitEvasion",
+}
+"""Where each shipped task lives."""
+
+
+def make_task(
+    task: str | type[Task] | Task, model: SimulatorModel, options: dict[str, Any] | None = None
+) -> Task:
+    """A task for the robot of a model.
+
+    Args:
+        task: the name of a shipped one (`navigation`), `path/to/file.py:ClassName`, a class, or a
+            Task that is already made.
+        model: gives the robot and the lidar.
+        options: further arguments of the class.
+
+    Raises:
+        ConfigError: no such task, an argument it does not know, or a Task for another robot.
+    """
+    if isinstance(task, Task):
+        return _checked(task, model, options)
+    found = task if isinstance(task, type) else _class_of(task)
+    try:
+        return found(model.robot, model.lidar, **(options or {}))
+    except TypeError as error:
+        reason = str(error).removeprefix(f"{found.__name__}.__init__() ")
+        raise ConfigError(f"task {found.__name__}, task_options {options}: {reason}.") from None
+
+
+def _checked(task: Task, model: SimulatorModel, options: dict[str, Any] | None) -> Task:
+    name = type(task).__name__
+    if options:
+        raise ConfigError(f"task {name} is already made; give {sorted(options)} to it, not beside.")
+    if task.robot != model.robot or task.lidar != model.lidar:
+        raise ConfigError(
+            f"task {name} is of the robot {task.robot.name!r} with {task.lidar.beams} beams, the "
+            f"model of {model.robot.name!r} with {model.lidar.beams}; make it with model.robot and "
+            "model.lidar."
+        )
+    return task
+
+
+def _class_of(name: str) -> type[Task]:
+    path, colon, attribute = name.rpartition(":")
+    if not colon:
+        if name not in TASKS:
+            hint = nearest(name, TASKS)
+            raise ConfigError(f"unknown task {name!r}; {hint} Or give path/to/file.py:ClassName.")
+        return _class_of(TASKS[name])
+    module = _load(Path(path)) if path.endswith(".py") else import_module(path)
+    found = getattr(module, attribute, None)
+    if not (isinstance(found, type) and issubclass(found, Task)):
+        tasks = [n for n, v in vars(module).items() if isinstance(v, type) and _own(v, module)]
+        raise ConfigError(f"task {name!r}: {path} has no such Task; {nearest(attribute, tasks)}")
+    return found
+
+
+def _own(found: type, module: Any) -> bool:
+    return issubclass(found, Task) and found.__module__ == module.__name__
+
+
+def _load(path: Path) -> Any:
+    """The module of a file, loaded anew only when the file has changed."""
+    if not path.is_file():
+        raise ConfigError(f"task {str(path)!r}: no such file; give path/to/file.py:ClassName.")
+    digest = sha256(str(path.resolve()).encode() + path.read_bytes())[:16]
+    name = f"nics_drl_bridge_task_{digest}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ConfigError(f"task {str(path)!r}: can't be imported; it must be a Python file.")
+    module = sys.modules[name] = module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module

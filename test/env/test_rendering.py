@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from robots import direct_model, field
+
+from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.errors import ConfigError
+
+BLUE = np.array([0x1F, 0x6F, 0xB2])
+
+
+def env(mode, **arguments):
+    return BridgeEnv(model=direct_model(), world=field(count=2), render_mode=mode, **arguments)
+
+
+def blue_at(picture):
+    """Mean row and column of the first robot's pixels, in shares of the picture."""
+    rows, columns = np.nonzero((np.abs(picture.astype(int) - BLUE) < 3).all(axis=-1))
+    return rows.mean() / picture.shape[0], columns.mean() / picture.shape[1]
+
+
+def test_a_picture_shows_the_robot_where_it_stands():
+    shown = env("rgb_array")
+    shown.reset(seed=0, options={"start": (1.5, -1.5, 0.0)})
+    picture = shown.render()
+    assert picture.dtype == np.uint8
+    assert picture.shape == (500, 500, 3)
+    assert blue_at(picture) == pytest.approx((0.5 + 1.5 / 6.6, 0.5 + 1.5 / 6.6), abs=0.02)
+    for _ in range(5):
+        shown.step(np.array([1.0, 0.0, 0.0], np.float32))
+    row, column = blue_at(shown.render())
+    assert row == pytest.approx(0.5 + 1.5 / 6.6, abs=0.02)
+    assert column > 0.5 + 1.9 / 6.6
+
+
+def test_every_robot_of_a_team_is_drawn():
+    shown = env("rgb_array", task="cooperative_reaching")
+    shown.reset(seed=1)
+    picture = shown.render().reshape(-1, 3).astype(int)
+    for colour in (BLUE, [0x2F, 0x85, 0x5A], [0x7A, 0x4F, 0xA3]):
+        assert (np.abs(picture - colour) < 3).all(axis=-1).sum() > 100
+
+
+def test_a_window_is_drawn_at_each_step_without_a_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        shown = env("human")
+        shown.reset(seed=0)
+        shown.step(np.zeros(3, np.float32))
+        assert shown.render() is None
+        shown.close()
+
+
+def test_nothing_is_drawn_without_a_mode_and_nothing_before_a_reset():
+    quiet = env(None)
+    quiet.reset(seed=0)
+    assert quiet.render() is None
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env("rgb_array").render()
+    with pytest.raises(ConfigError, match="unknown render_mode 'rgb_aray'; did you mean"):
+        env("rgb_aray")
+
+
+def test_a_vector_env_draws_what_its_single_envs_draw():
+    vector = BridgeVectorEnv(2, model=direct_model(), world=field(count=2), render_mode="rgb_array")
+    vector.reset(seed=3)
+    pictures = vector.render()
+    for n in range(2):
+        alone = env("rgb_array")
+        alone.reset(seed=3 + n)
+        assert np.array_equal(pictures[n], alone.render())
+
+
+def test_a_world_that_is_a_map_is_drawn_to_its_edges():
+    shown = BridgeEnv(world="room", render_mode="rgb_array")
+    shown.reset(seed=0)
+    picture = shown.render()
+    assert max(picture.shape) == 500
+    dark = (picture.max(axis=-1) < 80).sum()
+    assert dark > 500  # the walls of the map

@@ -1,0 +1,136 @@
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import SyncVectorEnv
+from robots import DIRECT, direct_model, field, lidar
+
+from nics_drl_bridge.env.actions import DRIVES, discrete_commands, still
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.registration import ENVIRONMENTS, TASK
+from nics_drl_bridge.env.task import bearing, distance
+from nics_drl_bridge.env.tasks import make_task
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.kinematics.spec import load_robot
+
+OWN = Path(__file__).resolve().parents[2] / "examples" / "own_task.py"
+PATROL = f"{OWN}:Patrol"
+
+
+@pytest.mark.parametrize("name", [name for name in ENVIRONMENTS if name != TASK])
+@pytest.mark.parametrize("actions", ["continuous", "discrete"])
+def test_gymnasiums_checker_finds_nothing_to_warn_of_in_any_task(name, actions):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make(
+            name, model=direct_model(), world=field(), task_options={"actions": actions}
+        )
+        check_env(env.unwrapped, skip_render_check=True)
+        env.close()
+
+
+def test_a_task_from_a_file_passes_the_checker_and_steps_alike_alone_and_in_a_vector():
+    arguments = {"model": direct_model(), "world": field(), "task": PATROL}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gymnasium.make(TASK, **arguments).unwrapped, skip_render_check=True)
+    ours = gymnasium.make_vec(TASK, 3, **arguments)
+    theirs = SyncVectorEnv([lambda: gymnasium.make(TASK, **arguments)] * 3)
+    assert isinstance(ours, BridgeVectorEnv)
+    assert np.array_equal(ours.reset(seed=0)[0], theirs.reset(seed=0)[0])
+    ours.action_space.seed(0)
+    for _ in range(80):
+        action = ours.action_space.sample()
+        for a, b in zip(ours.step(action)[:4], theirs.step(action)[:4], strict=True):
+            assert np.array_equal(a, b)
+
+
+def test_the_own_tasks_terms_stand_in_info_and_sum_to_the_reward():
+    env = gymnasium.make(TASK, model=direct_model(), world=field(), task=PATROL)
+    env.reset(seed=0, options={"start": (0.0, 0.0, 0.0), "places": [[1.0, 0.0], [0.0, 0.0]]})
+    arrivals, ahead = 0, np.array([0.5, 0.0, 0.0], np.float32)
+    for _ in range(40):
+        back = arrivals % 2 == 1
+        _, reward, terminated, _, info = env.step(-ahead if back else ahead)
+        assert reward == pytest.approx(sum(info["reward_terms"].values()))
+        assert info["reward_terms"]["arrival"] == 5.0 * (info["arrivals"] - arrivals)
+        arrivals = info["arrivals"]
+        if terminated:
+            break
+    assert arrivals == 3
+    assert info["is_success"]
+
+
+@pytest.mark.parametrize(
+    ("task", "options", "sentence"),
+    [
+        ("navigtion", None, "unknown task 'navigtion'; did you mean 'navigation'?"),
+        ("nowhere.py:Patrol", None, "task 'nowhere.py': no such file"),
+        (f"{OWN}:Patrole", None, "has no such Task; did you mean 'Patrol'?"),
+        ("navigation", {"goal_radus": 1.0}, "'goal_radus'"),
+        ("navigation", {"actions": "discreet"}, "did you mean 'discrete'?"),
+        ("cooperative_reaching", {"robots": 1}, "a team has at least 2"),
+        ("pursuit_evasion", {"evaders": 0}, "at least 1 each"),
+        (Navigation(DIRECT, lidar(beams=36)), None, "make it with model.robot and model.lidar"),
+        (Navigation(DIRECT, lidar()), {"goal_radius": 1.0}, "is already made"),
+    ],
+)
+def test_a_wrong_task_gives_one_sentence(task, options, sentence):
+    with pytest.raises(ConfigError) as caught:
+        make_task(task, direct_model(), options)
+    assert sentence in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_discrete_actions_are_the_papers_drives():
+    """efc-robot/MultiVehicleEnv, basic.py: stop, then ahead and back, each straight and turning."""
+    car = load_robot("ackermann")  # it can't reverse: speed from 0 to 1
+    assert discrete_commands(car).tolist() == [
+        [0, 0], [1, 0], [1, 0.5], [1, -0.5], [0, 0], [0, 0.5], [0, -0.5],
+    ]  # fmt: skip
+    mecanum = discrete_commands(load_robot("mecanum"))
+    assert mecanum.shape == (9, 3)
+    assert mecanum[4].tolist() == [-0.7, 0.0, 0.0]
+    assert mecanum[7:].tolist() == [[0.0, 0.7, 0.0], [0.0, -0.7, 0.0]]
+    assert len(DRIVES) == 7
+
+
+def test_a_discrete_action_gives_its_command_for_one_robot_and_for_many():
+    task = Navigation(DIRECT, lidar(), actions="discrete")
+    table = discrete_commands(DIRECT)
+    assert task.action_space.n == len(table) == 9
+    assert np.array_equal(task.command(3), table[3])
+    assert np.array_equal(task.command([[1], [4]]), table[[[1], [4]]])
+    assert still(DIRECT).tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_robot_without_cmd_vel_gets_each_command_alone():
+    wheels = DIRECT.model_validate(
+        {
+            "name": "wheels",
+            "footprint_radius": 0.2,
+            "command": [
+                {"name": "left_wheel", "unit": "rad/s", "min": -3.0, "max": 5.0},
+                {"name": "right_wheel", "unit": "rad/s", "min": 1.0, "max": 2.0},
+            ],
+        }
+    )
+    assert discrete_commands(wheels).tolist() == [[0, 1], [5, 1], [0, 2], [-3, 1], [0, 1]]
+
+
+def test_bearing_and_distance_agree_with_plane_geometry():
+    rng = np.random.default_rng(0)
+    pose, points = rng.normal(size=(50, 3)) * 3.0, rng.normal(size=(50, 2)) * 3.0
+    offset = points - pose[:, :2]
+    angle = np.arctan2(offset[:, 1], offset[:, 0]) - pose[:, 2]
+    expected = np.stack([np.hypot(*offset.T), np.cos(angle), np.sin(angle)], axis=1)
+    assert bearing(pose, points) == pytest.approx(expected, abs=1e-12)
+    assert distance(pose, points) == pytest.approx(expected[:, 0])
+    assert bearing(np.zeros((4, 1, 3)), np.ones((5, 2))).shape == (4, 5, 3)
+    assert bearing([1.0, 2.0, 0.3], [1.0, 2.0]).tolist() == [0.0, 1.0, 0.0]

@@ -1,0 +1,243 @@
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import TimeLimit
+from robots import direct_model, field
+
+from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.registration import ENVIRONMENTS, NAVIGATION, TASK
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.sim.simulator import FastSimulator
+
+MODES = ("NextStep", "SameStep")
+TASKS = (
+    {"task": "navigation"},
+    {"task": "navigation", "task_options": {"actions": "discrete"}},
+    {"task": "cooperative_reaching"},
+    {"task": "pursuit_evasion", "task_options": {"actions": "discrete"}},
+)
+IDS = ("navigation", "navigation-discrete", "cooperative", "pursuit-discrete")
+LIMIT = 25
+THREADS = (1, 2) if hasattr(FastSimulator, "step_part") else (1, 1)
+
+
+def model():
+    return direct_model(odometry=(0.05, 0.05))
+
+
+def vector(count, **arguments):
+    return BridgeVectorEnv(
+        count, **{"model": model(), "world": field(count=3), "max_episode_steps": LIMIT} | arguments
+    )
+
+
+def single(**arguments):
+    return TimeLimit(BridgeEnv(**{"model": model(), "world": field(count=3)} | arguments), LIMIT)
+
+
+def actions_of(env, steps, seed=0):
+    env.action_space.seed(seed)
+    return [env.action_space.sample() for _ in range(steps)]
+
+
+def assert_alike(ours, theirs, path="info"):
+    """Both infos hold the same entries, arrays and types."""
+    assert ours.keys() == theirs.keys(), path
+    for name, value in theirs.items():
+        mine, here = ours[name], f"{path}[{name!r}]"
+        if isinstance(value, dict):
+            assert_alike(mine, value, here)
+        elif value.dtype == object:
+            assert mine.dtype == object
+            for a, b in zip(mine, value, strict=True):
+                assert (a is None) == (b is None), here
+                assert a is None or np.array_equal(a, b), here
+        else:
+            assert mine.dtype == value.dtype, here
+            assert mine.shape == value.shape, here
+            assert np.array_equal(mine, value), here
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("task", TASKS, ids=IDS)
+def test_it_steps_as_gymnasiums_own_vector_env_of_single_envs(task, mode):
+    ours = vector(3, autoreset_mode=mode, **task)
+    theirs = SyncVectorEnv([lambda: single(**task)] * 3, autoreset_mode=mode)
+    assert ours.metadata["autoreset_mode"] == theirs.metadata["autoreset_mode"]
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    (mine, facts), (other, known) = ours.reset(seed=4), theirs.reset(seed=4)
+    assert np.array_equal(mine, other)
+    assert_alike(facts, known)
+    ended = 0
+    for action in actions_of(ours, 120):
+        one, another = ours.step(action), theirs.step(action)
+        for a, b in zip(one[:4], another[:4], strict=True):
+            assert a.dtype == b.dtype
+            assert np.array_equal(a, b)
+        assert_alike(one[4], another[4])
+        ended += int((one[2] | one[3]).sum())
+    assert ended >= 9
+
+
+@pytest.mark.parametrize("task", TASKS, ids=IDS)
+def test_a_world_does_not_depend_on_how_many_others_there_are(task):
+    def course(count):
+        env = vector(count, **task)
+        seen = [env.reset(seed=10)[0][:1]]
+        for action in actions_of(vector(1, **task), 2000):
+            step = env.step(np.repeat(action, count, axis=0))
+            seen += [part[:1].copy() for part in step[:4]]
+        return digest(seen)
+
+    assert len({course(count) for count in (1, 4, 16, 64)}) == 1
+
+
+def digest(arrays):
+    found = hashlib.sha256()
+    for array in arrays:
+        found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()
+
+
+COURSE = """
+import hashlib, sys
+import numpy as np
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+env = BridgeVectorEnv(4, model="differential", threads=int(sys.argv[1]))
+env.action_space.seed(0)
+found = hashlib.sha256(env.reset(seed=1)[0].tobytes())
+for _ in range(2000):
+    for part in env.step(env.action_space.sample())[:4]:
+        found.update(part.tobytes())
+print(found.hexdigest())
+"""
+
+
+@pytest.mark.timeout(300)  # a cold start compiles
+def test_2000_steps_give_the_same_digest_in_fresh_processes_with_any_number_of_threads():
+    found = []
+    for threads in THREADS:
+        command = [sys.executable, "-c", COURSE, str(threads)]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        found.append(done.stdout.strip())
+    assert len(set(found)) == 1
+    assert len(found[0]) == 64
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("task", TASKS, ids=IDS)
+def test_threads_change_no_bit(task, mode):
+    envs = [vector(5, threads=threads, autoreset_mode=mode, **task) for threads in THREADS]
+    firsts = [env.reset(seed=6) for env in envs]
+    for other in firsts[1:]:
+        assert np.array_equal(firsts[0][0], other[0])
+    for action in actions_of(envs[0], 60):
+        one, *others = [env.step(action) for env in envs]
+        for other in others:
+            for a, b in zip(one[:4], other[:4], strict=True):
+                assert np.array_equal(a, b)
+            assert_alike(one[4], other[4])
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_reset_amid_episodes_is_as_good_as_a_fresh_env(mode):
+    used, fresh = (vector(3, autoreset_mode=mode) for _ in range(2))
+    used.reset(seed=9)
+    for action in actions_of(used, 37, seed=3):
+        used.step(action)
+    assert np.array_equal(used.reset(seed=2)[0], fresh.reset(seed=2)[0])
+    for action in actions_of(used, 60):
+        for a, b in zip(used.step(action)[:4], fresh.step(action)[:4], strict=True):
+            assert np.array_equal(a, b)
+
+
+def test_returned_arrays_are_the_callers_own_unless_it_wants_none():
+    for copy in (True, False):
+        env = vector(2, copy=copy)
+        observation, info = env.reset(seed=0)
+        kept, poses = observation.copy(), info["pose"].copy()
+        for action in actions_of(env, 5):
+            env.step(action)
+        assert np.array_equal(observation, kept) == copy
+        assert np.array_equal(info["pose"], poses)
+
+
+def test_a_mask_resets_some_worlds_only():
+    env, other = vector(3), vector(3)
+    (observation, _), _ = env.reset(seed=0), other.reset(seed=0)
+    moves = actions_of(env, 3)
+    for action in moves:
+        moved = env.step(action)[0]
+    mask = np.array([False, True, False])
+    again, info = env.reset(seed=0, options={"reset_mask": mask})
+    assert np.array_equal(again[1], observation[1])
+    assert np.array_equal(again[::2], moved[::2])
+    assert np.array_equal(info["_episode_seed"], mask)
+
+
+def test_start_and_goal_can_be_given_to_all_worlds():
+    env = vector(2)
+    _, info = env.reset(seed=0, options={"start": (1.0, -1.0, 0.5), "goal": (-1.0, 1.0)})
+    assert info["pose"] == pytest.approx(np.array([[1.0, -1.0, 0.5]] * 2))
+    assert info["goal"] == pytest.approx(np.array([[-1.0, 1.0]] * 2))
+
+
+@pytest.mark.parametrize("name", [name for name in ENVIRONMENTS if name != TASK])
+@pytest.mark.parametrize("mode", MODES)
+def test_make_vec_gives_the_native_env_without_a_warning(name, mode):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make_vec(name, 2, model=model(), world=field(), autoreset_mode=mode)
+        assert isinstance(env.unwrapped, BridgeVectorEnv)
+        assert env.metadata["autoreset_mode"] is AutoresetMode(mode)
+        observation, _ = env.reset(seed=0)
+        assert observation in env.observation_space
+        observation, reward, *_ = env.step(env.action_space.sample())
+        assert observation in env.observation_space
+        assert reward.dtype == np.float64
+        env.close()
+
+
+def test_gymnasiums_wrappers_take_it():
+    env = gymnasium.make_vec(NAVIGATION, 2, model=model(), world=field(count=2))
+    env = gymnasium.wrappers.vector.RecordEpisodeStatistics(env)
+    env.reset(seed=0)
+    lengths = []
+    for action in actions_of(env, 400):
+        info = env.step(action)[4]
+        if "episode" in info:
+            lengths += info["episode"]["l"][info["_episode"]].tolist()
+    assert lengths
+    assert min(lengths) >= 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"autoreset_mode": "Disabled"}, "autoreset_mode 'Disabled': must be one of"),
+        ({"task": "navigtion"}, "unknown task 'navigtion'; did you mean 'navigation'?"),
+        ({"render_mode": "human"}, "unknown render_mode 'human'"),
+    ],
+)
+def test_a_wrong_argument_gives_one_sentence(arguments, sentence):
+    with pytest.raises(ConfigError, match=sentence[:40].replace("?", ".")):
+        vector(1, **arguments)
+
+
+def test_actions_that_hold_nan_are_refused():
+    env = vector(2)
+    env.reset(seed=0)
+    with pytest.raises(gymnasium.error.InvalidAction, match="NaN"):
+        env.step(np.full((2, 3), np.nan, np.float32))
+    with pytest.raises(gymnasium.error.InvalidAction, match="shape"):
+        env.step(np.zeros((3, 3), np.float32))

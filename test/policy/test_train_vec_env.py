@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.wrappers import FlattenObservation
+from robots import direct_model, field
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.env_checker import check_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+
+from nics_drl_bridge.env.registration import ENVIRONMENTS, TASK
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
+
+LIMIT = 30
+
+
+def vector(count=4, **arguments):
+    return BridgeVectorEnv(
+        count,
+        direct_model(odometry=(0.02, 0.02)),
+        field(count=3),
+        max_episode_steps=LIMIT,
+        **{"autoreset_mode": "SameStep"} | arguments,
+    )
+
+
+@pytest.mark.parametrize("name", [name for name in ENVIRONMENTS if name != TASK])
+@pytest.mark.parametrize("actions", ["continuous", "discrete"])
+def test_stable_baselines3s_checker_finds_nothing_to_warn_of(name, actions):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make(
+            name, model=direct_model(), world=field(), task_options={"actions": actions}
+        ).unwrapped
+        if env.robots > 1:  # it takes vectors only, and a team's observation is (M, O)
+            env = FlattenObservation(env)
+        check_env(env)
+
+
+def test_it_feeds_what_a_vec_env_of_single_envs_feeds():
+    def alone():
+        return gymnasium.make(
+            "NicsBridge/Navigation-v0",
+            max_episode_steps=LIMIT,
+            model=direct_model(odometry=(0.02, 0.02)),
+            world=field(count=3),
+        )
+
+    ours, theirs = TrainVecEnv(vector(2)), DummyVecEnv([alone, alone])
+    ours.seed(3)
+    theirs.seed(3)
+    assert np.array_equal(ours.reset(), theirs.reset())
+    rng, ended = np.random.default_rng(0), 0
+    for _ in range(100):
+        actions = rng.uniform(-1.0, 1.0, (2, 3)).astype(np.float32)
+        one, another = ours.step(actions), theirs.step(actions)
+        for a, b in zip(one[:3], another[:3], strict=True):
+            assert a.dtype == b.dtype
+            assert np.array_equal(a, b)
+        for n in np.flatnonzero(one[2]):
+            ended += 1
+            mine, other = one[3][n], another[3][n]
+            assert np.array_equal(mine["terminal_observation"], other["terminal_observation"])
+            for key in ("TimeLimit.truncated", "is_success", "collision"):
+                assert mine[key] == other[key]
+        assert all(one[3][n] == {} for n in np.flatnonzero(~one[2]))
+    assert ended > 4
+
+
+def test_the_observations_are_those_of_the_vector_env_without_a_copy():
+    env = vector()
+    fed = TrainVecEnv(env)
+    made = []
+    step = env.step
+    env.step = lambda actions: made.append(step(actions)) or made[-1]
+    fed.reset()
+    observation = fed.step(np.zeros((4, 3), np.float32))[0]
+    assert observation is made[0][0]
+
+
+@pytest.mark.parametrize("algorithm", [PPO, DQN])
+def test_an_algorithm_learns_on_it_and_counts_episodes(algorithm):
+    options = {"actions": "discrete"} if algorithm is DQN else None
+    env = VecMonitor(TrainVecEnv(vector(task_options=options)))
+    sizes = {"learning_starts": 100} if algorithm is DQN else {"n_steps": 64, "batch_size": 64}
+    model = algorithm("MlpPolicy", env, seed=0, device="cpu", **sizes)
+    model.learn(512)
+    assert len(model.ep_info_buffer) > 3
+    assert max(one["l"] for one in model.ep_info_buffer) <= LIMIT
+
+
+def test_an_env_that_it_can_not_feed_from_is_refused():
+    for arguments in ({"autoreset_mode": "NextStep"}, {"copy": False}):
+        with pytest.raises(ConfigError, match="autoreset_mode='SameStep', copy=True"):
+            TrainVecEnv(vector(**arguments))
+
+
+def test_pictures_of_all_worlds_are_tiled():
+    picture = TrainVecEnv(vector(render_mode="rgb_array"))
+    picture.reset()
+    assert picture.render().shape == (1000, 1000, 3)
