@@ -37,8 +37,6 @@ REACHABLE = 2.0
 """No state is believed beyond this many times its range: the model means nothing there."""
 START_STD = 1e-3
 """How well the pose is known at a reset [m, rad]."""
-HISTORY_NS = 1_000_000_000
-"""So long [ns] the past may still change, see `replay`."""
 LONGEST_GAP_S = 10.0
 """Over a longer silence, as when a clock jumps, the robot is taken to have stood still."""
 NANO = 1_000_000_000
@@ -126,13 +124,20 @@ class Estimator:
         """When a command that was sent at a time takes effect [ns]."""
         return stamp_ns + self._delay_ns
 
-    def command(self, stamp_ns: int, command: ArrayLike) -> bool:
+    def command(self, stamp_ns: int, command: ArrayLike, needed_ns: int | None = None) -> bool:
         """Notes a command (C,) sent at a time; it takes effect one latency later.
+
+        Args:
+            stamp_ns: when it was sent [ns].
+            command: in the units and the order of the RobotSpec.
+            needed_ns: earliest time [ns] that the estimate may be set back to; by default it may
+                not.
 
         Returns:
             False when there is one of that very time, which stays.
         """
-        return self._log.add(self.effective_ns(stamp_ns), command, self.time_ns - HISTORY_NS)
+        needed_ns = self.time_ns if needed_ns is None else needed_ns
+        return self._log.add(self.effective_ns(stamp_ns), command, needed_ns)
 
     def at(self, time_ns: int) -> tuple[Array, Array]:
         """Pose (3,) and body twist (3,) expected at a time, without moving the estimate.
