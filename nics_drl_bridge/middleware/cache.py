@@ -75,7 +75,7 @@ class TopicCache:
 
     def rate_hz(self, topic: str, arrival_ns: int) -> float:
         """How many come in a second, by the receiver's clock; it falls when one is overdue."""
-        arrivals = self.arrivals.get(topic, ())
+        arrivals = self.arrivals.get(topic, deque())
         intervals = len(arrivals) - 1
         if intervals < 1:
             return 0.0

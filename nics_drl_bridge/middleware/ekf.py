@@ -9,7 +9,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kinematics.kernels import SERIES, term_arrays
+from nics_drl_bridge.kinematics.kernels import SERIES, term_arrays, wrap
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.command_log import CommandLog
 from nics_drl_bridge.middleware.measurement import Kind, Measurement, Outcome, Verdict
@@ -146,7 +146,8 @@ class Estimator:
         estimate's the answer is that of the estimate.
         """
         mean, twist = kernels.look_ahead(
-            self._filter.x, self.time_ns, time_ns, self._timing, self._log.arrays, self._terms, SERIES
+            self._filter.x, self.time_ns, time_ns,
+            self._timing, self._log.arrays, self._terms, SERIES,
         )  # fmt: skip
         return mean[:3], twist
 
@@ -240,5 +241,5 @@ class Estimator:
 def _pose_residual(measured: Array, expected: Array) -> Array:
     """Difference of two poses (3,), its heading in [-pi, pi)."""
     difference = measured - expected
-    difference[2] = kernels.wrap(difference[2])
+    difference[2] = wrap(difference[2])
     return difference

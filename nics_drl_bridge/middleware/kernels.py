@@ -1,5 +1,4 @@
-"""Compiled parts of the estimator: the simulator's motion with its Jacobian, and what surrounds
-the update of the filter."""
+"""Compiled parts of the estimator: motion with its Jacobian, gates, numerical health."""
 
 from __future__ import annotations
 

@@ -228,9 +228,7 @@ class Middleware:
         }
         rejected = {surprises[k]: n for k, n in outcomes.items() if k[1] is Outcome.OUTLIER}
         noticed = {
-            surprises[k]: n
-            for k, n in outcomes.items()
-            if k[1] in (Outcome.NEWS, Outcome.JUMP)
+            surprises[k]: n for k, n in outcomes.items() if k[1] in (Outcome.NEWS, Outcome.JUMP)
         }
         if self._clock_jumps:
             noticed["clock: jump"] = self._clock_jumps
