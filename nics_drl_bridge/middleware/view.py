@@ -63,19 +63,25 @@ class Middleware:
         self._begin(time_ns, pose, std)
 
     def _begin(self, time_ns: int, pose: ArrayLike, std: ArrayLike) -> None:
-        self._start_ns = time_ns
+        self._start_ns, self._unstamped_ns = time_ns, time_ns - 1
         self._stamps.reset()
         self.estimator.reset(time_ns, pose, std)
         self._timeline.reset()
 
-    def command(self, stamp_ns: int, command: ArrayLike, arrival_ns: int | None = None) -> bool:
+    def command(
+        self, stamp_ns: int | None, command: ArrayLike, arrival_ns: int | None = None
+    ) -> bool:
         """Notes a command (C,) that was sent to the robot; says whether it was used.
 
         Args:
-            stamp_ns: when it was sent [ns].
+            stamp_ns: when it was sent [ns]; when None, at the stamp of the newest datum, and
+                after every earlier command without a stamp.
             command: in the units and the order of the RobotSpec.
             arrival_ns: when it came [ns]; None for one's own, whose stamp needs no check.
         """
+        if stamp_ns is None:
+            stamp_ns = max(self.newest_ns or self._start_ns, self._unstamped_ns + 1)
+            self._unstamped_ns = stamp_ns
         value = np.array(command, dtype=np.float64)
         reason = ""
         if value.shape != (self._width,):
