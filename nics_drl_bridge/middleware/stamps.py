@@ -5,11 +5,10 @@ from __future__ import annotations
 from operator import index
 
 FUTURE_NS = 1_000_000_000
-"""A stamp may be ahead of what is due by this much [ns]."""
+"""A stamp may be ahead of what is due by this much [ns], or by two control periods."""
 CLOCK_JUMP = 10
 """So many odometries in a row refused for their stamps: the robot's clock was set, or its
 simulation begun anew."""
-FROM_THE_FUTURE = f"more than {FUTURE_NS * 1e-9:g} s in the future"
 NO_STAMP = "stamp is no number"
 
 
@@ -17,11 +16,16 @@ class Stamps:
     """Compares how stamps go on with how the receiver's own time does.
 
     Only differences count: the clock of a robot may be off by any amount, and a simulation may
-    run slower, or faster as long as no step is longer than `FUTURE_NS`. The first datum
-    after a reset shows how the two clocks lie.
+    run slower, or faster as long as no two data are farther apart than the tolerance. The first
+    datum after a reset shows how the two clocks lie.
+
+    Args:
+        period_ns: between commands [ns].
     """
 
-    def __init__(self) -> None:
+    def __init__(self, period_ns: int = 0) -> None:
+        self._tolerance_ns = max(FUTURE_NS, 2 * period_ns)
+        self.from_the_future = f"more than {self._tolerance_ns * 1e-9:g} s in the future"
         self.reset()
 
     def reset(self) -> None:
@@ -38,10 +42,10 @@ class Stamps:
             return NO_STAMP
         if arrival_ns is None or self._stamp_ns is None:
             return ""
-        if stamp_ns <= self._stamp_ns + FUTURE_NS:
+        latest_ns = self._stamp_ns + self._tolerance_ns
+        if stamp_ns <= latest_ns or stamp_ns <= latest_ns + (arrival_ns - self._arrival_ns):
             return ""
-        elapsed_ns = max(arrival_ns - self._arrival_ns, 0)
-        return FROM_THE_FUTURE if stamp_ns > self._stamp_ns + elapsed_ns + FUTURE_NS else ""
+        return self.from_the_future
 
     def accept(self, stamp_ns: int, arrival_ns: int) -> None:
         """Notes a datum that is used."""

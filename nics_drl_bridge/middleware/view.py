@@ -11,7 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.cache import TopicCache
-from nics_drl_bridge.middleware.ekf import LEAST_POSE_STD, LEAST_TWIST_STD, START_STD, Estimator
+from nics_drl_bridge.middleware.ekf import (
+    LEAST_POSE_STD,
+    LEAST_TWIST_STD,
+    NANO,
+    START_STD,
+    Estimator,
+)
 from nics_drl_bridge.middleware.health import Health, TopicHealth
 from nics_drl_bridge.middleware.measurement import (
     CMD_VEL,
@@ -23,10 +29,9 @@ from nics_drl_bridge.middleware.measurement import (
     checked_covariance,
 )
 from nics_drl_bridge.middleware.replay import BEFORE_START, TOO_OLD, Timeline
-from nics_drl_bridge.middleware.stamps import FROM_THE_FUTURE, Stamps
+from nics_drl_bridge.middleware.stamps import Stamps
 
 NOT_FINITE = "NaN or inf"
-OFF_THE_CLOCK = (FROM_THE_FUTURE, TOO_OLD, BEFORE_START)
 
 
 class Middleware:
@@ -47,7 +52,8 @@ class Middleware:
         self._unknown = np.full(self._beams, np.nan, np.float32)
         self.estimator = Estimator(model)
         self._timeline = Timeline(self.estimator)
-        self._stamps = Stamps()
+        self._stamps = Stamps(round(model.control_period * NANO))
+        self._off_the_clock = (self._stamps.from_the_future, TOO_OLD, BEFORE_START)
         self.reset(0, np.zeros(3))
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
@@ -187,7 +193,7 @@ class Middleware:
             self.cache.take(topic, stamp_ns, arrival_ns, kept)
             return True
         self.cache.reject(f"{topic}: {reason}")
-        if topic == ODOM and reason in OFF_THE_CLOCK and self._stamps.refuse():
+        if topic == ODOM and reason in self._off_the_clock and self._stamps.refuse():
             self._follow_clock(stamp_ns)
         return False
 
