@@ -91,6 +91,11 @@ class RobotTopics:
         """Stamp of the newest datum [ns], 0 when there is none."""
         return self.middleware.newest_ns or 0
 
+    @property
+    def located(self) -> bool:
+        """Whether it is known where in the map the robot is."""
+        return not self._posed or POSE in self.middleware.cache.newest
+
     def view(self) -> RobotView:
         """What is known at the stamp of the newest datum."""
         return self.middleware.view(self.newest_ns)
