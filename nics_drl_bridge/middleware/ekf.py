@@ -34,7 +34,9 @@ PATIENCE: dict[Kind, float] = {Kind.TWIST: 3, Kind.YAW_RATE: np.inf, Kind.POSE: 
 NEWS = 0.5
 """A robot that is stuck or pushed may be off by this share of its state's range."""
 REACHABLE = 2.0
-"""No state is believed beyond this many times its range: the model means nothing there."""
+"""No state or command is believed beyond so many times its range: the model means nothing there."""
+FARTHEST = 1e8
+"""Nothing that is off by more than this [m, rad, m/s, rad/s] is ever believed."""
 START_STD = 1e-3
 """How well the pose is known at a reset [m, rad]."""
 LONGEST_GAP_S = 10.0
@@ -79,8 +81,9 @@ class Estimator:
         least = np.concatenate([np.full(3, LEAST_POSE_DRIFT), LEAST_STATE_DRIFT * reach])
         self._process = np.diag(np.maximum(model.noise.drift(model.robot), least) ** 2)
         self._news = np.concatenate([np.zeros(3), NEWS * reach]) ** 2
-        center = np.array([v.max + v.min for v in model.robot.state]) / 2.0
-        self._limits = center - REACHABLE / 2.0 * reach, center + REACHABLE / 2.0 * reach
+        low, high = np.array([(v.min, v.max) for v in model.robot.state]).reshape(-1, 2).T
+        self._limits = _widened(low, high)
+        self._least, self._most = _widened(model.robot.command_low, model.robot.command_high)
         linear, angular = (max(std, LEAST_TWIST_STD) for std in model.noise.odometry)
         self._noise = {
             Kind.TWIST: np.diag([linear, linear, angular]) ** 2,
@@ -137,7 +140,8 @@ class Estimator:
             False when there is one of that very time, which stays.
         """
         needed_ns = self.time_ns if needed_ns is None else needed_ns
-        return self._log.add(self.effective_ns(stamp_ns), command, needed_ns)
+        possible = np.minimum(np.maximum(command, self._least), self._most)
+        return self._log.add(self.effective_ns(stamp_ns), possible, needed_ns)
 
     def at(self, time_ns: int) -> tuple[Array, Array]:
         """Pose (3,) and body twist (3,) expected at a time, without moving the estimate.
@@ -189,7 +193,7 @@ class Estimator:
         innovation = residual(value, expected)
         distance = kernels.distance(innovation, derivative, self._filter.P, noise)
         outcome = Outcome.USED
-        if distance > GATE[kind]:
+        if not distance <= GATE[kind]:
             outcome = self._surprise(kind, innovation, derivative, noise)
         if outcome is Outcome.OUTLIER:
             self._count(kind, self._outliers[kind] + 1)
@@ -216,26 +220,43 @@ class Estimator:
 
     def _surprise(self, kind: Kind, innovation: Array, derivative: Array, noise: Array) -> Outcome:
         """What to make of a measurement beyond its gate; a robot that is stuck makes news."""
+        if not (np.abs(innovation) < FARTHEST).all():
+            return Outcome.OUTLIER
         believed = self._outliers[kind] + 1 >= PATIENCE[kind]
         if kind is Kind.TWIST:
             doubt = np.maximum(self._news - np.diag(self._filter.P), 0.0)
             doubtful = self._filter.P + np.diag(doubt)
-            if believed or kernels.distance(innovation, derivative, doubtful, noise) <= GATE[kind]:
+            if kernels.distance(innovation, derivative, doubtful, noise) <= GATE[kind]:
                 self._filter.P = doubtful
-                return Outcome.JUMP if believed else Outcome.NEWS
+                return Outcome.NEWS
+            if believed:
+                self._filter.P = doubtful
+                self._part()
         return Outcome.JUMP if believed else Outcome.OUTLIER
 
+    def _part(self) -> None:
+        """Lets a surprise about the pose tell nothing of the state, nor the other way round."""
+        covariance = np.array(self._filter.P)
+        covariance[:3, 3:], covariance[3:, :3] = 0.0, 0.0
+        self._filter.P = covariance
+
     def _jump(self, pose: Array, noise: Array) -> None:
-        """Takes a pose for the pose; nothing that was known of the old one tells of the state."""
-        mean, covariance = np.array(self._filter.x), np.array(self._filter.P)
-        mean[:3], covariance[:3], covariance[:, :3] = pose, 0.0, 0.0
-        covariance[:3, :3] = noise
-        self._filter.x, self._filter.P = mean, covariance
+        """Takes a pose for the pose."""
+        self._part()
+        mean = np.array(self._filter.x)
+        mean[:3], self._filter.P[:3, :3] = pose, noise
+        self._filter.x = mean
 
     def _count(self, kind: Kind, outliers: int) -> None:
         counts = list(self._outliers)
         counts[kind] = outliers
         self._outliers = (counts[0], counts[1], counts[2])
+
+
+def _widened(low: Array, high: Array) -> tuple[Array, Array]:
+    """Limits (n,), as far apart as the filter believes in."""
+    center, half = (high + low) / 2.0, REACHABLE * (high - low) / 2.0
+    return center - half, center + half
 
 
 def _pose_residual(measured: Array, expected: Array) -> Array:

@@ -10,6 +10,8 @@ from numba import njit
 from nics_drl_bridge.kinematics.kernels import advance, rates, wrap
 
 NANO = 1_000_000_000
+RUNAWAY = 1e9
+"""No pose or state is ever so far [m, rad, its unit], nor changes by so many times its cause."""
 LEAST_PIVOT = 1e-12
 """A variable is never known better than this share of its variance, given those before it,"""
 LEAST_VARIANCE = 1e-18
@@ -94,6 +96,9 @@ def in_effect(effective, count, time):  # type: ignore[no-untyped-def]
 def carry(mean, transition, begin, end, timing, log, terms, series):  # type: ignore[no-untyped-def]
     """Moves a mean (3 + S) from one time to another, command by command, in place.
 
+    Where the model runs away, as none does within its range, the robot is taken to have stood
+    still, too.
+
     Args:
         mean, transition, terms, series: see `predict`.
         begin, end: times [ns].
@@ -106,6 +111,7 @@ def carry(mean, transition, begin, end, timing, log, terms, series):  # type: ig
     if end - begin > longest:
         mean[3:] = 0.0
         return
+    before = mean[:3].copy()
     now, k = begin, in_effect(effective, count, begin + 1)
     while now < end:
         until = end
@@ -116,6 +122,9 @@ def carry(mean, transition, begin, end, timing, log, terms, series):  # type: ig
         if rest > 0:
             predict(mean, transition, commands[k], rest / NANO, 1, terms, series)
         now, k = until, k + 1
+    if not (np.all(np.abs(mean) < RUNAWAY) and np.all(np.abs(transition) < RUNAWAY)):
+        mean[:3], mean[3:] = before, 0.0
+        transition[:] = np.eye(mean.shape[0])
 
 
 @njit(cache=True)

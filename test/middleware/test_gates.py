@@ -56,6 +56,40 @@ def test_impossible_twists_are_believed_from_the_third_in_a_row_until_one_fits_a
     assert estimator.update_twist([0.5, 0.8, 0.0]).outcome is Outcome.OUTLIER
 
 
+def test_impossible_twists_do_not_move_the_pose():
+    estimator = driven()
+    before = estimator.at(estimator.time_ns)[0]
+    for _ in range(10):
+        estimator.update_twist([500.0, 300.0, -40.0])
+    assert np.array_equal(estimator.at(estimator.time_ns)[0], before)
+
+
+@pytest.mark.parametrize("value", [1e9, 1e200, 1e308])
+def test_what_is_beyond_all_bounds_is_never_believed_however_often_it_comes(value):
+    estimator = driven()
+    before = estimator.belief
+    for _ in range(20):
+        assert estimator.update_twist([value, 0.0, 0.0]).outcome is Outcome.OUTLIER
+        assert estimator.update_pose([0.0, -value, 0.0]).outcome is Outcome.OUTLIER
+        assert estimator.update_yaw_rate(value).outcome is Outcome.OUTLIER
+    assert np.array_equal(estimator.belief.mean, before.mean)
+    assert np.array_equal(estimator.belief.covariance, before.covariance)
+
+
+@pytest.mark.parametrize("robot", ["ackermann", "differential", "mecanum"])
+@pytest.mark.parametrize("value", [1e3, 1e100, 1e308, -1e308])
+def test_absurd_commands_leave_the_filter_sound(robot, value):
+    estimator = driven(robot)
+    for k in range(1, 60):
+        now = estimator.time_ns
+        estimator.command(now, np.full(len(estimator._log.arrays[1][0]), value))
+        estimator.predict(now + k * PERIOD)
+        estimator.update_twist(np.zeros(3))
+        assert np.isfinite(np.concatenate(estimator.at(now + 90 * SECOND))).all()
+        assert np.isfinite(np.concatenate(estimator.at(now + 9 * SECOND))).all()
+        np.linalg.cholesky(estimator.covariance)
+
+
 def test_a_pose_far_off_is_refused_and_the_fifth_in_a_row_is_taken_as_a_jump():
     estimator = driven()
     before, far = estimator.belief, [30.0, 2.0, -3.0]
