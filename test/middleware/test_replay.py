@@ -217,6 +217,8 @@ def test_a_late_command_after_a_silence_finds_the_commands_before_it():
     middleware.odometry(3 * SECOND, 2 * SECOND, np.zeros(3), np.zeros(3))
     expected = middleware.estimator.at(3 * SECOND)[0]
     assert expected[0] == pytest.approx(0.5 * 0.995, abs=1e-9)
+    for k in range(1, 400):  # so many that old ones have to go
+        middleware.command(3 * SECOND + k * MILLISECOND, [0.0, 0.0, 0.0])
     middleware.command(2 * SECOND + 500 * MILLISECOND + 1, [0.0, 0.0, 1.0])
     middleware.command(2 * SECOND + 505 * MILLISECOND - 1, [0.0, 0.0, 0.0])
     found = middleware.estimator.at(3 * SECOND)[0]
