@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.actions import check_action, still, team_space
+from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.env.task import Episodes, Memory, Task, override
 from nics_drl_bridge.env.tasks import make_task
 from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend, RobotView, Start
 from nics_drl_bridge.random_kernels import episode_seed
+from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world import World, load_world
 
@@ -95,7 +97,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             same bits as in the vector env. With it, one robot in process and one over `dds`,
             which always has it, give the same numbers.
         backend_options: passed to the backend, see `SimBackend` and `DdsBackend`.
-        randomisation: domain randomisation of the simulator, see `FastSimulator`.
+        randomisation: what each episode draws anew: the name of a shipped one, a YAML file, or a
+            Randomisation; the drawn values are in `info["randomisation"]` of a reset.
         render_mode: `rgb_array`, `human` or None.
 
     Raises:
@@ -116,7 +119,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         task_options: dict[str, Any] | None = None,
         estimator: bool | None = None,
         backend_options: dict[str, Any] | None = None,
-        randomisation: Any = None,
+        randomisation: str | Randomisation | None = None,
         render_mode: str | None = None,
     ) -> None:
         check_render_mode(render_mode, self.metadata)
@@ -144,7 +147,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             self._backend = backend
 
     def _backend_arguments(
-        self, backend: str, estimator: bool | None, randomisation: Any
+        self, backend: str, estimator: bool | None, randomisation: str | Randomisation | None
     ) -> dict[str, Any]:
         """What a backend by name is told beside the user's own options."""
         if self.robots > 1 and (backend != "sim" or estimator):
@@ -173,8 +176,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         else:
             self._episode += 1
         episode = int(episode_seed(self._seed, self._episode))
-        footprint = self.model.robot.footprint_radius
-        self.scene = sample_scene(self.world, footprint, episode, self.robots)
+        self.scene = self._scene_of(episode)
         starts = np.array(self.scene.starts)
         starts[...] = (options or {}).get("start", starts)
         self._view = self._lifted(self._backend.reset(Start(episode, self._row(starts))))
@@ -186,11 +188,24 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             "episode_seed": episode,
             "start": self._row(starts),
             "bodies": self.scene.bodies.copy(),
+            **self._drawn(),
         }
         observation = self.task.observation(self._view, self.memory)[0]
         if self.render_mode == "human":
             self.render()
         return self._row(observation), self._info(self._view, facts)
+
+    def _scene_of(self, episode: int) -> Scene:
+        if isinstance(self._backend, SimBackend):
+            return self._backend.simulator.scenes([episode])[0]
+        return sample_scene(self.world, self.model.robot.footprint_radius, episode, self.robots)
+
+    def _drawn(self) -> dict[str, Any]:
+        """What the randomisation drew for this episode, for `info`."""
+        drawn = self._backend.simulator.drawn if isinstance(self._backend, SimBackend) else {}
+        values = {name: values[0] for name, values in drawn.items()}
+        named = {name: self._fact(value) if value.ndim else value for name, value in values.items()}
+        return {"randomisation": named} if named else {}
 
     def step(
         self, action: NDArray[Any]
@@ -273,7 +288,10 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             drawing = import_module("nics_drl_bridge.env.rendering")
             self._picture = drawing.Picture(self.model, self.world, self.render_mode, RENDER_FPS)
         poses = np.reshape(self._true_pose, (self.robots, 3))
-        return self._picture.draw(poses, self._view.ranges[0], self.scene.bodies, self.memory)
+        bodies = self.scene.bodies
+        if isinstance(self._backend, SimBackend):
+            bodies = self._backend.simulator.obstacles[0]
+        return self._picture.draw(poses, self._view.ranges[0], bodies, self.memory)
 
     def close(self) -> None:
         """Leaves the robot with a zero command."""

@@ -15,6 +15,7 @@ from nics_drl_bridge.env.registration import MAX_EPISODE_STEPS
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world import World
 
 Observations = dict[str, NDArray[np.float32]]
@@ -43,7 +44,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         task: a name, `path/to/file.py:ClassName`, a class, or a Task.
         task_options: further arguments of the task's class.
         max_episode_steps: after so many steps an episode is truncated.
-        randomisation: domain randomisation of the simulator, see `FastSimulator`.
+        randomisation: what each episode draws anew, see `BridgeEnv`.
         render_mode: `rgb_array`, `human` or None.
 
     Raises:
@@ -64,7 +65,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         task: str | type[Task] | Task = "cooperative_reaching",
         task_options: dict[str, Any] | None = None,
         max_episode_steps: int = MAX_EPISODE_STEPS,
-        randomisation: Any = None,
+        randomisation: str | Randomisation | None = None,
         render_mode: str | None = None,
     ) -> None:
         self.env = BridgeEnv(

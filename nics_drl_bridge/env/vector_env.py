@@ -67,7 +67,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             array in the next step.
         renderer: `baked` or `exact` lidar.
         threads: of the simulator; the numbers do not depend on it.
-        randomisation: domain randomisation of the simulator, see `FastSimulator`.
+        randomisation: what each episode draws anew, see `BridgeEnv`.
         render_mode: `rgb_array`, of every world, or None.
 
     Raises:
@@ -188,7 +188,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         if options and "start" in options:
             starts = np.empty((len(worlds), self.robots, 3))
             starts[...] = options["start"]
-        scenes = self.simulator.reset(seeds, worlds, starts)  # type: ignore[arg-type]
+        scenes = self.simulator.reset(seeds, worlds, starts)
         self._bodies[worlds] = scenes.bodies
         data = self.simulator.data
         self._starts[worlds] = data.pose[worlds]
@@ -295,7 +295,16 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             "episode_seed": data.seeds[rows],
             "start": self._row(self._starts[rows]),
             "bodies": self._bodies[rows],
+            **self._drawn(rows),
         }
+
+    def _drawn(self, rows: Rows) -> dict[str, Any]:
+        """What the randomisation drew for episodes that begin."""
+        named = {
+            name: self._row(values[rows]) if values.ndim > 1 else values[rows]
+            for name, values in self.simulator.drawn.items()
+        }
+        return {"randomisation": named} if named else {}
 
     def _facts(self, outcome: Outcome) -> dict[str, Any]:
         """What `info` tells of a step, of every world, in arrays of its own."""
@@ -325,12 +334,11 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
                 drawing.Picture(self.model, self.world, self.render_mode, RENDER_FPS)
                 for _ in range(self.num_envs)
             ]
-        drawn = []
+        drawn, bodies = [], self.simulator.obstacles
         for n, picture in enumerate(self._pictures):
             memory = {name: rows[n : n + 1] for name, rows in self.memory.items()}
             data = self.simulator.data
-            bodies = self._bodies[n]
-            drawn.append(picture.draw(data.pose[n], data.ranges[n], bodies, memory))
+            drawn.append(picture.draw(data.pose[n], data.ranges[n], bodies[n], memory))
         return tuple(drawn)
 
     def close_extras(self, **kwargs: Any) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
+
+RATE_OVER = 32
+"""Rates are taken over so many arrivals."""
 
 
-@dataclass(frozen=True)
-class Datum:
+class Datum(NamedTuple):
     """A message as it arrived.
 
     Attributes:
@@ -25,15 +28,19 @@ class Datum:
 
 @dataclass
 class TopicCache:
-    """Keeps the newest datum of each topic and counts what was refused.
+    """Keeps the newest datum of each topic, when data came, and counts what was refused.
 
     Attributes:
         newest: topic -> datum.
         rejected: reason -> how many.
+        received: topic -> how many were taken.
+        arrivals: topic -> when the last ones came [ns].
     """
 
     newest: dict[str, Datum] = field(default_factory=dict)
     rejected: dict[str, int] = field(default_factory=dict)
+    received: dict[str, int] = field(default_factory=dict)
+    arrivals: dict[str, deque[int]] = field(default_factory=dict)
 
     def put(self, topic: str, stamp_ns: int, arrival_ns: int, value: Any) -> bool:
         """Stores a datum unless it is older than the one held, or a copy; says whether."""
@@ -43,9 +50,19 @@ class TopicCache:
                 f"{topic}: out of order" if stamp_ns < held.stamp_ns else f"{topic}: duplicate"
             )
             return False
-        sequence = 0 if held is None else held.sequence + 1
-        self.newest[topic] = Datum(stamp_ns, arrival_ns, sequence, value)
+        self.take(topic, stamp_ns, arrival_ns, value)
         return True
+
+    def take(self, topic: str, stamp_ns: int, arrival_ns: int, value: Any) -> None:
+        """Counts a datum, and stores it if it is the newest: a late one may be of use, too."""
+        held, count = self.newest.get(topic), self.received.get(topic, 0)
+        if held is None or stamp_ns > held.stamp_ns:
+            self.newest[topic] = Datum(stamp_ns, arrival_ns, count, value)
+        self.received[topic] = count + 1
+        arrivals = self.arrivals.get(topic)
+        if arrivals is None:
+            arrivals = self.arrivals[topic] = deque(maxlen=RATE_OVER)
+        arrivals.append(arrival_ns)
 
     def reject(self, reason: str) -> None:
         """Counts a refusal."""
@@ -55,3 +72,13 @@ class TopicCache:
         """Seconds since the newest datum was stamped; inf when there is none."""
         held = self.newest.get(topic)
         return float("inf") if held is None else (now_ns - held.stamp_ns) * 1e-9
+
+    def rate_hz(self, topic: str, arrival_ns: int) -> float:
+        """How many come in a second, by the receiver's clock; it falls when one is overdue."""
+        arrivals = self.arrivals.get(topic, deque())
+        intervals = len(arrivals) - 1
+        if intervals < 1:
+            return 0.0
+        overdue_ns = (arrival_ns - arrivals[0]) * intervals / (intervals + 1)
+        span_ns = max(arrivals[-1] - arrivals[0], overdue_ns)
+        return intervals / (span_ns * 1e-9) if span_ns > 0 else 0.0

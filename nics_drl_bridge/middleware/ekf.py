@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.geometry import wrap_angle
-from nics_drl_bridge.kinematics.kernels import SERIES, term_arrays
+from nics_drl_bridge.kinematics.kernels import SERIES, term_arrays, wrap
 from nics_drl_bridge.middleware import kernels
+from nics_drl_bridge.middleware.command_log import CommandLog
+from nics_drl_bridge.middleware.measurement import Kind, Measurement, Outcome, Verdict
 
 Array = NDArray[np.float64]
 
@@ -23,26 +24,47 @@ LEAST_TWIST_STD = 1e-3
 """A twist is never trusted more than this [m/s, rad/s],"""
 LEAST_POSE_STD = 1e-3
 """nor is a pose [m, rad]."""
-SURPRISE = 16.27
-"""A twist whose squared, normalised innovation exceeds this, once in a thousand, is news: the
-robot is stuck, slips or is pushed. (99.9 % of chi-squared with three degrees of freedom.)"""
+GYRO_STD = 0.02
+"""Of a yaw rate whose message does not say [rad/s]: a cheap gyro with its bias."""
+GATE = {Kind.TWIST: 16.27, Kind.YAW_RATE: 10.83, Kind.POSE: 16.27}
+"""A measurement whose squared, normalised innovation exceeds this, once in a thousand, is a
+surprise. (99.9 % of chi-squared with three degrees of freedom, or one.)"""
+PATIENCE: dict[Kind, float] = {Kind.TWIST: 3, Kind.YAW_RATE: np.inf, Kind.POSE: 5}
+"""So many outliers in a row are believed. A gyro never is: odometry says what the robot does."""
 NEWS = 0.5
-"""The state is then taken to be off by this share of its range."""
+"""A robot that is stuck or pushed may be off by this share of its state's range."""
 REACHABLE = 2.0
-"""No state is believed beyond this many times its range: the model means nothing there."""
+"""No state or command is believed beyond so many times its range: the model means nothing there."""
+FARTHEST = 1e8
+"""Nothing that is off by more than this [m, rad, m/s, rad/s] is ever believed."""
 START_STD = 1e-3
 """How well the pose is known at a reset [m, rad]."""
-COMMANDS_KEPT = 64
 LONGEST_GAP_S = 10.0
 """Over a longer silence, as when a clock jumps, the robot is taken to have stood still."""
 NANO = 1_000_000_000
 
 
+class Belief(NamedTuple):
+    """All that the filter holds at a time; its arrays are never changed in place.
+
+    Attributes:
+        time_ns: of the belief [ns].
+        mean: (3 + S,) x [m], y [m], heading [rad] in `map`, then the state of the RobotSpec.
+        covariance: (3 + S, 3 + S).
+        outliers: how many of each kind came in a row.
+    """
+
+    time_ns: int
+    mean: Array
+    covariance: Array
+    outliers: tuple[int, int, int]
+
+
 class Estimator:
     """Pose and state of one robot, predicted by the fitted model, corrected by measurements.
 
-    The mean is x [m], y [m], heading [rad] in `map`, then the state of the RobotSpec. Time is
-    an integer of nanoseconds, so that the same messages give the same numbers to the bit.
+    Time is an integer of nanoseconds, so that the same messages give the same numbers to the
+    bit. Measurements count at the time of the estimate; `replay` puts late ones in their place.
 
     Args:
         model: its kinematics predict, its drift is the Q and its sensors' noise the R of the
@@ -52,129 +74,193 @@ class Estimator:
     def __init__(self, model: SimulatorModel) -> None:
         self._terms = term_arrays(model.kinematics)
         dt, _, delay = model.timing
-        self._dt_ns, self._delay_ns = round(dt * NANO), round(dt * delay * NANO)
+        self._timing = round(dt * NANO), round(LONGEST_GAP_S * NANO)
+        self._delay_ns = round(dt * delay * NANO)
         size = len(model.robot.state)
         reach = np.array([v.max - v.min for v in model.robot.state])
         least = np.concatenate([np.full(3, LEAST_POSE_DRIFT), LEAST_STATE_DRIFT * reach])
         self._process = np.diag(np.maximum(model.noise.drift(model.robot), least) ** 2)
         self._news = np.concatenate([np.zeros(3), NEWS * reach]) ** 2
-        center = np.array([v.max + v.min for v in model.robot.state]) / 2.0
-        self._limits = center - REACHABLE / 2.0 * reach, center + REACHABLE / 2.0 * reach
-        self._pose_std = np.maximum(model.noise.pose, LEAST_POSE_STD)
+        low, high = np.array([(v.min, v.max) for v in model.robot.state]).reshape(-1, 2).T
+        self._limits = _widened(low, high)
+        self._least, self._most = _widened(model.robot.command_low, model.robot.command_high)
         linear, angular = (max(std, LEAST_TWIST_STD) for std in model.noise.odometry)
-        self._twist_noise = np.diag([linear, linear, angular]) ** 2
-        self._width = len(model.robot.command)
+        self._noise = {
+            Kind.TWIST: np.diag([linear, linear, angular]) ** 2,
+            Kind.YAW_RATE: np.diag([GYRO_STD**2]),
+            Kind.POSE: np.diag(np.maximum(model.noise.pose, LEAST_POSE_STD) ** 2),
+        }
+        self._observe_pose = np.eye(3, 3 + size)
+        self._log = CommandLog(len(model.robot.command))
         self._filter = ExtendedKalmanFilter(dim_x=3 + size, dim_z=3)
         self.reset(0, np.zeros(3))
 
-    def reset(self, time_ns: int, pose: ArrayLike) -> None:
-        """Begins at a known pose (3,), standing still, with a zero command."""
-        self.time_ns = time_ns
+    def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
+        """Begins at a pose (3,), standing still, with a zero command.
+
+        Args:
+            time_ns: when [ns].
+            pose: x [m], y [m], heading [rad] in `map`.
+            std: how well it is known [m, rad]: one number, or (3,).
+        """
         size = self._filter.dim_x
-        self._filter.x = np.zeros(size)
-        self._filter.x[:3] = pose
-        self._filter.P = np.eye(size) * START_STD**2
-        self._commands: deque[tuple[int, Array]] = deque(maxlen=COMMANDS_KEPT)
-        self._commands.append((np.iinfo(np.int64).min, np.zeros(self._width)))
+        mean, deviation = np.zeros(size), np.full(size, START_STD)
+        mean[:3], deviation[:3] = pose, std
+        self.belief = Belief(time_ns, mean, np.diag(deviation**2), (0, 0, 0))
+        self._log.clear()
+
+    @property
+    def belief(self) -> Belief:
+        """What the filter holds; to be set again when the past has changed."""
+        return Belief(self.time_ns, self._filter.x, self._filter.P, self._outliers)
+
+    @belief.setter
+    def belief(self, belief: Belief) -> None:
+        self.time_ns, self._filter.x, self._filter.P, self._outliers = belief
 
     @property
     def covariance(self) -> Array:
         """(3 + S, 3 + S) of pose and state."""
         return np.array(self._filter.P)
 
-    def command(self, stamp_ns: int, command: ArrayLike) -> None:
-        """Notes a command (C,) sent at a time; it takes effect one latency later."""
-        self._commands.append((stamp_ns + self._delay_ns, np.array(command, dtype=np.float64)))
+    def effective_ns(self, stamp_ns: int) -> int:
+        """When a command that was sent at a time takes effect [ns]."""
+        return stamp_ns + self._delay_ns
+
+    def command(self, stamp_ns: int, command: ArrayLike, needed_ns: int | None = None) -> bool:
+        """Notes a command (C,) sent at a time; it takes effect one latency later.
+
+        Args:
+            stamp_ns: when it was sent [ns].
+            command: in the units and the order of the RobotSpec.
+            needed_ns: earliest time [ns] that the estimate may be set back to; by default it may
+                not.
+
+        Returns:
+            False when there is one of that very time, which stays.
+        """
+        needed_ns = self.time_ns if needed_ns is None else needed_ns
+        possible = np.minimum(np.maximum(command, self._least), self._most)
+        return self._log.add(self.effective_ns(stamp_ns), possible, needed_ns)
 
     def at(self, time_ns: int) -> tuple[Array, Array]:
         """Pose (3,) and body twist (3,) expected at a time, without moving the estimate.
 
-        Data that arrive later, with earlier stamps, still count in full.
+        Data that arrive later, with earlier stamps, still count in full. At a time before the
+        estimate's the answer is that of the estimate.
         """
-        mean, command = np.array(self._filter.x), self._command_at(time_ns - 1)
-        self._carry(mean, np.eye(len(mean)), time_ns)
-        return mean[:3], kernels.twist_of(mean, command, self._terms)[0]
+        mean, twist = kernels.look_ahead(
+            self._filter.x, self.time_ns, time_ns,
+            self._timing, self._log.arrays, self._terms, SERIES,
+        )  # fmt: skip
+        return mean[:3], twist
 
     def predict(self, time_ns: int) -> None:
         """Moves the estimate forward to a time; an earlier time changes nothing."""
         if time_ns <= self.time_ns:
             return
-        transition = np.eye(self._filter.dim_x)
-        self._carry(self._filter.x, transition, time_ns)
-        elapsed = (time_ns - self.time_ns) / NANO
-        self._filter.P = transition @ self._filter.P @ transition.T + self._process * elapsed
+        self._filter.x, self._filter.P = kernels.forecast(
+            self._filter.x, self._filter.P, self._process, self.time_ns, time_ns,
+            self._timing, self._log.arrays, self._terms, SERIES,
+        )  # fmt: skip
         self.time_ns = time_ns
 
-    def _carry(self, mean: Array, transition: Array, time_ns: int) -> None:
-        """Moves a mean from the time of the estimate to a later one, command by command."""
-        now = self.time_ns
-        if time_ns - now > LONGEST_GAP_S * NANO:
-            mean[3:] = 0.0
-            return
-        for effective in [*(effective for effective, _ in self._commands), time_ns]:
-            until = min(effective, time_ns)
-            if until > now:
-                self._move(mean, transition, self._command_at(now), until - now)
-                now = until
-
-    def _move(self, mean: Array, transition: Array, command: Array, duration_ns: int) -> None:
-        steps, rest = divmod(duration_ns, self._dt_ns)
-        kernels.predict(mean, transition, command, self._dt_ns / NANO, steps, self._terms, SERIES)
-        if rest:
-            kernels.predict(mean, transition, command, rest / NANO, 1, self._terms, SERIES)
-
-    def _command_at(self, time_ns: int) -> Array:
-        """The command (C,) in effect at a time."""
-        newest = self._commands[0][1]
-        for effective, command in self._commands:
-            if effective <= time_ns:
-                newest = command
-        return newest
-
-    def update_twist(self, twist: ArrayLike) -> None:
+    def update_twist(self, twist: ArrayLike) -> Verdict:
         """Corrects by a measured body twist (3,) at the time of the estimate."""
-        command = self._command_at(self.time_ns - 1)
-        expected, derivative = kernels.twist_of(self._filter.x, command, self._terms)
-        measured = np.asarray(twist, dtype=np.float64)
-        innovation = measured - expected
-        covariance = derivative @ self._filter.P @ derivative.T + self._twist_noise
-        if innovation @ np.linalg.solve(covariance, innovation) > SURPRISE:
-            variance = np.diag(self._filter.P)
-            self._filter.P = self._filter.P + np.diag(np.maximum(self._news - variance, 0.0))
-        self._filter.update(
-            measured,
-            HJacobian=lambda _: derivative,
-            Hx=lambda _: expected,
-            R=self._twist_noise,
-        )
-        self._settle()
+        return self.correct(Measurement(Kind.TWIST, np.array(twist, dtype=np.float64)))
 
-    def update_pose(self, pose: ArrayLike, std: ArrayLike | None = None) -> None:
+    def update_yaw_rate(self, rate: float, std: float | None = None) -> Verdict:
+        """Corrects by a measured yaw rate [rad/s]."""
+        noise = None if std is None else np.array([[std**2]])
+        return self.correct(Measurement(Kind.YAW_RATE, np.array([rate]), noise))
+
+    def update_pose(self, pose: ArrayLike, std: ArrayLike | None = None) -> Verdict:
         """Corrects by a measured pose (3,).
 
         Args:
             pose: x [m], y [m], heading [rad] in `map`.
             std: (3,) its standard deviations; those of the model's pose sensor when None.
         """
-        std = self._pose_std if std is None else std
-        observe = np.eye(3, self._filter.dim_x)
-        self._filter.update(
-            np.asarray(pose, dtype=np.float64),
-            HJacobian=lambda _: observe,
-            Hx=lambda mean: mean[:3],
-            R=np.diag(np.asarray(std, dtype=np.float64) ** 2),
-            residual=_pose_residual,
-        )
-        self._settle()
+        noise = None if std is None else np.diag(np.asarray(std, dtype=np.float64) ** 2)
+        return self.correct(Measurement(Kind.POSE, np.array(pose, dtype=np.float64), noise))
 
-    def _settle(self) -> None:
-        """Brings the heading into [-pi, pi) and the state to where it can be."""
-        self._filter.x[2] = wrap_angle(self._filter.x[2])
-        self._filter.x[3:] = np.clip(self._filter.x[3:], *self._limits)
+    def correct(self, measurement: Measurement) -> Verdict:
+        """Corrects by a measurement at the time of the estimate, unless it is an outlier."""
+        kind, value, noise = measurement
+        noise = self._noise[kind] if noise is None else noise
+        expected, derivative = self._expect(kind)
+        residual = _pose_residual if kind is Kind.POSE else np.subtract
+        innovation = residual(value, expected)
+        distance = kernels.distance(innovation, derivative, self._filter.P, noise)
+        outcome = Outcome.USED
+        if not distance <= GATE[kind]:
+            outcome = self._surprise(kind, innovation, derivative, noise)
+        if outcome is Outcome.OUTLIER:
+            self._count(kind, self._outliers[kind] + 1)
+            return Verdict(distance, outcome)
+        if kind is Kind.POSE and outcome is Outcome.JUMP:
+            self._jump(value, noise)
+        else:
+            self._filter.update(
+                value, lambda _: derivative, lambda _: expected, R=noise, residual=residual
+            )
+        if self._outliers[kind] and not (outcome is Outcome.JUMP and kind is Kind.TWIST):
+            self._count(kind, 0)
+        kernels.settle(self._filter.x, self._filter.P, *self._limits)
+        return Verdict(distance, outcome)
+
+    def _expect(self, kind: Kind) -> tuple[Array, Array]:
+        """What a sensor should measure (n,), and its derivative (n, 3 + S)."""
+        if kind is Kind.POSE:
+            return self._filter.x[:3], self._observe_pose
+        twist, derivative = kernels.expect(
+            self._filter.x, self.time_ns, self._log.arrays, self._terms
+        )
+        return (twist, derivative) if kind is Kind.TWIST else (twist[2:], derivative[2:])
+
+    def _surprise(self, kind: Kind, innovation: Array, derivative: Array, noise: Array) -> Outcome:
+        """What to make of a measurement beyond its gate; a robot that is stuck makes news."""
+        if not (np.abs(innovation) < FARTHEST).all():
+            return Outcome.OUTLIER
+        believed = self._outliers[kind] + 1 >= PATIENCE[kind]
+        if kind is Kind.TWIST:
+            doubt = np.maximum(self._news - np.diag(self._filter.P), 0.0)
+            doubtful = self._filter.P + np.diag(doubt)
+            if kernels.distance(innovation, derivative, doubtful, noise) <= GATE[kind]:
+                self._filter.P = doubtful
+                return Outcome.NEWS
+            if believed:
+                self._filter.P = doubtful
+                self._part()
+        return Outcome.JUMP if believed else Outcome.OUTLIER
+
+    def _part(self) -> None:
+        """Lets a surprise about the pose tell nothing of the state, nor the other way round."""
+        covariance = np.array(self._filter.P)
+        covariance[:3, 3:], covariance[3:, :3] = 0.0, 0.0
+        self._filter.P = covariance
+
+    def _jump(self, pose: Array, noise: Array) -> None:
+        """Takes a pose for the pose."""
+        self._part()
+        mean = np.array(self._filter.x)
+        mean[:3], self._filter.P[:3, :3] = pose, noise
+        self._filter.x = mean
+
+    def _count(self, kind: Kind, outliers: int) -> None:
+        counts = list(self._outliers)
+        counts[kind] = outliers
+        self._outliers = (counts[0], counts[1], counts[2])
+
+
+def _widened(low: Array, high: Array) -> tuple[Array, Array]:
+    """Limits (n,), as far apart as the filter believes in."""
+    center, half = (high + low) / 2.0, REACHABLE * (high - low) / 2.0
+    return center - half, center + half
 
 
 def _pose_residual(measured: Array, expected: Array) -> Array:
     """Difference of two poses (3,), its heading in [-pi, pi)."""
     difference = measured - expected
-    difference[2] = wrap_angle(difference[2])
+    difference[2] = wrap(difference[2])
     return difference

@@ -1,4 +1,4 @@
-"""Compiled prediction of the estimator: the simulator's motion with its Jacobian."""
+"""Compiled parts of the estimator: motion with its Jacobian, gates, numerical health."""
 
 from __future__ import annotations
 
@@ -7,7 +7,15 @@ import math
 import numpy as np
 from numba import njit
 
-from nics_drl_bridge.kinematics.kernels import advance, rates
+from nics_drl_bridge.kinematics.kernels import advance, rates, wrap
+
+NANO = 1_000_000_000
+RUNAWAY = 1e9
+"""No pose or state is ever so far [m, rad, its unit], nor changes by so many times its cause."""
+LEAST_PIVOT = 1e-12
+"""A variable is never known better than this share of its variance, given those before it,"""
+LEAST_VARIANCE = 1e-18
+"""nor better than this."""
 
 
 @njit(cache=True)
@@ -69,3 +77,114 @@ def twist_of(mean, command, terms):  # type: ignore[no-untyped-def]
     rates_jacobian(jacobian, x, terms)
     derivative[:, 3:] = jacobian[:3, :size]
     return dq[:3].copy(), derivative
+
+
+@njit(cache=True)
+def in_effect(effective, count, time):  # type: ignore[no-untyped-def]
+    """Which command is in effect just before a time: the last that took effect earlier."""
+    low, high = 0, count
+    while low < high:
+        middle = (low + high) // 2
+        if effective[middle] < time:
+            low = middle + 1
+        else:
+            high = middle
+    return max(low - 1, 0)
+
+
+@njit(cache=True)
+def carry(mean, transition, begin, end, timing, log, terms, series):  # type: ignore[no-untyped-def]
+    """Moves a mean (3 + S) from one time to another, command by command, in place.
+
+    Where the model runs away, as none does within its range, the robot is taken to have stood
+    still, too.
+
+    Args:
+        mean, transition, terms, series: see `predict`.
+        begin, end: times [ns].
+        timing: the model's step, and the silence over which the robot is taken to have stood
+            still [ns].
+        log: since when each command is in effect [ns] (K,), the commands (K, C), how many.
+    """
+    step, longest = timing
+    effective, commands, count = log
+    if end - begin > longest:
+        mean[3:] = 0.0
+        return
+    before = mean[:3].copy()
+    now, k = begin, in_effect(effective, count, begin + 1)
+    while now < end:
+        until = end
+        if k + 1 < count and effective[k + 1] < end:
+            until = effective[k + 1]
+        steps, rest = (until - now) // step, (until - now) % step
+        predict(mean, transition, commands[k], step / NANO, steps, terms, series)
+        if rest > 0:
+            predict(mean, transition, commands[k], rest / NANO, 1, terms, series)
+        now, k = until, k + 1
+    if not (np.all(np.abs(mean) < RUNAWAY) and np.all(np.abs(transition) < RUNAWAY)):
+        mean[:3], mean[3:] = before, 0.0
+        transition[:] = np.eye(mean.shape[0])
+
+
+@njit(cache=True)
+def forecast(mean, covariance, process, begin, end, timing, log, terms, series):  # type: ignore[no-untyped-def]
+    """Mean and covariance at a later time; `process` (3 + S, 3 + S) grows with every second."""
+    moved, transition = mean.copy(), np.eye(mean.shape[0])
+    carry(moved, transition, begin, end, timing, log, terms, series)
+    spread = transition @ covariance @ transition.T + process * ((end - begin) / NANO)
+    return moved, (spread + spread.T) * 0.5
+
+
+@njit(cache=True)
+def look_ahead(mean, begin, end, timing, log, terms, series):  # type: ignore[no-untyped-def]
+    """Mean (3 + S) and body twist (3,) at a time; the present one when that is earlier."""
+    moved = mean.copy()
+    if end > begin:
+        carry(moved, np.eye(mean.shape[0]), begin, end, timing, log, terms, series)
+    effective, commands, count = log
+    command = commands[in_effect(effective, count, max(begin, end))]
+    return moved, twist_of(moved, command, terms)[0]
+
+
+@njit(cache=True)
+def expect(mean, now, log, terms):  # type: ignore[no-untyped-def]
+    """The body twist (3,) to measure at the time of the mean, and its derivative (3, 3 + S)."""
+    effective, commands, count = log
+    return twist_of(mean, commands[in_effect(effective, count, now)], terms)
+
+
+@njit(cache=True)
+def distance(innovation, derivative, covariance, noise):  # type: ignore[no-untyped-def]
+    """Squared, normalised innovation (Mahalanobis): chi-squared when the filter is right."""
+    spread = derivative @ covariance @ derivative.T + noise
+    return innovation @ np.linalg.solve(spread, innovation)
+
+
+@njit(cache=True)
+def settle(mean, covariance, low, high):  # type: ignore[no-untyped-def]
+    """Brings an estimate to where it can be, in place.
+
+    The heading comes into [-pi, pi), the state within its limits (S,), the covariance is made
+    symmetric. Where rounding left a pivot of its Cholesky factor at nothing, the variance is
+    raised to what makes it positive.
+    """
+    size = mean.shape[0]
+    mean[2] = wrap(mean[2])
+    for i in range(3, size):
+        mean[i] = min(max(mean[i], low[i - 3]), high[i - 3])
+    factor = np.zeros((size, size))
+    for i in range(size):
+        for j in range(i + 1):
+            both = 0.5 * (covariance[i, j] + covariance[j, i])
+            covariance[i, j], covariance[j, i] = both, both
+            for k in range(j):
+                both -= factor[i, k] * factor[j, k]
+            if j < i:
+                factor[i, j] = both / factor[j, j]
+                continue
+            least = max(LEAST_PIVOT * covariance[i, i], LEAST_VARIANCE)
+            if both < least:
+                covariance[i, i] += least - both
+                both = least
+            factor[i, i] = math.sqrt(both)

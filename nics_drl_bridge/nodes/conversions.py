@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Quaternion, Twist
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion, Twist
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
-from sensor_msgs.msg import JointState, LaserScan
+from sensor_msgs.msg import Imu, JointState, LaserScan
 
 from nics_drl_bridge.kinematics.joints import POSITION_UNITS
 from nics_drl_bridge.kinematics.spec import RobotSpec
@@ -115,6 +115,29 @@ def odometry_from_ros(message: Odometry) -> tuple[Array, Array]:
     return np.array([pose.position.x, pose.position.y, heading]), twist_from_ros(
         message.twist.twist
     )
+
+
+PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+"""Where x, y and heading stand in the 6 x 6 covariance of a message."""
+
+
+def pose_from_ros(
+    message: PoseStamped | PoseWithCovarianceStamped,
+) -> tuple[Array, Array | None]:
+    """Pose (3,) of a message and its covariance (3, 3); None where it carries none."""
+    pose, covariance = message.pose, None
+    if isinstance(message, PoseWithCovarianceStamped):
+        pose, covariance = pose.pose, np.reshape(pose.covariance, (6, 6))[PLANAR]
+    heading = heading_from_ros(pose.orientation)
+    return np.array([pose.position.x, pose.position.y, heading]), covariance
+
+
+def imu_from_ros(message: Imu) -> tuple[float, float] | None:
+    """Yaw rate [rad/s] and its variance [rad^2/s^2]; None where it measures no rates."""
+    covariance = message.angular_velocity_covariance
+    if covariance[0] == -1.0:
+        return None
+    return float(message.angular_velocity.z), float(covariance[8])
 
 
 def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState:

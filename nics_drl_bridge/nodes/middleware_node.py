@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
@@ -9,16 +12,20 @@ from rclpy.context import Context
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.middleware.health import Health
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.nodes.runner import declare, declare_model, run_node
 
 DIAGNOSTICS_PERIOD_S = 1.0
+SILENCE_S = 5.0
+"""Diagnostics warn of a topic that has been silent for so long."""
 
 
 class MiddlewareNode(Node):
-    """Listens to `scan`, `odom` and `cmd_vel`; publishes `odometry/filtered` and `/diagnostics`.
+    """Listens to a robot's topics; publishes `odometry/filtered` and `/diagnostics`.
 
+    Which topics, `RobotTopics` says; what becomes of them, `docs/middleware.md`.
     `~/reset` forgets everything, so that the next odometry fixes `map` anew.
 
     Args:
@@ -39,8 +46,10 @@ class MiddlewareNode(Node):
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=steady)
 
     def _publish(self, stamp_ns: int) -> None:
-        view = self._topics.middleware.view(stamp_ns)
-        covariance = self._topics.middleware.estimator.covariance
+        estimator = self._topics.middleware.estimator
+        # A pose or a yaw rate may have been newer.
+        stamp_ns = max(stamp_ns, estimator.time_ns)
+        view, covariance = self._topics.middleware.view(stamp_ns), estimator.covariance
         frames = (
             str(self.get_parameter("map_frame").value),
             str(self.get_parameter("base_frame").value),
@@ -56,17 +65,38 @@ class MiddlewareNode(Node):
         return response
 
     def _diagnose(self) -> None:
-        cache = self._topics.middleware.cache
+        health = self._topics.middleware.health(self._topics.now_ns())
         status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: topics")
-        missing = [topic for topic in ("scan", "odom") if topic not in cache.newest]
-        status.level = DiagnosticStatus.WARN if missing else DiagnosticStatus.OK
-        status.message = f"nothing on {', '.join(missing)} yet" if missing else "receiving"
-        facts = {f"{topic} received": datum.sequence + 1 for topic, datum in cache.newest.items()}
-        facts |= {f"rejected, {reason}": count for reason, count in cache.rejected.items()}
-        status.values = [KeyValue(key=key, value=str(value)) for key, value in facts.items()]
+        trouble = silence(health, self._topics.expected)
+        status.level = DiagnosticStatus.WARN if trouble else DiagnosticStatus.OK
+        status.message = trouble or "receiving"
+        status.values = [KeyValue(key=key, value=value) for key, value in facts(health).items()]
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
+
+
+def silence(health: Health, expected: Sequence[str]) -> str:
+    """Which of the expected topics say nothing, as a sentence; empty when all speak."""
+    missing = [topic for topic in expected if topic not in health.topics]
+    if missing:
+        return f"nothing on {', '.join(missing)} yet"
+    silent = [topic for topic in expected if health.topics[topic].age_s > SILENCE_S]
+    return f"nothing on {', '.join(silent)} for {SILENCE_S:g} s" if silent else ""
+
+
+def facts(health: Health) -> dict[str, str]:
+    """Health as keys and values for people."""
+    told = {}
+    for topic, each in health.topics.items():
+        told[f"{topic} received"] = str(each.received)
+        told[f"{topic} rate [Hz]"] = f"{each.rate_hz:.3g}"
+        told[f"{topic} age [s]"] = f"{each.age_s:.3f}"
+        if not math.isnan(each.innovation):
+            told[f"{topic} innovation"] = f"{each.innovation:.3g}"
+    told |= {f"rejected, {reason}": str(count) for reason, count in health.rejected.items()}
+    told |= {f"noticed, {reason}": str(count) for reason, count in health.noticed.items()}
+    return told | {"late and put in place": str(health.replayed)}
 
 
 def main(args: list[str] | None = None) -> None:

@@ -66,8 +66,11 @@ class PolicyNode(Node):
         self._raw.publish(self._message(self._twist(), scan_ns))
 
     def _twist(self) -> NDArray[np.float64]:
-        """The command (3,) for the present view; zero without a goal, at it, or at a touch."""
-        if not np.isfinite(self._goal).all():
+        """The command (3,) for the present view; zero without a goal, at it, or at a touch.
+
+        Where a pose sensor tells where the robot is, zero before its first pose too.
+        """
+        if not (self._topics.located and np.isfinite(self._goal).all()):
             return np.zeros(3)
         view = self._topics.view()
         memory = {"goal": self._goal}

@@ -5,28 +5,44 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from geometry_msgs.msg import Twist
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
-from sensor_msgs.msg import LaserScan
+from sensor_msgs.msg import Imu, LaserScan
 
+from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.view import Middleware
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.runner import declare
+
+NO_POSE = "none"
+POSE_TYPES = {
+    "PoseStamped": PoseStamped,
+    "PoseWithCovarianceStamped": PoseWithCovarianceStamped,
+}
+ANYWHERE = (100.0, 100.0, np.pi)
+"""How well odometry alone tells where a robot is in the map of a pose sensor [m, rad]."""
 
 
 class RobotTopics:
-    """Subscribes to `scan`, `odom` and `cmd_vel` and keeps the middleware up to date.
+    """Subscribes to a robot's topics and keeps the middleware up to date.
 
-    Data are used at their own stamps; a command, which has none, at the stamp of the newest
-    datum before it. The first odometry fixes where `map` is.
+    These are `scan`, `odom` and `cmd_vel`, and if the node's parameters `pose_type` and `use_imu`
+    say so, `pose` and `imu`. Data are used at their own stamps; a command, which has none, at
+    the stamp of the newest datum before it. The first odometry fixes where `map` is, unless there
+    is a pose sensor: then the first pose does.
 
     Args:
         node: whose topics they are.
         model: of the robot.
-        on_odometry: called with the stamp [ns] after each odometry that was used.
+        on_odometry: called with the stamp [ns] after each odometry that is the newest.
         on_scan: called with the stamp [ns] after each scan that was used.
+
+    Raises:
+        ConfigError: no such `pose_type`.
     """
 
     def __init__(
@@ -38,48 +54,95 @@ class RobotTopics:
     ) -> None:
         self._node, self._robot, self._lidar = node, model.robot, model.lidar
         self.middleware = Middleware(model)
-        self.newest_ns = 0
-        self._started = False
+        self.restart()
         self._on_odometry, self._on_scan = on_odometry, on_scan
-        node.create_subscription(LaserScan, "scan", self._take_scan, qos.SENSOR)
-        node.create_subscription(Odometry, "odom", self._take_odometry, qos.SENSOR)
-        node.create_subscription(Twist, "cmd_vel", self._take_command, qos.COMMAND)
+        node.create_subscription(LaserScan, SCAN, self._take_scan, qos.SENSOR)
+        node.create_subscription(Odometry, ODOM, self._take_odometry, qos.SENSOR)
+        node.create_subscription(Twist, CMD_VEL, self._take_command, qos.COMMAND)
+        self.expected = (SCAN, ODOM, *self._subscribe_optional())
+
+    def _subscribe_optional(self) -> list[str]:
+        """The topics that the parameters ask for."""
+        node, asked = self._node, []
+        about = f"Type of `{POSE}`, in the map frame: {NO_POSE}, {', '.join(POSE_TYPES)}."
+        pose_type = str(declare(node, "pose_type", NO_POSE, about, read_only=True))
+        self._posed = pose_type != NO_POSE
+        if self._posed:
+            if pose_type not in POSE_TYPES:
+                raise ConfigError(
+                    f"parameter 'pose_type': there is no {pose_type!r}; "
+                    f"{nearest(pose_type, (NO_POSE, *POSE_TYPES))}"
+                )
+            kind = POSE_TYPES[pose_type]
+            node.create_subscription(kind, POSE, self._take_pose, qos.SENSOR)
+            asked.append(POSE)
+        if declare(node, "use_imu", False, "Whether to use the yaw rate of `imu`.", read_only=True):
+            node.create_subscription(Imu, IMU, self._take_imu, qos.SENSOR)
+            asked.append(IMU)
+        return asked
 
     def restart(self) -> None:
-        """Forgets everything; the next odometry fixes `map` anew."""
+        """Forgets everything; the next odometry begins anew."""
         self._started = False
-        self.newest_ns = 0
+        self.middleware.reset(0, np.zeros(3))
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest datum [ns], 0 when there is none."""
+        return self.middleware.newest_ns or 0
+
+    @property
+    def located(self) -> bool:
+        """Whether it is known where in the map the robot is."""
+        return not self._posed or POSE in self.middleware.cache.newest
 
     def view(self) -> RobotView:
         """What is known at the stamp of the newest datum."""
         return self.middleware.view(self.newest_ns)
 
-    def _arrival_ns(self) -> int:
+    def now_ns(self) -> int:
+        """The time on the clock of arrivals [ns]."""
         return int(self._node.get_clock().now().nanoseconds)
 
     def _take_scan(self, message: LaserScan) -> None:
         stamp = conversions.stamp_from_ros(message.header.stamp)
         ranges = conversions.scan_from_ros(self._lidar, message)
-        if self.middleware.scan(stamp, self._arrival_ns(), ranges):
-            self.newest_ns = max(self.newest_ns, stamp)
-            if self._on_scan is not None:
-                self._on_scan(stamp)
+        used = self.middleware.scan(stamp, self.now_ns(), ranges)
+        if used and self._on_scan is not None:
+            self._on_scan(stamp)
 
     def _take_odometry(self, message: Odometry) -> None:
         stamp = conversions.stamp_from_ros(message.header.stamp)
         pose, twist = conversions.odometry_from_ros(message)
         if not self._started and np.isfinite(pose).all():
-            self.middleware.reset(stamp, pose)
-            self._started = True
-        if self.middleware.odometry(stamp, self._arrival_ns(), pose, twist):
-            self.newest_ns = max(self.newest_ns, stamp)
-            if self._on_odometry is not None:
-                self._on_odometry(stamp)
+            self._begin(stamp, pose)
+        used = self.middleware.odometry(stamp, self.now_ns(), pose, twist)
+        if used and self._on_odometry is not None and self._is_newest(stamp):
+            self._on_odometry(stamp)
+
+    def _begin(self, stamp_ns: int, pose: conversions.Array) -> None:
+        if self._posed:
+            self.middleware.reset(stamp_ns, pose, ANYWHERE)
+        else:
+            self.middleware.reset(stamp_ns, pose)
+        self._started = True
+
+    def _is_newest(self, stamp_ns: int) -> bool:
+        return self.middleware.cache.newest[ODOM].stamp_ns == stamp_ns
+
+    def _take_pose(self, message: PoseStamped | PoseWithCovarianceStamped) -> None:
+        stamp = conversions.stamp_from_ros(message.header.stamp)
+        pose, covariance = conversions.pose_from_ros(message)
+        self.middleware.pose(stamp, self.now_ns(), pose, covariance)
+
+    def _take_imu(self, message: Imu) -> None:
+        stamp = conversions.stamp_from_ros(message.header.stamp)
+        measured = conversions.imu_from_ros(message)
+        if measured is None:
+            self.middleware.cache.reject(f"{IMU}: no angular velocity")
+            return
+        self.middleware.imu(stamp, self.now_ns(), *measured)
 
     def _take_command(self, message: Twist) -> None:
         command = self._robot.from_cmd_vel(conversions.twist_from_ros(message))
-        if not np.isfinite(command).all():
-            # One NaN would make the estimate NaN for ever.
-            self.middleware.cache.reject("cmd_vel: NaN or inf")
-            return
-        self.middleware.command(self.newest_ns, command)
+        self.middleware.command(None, command)

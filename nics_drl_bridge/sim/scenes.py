@@ -80,6 +80,8 @@ class SceneSampler:
         footprint_radius: of a robot [m].
         robots: M.
         sizes: factors that obstacles may be larger by.
+        most: the greatest number of random obstacles that `draw` may be asked for, if it is more
+            than the world has.
 
     Attributes:
         shapes: every shape that can occur: those of the world in the first size, then in the next.
@@ -97,7 +99,9 @@ class SceneSampler:
         footprint_radius: float,
         robots: int = 1,
         sizes: Sequence[float] = (1.0,),
+        most: int | None = None,
     ) -> None:
+        world = world if most is None else _with_room(world, most)
         self.world, self.robots = world, robots
         self.shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
         self._sizes = len(sizes)
@@ -214,6 +218,26 @@ def scaled(shape: Shape, factor: float) -> Shape:
         (x1, y1), (x2, y2) = shape.ends
         return Segment(ends=((x1 * factor, y1 * factor), (x2 * factor, y2 * factor)))
     return Polygon(points=tuple((x * factor, y * factor) for x, y in shape.points))
+
+
+def _with_room(world: World, most: int) -> World:
+    """The world with so many places for random obstacles, shared out as the groups' are."""
+    at_random = [group for group in world.obstacles if not group.at]
+    if most and not at_random:
+        raise ConfigError(
+            f"{world.source}: key 'obstacles': {most} are asked for at random, but no group has a "
+            "`count`; add one."
+        )
+    total = sum(group.counts[1] for group in at_random)
+    if total >= most:
+        return world
+    groups = list(world.obstacles)
+    for g, group in enumerate(groups):
+        if not group.at:
+            share = group.counts[1] / total if total else 1.0 / len(at_random)
+            count = group.counts[0], math.ceil(share * most)
+            groups[g] = group.model_copy(update={"count": count})
+    return world.model_copy(update={"obstacles": tuple(groups)})
 
 
 def _seeds(seeds: ArrayLike) -> NDArray[np.int64]:

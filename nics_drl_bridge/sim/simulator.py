@@ -89,7 +89,9 @@ class FastSimulator:
         self.drawn: dict[str, NDArray[Any]] = {}
         self._footprint = footprint_shape(model.robot)
         sizes = (1.0,) if randomisation is None else randomisation.sizes
-        self.sampler = SceneSampler(world, self._footprint.radius, robots, sizes)
+        counts = None if randomisation is None else randomisation.obstacles.count
+        most = None if counts is None else counts[1]
+        self.sampler = SceneSampler(world, self._footprint.radius, robots, sizes, most)
         shapes = (*self.sampler.shapes, self._footprint)
         table = with_shapes(model.lidar, model.table, shapes)
         self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
@@ -144,12 +146,7 @@ class FastSimulator:
             ConfigError: the seeds or starts do not fit, or the world has no room for a scene.
         """
         chosen = np.arange(len(self.data.steps)) if worlds is None else np.asarray(worlds, np.int64)
-        draws = None if self._draws is None else self._draws.draw(seeds)
-        scenes = (
-            self.sampler.draw(seeds)
-            if draws is None
-            else self.sampler.draw(seeds, draws.count, draws.size)
-        )
+        scenes, draws = self._draw(seeds)
         begin = scenes.starts if starts is None else np.asarray(starts, dtype=np.float64)
         if len(scenes) != len(chosen) or begin.shape != scenes.starts.shape:
             raise ConfigError(
@@ -163,6 +160,25 @@ class FastSimulator:
             box.begin()
         kernels.begin(self._packed[0], chosen)
         return scenes
+
+    def scenes(self, seeds: ArrayLike) -> Scenes:
+        """The scenes that `reset` would begin with for some seeds (n,)."""
+        return self._draw(seeds)[0]
+
+    def _draw(self, seeds: ArrayLike) -> tuple[Scenes, Draws | None]:
+        if self._draws is None:
+            return self.sampler.draw(seeds), None
+        draws = self._draws.draw(seeds)
+        return self.sampler.draw(seeds, draws.count, draws.size), draws
+
+    @property
+    def obstacles(self) -> Array:
+        """(N, K, 7) the obstacles as they stand now, as `scenes` tells where they began."""
+        bodies = self.data.bodies[:, : self.sampler.count].copy()
+        index = np.zeros(int(self._in_table.max()) + 1)
+        index[self._in_table[:-1]] = np.arange(len(self.sampler.shapes))
+        bodies[..., SHAPE] = index[bodies[..., SHAPE].astype(np.int64)]
+        return bodies
 
     def _place(self, chosen: Indices, seeds: Indices, scenes: Scenes, starts: Array) -> None:
         data = self.data

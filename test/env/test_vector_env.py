@@ -16,7 +16,6 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.registration import ENVIRONMENTS, NAVIGATION, TASK
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.sim.simulator import FastSimulator
 
 MODES = ("NextStep", "SameStep")
 TASKS = (
@@ -27,7 +26,7 @@ TASKS = (
 )
 IDS = ("navigation", "navigation-discrete", "cooperative", "pursuit-discrete")
 LIMIT = 25
-THREADS = (1, 2) if hasattr(FastSimulator, "step_part") else (1, 1)
+THREADS = (1, 2)
 
 
 def model():

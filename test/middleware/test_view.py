@@ -49,12 +49,22 @@ def test_the_view_holds_the_newest_data_with_their_ages(middleware):
     assert (view.scan_age_s, view.odom_age_s) == pytest.approx((0.4, 0.3))
 
 
-@pytest.mark.parametrize("stamp", [SECOND + PERIOD, SECOND + 2 * PERIOD])
-def test_old_and_repeated_odometry_is_refused_counted_and_changes_nothing(middleware, stamp):
-    middleware.odometry(SECOND + 2 * PERIOD, 0, [0, 0, 0], [0.4, 0.0, 0.1])
+@pytest.mark.parametrize(
+    ("stamp", "reason"),
+    [
+        (SECOND - 1, "odom: not after the reset"),
+        (SECOND, "odom: not after the reset"),
+        (SECOND + PERIOD, "odom: older than 1 s"),
+        (3 * SECOND, "odom: duplicate"),
+    ],
+)
+def test_old_and_repeated_odometry_is_refused_counted_and_changes_nothing(
+    middleware, stamp, reason
+):
+    middleware.odometry(3 * SECOND, 0, [0, 0, 0], [0.4, 0.0, 0.1])
     before = state(middleware)
     assert not middleware.odometry(stamp, 0, [9.0, 9.0, 9.0], [9.0, 9.0, 9.0])
-    assert refused(middleware) == 1
+    assert middleware.cache.rejected == {reason: 1}
     assert_same(before, state(middleware))
 
 
@@ -135,3 +145,41 @@ def test_asking_for_a_view_changes_nothing(middleware):
     for later in (3, 50, 2):
         middleware.view(later * SECOND)
     assert_same(before, state(middleware, 2 * SECOND))
+
+
+def test_late_odometry_counts_but_the_newest_stays_the_newest(middleware):
+    middleware.odometry(3 * SECOND, 7, [3.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    assert middleware.odometry(3 * SECOND - PERIOD, 9, [2.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    newest = middleware.cache.newest["odom"]
+    assert (newest.stamp_ns, newest.arrival_ns, newest.value[0][0]) == (3 * SECOND, 7, 3.0)
+    assert middleware.health(9).topics["odom"].received == 2
+
+
+def test_health_tells_rates_ages_refusals_and_innovations(middleware):
+    for k in range(1, 101):
+        now = SECOND + k * PERIOD // 5
+        middleware.imu(now, now + 7, 0.0)
+        if k % 5 == 0:
+            middleware.odometry(now, now + 7, *STILL)
+            middleware.pose(now, now + 7, [1.0, 2.0, 0.5] if k < 100 else [8.0, 2.0, 0.5])
+    middleware.scan(3 * SECOND, 3 * SECOND, RANGES)
+    health = middleware.health(4 * SECOND + 7)
+    rates = {topic: each.rate_hz for topic, each in health.topics.items()}
+    # A second after the last: 32 arrivals of the gyro in 1.62 s, 20 of the others in 2.9 s.
+    slow = {"imu": 32 / 1.62, "odom": 20 / 2.9, "pose": 20 / 2.9, "scan": 0.0}
+    assert rates == pytest.approx(slow)
+    assert middleware.health(3 * SECOND + 7).topics["imu"].rate_hz == pytest.approx(50.0)
+    assert health.topics["odom"].age_s == pytest.approx(1.0)
+    assert {t: each.received for t, each in health.topics.items()} == {
+        "imu": 100, "odom": 20, "pose": 20, "scan": 1
+    }  # fmt: skip
+    assert health.topics["odom"].innovation == pytest.approx(0.0)
+    assert health.topics["pose"].innovation > 1000.0
+    assert np.isnan(health.topics["scan"].innovation)
+    assert health.rejected == {"pose: outlier": 1}
+    assert health.replayed == 20  # of equal stamps, the yaw rate counts after the twist
+
+
+def test_without_data_nothing_is_healthy_or_ill(middleware):
+    health = middleware.health(SECOND)
+    assert (health.topics, health.rejected, health.noticed, health.replayed) == ({}, {}, {}, 0)

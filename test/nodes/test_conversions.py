@@ -7,9 +7,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
-from geometry_msgs.msg import Quaternion
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
 from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import LaserScan
+from sensor_msgs.msg import Imu, LaserScan
 
 from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
@@ -151,3 +151,31 @@ def test_a_state_is_told_by_joints_of_its_names():
     assert message.name == ["speed", "steering"]
     assert list(message.velocity) == [0.7, 0.0]
     assert list(message.position) == [0.0, -0.3]
+
+
+def test_a_measured_pose_comes_with_the_covariance_of_x_y_and_heading():
+    message = PoseWithCovarianceStamped()
+    message.pose.pose.position.x, message.pose.pose.position.y = 1.5, -2.0
+    message.pose.pose.orientation = conversions.heading_to_ros(-3.0)
+    message.pose.covariance = np.arange(36, dtype=np.float64)
+    pose, covariance = conversions.pose_from_ros(over_the_wire(message))
+    assert pose == pytest.approx([1.5, -2.0, -3.0])
+    assert covariance.tolist() == [[0.0, 1.0, 5.0], [6.0, 7.0, 11.0], [30.0, 31.0, 35.0]]
+
+
+def test_a_pose_without_covariance_says_so():
+    message = PoseStamped()
+    message.pose.position.x, message.pose.position.y = 1.5, -2.0
+    message.pose.orientation = conversions.heading_to_ros(0.5)
+    pose, covariance = conversions.pose_from_ros(over_the_wire(message))
+    assert pose == pytest.approx([1.5, -2.0, 0.5])
+    assert covariance is None
+
+
+def test_an_imu_gives_its_yaw_rate_and_variance_unless_it_has_none():
+    message = Imu()
+    message.angular_velocity.z = -0.75
+    message.angular_velocity_covariance[8] = 0.25
+    assert conversions.imu_from_ros(over_the_wire(message)) == (-0.75, 0.25)
+    message.angular_velocity_covariance[0] = -1.0
+    assert conversions.imu_from_ros(over_the_wire(message)) is None

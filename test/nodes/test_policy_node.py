@@ -97,3 +97,26 @@ def test_it_leaves_a_zero_command_behind(driving):
     assert policy.close() == 0
     peer.until(lambda: said["cmd_vel_raw"][-1].twist == Twist(), "a zero command")
     assert "Traceback" not in policy.log.read_text(encoding="utf-8")
+
+
+def test_with_a_pose_sensor_it_waits_until_it_knows_where_in_the_map_it_is(launch, meet, domain_id):
+    peer = meet(domain_id)
+    start = {"episode_start": [-2.0, 0.0, 0.0], "episode_start_given": True}
+    simulator = launch("simulator_node", domain_id, world="empty", **start)
+    policy = launch("policy_node", domain_id, pose_type="PoseStamped", goal=[0.0, 0.0])
+    raw = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
+    scans = peer.listen(LaserScan, "scan")
+    poses = peer.speak(PoseStamped, "pose")
+    peer.until(lambda: len(raw) >= 5, "commands")
+    assert all(each.twist == Twist() for each in raw)
+    pose = PoseStamped(header=scans[-1].header)
+    pose.pose.position.x, pose.pose.orientation.w = -3.0, 1.0
+
+    def goes():
+        pose.header = scans[-1].header
+        poses.publish(pose)
+        return raw[-1].twist.linear.x > 0.1
+
+    peer.until(goes, "driving")
+    simulator.check()
+    policy.check()

@@ -1,0 +1,228 @@
+"""How far off are raw odometry and the estimate, and does the estimate know how far off it is?
+
+Simulated drives of robots that drift, with noisy odometry and motion capture, both at 10 Hz, both
+100 ms late, 5 % of them lost. The odometry is compared with where the robot was at its stamp; the
+estimate, harder, with where the robot is when it is asked, 100 ms later. NEES is that of the pose
+at the newest measurement, once at the end of each drive. Then random steps, all of which have to
+leave the covariance finite, symmetric and positive definite.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.calibration.noise_model import Level, Noise
+from nics_drl_bridge.generator import SimulatorModel, builtin_model
+from nics_drl_bridge.middleware.ekf import Estimator
+from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world import World
+
+Array = NDArray[np.float64]
+ROBOTS = ("ackermann", "differential", "mecanum")
+SECOND = 1_000_000_000
+PERIOD = SECOND // 10
+LATENCY = 100_000_000
+LOST = 0.05
+DRIVE_S = 30
+POSE_STD = np.array([0.02, 0.02, 0.02])
+"""Of motion capture [m, m, rad]."""
+STATE_DRIFT = 0.02
+"""The state drifts by this share of its range within a second."""
+NOISE = Noise(
+    odom_linear=Level(std=0.05, unit="m/s", source="measured"),
+    odom_angular=Level(std=0.05, unit="rad/s", source="measured"),
+    position_drift=Level(std=0.03, unit="m/sqrt(s)", source="measured"),
+    heading_drift=Level(std=0.03, unit="rad/sqrt(s)", source="measured"),
+)
+WIDE = World.model_validate(
+    {
+        "name": "wide",
+        "size": [200.0, 200.0],
+        "obstacles": {"count": 0, "radii": [0.25], "gap": 0.3},
+        "clearance": 0.1,
+        "goal_distance": [1.0, 3.0],
+    }
+)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Errors of one drive.
+
+    Attributes:
+        raw: (T,) squared distance of the odometry from the truth at its stamp [m^2].
+        estimated: (T,) of the estimate from the truth at the time of asking [m^2].
+        nees: of the pose at the newest measurement, at the end.
+    """
+
+    raw: Array
+    estimated: Array
+    nees: float
+
+
+def noisy(robot: str) -> SimulatorModel:
+    """A shipped robot with the noise of this benchmark."""
+    model = builtin_model(robot)
+    states = {
+        v.name: Level(
+            std=STATE_DRIFT * (v.max - v.min), unit=f"{v.unit}/sqrt(s)", source="measured"
+        )
+        for v in model.robot.state
+    }
+    return replace(model, noise=NOISE.model_copy(update={"state_drift": states}))
+
+
+def drive(model: SimulatorModel, simulator: FastSimulator, seed: int) -> Drive:
+    """Drives at random; measurements are under way for the latency, and some get lost."""
+    rng, middleware = np.random.default_rng(seed), Middleware(model)
+    start = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
+    simulator.reset([seed], starts=start[None, None])
+    middleware.reset(0, start)
+    truth, underway = [start], deque[tuple[int, str, tuple[Any, ...]]]()
+    raw, estimated = [], []
+    for k in range(DRIVE_S * 10):
+        if k % 5 == 0:
+            command = rng.uniform(model.robot.command_low, model.robot.command_high)
+        middleware.command(k * PERIOD, command)
+        simulator.step(command[None, None])
+        now, data = (k + 1) * PERIOD, simulator.data
+        truth.append(data.pose[0, 0].copy())
+        raw.append(np.sum((data.odom[0, 0] - truth[-1])[:2] ** 2))
+        odometry = data.odom[0, 0].copy(), data.twist[0, 0].copy()
+        captured = truth[-1] + rng.normal(size=3) * POSE_STD
+        for topic, content in (("odom", odometry), ("pose", (captured, np.diag(POSE_STD**2)))):
+            if rng.random() >= LOST:
+                underway.append((now, topic, content))
+        while underway and underway[0][0] + LATENCY <= now:
+            stamp, topic, content = underway.popleft()
+            take = middleware.odometry if topic == "odom" else middleware.pose
+            take(stamp, now, *content)
+        estimated.append(np.sum((middleware.view(now).pose - truth[-1])[:2] ** 2))
+    belief = middleware.estimator.belief
+    error = belief.mean[:3] - truth[belief.time_ns // PERIOD]
+    error[2] = geometry.wrap_angle(error[2])
+    nees = float(error @ np.linalg.solve(belief.covariance[:3, :3], error))
+    return Drive(np.array(raw), np.array(estimated), nees)
+
+
+def summary(drives: list[Drive]) -> dict[str, Any]:
+    """What the drives show together."""
+    low, high = chi2.ppf([0.025, 0.975], 3 * len(drives)) / len(drives)
+    return {
+        "raw_rmse_m": float(np.sqrt(np.mean([each.raw for each in drives]))),
+        "ekf_rmse_m": float(np.sqrt(np.mean([each.estimated for each in drives]))),
+        "nees_mean": float(np.mean([each.nees for each in drives])),
+        "nees_95_band": [float(low), float(high)],
+    }
+
+
+def random_steps(model: SimulatorModel, steps: int, seed: int) -> dict[str, Any]:
+    """Predicts and updates at random, and looks at the covariance after every step."""
+    rng, estimator, now = np.random.default_rng(seed), Estimator(model), 0
+    low, high = model.robot.command_low, model.robot.command_high
+    sound = True
+    for step in range(steps):
+        kind = int(rng.integers(5))
+        if kind == 0:
+            now += int(rng.integers(1, 3 * PERIOD))
+            estimator.predict(now)
+        elif kind == 1:
+            estimator.command(now, rng.uniform(low, high))
+        elif kind == 2:
+            estimator.update_twist(rng.normal(size=3) * 10.0 ** rng.uniform(-3.0, 2.0))
+        elif kind == 3:
+            estimator.update_yaw_rate(float(rng.normal()), 10.0 ** rng.uniform(-6.0, 1.0))
+        else:
+            estimator.update_pose(rng.normal(size=3), 10.0 ** rng.uniform(-6.0, 3.0, 3))
+        mean, covariance = estimator.belief.mean, estimator.belief.covariance
+        sound = sound and bool(np.isfinite(mean).all() and (covariance == covariance.T).all())
+        try:
+            np.linalg.cholesky(covariance)
+        except np.linalg.LinAlgError:
+            sound = False
+        if not sound:
+            return {"random_steps": step + 1, "finite_and_positive_definite": False}
+    return {"random_steps": steps, "finite_and_positive_definite": True}
+
+
+def cycle_us(model: SimulatorModel, cycles: int) -> float:
+    """Median time of what the single env asks of the middleware in a step [us]."""
+    middleware, times = Middleware(model), []
+    middleware.reset(0, np.zeros(3))
+    ranges = np.ones(model.lidar.beams, np.float32)
+    command = 0.3 * model.robot.command_high
+    for k in range(cycles):
+        now = (k + 1) * PERIOD
+        twist = middleware.view(now).twist
+        begin = time.perf_counter()
+        middleware.command(k * PERIOD, command)
+        middleware.odometry(now, now, np.zeros(3), twist)
+        middleware.scan(now, now, ranges)
+        middleware.view(now)
+        times.append(time.perf_counter() - begin)
+    return float(np.median(times)) * 1e6
+
+
+def run(drives: int, steps: int, seed: int) -> dict[str, Any]:
+    """Drives every robot, then takes random steps with one after the other."""
+    found = {}
+    for robot in ROBOTS:
+        model = noisy(robot)
+        simulator = FastSimulator(model, WIDE)
+        found[robot] = [drive(model, simulator, seed + k) for k in range(drives)]
+    shares = [random_steps(noisy(r), -(-steps // len(ROBOTS)), seed) for r in ROBOTS]
+    return {
+        **summary([each for robot in ROBOTS for each in found[robot]]),
+        "robots": {robot: summary(found[robot]) for robot in ROBOTS},
+        "drives": drives * len(ROBOTS),
+        "random_steps": sum(share["random_steps"] for share in shares),
+        "finite_and_positive_definite": all(
+            share["finite_and_positive_definite"] for share in shares
+        ),
+        "cycle_us": cycle_us(noisy(ROBOTS[0]), 3000),
+    }
+
+
+def table_of(result: dict[str, Any]) -> str:
+    """The figures for people."""
+    row = "{:<14}{:>10}{:>10}{:>8}   {}\n"
+    text = row.format("", "raw [m]", "EKF [m]", "NEES", "95 % band")
+    for name, each in {**result["robots"], "all": result}.items():
+        low, high = each["nees_95_band"]
+        text += row.format(
+            name, f"{each['raw_rmse_m']:.3f}", f"{each['ekf_rmse_m']:.3f}",
+            f"{each['nees_mean']:.2f}", f"{low:.2f} to {high:.2f}",
+        )  # fmt: skip
+    sound = "all" if result["finite_and_positive_definite"] else "NOT all"
+    return (
+        f"{text}{result['random_steps']} random steps, {sound} finite and positive definite; "
+        f"{result['cycle_us']:.0f} us for command, odometry, scan and view\n"
+    )
+
+
+def main() -> None:
+    """Prints a table, or one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--drives", type=int, default=100, help="of each robot")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="random steps")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    result = run(given.drives, given.steps, given.seed)
+    sys.stdout.write(json.dumps(result) + "\n" if given.json else table_of(result))
+
+
+if __name__ == "__main__":
+    main()

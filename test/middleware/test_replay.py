@@ -1,0 +1,226 @@
+"""Whatever the order of arrival, the estimate is that of the order of the stamps."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from robots import direct_model
+
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.middleware.ekf import Estimator
+from nics_drl_bridge.middleware.measurement import Kind, Measurement, Outcome
+from nics_drl_bridge.middleware.replay import BEFORE_START, DUPLICATE, HISTORY_NS, TOO_OLD, Timeline
+from nics_drl_bridge.middleware.view import Middleware
+
+SECOND = 1_000_000_000
+MILLISECOND = 1_000_000
+ROBOTS = ("ackermann", "differential", "mecanum")
+
+
+class Message(NamedTuple):
+    """A message of a robot and how long it is under way."""
+
+    topic: str
+    stamp_ns: int
+    value: np.ndarray
+    underway_ns: int
+
+
+START = [0.5, -0.3, 3.0]
+TOPICS = ("cmd_vel", "odom", "imu", "pose")
+PERIODS_MS = (50, 50, 20, 100)
+
+
+def messages(model, rng, seconds=6.0, latest_ns=HISTORY_NS):
+    """What is sent on a drive: noisy, one in nine far off, many with equal stamps."""
+    stamps = {}
+    for topic, period_ms in zip(TOPICS, PERIODS_MS, strict=True):
+        ticks = np.arange(1, int(seconds * 1000 / period_ms)) * period_ms
+        moved = ticks + rng.integers(0, period_ms, len(ticks)) * (rng.random(len(ticks)) < 0.3)
+        stamps[topic] = [int(ms) * MILLISECOND for ms in moved]
+    truth, made = Estimator(model), []
+    truth.reset(0, START)
+    for stamp in stamps["cmd_vel"]:
+        command = rng.uniform(model.robot.command_low, model.robot.command_high)
+        truth.command(stamp, command)
+        made.append(Message("cmd_vel", stamp, command, 0))
+    for topic in TOPICS[1:]:
+        for k, stamp in enumerate(stamps[topic]):
+            pose, twist = truth.at(stamp)
+            value = {"odom": twist, "imu": twist[2:], "pose": pose}[topic]
+            error = rng.normal(size=len(value)) * (3.0 if k % 9 == 4 else 0.01)
+            made.append(Message(topic, stamp, value + error, 0))
+    made = [m._replace(underway_ns=int(rng.integers(0, latest_ns))) for m in made]
+    return sorted(made, key=lambda m: (m.stamp_ns, TOPICS.index(m.topic)))
+
+
+def feed(middleware, message):
+    """Hands a message to the middleware, all at one moment of the receiver's clock."""
+    stamp, value = message.stamp_ns, message.value
+    if message.topic == "cmd_vel":
+        return middleware.command(stamp, value, stamp)
+    arrival = stamp + message.underway_ns
+    if message.topic == "odom":
+        return middleware.odometry(stamp, arrival, np.zeros(3), value)
+    if message.topic == "imu":
+        return middleware.imu(stamp, arrival, float(value[0]))
+    return middleware.pose(stamp, arrival, value, np.eye(3) * 0.05**2)
+
+
+def fed(model, drive):
+    middleware = Middleware(model)
+    middleware.reset(0, START)
+    for message in drive:
+        assert feed(middleware, message), message
+    return middleware
+
+
+def numbers(middleware):
+    belief = middleware.estimator.belief
+    pose, twist = middleware.estimator.at(belief.time_ns + SECOND // 3)
+    return belief.time_ns, np.concatenate([belief.mean, belief.covariance.ravel(), pose, twist])
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("seed", range(4))
+def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order(robot, seed):
+    model, rng = builtin_model(robot), np.random.default_rng(seed)
+    drive = messages(model, rng)
+    late = sorted(drive, key=lambda m: m.stamp_ns + m.underway_ns)
+    assert late != drive
+    ordered, shuffled = fed(model, drive), fed(model, late)
+    (expected_ns, expected), (found_ns, found) = numbers(ordered), numbers(shuffled)
+    assert found_ns == expected_ns
+    assert found == pytest.approx(expected, abs=1e-9)
+    one, other = ordered.health(0), shuffled.health(0)
+    assert (one.rejected, one.noticed) == (other.rejected, other.noticed)
+    assert all(one.rejected[f"{topic}: outlier"] >= 2 for topic in ("odom", "imu", "pose"))
+    assert all(one.topics[topic].received > 50 for topic in ("odom", "imu", "pose"))
+    assert sum(one.rejected.values()) < 120
+    assert one.replayed == 0
+    assert other.replayed > 100
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_any_order_of_one_seconds_data_gives_the_same_estimate(seed):
+    model, rng = builtin_model("ackermann"), np.random.default_rng(100 + seed)
+    drive = messages(model, rng, seconds=0.9)
+    _, expected = numbers(fed(model, drive))
+    shuffled = [drive[k] for k in rng.permutation(len(drive))]
+    assert numbers(fed(model, shuffled))[1] == pytest.approx(expected, abs=1e-9)
+
+
+def test_of_equal_stamps_the_order_of_arrival_does_not_matter():
+    model, rng = builtin_model("differential"), np.random.default_rng(7)
+    at_once = [
+        Message("pose", SECOND, rng.normal(size=3) * 0.05, 0),
+        Message("imu", SECOND, np.array([0.2]), 0),
+        Message("odom", SECOND, np.array([0.1, 0.0, 0.1]), 0),
+    ]
+    results = [
+        numbers(fed(model, [at_once[k] for k in order]))[1]
+        for order in ([0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0])
+    ]
+    assert all(np.array_equal(results[0], other) for other in results)
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.25])
+def test_a_late_command_counts_from_when_it_was_sent(latency):
+    model = direct_model(latency)
+    middleware = Middleware(model)
+    middleware.reset(0, np.zeros(3))
+    for tenth in range(1, 8):
+        middleware.odometry(tenth * SECOND // 10, 0, np.zeros(3), np.zeros(3))
+    assert middleware.estimator.at(SECOND)[0][0] == 0.0
+    assert middleware.command(SECOND // 10, [1.0, 0.0, 0.0])
+    assert middleware.estimator.at(SECOND)[0][0] == pytest.approx(0.9 - latency, abs=1e-9)
+
+
+def test_copies_change_nothing_even_late_ones():
+    model, rng = builtin_model("mecanum"), np.random.default_rng(2)
+    drive = messages(model, rng, seconds=2.0, latest_ns=1)
+    middleware = fed(model, drive)
+    before = numbers(middleware)
+    newest = drive[-1].stamp_ns
+    copies = [m for m in drive if m.stamp_ns >= newest - HISTORY_NS + 100 * MILLISECOND]
+    for copy in copies:
+        assert not feed(middleware, copy._replace(value=copy.value + 0.1)), copy
+    after = numbers(middleware)
+    assert after[0] == before[0]
+    assert np.array_equal(after[1], before[1])
+    rejected = middleware.health(0).rejected
+    for topic in ("odom", "imu", "pose", "cmd_vel"):
+        wanted = sum(m.topic == topic for m in copies)
+        assert rejected[f"{topic}: duplicate"] == wanted > 5
+
+
+@pytest.fixture
+def timeline():
+    estimator = Estimator(builtin_model("ackermann"))
+    estimator.reset(SECOND, np.zeros(3))
+    return Timeline(estimator)
+
+
+def twist(speed=0.0):
+    return Measurement(Kind.TWIST, np.array([speed, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("stamp", "reason"),
+    [
+        (4 * SECOND - 1, TOO_OLD),
+        (4 * SECOND, ""),
+        (4 * SECOND + 1, ""),
+        (5 * SECOND, DUPLICATE),
+        (SECOND, BEFORE_START),
+        (0, BEFORE_START),
+    ],
+)
+def test_what_is_later_than_a_second_is_refused_with_the_reason(timeline, stamp, reason):
+    for k in range(1, 9):
+        assert timeline.measure(SECOND + k * SECOND // 2, twist()) == ""
+    assert timeline.newest_ns == 5 * SECOND
+    assert timeline.measure(stamp, Measurement(Kind.TWIST, np.zeros(3))) in (reason, DUPLICATE)
+    if reason and reason is not DUPLICATE:
+        assert timeline.measure(stamp, twist()) == reason
+
+
+@pytest.mark.parametrize(
+    ("stamp", "reason"),
+    [(SECOND - 1, BEFORE_START), (2 * SECOND, TOO_OLD), (5 * SECOND, ""), (9 * SECOND, "")],
+)
+def test_commands_that_are_too_late_are_refused_with_the_reason(timeline, stamp, reason):
+    for k in range(1, 5):
+        timeline.measure(SECOND + k * SECOND, twist())
+    assert timeline.command(stamp, [0.5, 0.0]) == reason
+    if not reason:
+        assert timeline.command(stamp, [0.2, 0.0]) == DUPLICATE
+
+
+def test_the_past_is_as_long_as_a_second_and_no_longer(timeline):
+    for k in range(1, 1001):
+        timeline.measure(SECOND + k * 10 * MILLISECOND, twist())
+    assert len(timeline._entries) == 102
+    assert timeline.outcomes()[Kind.TWIST, Outcome.USED] == 1000
+
+
+def test_a_late_command_after_a_silence_finds_the_commands_before_it():
+    """What was in effect before the last second is needed where the data are sparse."""
+    model = direct_model()
+    middleware = Middleware(model)
+    middleware.reset(0, np.zeros(3))
+    middleware.odometry(SECOND, 0, np.zeros(3), np.zeros(3))
+    for k in range(1, 400):
+        middleware.command(SECOND + k * 5 * MILLISECOND, [0.5 if k < 200 else 0.0, 0.0, 0.0])
+    middleware.odometry(3 * SECOND, 2 * SECOND, np.zeros(3), np.zeros(3))
+    expected = middleware.estimator.at(3 * SECOND)[0]
+    assert expected[0] == pytest.approx(0.5 * 0.995, abs=1e-9)
+    for k in range(1, 400):  # so many that old ones have to go
+        middleware.command(3 * SECOND + k * MILLISECOND, [0.0, 0.0, 0.0])
+    middleware.command(2 * SECOND + 500 * MILLISECOND + 1, [0.0, 0.0, 1.0])
+    middleware.command(2 * SECOND + 505 * MILLISECOND - 1, [0.0, 0.0, 0.0])
+    found = middleware.estimator.at(3 * SECOND)[0]
+    assert found[:2] == pytest.approx(expected[:2], abs=1e-9)
+    assert found[2] == pytest.approx(0.005, abs=1e-6)
