@@ -36,8 +36,8 @@ class Timeline:
 
     A late one is put where it belongs, and the filter is run again from before it. The same
     arithmetic is done as if it had come in time, so that the result is the same to the bit, as
-    long as nothing is later than `HISTORY_NS`. The past of filters in this manner, by rewinding
-    to a snapshot, is that of robot_localization's `smooth_lagged_data`.
+    long as nothing is later than `HISTORY_NS`. Going back to a snapshot of the filter is the idea
+    of robot_localization's `smooth_lagged_data`.
 
     Args:
         estimator: to feed; nobody else may.

@@ -102,8 +102,19 @@ def test_a_pose_far_off_is_refused_and_the_fifth_in_a_row_is_taken_as_a_jump():
     assert pose == pytest.approx(far)
     assert twist[0] == pytest.approx(0.5, abs=0.1)  # it still drives
     assert np.sqrt(np.diag(estimator.covariance)[:3]) == pytest.approx(0.02)
+    assert (estimator.covariance[:3, 3:] == 0.0).all()  # it says nothing of the state
     assert np.linalg.eigvalsh(estimator.covariance).min() > 0.0
     assert estimator.update_pose(far, [0.02] * 3).outcome is Outcome.USED
+
+
+@pytest.mark.parametrize(("believed", "measured"), [(3.13, -3.14), (-3.13, 3.14)])
+def test_a_heading_beyond_the_seam_is_near_and_no_outlier(believed, measured):
+    estimator = Estimator(builtin_model("differential"))
+    estimator.reset(0, [0.0, 0.0, believed], 0.02)
+    verdict = estimator.update_pose([0.0, 0.0, measured], [0.02] * 3)
+    assert verdict.outcome is Outcome.USED
+    assert verdict.distance == pytest.approx((2.0 * np.pi - 6.27) ** 2 / (2 * 0.02**2))
+    assert abs(estimator.at(0)[0][2]) > 3.13
 
 
 def test_outliers_are_counted_in_a_row_only():
