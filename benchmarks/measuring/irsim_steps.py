@@ -10,7 +10,6 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from statistics import median
 
 import irsim
 import numpy as np
@@ -18,38 +17,58 @@ import yaml
 from irsim_scans import world
 
 WARM_UP = 3
-EPISODE = 25
 
 
-def steps(circles: list[list[float]], about: dict, repeats: int) -> list[float]:
-    """Times of many steps [s]: the robot moves by a random command, and its lidar scans."""
+def field(circles: list[list[float]], about: dict, substeps: int) -> dict:
+    """The circles and the four walls around a robot that collides, as ours does."""
+    scene = world(circles, about)
+    x1, y1, x2, y2 = about["walls"]
+    corners = [[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]]
+    scene["obstacle"].append({"shape": {"name": "linestring", "vertices": corners}})
+    scene["world"]["collision_mode"] = "stop"
+    scene["world"]["step_time"] = about["period"] / substeps
+    scene["robot"][0]["shape"]["radius"] = about["footprint"]
+    return scene
+
+
+def steps(circles: list[list[float]], about: dict, repeats: int, substeps: int) -> float:
+    """Seconds per step: the robot moves by a random command, and its lidar scans.
+
+    One that touched something begins anew, as in any environment; it would stand still, without a
+    scan. The time that this takes counts, as it does for us.
+    """
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "world.yaml"
-        scene = world(circles, about)
-        scene["world"]["step_time"] = about["period"]
-        file.write_text(yaml.safe_dump(scene))
+        file.write_text(yaml.safe_dump(field(circles, about, substeps)))
         env = irsim.make(str(file), display=False, disable_all_plot=True, log_level="ERROR")
-    rng, times = np.random.default_rng(0), []
+    rng, begin, moved = np.random.default_rng(0), 0.0, False
     for k in range(WARM_UP + repeats):
-        if k % EPISODE == 0:
-            env.reset()
+        if k == WARM_UP:
+            begin = time.perf_counter()
         action = np.array([[rng.uniform(0.0, 1.0)], [rng.uniform(-2.0, 2.0)]])
-        begin = time.perf_counter()
-        env.step(action)
-        ranges = env.robot.lidar.range_data
-        times.append(time.perf_counter() - begin)
-    if len(ranges) != about["beams"] or not np.any(env.robot.state[:2]):
+        for _ in range(substeps):
+            env.step(action)
+        ranges, moved = env.robot.lidar.range_data, moved or bool(np.any(env.robot.state[:2]))
+        if env.robot.collision_flag:
+            env.reset()
+    seconds = (time.perf_counter() - begin) / repeats
+    if len(ranges) != about["beams"] or not moved:
         raise SystemExit("the robot did not move, or its lidar did not scan")
     env.end(0)
-    return times[WARM_UP:]
+    return seconds
 
 
 def main() -> None:
-    """Prints the steps per second."""
+    """Prints the steps per second, by the number of substeps in a step."""
     given = json.loads(Path(sys.argv[1]).read_text())
-    times = [steps(circles, given["about"], given["repeats"]) for circles in given["scenes"]]
-    middle = median(seconds for each in times for seconds in each)
-    sys.stdout.write("\n" + json.dumps({"steps_per_s": 1.0 / middle}) + "\n")
+    rates = {}
+    for substeps in given["substeps"]:
+        each = [
+            steps(scene["circles"], {**given["about"], **scene}, given["repeats"], substeps)
+            for scene in given["scenes"]
+        ]
+        rates[substeps] = len(each) / sum(each)
+    sys.stdout.write("\n" + json.dumps(rates) + "\n")
 
 
 if __name__ == "__main__":

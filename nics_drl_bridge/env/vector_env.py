@@ -216,7 +216,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         given = check_action(actions, self.action_space, "actions")
         out = np.empty_like(self._out) if self.copy else self._out
         begun = self._over.copy()  # these ignore their action and begin anew
-        outcome = self._all_parts(lambda part: self._advance(part, given[part], out))
+        outcome = self._all_parts(lambda part: self._advance(part, given[part], out, begun))
         terminated = self.ended.all(axis=1) & ~begun
         truncated = (self.simulator.data.steps >= self._limit) & ~begun
         reward = np.where(begun, 0.0, _over_robots(self._reward))
@@ -226,7 +226,6 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         if self._mode is AutoresetMode.SAME_STEP:
             self._end_at_once(out, over, facts, infos)
         else:
-            self._begin(np.flatnonzero(begun), out)
             self._over = over
             self._tell(infos, facts, begun)
         return self._row(out), reward, terminated, truncated, infos
@@ -236,8 +235,13 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         done = self.simulator.run_parts(advance)
         return done[0] if len(done) == 1 else _joined(done)
 
-    def _advance(self, part: slice, actions: NDArray[Any], out: Observation) -> Outcome:
-        """One control period of the worlds of a part; what they see goes into their rows."""
+    def _advance(
+        self, part: slice, actions: NDArray[Any], out: Observation, begun: Flags
+    ) -> Outcome:
+        """One control period of the worlds of a part; what they see goes into their rows.
+
+        Those in `begun` (N,) begin anew instead.
+        """
         data, count = self.simulator.data, part.stop - part.start
         ended = self.ended[part]
         command = self.task.command(actions).reshape(count, self.robots, -1)
@@ -256,6 +260,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             terms = {name: np.where(ended, 0.0, term) for name, term in terms.items()}
         self._reward[part] = sum(terms.values(), np.zeros(ended.shape))
         self.ended[part] = ended | outcome.ended
+        self._begin(part.start + np.flatnonzero(begun[part]), out)
         return Outcome(terms, outcome.ended, outcome.info)
 
     def _end_at_once(
@@ -269,7 +274,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             known = self._known(rows) | vector_info.rows_of(facts, rows)
             vector_info.put_rows(final, known, rows, self.num_envs)
             infos["final_info"], infos["_final_info"] = final, over.copy()
-            self._begin(rows, out)
+            self.simulator.run_parts(
+                lambda part: self._begin(part.start + np.flatnonzero(over[part]), out)
+            )
         self._tell(infos, facts, over)
 
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:

@@ -132,7 +132,7 @@ class FastSimulator:
         worlds: ArrayLike | None = None,
         starts: ArrayLike | None = None,
     ) -> Scenes:
-        """Begins episodes.
+        """Begins episodes. Threads may do so at the same time, each in worlds of another part.
 
         Args:
             seeds: of each episode (n,); a seed fixes scene, start, goal, noise and randomisation.
@@ -156,9 +156,11 @@ class FastSimulator:
         self._place(chosen, np.asarray(seeds, dtype=np.int64), scenes, begin)
         if draws is not None:
             self._assign(chosen, draws)
-        for box in self._boxes.values():
-            box.begin()
-        kernels.begin(self._packed[0], chosen)
+        for part in self.parts:
+            of_part = chosen[(chosen >= part.start) & (chosen < part.stop)]
+            if len(of_part):
+                self._boxes[part.start].begin()
+                kernels.begin(self._packed[part.start], of_part)
         return scenes
 
     def scenes(self, seeds: ArrayLike) -> Scenes:
