@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.env.actions import Actions, action_space, discrete_commands, scaled
+from nics_drl_bridge.env.contact import contact_ranges
 from nics_drl_bridge.env.kernels import LIMIT
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.interface import RobotView
@@ -190,13 +191,7 @@ class Task(ABC):
     @cached_property
     def contact_ranges(self) -> NDArray[np.float32]:
         """(B,) range at which each beam leaves the footprint and its margin [m]."""
-        x, y, heading = self.lidar.mount
-        angles = self.lidar.angles + heading
-        limit = self.robot.footprint_radius + self.contact_margin
-        along = x * np.cos(angles) + y * np.sin(angles)
-        rest = limit * limit - x * x - y * y + along * along
-        leaves = np.where(rest >= 0.0, np.sqrt(np.maximum(rest, 0.0)) - along, -np.inf)
-        return leaves.astype(np.float32)
+        return contact_ranges(self.robot, self.lidar, self.contact_margin)
 
 
 def bearing(pose: ArrayLike, points: ArrayLike) -> Array:
