@@ -46,7 +46,7 @@ class FastSimulator:
         longest_delay: greatest latency of commands that `data.delay` may be given [substeps]; the
             model's by default, or what the randomisation may draw.
         longest_age: greatest age of scan and odometry that `data.age` may be given [substeps];
-            by default 0, or what the randomisation may draw.
+            more if the randomisation may draw it.
 
     Attributes:
         data: all that changes, see `Worlds`.
@@ -67,7 +67,7 @@ class FastSimulator:
         threads: int = 1,
         randomisation: str | Randomisation | None = None,
         longest_delay: int | None = None,
-        longest_age: int | None = None,
+        longest_age: int = 0,
     ) -> None:
         if worlds < 1 or robots < 1:
             raise ConfigError(
@@ -78,13 +78,16 @@ class FastSimulator:
         self.model, self.world = model, world
         self.randomisation = randomisation
         self._draws = None if randomisation is None else Sampler(randomisation, model, robots)
-        delay, age = self._latencies(longest_delay, longest_age)
-        if threads < 1 or delay < model.timing[2] or age < 0:
+        delay = model.timing[2] if longest_delay is None else longest_delay
+        if threads < 1 or delay < model.timing[2] or longest_age < 0:
             raise ConfigError(
                 f"a simulator needs at least 1 thread, a longest_delay of at least the model's "
                 f"{model.timing[2]} substeps and a longest_age of at least 0, not {threads}, "
-                f"{delay} and {age}."
+                f"{delay} and {longest_age}."
             )
+        if self._draws is not None:
+            delay = max(delay, self._draws.longest_delay)
+            longest_age = max(longest_age, self._draws.longest_age)
         self.goals: Array = np.zeros((worlds, robots, 2))
         self.drawn: dict[str, NDArray[Any]] = {}
         self._footprint = footprint_shape(model.robot)
@@ -96,20 +99,11 @@ class FastSimulator:
         table = with_shapes(model.lidar, model.table, shapes)
         self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
         self._scanner = Scanner(model.lidar, table, renderer, world.grid)
-        self._sizes = Sizes(worlds, robots, self.sampler.count, delay, age)
+        self._sizes = Sizes(worlds, robots, self.sampler.count, delay, longest_age)
         self.data = allocate(model, self._sizes)
         self.parts = split(worlds, threads)
         self._boxes = {part.start: CommandBox(model.kinematics, model.robot) for part in self.parts}
         self._crew = Crew(len(self.parts))
-
-    def _latencies(self, delay: int | None, age: int | None) -> tuple[int, int]:
-        """The longest ones that are to be stored [substeps]."""
-        drawn = (
-            (0, 0) if self._draws is None else (self._draws.longest_delay, self._draws.longest_age)
-        )
-        if delay is None:
-            delay = max(self.model.timing[2], drawn[0])
-        return max(delay, drawn[0]), max(0 if age is None else age, drawn[1])
 
     @cached_property
     def _packed(self) -> dict[int, Any]:

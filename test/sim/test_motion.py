@@ -281,7 +281,7 @@ def test_what_moves_keeps_clear_of_a_static_map(motion, heading):
         ({"kind": "patrol", "waypoints": [[0, 0], [0, 0]], "speed": 1.0}, "must differ"),
         ({"kind": "patrol", "waypoints": [[0, 0], [1, 0], [0, 0]], "speed": 1.0}, "must differ"),
         ({"kind": "pedestrian", "relaxation": 0.0}, "relaxation"),
-        ({"kind": "pedestrain"}, "'wander', 'patrol', 'pedestrian'"),
+        ({"kind": "pedestrain"}, "unknown kind 'pedestrain'; did you mean 'pedestrian'?"),
     ],
 )
 def test_a_wrong_motion_is_one_sentence(motion, sentence):
