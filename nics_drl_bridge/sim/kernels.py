@@ -362,12 +362,14 @@ def _look(fields, scene, view, motion, room, chosen):  # type: ignore[no-untyped
     (
         pose, _, _, bodies, _, _, ranges, _, steps, seeds, faults, _, _, age, _, velocity, past, _,
     ) = fields  # fmt: skip
-    walls, sensors, (dt, substeps) = scene[0], room[4], motion[4]
+    walls, scattered, sensors, (dt, substeps) = scene[0], scene[4], room[4], motion[4]
     for n in chosen:
         if sensing.needs_own(n, age, faults):
+            if scattered:
+                crowd.sort_bodies(bodies, n, room[3][0])
             sensing.look_alone(
-                n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, False, view,
-                sensors, room[3], dt, substeps,
+                n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, scattered,
+                view, sensors, room[3], dt, substeps,
             )  # fmt: skip
         else:
             sensors[1][0] = n
