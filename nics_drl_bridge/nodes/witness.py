@@ -97,8 +97,7 @@ class Witness:
                     if future.result().success:
                         return ""
                     reason = str(future.result().message)
-            with self._changed:
-                self._changed.wait(ASK_AGAIN_S)
+            threading.Event().wait(ASK_AGAIN_S)
         return reason
 
     def __enter__(self) -> Witness:

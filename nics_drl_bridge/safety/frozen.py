@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import between
 from nics_drl_bridge.safety.inputs import Scan
-from nics_drl_bridge.safety.state import Cause, GateConfig, GateState, Sameness
+from nics_drl_bridge.safety.state import Cause, GateConfig, GateState, Push, Sameness
 
 IDENTICAL = 3
 """So many scans in a row must be identical."""
-PUSH_LINEAR, PUSH_TURN = 0.05, 0.1
-"""A command above this must move the robot [m/s, rad/s],"""
 RESPONSE = 0.1
-"""at least at this share of it."""
-STILL_LINEAR, STILL_TURN = 0.02, 0.05
-"""A robot that moves less stands still [m/s, rad/s]."""
+"""A robot covers at least this share of the path that it is told,"""
+LEAST_PATH, LEAST_TURN = 0.03, 0.1
+"""if it is told more than this within the time [m, rad]."""
+STILL_LINEAR, STILL_TURN = 0.05, 0.1
+"""A robot that moves less stands still; odometry is noisy [m/s, rad/s]."""
 
 
 def compare(state: GateState, scan: Scan) -> Sameness:
@@ -38,18 +38,20 @@ def stands_still(twist: NDArray[np.float64]) -> bool:
 
 
 def watch_motion(config: GateConfig, state: GateState, now: float) -> GateState:
-    """Notes whether the robot does what it was told."""
+    """Sums up what the robot was told, in windows of `stuck_s`."""
     if state.odometry is None or config.limits is None:
         return state
-    linear = float(np.linalg.norm(state.value[config.limits.linear]))
-    turn = float(np.abs(state.value[config.limits.turn]).sum())
-    pushed = linear > PUSH_LINEAR or turn > PUSH_TURN
-    twist = state.odometry.twist
-    moves = np.hypot(twist[0], twist[1]) > RESPONSE * max(linear, PUSH_LINEAR) or abs(
-        twist[2]
-    ) > RESPONSE * max(turn, PUSH_TURN)
-    since = state.pushing_s if state.pushing_s is not None else now
-    return replace(state, pushing_s=since if pushed and not moves else None)
+    push, value = state.push, state.value
+    if push is None or now - push.since_s > config.stuck_s:
+        return replace(state, push=Push(now, now, state.odometry.pose))
+    passed = now - push.last_s
+    told = replace(
+        push,
+        last_s=now,
+        path=push.path + passed * float(np.linalg.norm(value[config.limits.linear])),
+        turn=push.turn + passed * abs(float(value[config.limits.turn].sum())),
+    )
+    return replace(state, push=told)
 
 
 def scan_frozen(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -67,8 +69,15 @@ def scan_frozen(config: GateConfig, state: GateState, now: float) -> Cause | Non
 
 def no_motion(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The robot is told to move and odometry shows none: stuck, unpowered, or frozen data."""
-    if state.pushing_s is None or now - state.pushing_s <= config.stuck_s:
+    push = state.push
+    if push is None or state.odometry is None or now - push.since_s <= config.stuck_s:
         return None
-    return Cause(
-        "no_motion", "odom", "no motion although commanded", now - state.pushing_s, config.stuck_s
-    )
+    if push.path < LEAST_PATH and push.turn < LEAST_TURN:
+        return None
+    moved = between(push.pose, state.odometry.pose)
+    drove = push.path >= LEAST_PATH and np.hypot(moved[0], moved[1]) >= RESPONSE * push.path
+    turned = push.turn >= LEAST_TURN and abs(moved[2]) >= RESPONSE * push.turn
+    if drove or turned:
+        return None
+    detail = f"no motion in {now - push.since_s:.2f} s, told were {push.path:.2f} m"
+    return Cause("no_motion", "odom", f"{detail} and {push.turn:.2f} rad")

@@ -70,7 +70,7 @@ def _serve(
         failed = arming.failures(config, state, given, now)
         if failed:
             return state, _Answer("; ".join(failed))
-        state = replace(state, armed=True, same=Sameness(), pushing_s=None)
+        state = replace(state, armed=True, same=Sameness(), push=None)
         return state, _Answer("armed", granted=True)
     if isinstance(given, Reset):
         stop = reset(state.e_stop)
@@ -84,7 +84,7 @@ def _serve(
 def _stopped(state: GateState, now: float, disarm: bool) -> GateState:
     zero = np.zeros_like(state.value)
     return replace(
-        state, value=zero, slope=zero, moved_s=now, pushing_s=None, recent=(),
+        state, value=zero, slope=zero, moved_s=now, push=None, recent=(),
         armed=state.armed and not disarm,
     )  # fmt: skip
 

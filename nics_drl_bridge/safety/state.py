@@ -62,7 +62,7 @@ class GateConfig:
         estimate_std: greatest standard deviation of position [m] and heading [rad] for that.
         estimate_silence_s: greatest age of the estimate for that [s].
         frozen_distance: identical scans over such a path are frozen [m, or rad of turning].
-        stuck_s: no motion for so long while commanded is frozen odometry or a stuck robot [s].
+        stuck_s: no motion within such a time while commanded is a stop [s].
         shield: see there; None for none.
     """
 
@@ -147,6 +147,24 @@ class Sameness:
 
 
 @dataclass(frozen=True)
+class Push:
+    """What the robot was told over some time.
+
+    Attributes:
+        since_s, last_s: from when to when [s].
+        pose: (3,) by odometry at the beginning.
+        path: that it should have covered [m].
+        turn: by which it should have turned [rad].
+    """
+
+    since_s: float
+    last_s: float
+    pose: Array
+    path: float = 0.0
+    turn: float = 0.0
+
+
+@dataclass(frozen=True)
 class EStopState:
     """What is known of the emergency stop.
 
@@ -183,7 +201,7 @@ class GateState:
         malformed: what is wrong with the newest command; empty when nothing is.
         same: see there.
         restless_s: when odometry last showed motion [s].
-        pushing_s: since when the robot has been told to move and has not; None when it moves.
+        push: what the robot was told lately; None when it was stopped.
         recent: times and values of the commands published within the latency.
         e_stop: see there.
     """
@@ -210,7 +228,7 @@ class GateState:
     malformed: str = ""
     same: Sameness = Sameness()
     restless_s: float = float("-inf")
-    pushing_s: float | None = None
+    push: Push | None = None
     recent: tuple[tuple[float, Array], ...] = ()
     e_stop: EStopState = EStopState()
 

@@ -224,7 +224,7 @@ def test_the_e_stop_by_service_stops_and_its_cause_is_diagnosed(robot):
 
 def test_every_stop_is_in_the_black_box_and_replays(robot, black_box):
     robot.drives()
-    robot.silent = {"scan"}
+    robot.silent, robot.stamped = {"scan"}, robot.stamp_ns
     robot.stops()
     robot.peer.until(lambda: list(black_box.glob("*scan_silent.jsonl")), "a file")
     again = replay(sorted(black_box.glob("*scan_silent.jsonl"))[-1])

@@ -305,11 +305,20 @@ def test_scans_without_any_return_may_be_identical():
 def test_no_motion_although_commanded_latches_a_stop():
     rig = driving()
     rig.speed = 0.0
-    assert 1.0 < rig.until_stopped(1.5) < 1.5
+    assert rig.until_stopped(2.1) > 0.5
     assert rig.rule == "no_motion"
     rig.speed = 0.5
     rig.run(1.0)
     assert not rig.moves
+
+
+def test_odometry_whose_noise_looks_like_motion_does_not_hide_a_robot_that_is_stuck():
+    rng, rig = np.random.default_rng(0), driving()
+    rig.speed = 0.0
+    odom = rig.odom
+    rig.odom = lambda: odom(twist=rng.normal(scale=0.05, size=3))
+    rig.until_stopped(2.1)
+    assert rig.rule == "no_motion"
 
 
 def test_a_car_that_only_steers_need_not_move():

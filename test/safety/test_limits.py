@@ -148,3 +148,14 @@ def test_without_limits_nothing_is_armed():
     rig.run(1.5)
     assert not rig.arm().granted
     assert rig.decision.answer == "limits_set: no limits are set, name their file in `limits`"
+
+
+def test_the_gate_cuts_the_speed_of_a_robot_and_keeps_its_curve():
+    rig = Rig(config("differential"))
+    rig.wish = np.array([2.0, 0.0, 1.0])
+    rig.run(1.5)
+    assert rig.arm().granted
+    rig.run(0.4)
+    rig.speed = 1.0
+    rig.run(1.0)
+    assert rig.decision.twist == pytest.approx([1.0, 0.0, 0.5])
