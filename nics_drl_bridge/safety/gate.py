@@ -47,8 +47,8 @@ def decide(
     if cause is not None:
         if latches and state.armed:
             state = replace(state, latched=cause)
-        state = _stopped(state, now, disarm=latches)
         publish = was_moving or isinstance(given, Tick)
+        state = _stopped(state, now if publish else state.moved_s, disarm=latches)
         return state, _decision(config, state, publish, cause, refused, answer)
     if not isinstance(given, Tick) or now - state.moved_s < LEAST_STEP_S:
         return state, _decision(config, state, False, None, refused, answer)
@@ -81,10 +81,10 @@ def _serve(
     return state, _Answer()
 
 
-def _stopped(state: GateState, now: float, disarm: bool) -> GateState:
+def _stopped(state: GateState, moved_s: float, disarm: bool) -> GateState:
     zero = np.zeros_like(state.value)
     return replace(
-        state, value=zero, slope=zero, moved_s=now, push=None, recent=(),
+        state, value=zero, slope=zero, moved_s=moved_s, push=None, recent=(),
         armed=state.armed and not disarm,
     )  # fmt: skip
 

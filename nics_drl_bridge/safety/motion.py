@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,6 +47,6 @@ def follow(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     """Limits rate and jerk, see `limits.follow`."""
     if config.limits is None:
         return motion
-    since = now - state.moved_s
+    since = now - state.moved_s if math.isfinite(state.moved_s) else config.gap_s
     value, slope = limits.follow(state.value, state.slope, motion.value, since, config.limits)
     return replace(motion, value=value, slope=slope)
