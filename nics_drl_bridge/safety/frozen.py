@@ -15,7 +15,7 @@ IDENTICAL = 3
 """So many scans in a row must be identical."""
 RESPONSE = 0.1
 """A robot covers at least this share of the path that it is told,"""
-LEAST_PATH, LEAST_TURN = 0.03, 0.1
+LEAST_PATH, LEAST_TURN = 0.03, 0.25
 """if it is told more than this within the time [m, rad]."""
 STILL_LINEAR, STILL_TURN = 0.05, 0.1
 """A robot that moves less stands still; odometry is noisy [m/s, rad/s]."""
@@ -43,15 +43,12 @@ def watch_motion(config: GateConfig, state: GateState, now: float) -> GateState:
         return state
     push, value = state.push, state.value
     if push is None or now - push.since_s > config.stuck_s:
-        return replace(state, push=Push(now, now, state.odometry.pose))
-    passed = now - push.last_s
-    told = replace(
-        push,
-        last_s=now,
-        path=push.path + passed * float(np.linalg.norm(value[config.limits.linear])),
-        turn=push.turn + passed * abs(float(value[config.limits.turn].sum())),
-    )
-    return replace(state, push=told)
+        return replace(state, push=Push(now, now, state.odometry.pose, np.zeros(3)))
+    moving = np.zeros(3)
+    angles = ~(config.limits.linear | config.limits.turn)
+    moving[list(config.fields)] = np.where(angles, 0.0, value)
+    told = push.told + (now - push.last_s) * moving
+    return replace(state, push=replace(push, last_s=now, told=told))
 
 
 def scan_frozen(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -72,12 +69,13 @@ def no_motion(config: GateConfig, state: GateState, now: float) -> Cause | None:
     push = state.push
     if push is None or state.odometry is None or now - push.since_s <= config.stuck_s:
         return None
-    if push.path < LEAST_PATH and push.turn < LEAST_TURN:
+    path, turn = float(np.hypot(push.told[0], push.told[1])), abs(float(push.told[2]))
+    if path < LEAST_PATH and turn < LEAST_TURN:
         return None
     moved = between(push.pose, state.odometry.pose)
-    drove = push.path >= LEAST_PATH and np.hypot(moved[0], moved[1]) >= RESPONSE * push.path
-    turned = push.turn >= LEAST_TURN and abs(moved[2]) >= RESPONSE * push.turn
+    drove = path >= LEAST_PATH and np.hypot(moved[0], moved[1]) >= RESPONSE * path
+    turned = turn >= LEAST_TURN and abs(moved[2]) >= RESPONSE * turn
     if drove or turned:
         return None
-    detail = f"no motion in {now - push.since_s:.2f} s, told were {push.path:.2f} m"
-    return Cause("no_motion", "odom", f"{detail} and {push.turn:.2f} rad")
+    detail = f"no motion in {now - push.since_s:.2f} s, told were {path:.2f} m and {turn:.2f} rad"
+    return Cause("no_motion", "odom", detail)

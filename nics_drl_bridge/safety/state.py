@@ -153,15 +153,14 @@ class Push:
     Attributes:
         since_s, last_s: from when to when [s].
         pose: (3,) by odometry at the beginning.
-        path: that it should have covered [m].
-        turn: by which it should have turned [rad].
+        told: (3,) the way that it was told, the sum of its body twists x time [m, m, rad]; what
+            goes there and back again adds up to nothing.
     """
 
     since_s: float
     last_s: float
     pose: Array
-    path: float = 0.0
-    turn: float = 0.0
+    told: Array
 
 
 @dataclass(frozen=True)

@@ -321,6 +321,16 @@ def test_odometry_whose_noise_looks_like_motion_does_not_hide_a_robot_that_is_st
     assert rig.rule == "no_motion"
 
 
+def test_a_robot_that_wags_need_not_get_anywhere():
+    rig = Rig(config("differential"))
+    rig.wish = np.array([0.0, 0.0, 1.0])
+    rig.run(1.5)
+    assert rig.arm().granted
+    for _ in range(20):
+        rig.wish = -rig.wish
+        assert rig.run(0.2).cause is None
+
+
 def test_a_car_that_only_steers_need_not_move():
     rig = Rig()
     rig.wish = np.array([0.0, 0.0, 0.3])
