@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from nics_drl_bridge.safety.e_stop import e_stop_pressed, e_stop_silent
-from nics_drl_bridge.safety.freshness import gap_free, rate
+from nics_drl_bridge.safety.freshness import NANO, gap_free, rate
 from nics_drl_bridge.safety.frozen import stands_still
 from nics_drl_bridge.safety.inputs import Arm
 from nics_drl_bridge.safety.state import Arrivals, GateConfig, GateState
@@ -50,6 +50,18 @@ def scan_rate(config: GateConfig, state: GateState, request: Arm, now: float) ->
 def odom_rate(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
     """Odometry comes as often as declared."""
     return _rate("odom", state.odometries, config, now, config.odom_rate)
+
+
+def clocks_agree(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
+    """Scan and odometry are stamped by clocks that tell the same time."""
+    scans, odometries = state.scans, state.odometries
+    if not (scans.times and odometries.times):
+        return "scan and odom have not both come"
+    stamped = (scans.stamps_ns[-1] - odometries.stamps_ns[-1]) * NANO
+    apart = stamped - (scans.times[-1] - odometries.times[-1])
+    if abs(apart) <= config.clock_jump_s:
+        return ""
+    return f"the stamps of scan are {apart:.3f} s ahead of those of odom"
 
 
 def estimator_converged(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
@@ -102,6 +114,7 @@ CHECKS: tuple[Check, ...] = (
     scan_rate,
     odom_fresh,
     odom_rate,
+    clocks_agree,
     estimator_converged,
     one_publisher,
     standing_still,

@@ -37,8 +37,8 @@ def test_a_gate_that_knows_nothing_names_every_check_that_fails():
 @pytest.mark.parametrize(
     ("silent", "names"),
     [
-        ("scan", {"scan_fresh", "scan_rate"}),
-        ("odom", {"odom_fresh", "odom_rate", "standing_still"}),
+        ("scan", {"scan_fresh", "scan_rate", "clocks_agree"}),
+        ("odom", {"odom_fresh", "odom_rate", "standing_still", "clocks_agree"}),
         ("estimate", {"estimator_converged"}),
         ("e_stop", {"e_stop_released"}),
         ("command", None),
@@ -83,6 +83,15 @@ def test_a_simulation_that_runs_at_double_speed_keeps_its_declared_rates():
         rig.send()
         rig.tick()
     assert rig.arm().granted
+
+
+@pytest.mark.parametrize("off_s", [3600.0, -3600.0, 0.6])
+def test_stamps_of_scan_and_odometry_that_are_far_apart_are_named(off_s):
+    rig = Rig()
+    scan = rig.scan
+    rig.scan = lambda: scan(stamp_ns=rig.stamp + round(off_s * NANO))
+    rig.run(1.5)
+    assert failed(rig) == {"clocks_agree"}
 
 
 @pytest.mark.parametrize("std", [[0.6, 0.0], [0.0, 0.6]])
