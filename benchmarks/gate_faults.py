@@ -72,6 +72,10 @@ class Robot:
         }
         self.heard: list[tuple[float, np.ndarray]] = []
         self.node.create_subscription(Twist, "cmd_vel", self._hear, qos.COMMAND)
+        self._clients = {
+            service: self.node.create_client(Trigger, f"command_gate/{service}")
+            for service in ("arm", "reset", "e_stop")
+        }
         self.node.create_timer(PERIOD_S, self._send)
         self._now_ns, self._x, self.sent_s = time.time_ns(), 0.0, dict.fromkeys(ALL, 0.0)
         self.last: dict[str, Any] = {}
@@ -109,7 +113,7 @@ class Robot:
             return
         if name in self.change:
             message = self.change[name](message)
-        else:
+        elif not self.jump_ns:
             self.sent_s[name] = time.monotonic()
         self._topics[name].publish(message)
         self.last[name] = message
@@ -130,11 +134,10 @@ class Robot:
 
     def call(self, service: str) -> Trigger.Response:
         """Asks the gate for something."""
-        client = self.node.create_client(Trigger, f"command_gate/{service}")
+        client = self._clients[service]
         self.until(client.service_is_ready, PATIENCE_S, service)
         future = client.call_async(Trigger.Request())
         self.until(future.done, PATIENCE_S, service)
-        self.node.destroy_client(client)
         return future.result()
 
     @property

@@ -81,6 +81,24 @@ class Replay:
     entries: tuple[Entry, ...]
     differing: tuple[int, ...]
 
+    @property
+    def story(self) -> list[str]:
+        """A line for each change between passing and stopping, and one about the replay."""
+        if not self.entries:
+            return ["no inputs"]
+        end, lines, before = self.entries[-1].now, [], "nothing"
+        for entry in self.entries:
+            cause = entry.decision.cause
+            rule = "" if cause is None else cause.rule
+            if rule != before:
+                line = "commands pass" if cause is None else f"stopped by {cause.line}"
+                lines.append(f"{entry.now - end:+8.3f} s  {line}")
+            before = rule
+        total, other = len(self.entries), len(self.differing)
+        same = "all decided the same again"
+        verdict = same if not other else f"{other} decided otherwise, first {self.differing[0]}"
+        return [*lines, f"{total} inputs over {end - self.entries[0].now:.3f} s: {verdict}"]
+
 
 def replay(path: Path) -> Replay:
     """Decides on everything in a file anew.

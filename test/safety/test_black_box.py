@@ -49,6 +49,15 @@ def test_a_stop_replays_to_the_same_decisions_bit_for_bit(tmp_path):
         assert (held.now, type(held.given)) == (read.now, type(read.given))
 
 
+def test_the_story_of_a_replay_names_each_stop_and_when_it_was(tmp_path):
+    stopped(tmp_path / "stop.jsonl")
+    story = replay(tmp_path / "stop.jsonl").story
+    assert "stopped by disarmed" in story[0]
+    assert story[-2].startswith("  +0.000 s  stopped by stamps_jumped: topic=scan")
+    assert any("stopped by command_malformed: topic=cmd_vel_raw" in line for line in story)
+    assert story[-1].endswith("all decided the same again")
+
+
 def test_it_replays_from_the_middle_once_the_oldest_is_forgotten(tmp_path):
     rig = stopped(tmp_path / "stop.jsonl", kept_s=0.5)
     again = replay(tmp_path / "stop.jsonl")
