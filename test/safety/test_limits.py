@@ -150,12 +150,17 @@ def test_without_limits_nothing_is_armed():
     assert rig.decision.answer == "limits_set: no limits are set, name their file in `limits`"
 
 
-def test_the_gate_cuts_the_speed_of_a_robot_and_keeps_its_curve():
+@pytest.mark.parametrize(
+    ("wish", "speed", "turn"),
+    [(2.0, 1.0, 0.5), (0.5, 0.25, 2.0)],
+    ids=["too fast", "turns too fast"],
+)
+def test_the_gate_cuts_what_is_too_much_and_keeps_the_curve(wish, speed, turn):
     rig = Rig(config("differential"))
-    rig.wish = np.array([2.0, 0.0, 1.0])
+    rig.wish = np.array([wish, 0.0, wish * turn / speed])
     rig.run(1.5)
     assert rig.arm().granted
     rig.run(0.4)
-    rig.speed = 1.0
+    rig.speed = speed
     rig.run(1.0)
-    assert rig.decision.twist == pytest.approx([1.0, 0.0, 0.5])
+    assert rig.decision.twist == pytest.approx([speed, 0.0, turn])
