@@ -98,7 +98,7 @@ def _declare_shield(node: Node, model: SimulatorModel) -> ShieldConfig | None:
         latency_s=latency,
         deceleration=deceleration,
         margin=margin,
-        hold_s=DEFAULTS.gap_s / 2.0,
+        hold_s=DEFAULTS.gap_s,
         footprint_radius=model.robot.footprint_radius,
         wheelbase=wheelbase(model.robot),
     )

@@ -37,6 +37,7 @@ class Robot:
     def __init__(self, peer, lidar):
         self.peer, self.lidar, self.stamp_ns, self.x = peer, lidar, 10**18, 0.0
         self.silent, self.wish, self.stamped = set(), (0.5, 0.0, 0.0), None
+        self.distance = 1.0
         self.passed = peer.listen(Twist, "cmd_vel", qos.COMMAND)
         self.topics = {
             "scan": peer.speak(LaserScan, "scan"),
@@ -55,7 +56,9 @@ class Robot:
         odometry = conversions.odometry_to_ros(
             [self.x, 0.0, 0.0], [speed, 0.0, 0.0], self.stamp_ns, ("odom", "base_link"), (1e-4,) * 4
         )
-        ranges = np.full(self.lidar.beams, 1.0 + self.stamp_ns % 7_000_000_000 * 1e-10, np.float32)
+        ranges = np.full(
+            self.lidar.beams, self.distance + self.stamp_ns % 7_000_000_000 * 1e-10, np.float32
+        )
         said = {
             "odom": odometry,
             "filtered": odometry,
@@ -230,6 +233,27 @@ def test_every_stop_is_in_the_black_box_and_replays(robot, black_box):
     again = replay(sorted(black_box.glob("*scan_silent.jsonl"))[-1])
     assert again.differing == ()
     assert again.entries[-1].decision.cause.rule == "scan_silent"
+
+
+def test_with_a_shield_it_stops_before_an_obstacle_and_counts_it(
+    launch, meet, domain_id, model, tmp_path
+):
+    launch(
+        "command_gate",
+        domain_id,
+        limits="ackermann",
+        black_box=str(tmp_path),
+        shield=True,
+        **PATIENT,
+    )
+    robot = Robot(meet(domain_id), model.lidar)
+    robot.distance = 3.0
+    robot.drives(0.2, 0.0, 0.0)
+    robot.distance = 0.19
+    robot.stops()
+    facts = robot.diagnosed()
+    assert facts[""] == "commands pass"
+    assert int(facts["cut by the shield"]) > 0
 
 
 def test_without_limits_it_can_not_be_armed(launch, meet, domain_id, model):
