@@ -111,12 +111,22 @@ def take(config: GateConfig, state: GateState, given: Input, now: float) -> tupl
     if isinstance(given, Estimate):
         state = replace(state, estimate=given, estimate_s=now)
     elif isinstance(given, Command):
-        state = replace(state, command=given, command_s=now, malformed="")
+        state = _take_command(state, given, now)
     elif isinstance(given, EStop):
         state = replace(state, e_stop=e_stop.hear(state.e_stop, given.pressed, now))
     elif isinstance(given, Press):
         state = replace(state, e_stop=replace(state.e_stop, latched=True))
     return state, ""
+
+
+def _take_command(state: GateState, command: Command, now: float) -> GateState:
+    """A command counts once the scan behind it is here, too; the one before holds until then."""
+    if command.stamp_ns not in state.scans.stamps_ns:
+        since = now if state.pending_s is None else state.pending_s
+        return replace(state, pending=command, pending_s=since)
+    return replace(
+        state, command=command, command_s=now, malformed="", pending=None, pending_s=None
+    )
 
 
 def _take_scan(
@@ -127,7 +137,10 @@ def _take_scan(
         jumped = SCAN if fault == "jumped" else ""
         return replace(state, scans=arrivals, jumped=jumped), f"scan: its stamp {fault}"
     same, obstacles = frozen.compare(state, scan), shield.obstacles(config, scan.ranges)
-    return replace(state, scans=arrivals, scan=scan, same=same, obstacles=obstacles), ""
+    state = replace(state, scans=arrivals, scan=scan, same=same, obstacles=obstacles)
+    if state.pending is not None and state.pending.stamp_ns == scan.stamp_ns:
+        state = _take_command(state, state.pending, now)
+    return state, ""
 
 
 def _take_odometry(

@@ -52,6 +52,7 @@ class GateConfig:
         scan_age_s: of the newest scan, and of the scan behind a command, at most [s].
         odom_age_s: of the newest odometry, at most [s].
         command_age_s: of the newest command, at most [s].
+        race_s: by how much a command may overtake its scan on the way here [s].
         settle_s: how long data must be fresh and the robot stand still before it is armed [s].
         rate_tolerance: share by which a rate may differ from the declared one.
         clock_jump_s: a stamp this far ahead of the steady clock, or back, is a jump [s].
@@ -76,6 +77,7 @@ class GateConfig:
     scan_age_s: float = 0.35
     odom_age_s: float = 0.35
     command_age_s: float = 0.30
+    race_s: float = 0.05
     settle_s: float = 1.0
     rate_tolerance: float = 0.3
     clock_jump_s: float = 0.5
@@ -196,6 +198,8 @@ class GateState:
         jumped: the topic whose stamps have just jumped.
         scan, odometry, estimate, command: the newest accepted of each.
         estimate_s, command_s: when those arrived [s].
+        pending: a command whose scan has not arrived here yet.
+        pending_s: since when commands have named such scans [s]; None when the newest does not.
         obstacles: (P, 2) what the newest scan shows, in `base_link` [m].
         malformed: what is wrong with the newest command; empty when nothing is.
         same: see there.
@@ -223,6 +227,8 @@ class GateState:
     command: Command | None = None
     estimate_s: float = float("-inf")
     command_s: float = float("-inf")
+    pending: Command | None = None
+    pending_s: float | None = None
     obstacles: Array | None = None
     malformed: str = ""
     same: Sameness = Sameness()

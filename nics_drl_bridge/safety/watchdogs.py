@@ -15,7 +15,9 @@ def command_malformed(config: GateConfig, state: GateState, now: float) -> Cause
 
 def command_missing(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The policy has not spoken yet."""
-    return Cause("command_missing", RAW, "no command yet") if state.command is None else None
+    if state.command is not None or state.pending is not None:
+        return None
+    return Cause("command_missing", RAW, "no command yet")
 
 
 def command_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -27,11 +29,16 @@ def command_silent(config: GateConfig, state: GateState, now: float) -> Cause | 
 
 
 def scan_behind_unknown(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The command names a scan that never arrived; one from the future, perhaps."""
-    if state.command is None or state.command.stamp_ns in state.scans.stamps_ns:
+    """Commands name scans that do not arrive; from the future, perhaps. One may be on its way."""
+    command, known = state.command, state.scans.stamps_ns
+    if state.pending is not None and state.pending_s is not None:
+        if now - state.pending_s <= config.race_s and command is not None:
+            return None
+        command = state.pending
+    if command is None or command.stamp_ns in known:
         return None
     return Cause(
-        "scan_behind_unknown", RAW, f"the scan behind it ({state.command.stamp_ns}) never arrived"
+        "scan_behind_unknown", RAW, f"the scan behind it ({command.stamp_ns}) never arrived"
     )
 
 

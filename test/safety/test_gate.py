@@ -92,9 +92,32 @@ def test_a_republisher_does_not_hide_a_policy_that_hangs():
 @pytest.mark.parametrize("off_s", [-3600.0, 1e-9, 0.05, 3600.0])
 def test_a_command_that_names_a_scan_that_never_came_stops_the_robot(off_s):
     rig = driving()
-    rig.command(stamp=rig.stamp + round(off_s * NANO))
+    for _ in range(4):
+        rig.run(TICK_S, without="command")
+        rig.command(stamp=rig.stamp + round(off_s * NANO))
     assert rig.rule == "scan_behind_unknown"
     assert not rig.published[-1][1].any()
+
+
+def test_a_command_that_overtakes_its_scan_does_not_stop_the_robot():
+    rig = driving()
+    rig.run(0.06, without="scan command")
+    rig.stamp += 1
+    rig.wish = np.array([0.3, 0.0, 0.0])
+    rig.command()
+    rig.now += TICK_S
+    assert rig.tick().cause is None
+    assert rig.state.command.twist[0] == 0.5
+    rig.scan()
+    assert rig.state.command.twist[0] == 0.3
+    assert rig.tick().cause is None
+
+
+def test_a_command_whose_scan_never_came_does_not_undo_a_malformed_one():
+    rig = driving()
+    rig.command([np.nan, 0.0, 0.0])
+    rig.command(stamp=rig.stamp + 1)
+    assert rig.rule == "command_malformed"
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
