@@ -243,6 +243,21 @@ def record(
 
 
 @app.command()
+def replay(
+    file: Annotated[Path, typer.Argument(help="What command_gate wrote at a stop, *.jsonl.")],
+) -> None:
+    """Decides anew on what led to a stop of the gate, and tells the stops in it."""
+    with _one_sentence():
+        from nics_drl_bridge.safety import black_box
+
+        again = black_box.replay(file)
+        for line in again.story:
+            typer.echo(line)
+        if again.differing:
+            raise typer.Exit(1)
+
+
+@app.command()
 def demo(
     recording: Annotated[
         Path | None, typer.Option(help="A drive; by default one of the textbook robot.")

@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 
 from nics_drl_bridge.calibration.identify import Identified
+from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registration import NAVIGATION, register_envs
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError
@@ -36,6 +37,8 @@ RECORDING_SEED = 1
 POLICY = "go_to_goal"
 LIVE_RATE = 2.0
 LIVE_TIMEOUT_S = 40.0
+FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05
+"""The gate's limits in the demo: from zero to the greatest command, and to its greatest change."""
 IN_PROCESS, OVER_DDS = "in process", "over DDS"
 Say = Callable[[str], None]
 
@@ -201,7 +204,11 @@ def _drive_live(plan: Plan, model: SimulatorModel, say: Say) -> Live:
             "episode_seed": 0,
         },
         "middleware_node": {"model": folder},
-        "command_gate": {"model": folder},
+        "command_gate": {
+            "model": folder,
+            "limits": str(_write_limits(model.robot, plan.out / "limits.yaml")),
+            "black_box": str(plan.out / "black_box"),
+        },
         "policy_node": {"model": folder, "policy": POLICY, "goal": goal},
     }
     domain_id, logs = free_domain_id(), plan.out / "logs" / "realtime"
@@ -217,6 +224,12 @@ def _drive_live(plan: Plan, model: SimulatorModel, say: Say) -> Live:
                     f"{node} publishes nothing after {LIVE_TIMEOUT_S:g} s; look at its log, "
                     f"{processes[0].log}."
                 )
+        refused = witness.arms("command_gate", LIVE_TIMEOUT_S)
+        for process in processes:
+            process.check()
+        if refused:
+            raise BackendError(f"command_gate can't be armed: {refused}")
+        say("  command_gate is armed; no emergency stop is required of a simulation")
         task = Navigation(model.robot, model.lidar)
         # The policy stops where it believes to be there; its odometry drifts.
         arrived = witness.arrives(goal, task.goal_radius + 0.1, LIVE_TIMEOUT_S)
@@ -226,6 +239,18 @@ def _drive_live(plan: Plan, model: SimulatorModel, say: Say) -> Live:
     say(f"  the deployed nodes {'reached' if arrived else 'did not reach'} the goal of seed 0")
     result = "success" if arrived else "time-out"
     return Live(arrived, Episode(0, result, path, path, scene.goals[0], scene.bodies, 0.0))
+
+
+def _write_limits(robot: RobotSpec, path: Path) -> Path:
+    """Limits that let a simulated robot do all it can, within a time to get there."""
+    commands = {}
+    for variable in robot.command:
+        low, high = min(variable.min, 0.0), max(variable.max, 0.0)
+        rate = max(-low, high) / FULL_COMMAND_S
+        jerk = rate / FULL_RATE_S
+        commands[variable.name] = {"min": low, "max": high, "rate": rate, "jerk": jerk}
+    write_text(path, dump_yaml({"robot": robot.name, "commands": commands}))
+    return path
 
 
 def _report(

@@ -61,7 +61,7 @@ def test_it_tells_its_version_and_its_commands(tmp_path):
     assert nics("--version", cwd=tmp_path).stdout == f"{__version__}\n"
     told = nics("--help", cwd=tmp_path)
     assert told.returncode == 0
-    assert {"generate", "bake", "demo"} <= set(told.stdout.split())
+    assert {"generate", "bake", "replay", "demo"} <= set(told.stdout.split())
 
 
 def test_an_unknown_command_or_option_is_refused(tmp_path):
@@ -85,6 +85,12 @@ def test_generate_makes_a_model_of_a_recording_and_replaces_it(drive, tmp_path):
     assert again.returncode == 0, again.stderr
     assert names(tmp_path / "models") == {"car"}
     assert load_model(tmp_path / "models" / "car").fingerprint != model.fingerprint
+
+
+def test_replay_of_something_else_is_one_sentence(tmp_path):
+    (tmp_path / "stop.jsonl").write_text("{}", encoding="utf-8")
+    assert "is no black box" in refused(nics("replay", "stop.jsonl", cwd=tmp_path))
+    assert "no such file" in refused(nics("replay", "none.jsonl", cwd=tmp_path))
 
 
 def test_generate_reads_the_folder_of_a_real_drive(shared_recordings, tmp_path):

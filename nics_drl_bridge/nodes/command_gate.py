@@ -3,28 +3,48 @@
 from __future__ import annotations
 
 import time
-from collections import OrderedDict
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry as OdometryMessage
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
 
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.runner import declare, declare_model, last_word, run_node
-from nics_drl_bridge.safety.gate import Decision, Limits, Request, decide
+from nics_drl_bridge.nodes.gate_log import GateLog
+from nics_drl_bridge.nodes.gate_parameters import declare_gate
+from nics_drl_bridge.nodes.runner import last_word, run_node
+from nics_drl_bridge.safety.black_box import Entry
+from nics_drl_bridge.safety.gate import decide
+from nics_drl_bridge.safety.inputs import (
+    Arm,
+    Command,
+    Estimate,
+    EStop,
+    Input,
+    Odometry,
+    Press,
+    Reset,
+    Scan,
+    Tick,
+)
+from nics_drl_bridge.safety.state import Decision, begin
 
-PERIOD_S = 0.05
-SCANS_KEPT = 50
+PERIOD_S = 0.02
+DIAGNOSTICS_PERIOD_S = 1.0
 
 
 class CommandGate(Node):
     """Stands between `cmd_vel_raw` and `cmd_vel`, in a process of its own.
 
-    It judges the age of the scan behind each command by its own steady clock: a policy that
-    hangs while something repeats its last command is stopped too.
+    It starts disarmed. `~/arm` lets commands pass if nothing speaks against it, `~/e_stop`
+    presses the emergency stop, `~/reset` clears a latched stop and leaves the gate disarmed. All
+    that it decides is in `safety`, on the steady clock.
 
     Args:
         context: to live in.
@@ -32,53 +52,93 @@ class CommandGate(Node):
 
     def __init__(self, context: Context) -> None:
         super().__init__("command_gate", context=context)
-        robot = declare_model(self).robot
-        age = declare(
-            self,
-            "scan_age",
-            0.35,
-            "Oldest scan behind a command [s].",
-            low=0.01,
-            high=10.0,
-            read_only=True,
-        )
-        self._limits = Limits(
-            robot.to_cmd_vel(robot.command_low), robot.to_cmd_vel(robot.command_high), float(age)
-        )
-        self._request: Request | None = None
-        self._arrivals: OrderedDict[int, float] = OrderedDict()
-        self._cause = ""
+        parameters = declare_gate(self)
+        self._config, self._lidar = parameters.config, parameters.lidar
+        self._state = begin(self._config)
+        self._log = GateLog(self._config, parameters.black_box, self.get_logger())
+        if not self._config.e_stop_required:
+            self.get_logger().warning(
+                "e_stop_required is false: silence of e_stop does not stop the robot. That is for "
+                "simulations; set it on a vehicle."
+            )
         self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._listen()
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(PERIOD_S, lambda: self._decide(Tick()), clock=steady)
+        self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=steady)
+
+    def _listen(self) -> None:
         self.create_subscription(LaserScan, "scan", self._on_scan, qos.SENSOR)
+        self.create_subscription(OdometryMessage, "odom", self._on_odometry, qos.SENSOR)
+        self.create_subscription(
+            OdometryMessage, "odometry/filtered", self._on_estimate, qos.SENSOR
+        )
         self.create_subscription(TwistStamped, "cmd_vel_raw", self._on_command, qos.COMMAND)
-        self.create_timer(PERIOD_S, self._on_time, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_subscription(Bool, "e_stop", self._on_e_stop, qos.EVERY_COMMAND)
+        self.create_service(Trigger, "~/arm", self._on_arm)
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(Trigger, "~/e_stop", self._on_e_stop_call)
 
     def _on_scan(self, message: LaserScan) -> None:
-        self._arrivals.setdefault(
-            conversions.stamp_from_ros(message.header.stamp), time.monotonic()
-        )
-        while len(self._arrivals) > SCANS_KEPT:
-            self._arrivals.popitem(last=False)
+        stamp = conversions.stamp_from_ros(message.header.stamp)
+        ranges = conversions.scan_from_ros(self._lidar, message)
+        self._decide(Scan(stamp, ranges, (message.angle_min, message.angle_increment)))
+
+    def _on_odometry(self, message: OdometryMessage) -> None:
+        stamp = conversions.stamp_from_ros(message.header.stamp)
+        pose, twist = conversions.odometry_from_ros(message)
+        if not conversions.is_rotation(message.pose.pose.orientation):
+            pose = np.full(3, np.nan)
+        self._decide(Odometry(stamp, pose, twist))
+
+    def _on_estimate(self, message: OdometryMessage) -> None:
+        variance = np.reshape(message.pose.covariance, (6, 6)).diagonal()
+        std = np.sqrt([max(variance[0], variance[1]), variance[5]])
+        self._decide(Estimate(conversions.twist_from_ros(message.twist.twist), std))
 
     def _on_command(self, message: TwistStamped) -> None:
-        arrival = self._arrivals.get(conversions.stamp_from_ros(message.header.stamp))
-        self._request = Request(conversions.twist_from_ros(message.twist), arrival)
-        self._publish(decide(time.monotonic(), self._request, self._limits))
+        stamp = conversions.stamp_from_ros(message.header.stamp)
+        self._decide(Command(stamp, conversions.twist_from_ros(message.twist)))
 
-    def _on_time(self) -> None:
-        decision = decide(time.monotonic(), self._request, self._limits)
-        if decision.cause:
-            self._publish(decision)
+    def _on_e_stop(self, message: Bool) -> None:
+        self._decide(EStop(bool(message.data)))
 
-    def _publish(self, decision: Decision) -> None:
-        if decision.cause and not self._cause:
-            self.get_logger().warning(f"stopped: {decision.cause}")
-        self._cause = decision.cause
-        self._out.publish(conversions.twist_to_ros(decision.twist))
+    def _on_arm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._answer(Arm(self.count_publishers(self._out.topic_name)), response)
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return self._answer(Reset(), response)
+
+    def _on_e_stop_call(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._decide(Press())
+        response.success, response.message = True, "the e-stop is pressed; ~/reset releases it"
+        return response
+
+    def _answer(self, given: Input, response: Trigger.Response) -> Trigger.Response:
+        decision = self._decide(given)
+        response.success, response.message = decision.granted, decision.answer
+        self.get_logger().info(f"{type(given).__name__.lower()}: {decision.answer}")
+        return response
+
+    def _decide(self, given: Input) -> Decision:
+        now, before = time.monotonic(), self._state
+        self._state, decision = decide(self._config, before, given, now)
+        if decision.publish:  # first of all: what follows may take its time
+            self._out.publish(conversions.twist_to_ros(decision.twist))
+        self._log.note(Entry(now, given, before, decision))
+        return decision
+
+    def _diagnose(self) -> None:
+        status = self._log.status(self.get_fully_qualified_name(), self._state)
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
 
     def stop(self) -> None:
         """Leaves a zero command behind."""
         last_word(self._out, conversions.twist_to_ros(np.zeros(3)))
+        self._log.close()
 
 
 def main(args: list[str] | None = None) -> None:

@@ -19,6 +19,8 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 
 Array = NDArray[np.float64]
 NANO = 1_000_000_000
+QUATERNION_TOLERANCE = 0.1
+"""By which the squared length of a rotation may differ from 1."""
 
 
 def stamp_to_ros(time_ns: int) -> Time:
@@ -39,6 +41,12 @@ def heading_to_ros(heading: float) -> Quaternion:
 def heading_from_ros(q: Quaternion) -> float:
     """The heading [rad] of a quaternion."""
     return math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+
+
+def is_rotation(q: Quaternion) -> bool:
+    """Whether a quaternion is of about unit length; one of zeros is what nobody filled in."""
+    length2 = q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z
+    return bool(abs(length2 - 1.0) < QUATERNION_TOLERANCE)
 
 
 def twist_to_ros(twist: ArrayLike) -> Twist:

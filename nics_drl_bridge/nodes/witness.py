@@ -11,9 +11,13 @@ from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from std_srvs.srv import Trigger
 
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.runner import open_context
+
+ASK_AGAIN_S = 0.2
+ANSWER_S = 2.0
 
 
 class Witness:
@@ -71,6 +75,30 @@ class Witness:
                 if time.monotonic() > deadline:
                     return False
                 self._changed.wait(0.2)
+
+    def arms(self, gate: str, timeout_s: float) -> str:
+        """Asks a gate to let commands pass, again and again until it does.
+
+        Args:
+            gate: name of the node.
+            timeout_s: for how long [s].
+
+        Returns:
+            Nothing, or the gate's last reason not to.
+        """
+        client = self._node.create_client(Trigger, f"{gate}/arm")
+        deadline, reason = time.monotonic() + timeout_s, f"{gate}/arm does not answer"
+        while time.monotonic() < deadline:
+            if client.wait_for_service(timeout_sec=ASK_AGAIN_S):
+                answered = threading.Event()
+                future = client.call_async(Trigger.Request())
+                future.add_done_callback(lambda _, answered=answered: answered.set())
+                if answered.wait(ANSWER_S):
+                    if future.result().success:
+                        return ""
+                    reason = str(future.result().message)
+            threading.Event().wait(ASK_AGAIN_S)
+        return reason
 
     def __enter__(self) -> Witness:
         return self

@@ -1,77 +1,116 @@
-"""The gate's rule: which command may reach the robot now.
+"""The gate: one pure function from (time, state, input) to (state, decision).
 
-A pure function of (time, state, inputs), so that it is tested with any clock. Times are
-seconds of a steady clock.
+It reads no clock, draws nothing at random and touches nothing outside, so that a recording of its
+inputs replays to the same decisions, bit for bit.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What the robot may be told.
-
-    Attributes:
-        low, high: (3,) least and greatest linear.x, linear.y, angular.z of `cmd_vel`.
-        scan_age_s: a command is void once the scan behind it arrived so long ago [s].
-    """
-
-    low: Array
-    high: Array
-    scan_age_s: float = 0.35
+from nics_drl_bridge.safety import arming, motion, rules
+from nics_drl_bridge.safety.clocks import take_time
+from nics_drl_bridge.safety.e_stop import reset
+from nics_drl_bridge.safety.frozen import watch_motion
+from nics_drl_bridge.safety.inputs import Arm, Input, Reset, Tick
+from nics_drl_bridge.safety.intake import take
+from nics_drl_bridge.safety.limits import LEAST_STEP_S
+from nics_drl_bridge.safety.state import Cause, Decision, GateConfig, GateState, Sameness
 
 
-@dataclass(frozen=True)
-class Request:
-    """A command of the policy, as the gate received it.
+def decide(
+    config: GateConfig, state: GateState, given: Input, now: float
+) -> tuple[GateState, Decision]:
+    """What to do after an input.
 
-    Attributes:
-        twist: (3,) linear.x, linear.y, angular.z.
-        scan_arrival_s: when the scan behind it arrived here; None when it never did.
-    """
-
-    twist: Array
-    scan_arrival_s: float | None
-
-
-@dataclass(frozen=True)
-class Decision:
-    """What to publish, and why not what was asked.
-
-    Attributes:
-        twist: (3,) to publish.
-        cause: empty when the command passed, possibly limited.
-    """
-
-    twist: Array
-    cause: str = ""
-
-
-def decide(now_s: float, request: Request | None, limits: Limits) -> Decision:
-    """The command for now: the policy's within the limits, or zero with the cause.
+    Only a tick publishes a motion; a stop is published at whatever input brings it about, and at
+    every tick while it lasts. A stop is zero at once: limits of rate and jerk hold for motion.
 
     Args:
-        now_s: steady time [s].
-        request: the newest of the policy.
-        limits: of the robot.
+        config: of the gate.
+        state: before.
+        given: what happened.
+        now: steady time [s].
+
+    Returns:
+        The state after, and the decision.
     """
-    if request is None:
-        return Decision(np.zeros(3), "no command yet")
-    if not np.isfinite(request.twist).all():
-        return Decision(np.zeros(3), "cmd_vel_raw holds NaN or inf")
-    if request.scan_arrival_s is None:
-        return Decision(np.zeros(3), "the scan behind cmd_vel_raw never arrived here")
-    age = now_s - request.scan_arrival_s
-    if not 0.0 <= age <= limits.scan_age_s:
-        return Decision(
-            np.zeros(3),
-            f"the scan behind cmd_vel_raw is {age:.3f} s old, the limit is {limits.scan_age_s} s",
-        )
-    return Decision(np.clip(request.twist, limits.low, limits.high))
+    state = take_time(config, state, given, now)
+    if state.clock_fault:
+        now = state.now_s  # the last that could be believed
+    state, refused = take(config, state, given, now)
+    state, answer = _serve(config, state, given, now)
+    was_moving = bool(state.value.any())
+    cause, latches = rules.first_cause(config, state, now)
+    if cause is not None:
+        if latches and state.armed:
+            state = replace(state, latched=cause)
+        publish = was_moving or isinstance(given, Tick)
+        state = _stopped(state, now if publish else state.moved_s, disarm=latches)
+        return state, _decision(config, state, publish, cause, refused, answer)
+    if not isinstance(given, Tick) or now - state.moved_s < LEAST_STEP_S:
+        return state, _decision(config, state, False, None, refused, answer)
+    state, shielded = _move(config, state, now)
+    return state, replace(_decision(config, state, True, None, refused, answer), shielded=shielded)
+
+
+@dataclass(frozen=True)
+class _Answer:
+    text: str = ""
+    granted: bool = False
+
+
+def _serve(
+    config: GateConfig, state: GateState, given: Input, now: float
+) -> tuple[GateState, _Answer]:
+    """Arms or resets, if asked to."""
+    if isinstance(given, Arm):
+        failed = arming.failures(config, state, given, now)
+        if failed:
+            return state, _Answer("; ".join(failed))
+        state = replace(state, armed=True, same=Sameness(), push=None)
+        return state, _Answer("armed", granted=True)
+    if isinstance(given, Reset):
+        stop = reset(state.e_stop)
+        state = replace(state, e_stop=stop, latched=None, armed=False)
+        if stop.latched:
+            return state, _Answer("the e-stop is still pressed")
+        return state, _Answer("reset; call ~/arm to let commands pass", granted=True)
+    return state, _Answer()
+
+
+def _stopped(state: GateState, moved_s: float, disarm: bool) -> GateState:
+    zero = np.zeros_like(state.value)
+    return replace(
+        state, value=zero, slope=zero, moved_s=moved_s, push=None, recent=(),
+        armed=state.armed and not disarm,
+    )  # fmt: skip
+
+
+def _move(config: GateConfig, state: GateState, now: float) -> tuple[GateState, bool]:
+    """The next motion towards the newest command."""
+    moved = motion.asked(config, state)
+    for shape in rules.SHAPERS:
+        moved = shape(config, state, moved, now)
+    past = 0.0 if config.shield is None else config.shield.latency_s
+    recent = tuple(each for each in state.recent if each[0] >= now - past)
+    state = replace(
+        state, value=moved.value, slope=moved.slope, moved_s=now,
+        recent=(*recent, (now, moved.value)) if past > 0.0 else (),
+    )  # fmt: skip
+    return watch_motion(config, state, now), moved.shielded
+
+
+def _decision(
+    config: GateConfig,
+    state: GateState,
+    publish: bool,
+    cause: Cause | None,
+    refused: str,
+    answer: _Answer,
+) -> Decision:
+    twist = np.zeros(3)
+    twist[list(config.fields)] = state.value
+    return Decision(twist, publish, cause, refused, answer.text, answer.granted)

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import math
 import signal
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -9,118 +11,278 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
 
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.safety.black_box import replay
 from nodes.peer import DEADLINE_S
 
 pytestmark = pytest.mark.ros
 
 SOON_S = 0.5  # what the gate is made for, on a machine with time
 LATE_S = 5.0
+PERIOD_S = 0.1
+PATIENT = {"scan_age": 1.0, "odom_age": 1.0, "command_age": 1.0, "rate_tolerance": 0.6}
+"""This machine may be busy with other tests."""
 
 
 class Robot:
-    """Scans and commands into a gate, and what comes out of it."""
+    """A robot with its policy around a gate; it does what it is told."""
 
     def __init__(self, peer, lidar):
-        self.peer, self.lidar, self.stamp_ns = peer, lidar, 0
+        self.peer, self.lidar, self.stamp_ns, self.x = peer, lidar, 10**18, 0.0
+        self.silent, self.wish, self.stamped = set(), (0.5, 0.0, 0.0), None
+        self.distance = 1.0
         self.passed = peer.listen(Twist, "cmd_vel", qos.COMMAND)
-        self.scan = peer.speak(LaserScan, "scan")
-        self.raw = peer.speak(TwistStamped, "cmd_vel_raw")
+        self.topics = {
+            "scan": peer.speak(LaserScan, "scan"),
+            "odom": peer.speak(Odometry, "odom"),
+            "filtered": peer.speak(Odometry, "odometry/filtered"),
+            "cmd_vel_raw": peer.speak(TwistStamped, "cmd_vel_raw"),
+            "e_stop": peer.speak(Bool, "e_stop"),
+        }
+        peer.node.create_timer(PERIOD_S, self.sends)
 
-    def scans(self):
-        """Publishes the next scan."""
-        self.stamp_ns += 1
-        ranges = np.ones(self.lidar.beams, np.float32)
-        self.scan.publish(conversions.scan_to_ros(self.lidar, ranges, self.stamp_ns, "laser"))
+    def sends(self):
+        """What arrives in a period."""
+        speed = self.passed[-1].linear.x if self.passed else 0.0
+        self.x += speed * PERIOD_S
+        self.stamp_ns += round(PERIOD_S * conversions.NANO)
+        odometry = conversions.odometry_to_ros(
+            [self.x, 0.0, 0.0], [speed, 0.0, 0.0], self.stamp_ns, ("odom", "base_link"), (1e-4,) * 4
+        )
+        ranges = np.full(
+            self.lidar.beams, self.distance + self.stamp_ns % 7_000_000_000 * 1e-10, np.float32
+        )
+        said = {
+            "odom": odometry,
+            "filtered": odometry,
+            "scan": conversions.scan_to_ros(self.lidar, ranges, self.stamp_ns, "laser"),
+            "e_stop": Bool(data=False),
+            "cmd_vel_raw": self.command(),
+        }
+        for topic in said.keys() - self.silent:
+            self.topics[topic].publish(said[topic])
 
-    def asks(self, speed, steering=0.0, stamp_ns=None):
-        """Publishes what a policy computed from the last scan, or from another."""
-        message = TwistStamped(twist=conversions.twist_to_ros([speed, 0.0, steering]))
-        stamp_ns = self.stamp_ns if stamp_ns is None else stamp_ns
+    def command(self):
+        message = TwistStamped(twist=conversions.twist_to_ros(self.wish))
+        stamp_ns = self.stamp_ns if self.stamped is None else self.stamped
         message.header.stamp = conversions.stamp_to_ros(stamp_ns)
-        self.raw.publish(message)
+        return message
 
-    def gets(self, speed, steering=0.0, again=None):
-        """Waits for a command, repeating an act as long as it does not come."""
-        wanted = conversions.twist_to_ros([speed, 0.0, steering])
-        self.passed.clear()
+    def call(self, service):
+        return self.peer.call(Trigger, f"command_gate/{service}")
+
+    def gets(self, *wanted):
+        """Waits for a command to come out."""
+        wanted = conversions.twist_to_ros(wanted)
         deadline = time.monotonic() + DEADLINE_S
+        self.passed.clear()
         while time.monotonic() < deadline:
-            if again is not None:
-                again()
-            self.peer.another(self.passed, "command")
-            if self.passed[-1] == wanted:
+            if self.peer.another(self.passed, "command") == wanted:
                 return
-        raise AssertionError(f"({speed}, {steering}) never came, but {self.passed[-1]}")
+        raise AssertionError(f"{wanted} never came, but {self.passed[-1]}")
 
-    def drives(self, speed=0.5, steering=0.0):
-        self.gets(speed, steering, again=lambda: (self.scans(), self.asks(speed, steering)))
+    def stops(self):
+        self.gets(0.0, 0.0, 0.0)
+
+    def drives(self, *wish):
+        """Everything is well, the gate is armed, and the robot drives."""
+        self.silent, self.stamped = set(), None
+        self.wish = wish or (0.5, 0.0, 0.0)
+        deadline = time.monotonic() + DEADLINE_S
+        while self.diagnosed()["armed"] != "True":
+            self.wish = (0.0, 0.0, 0.0)
+            self.call("reset")
+            answer = self.call("arm")
+            assert answer.success or time.monotonic() < deadline, answer.message
+        self.wish = wish or (0.5, 0.0, 0.0)
+        self.gets(*self.wish)
+
+    def diagnosed(self):
+        """What the gate says next about itself."""
+        said = self.peer.listen(DiagnosticArray, "/diagnostics")
+        status = self.peer.another(said, "diagnostics").status[0]
+        return {value.key: value.value for value in status.values} | {"": status.message}
 
 
 @pytest.fixture(scope="module")
-def robot(launch, meet, module_domain_id, model):
-    gate = launch("command_gate", module_domain_id)
+def black_box(tmp_path_factory):
+    return tmp_path_factory.mktemp("black_box")
+
+
+@pytest.fixture(scope="module")
+def robot(launch, meet, module_domain_id, model, black_box):
+    gate = launch(
+        "command_gate", module_domain_id, limits="ackermann", black_box=str(black_box), **PATIENT
+    )
     yield Robot(meet(module_domain_id), model.lidar)
     gate.check()
 
 
+def test_it_imports_nothing_that_learns_or_infers():
+    code = (
+        "import sys\nfrom nics_drl_bridge.nodes import command_gate\n"
+        "print(*{name.partition('.')[0] for name in sys.modules})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert "rclpy" in loaded
+    assert not loaded & {"torch", "onnxruntime", "onnx", "stable_baselines3", "gymnasium"}
+
+
+def test_it_starts_disarmed_and_refuses_by_name_to_be_armed(robot):
+    robot.silent = {"scan", "filtered"}
+    robot.stops()
+    answer = robot.call("arm")
+    assert not answer.success
+    for check in ("scan_fresh", "scan_rate", "estimator_converged"):
+        assert f"{check}: " in answer.message
+    robot.silent = set()
+    robot.stops()
+    assert robot.diagnosed()["armed"] == "False"
+
+
 def test_a_command_with_a_fresh_scan_behind_it_passes(robot):
-    robot.drives(0.5, -0.25)
+    robot.drives(0.5, 0.0, -0.25)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_a_command_that_is_no_number_becomes_zero(robot, bad):
     robot.drives()
-    robot.gets(0.0, again=lambda: (robot.scans(), robot.asks(0.5, bad)))
+    robot.wish = (0.5, 0.0, bad)
+    robot.stops()
 
 
 def test_a_command_is_limited_to_what_the_robot_may_do(robot):
-    robot.gets(1.0, 0.5, again=lambda: (robot.scans(), robot.asks(99.0, 99.0)))
-    robot.gets(0.0, -0.5, again=lambda: (robot.scans(), robot.asks(-99.0, -99.0)))
+    robot.drives()
+    robot.wish = (9.0, 0.0, 4.0)
+    robot.gets(1.0, 0.0, 0.5)
+    robot.wish = (-9.0, 0.0, -4.0)
+    robot.gets(0.0, 0.0, -0.5)
+
+
+def test_a_command_that_is_far_out_of_range_becomes_zero(robot):
+    robot.drives()
+    robot.wish = (99.0, 0.0, 99.0)
+    robot.stops()
 
 
 def test_a_component_that_the_robot_has_no_use_for_becomes_zero(robot):
-    def sideways():
-        robot.scans()
-        message = TwistStamped(twist=conversions.twist_to_ros([0.5, 0.7, 0.1]))
-        message.header.stamp = conversions.stamp_to_ros(robot.stamp_ns)
-        robot.raw.publish(message)
-
-    robot.gets(0.5, 0.1, again=sideways)
+    robot.drives()
+    robot.wish = (0.5, 0.7, 0.1)
+    robot.gets(0.5, 0.0, 0.1)
 
 
 @pytest.mark.parametrize("off_ns", [1_000_000, 3600 * conversions.NANO])
 def test_a_command_stamped_with_an_unknown_scan_becomes_zero(robot, off_ns):
     robot.drives()
     # In the future too: a stamp alone proves nothing.
-    robot.gets(
-        0.0, again=lambda: (robot.scans(), robot.asks(0.5, stamp_ns=robot.stamp_ns + off_ns))
-    )
+    robot.stamped = robot.stamp_ns + off_ns
+    robot.stops()
 
 
 def test_a_command_repeated_without_new_scans_runs_out(robot):
     robot.drives()
-    began = time.monotonic()
-    robot.gets(0.0, again=lambda: robot.asks(0.5))
+    robot.stamped, began = robot.stamp_ns, time.monotonic()
+    robot.stops()
     assert 0.1 < time.monotonic() - began < LATE_S
 
 
-def test_scans_alone_do_not_keep_a_command_alive(robot):
+@pytest.mark.parametrize("silent", ["scan", "odom", "cmd_vel_raw"])
+def test_a_topic_that_falls_silent_stops_the_robot_until_it_speaks_again(robot, silent):
     robot.drives()
-    robot.gets(0.0, again=robot.scans)
+    robot.silent = {silent}
+    robot.stops()
+    robot.silent = set()
+    robot.gets(*robot.wish)
+
+
+def test_the_e_stop_by_topic_stops_and_a_reset_alone_does_not_move(robot):
+    robot.drives()
+    robot.topics["e_stop"].publish(Bool(data=True))
+    robot.stops()
+    assert not robot.call("arm").success
+    assert robot.call("reset").success
+    known = len(robot.passed)
+    robot.peer.until(lambda: len(robot.passed) > known + 20, "20 more commands")
+    assert set(map(str, robot.passed[known:])) == {str(Twist())}
+    robot.drives()
+
+
+def test_the_e_stop_by_service_stops_and_its_cause_is_diagnosed(robot):
+    robot.drives()
+    assert robot.call("e_stop").success
+    robot.stops()
+    facts = robot.diagnosed()
+    assert facts[""].startswith("e_stop_pressed: topic=e_stop")
+    assert int(facts["stopped, e_stop_pressed"]) >= 1
+    assert facts["armed"] == "False"
+
+
+def test_every_stop_is_in_the_black_box_and_replays(robot, black_box):
+    robot.drives()
+    robot.silent, robot.stamped = {"scan"}, robot.stamp_ns
+    robot.stops()
+    robot.peer.until(lambda: list(black_box.glob("*scan_silent.jsonl")), "a file")
+    again = replay(sorted(black_box.glob("*scan_silent.jsonl"))[-1])
+    assert again.differing == ()
+    assert again.entries[-1].decision.cause.rule == "scan_silent"
+
+
+def test_with_a_shield_it_stops_before_an_obstacle_and_counts_it(
+    launch, meet, domain_id, model, tmp_path
+):
+    launch(
+        "command_gate",
+        domain_id,
+        limits="ackermann",
+        black_box=str(tmp_path),
+        shield=True,
+        **PATIENT,
+    )
+    robot = Robot(meet(domain_id), model.lidar)
+    robot.distance = 3.0
+    robot.drives(0.2, 0.0, 0.0)
+    robot.distance = 0.19
+    robot.stops()
+    facts = robot.diagnosed()
+    assert facts[""] == "commands pass"
+    assert int(facts["cut by the shield"]) > 0
+
+
+def test_without_limits_it_can_not_be_armed(launch, meet, domain_id, model):
+    launch("command_gate", domain_id)
+    robot = Robot(meet(domain_id), model.lidar)
+    robot.stops()
+    assert "limits_set: " in robot.call("arm").message
+
+
+def test_limits_of_another_robot_end_it_with_one_sentence(launch, meet, domain_id):
+    gate = launch("command_gate", domain_id, limits="mecanum")
+    meet(domain_id).until(lambda: gate._process.poll() is not None, "its end")
+    last = gate.log.read_text(encoding="utf-8").strip().splitlines()[-1]
+    assert "the limits are for 'mecanum', not for 'ackermann'" in last
+    assert gate._process.returncode == 2
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_policy_that_dies_or_hangs_stops_the_robot(launch, meet, domain_id, how):
+def test_a_policy_that_dies_or_hangs_stops_the_robot(launch, meet, domain_id, how, tmp_path):
     launch("simulator_node", domain_id, world="empty")
-    launch("command_gate", domain_id)
+    launch("middleware_node", domain_id)
+    launch("command_gate", domain_id, limits="ackermann", black_box=str(tmp_path))
     peer = meet(domain_id)
     passed = peer.listen(Twist, "cmd_vel", qos.COMMAND)
     # As far as the field goes, so that it does not arrive in between.
     policy = launch("policy_node", domain_id, goal=[100.0, 0.0])
+    deadline = time.monotonic() + DEADLINE_S
+    while not (answer := peer.call(Trigger, "command_gate/arm")).success:
+        assert time.monotonic() < deadline, answer.message
     peer.until(lambda: passed and passed[-1].linear.x > 0.0, "the robot drives")
     policy._process.send_signal(how)
     began = time.monotonic()
@@ -134,8 +296,8 @@ def test_a_policy_that_dies_or_hangs_stops_the_robot(launch, meet, domain_id, ho
         peer.until(lambda: passed[-1].linear.x > 0.0, "the robot drives on once it wakes")
 
 
-def test_it_leaves_a_zero_command_behind(launch, meet, domain_id, model):
-    gate = launch("command_gate", domain_id)
+def test_it_leaves_a_zero_command_behind(launch, meet, domain_id, model, tmp_path):
+    gate = launch("command_gate", domain_id, limits="ackermann", black_box=str(tmp_path), **PATIENT)
     robot = Robot(meet(domain_id), model.lidar)
     robot.drives()
     assert gate.close() == 0

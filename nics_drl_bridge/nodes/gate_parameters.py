@@ -1,0 +1,120 @@
+"""The parameters of `command_gate`."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rclpy.node import Node
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.nodes.runner import declare, declare_model
+from nics_drl_bridge.safety.limits import load_limits
+from nics_drl_bridge.safety.state import GateConfig, ShieldConfig
+
+DEFAULTS = GateConfig((), None, np.zeros(0), (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class GateParameters:
+    """What `command_gate` is to do.
+
+    Attributes:
+        config: of the rules.
+        lidar: whose scans it gets.
+        black_box: folder of the recordings of stops.
+    """
+
+    config: GateConfig
+    lidar: LidarSpec
+    black_box: Path
+
+
+def declare_gate(node: Node) -> GateParameters:
+    """Declares the parameters of a gate, and reads them.
+
+    Raises:
+        ConfigError: a value can't be used.
+    """
+
+    def get(name: str, default: Any, description: str, **limits: Any) -> Any:
+        return declare(node, name, default, description, read_only=True, **limits)
+
+    def seconds(name: str, default: float, description: str) -> float:
+        return float(get(name, default, f"{description} [s].", low=0.01, high=10.0))
+
+    model = declare_model(node)
+    lidar, robot = model.lidar, model.robot
+    limits = get("limits", "", "Limits of the robot: a shipped file, or a YAML file; no default.")
+    needs_e_stop = "Whether silence of e_stop counts as pressed; set it on every vehicle."
+    needs_estimate = "Whether arming needs odometry/filtered."
+    folder = "Where a stop's last 30 s are written; ~/.ros/black_box if empty."
+    config = GateConfig(
+        fields=tuple(int(i) for i in np.flatnonzero(robot.to_cmd_vel(np.ones(len(robot.command))))),
+        limits=load_limits(limits, robot) if limits else None,
+        beam_angles=lidar.angles,
+        mount=lidar.mount,
+        range_min=lidar.range_min,
+        scan_rate=lidar.rate,
+        odom_rate=get("odom_rate", 1.0 / model.control_period, "Of odom [Hz].", low=0.1, high=1e4),
+        scan_age_s=seconds("scan_age", DEFAULTS.scan_age_s, "Oldest scan, and behind a command"),
+        odom_age_s=seconds("odom_age", DEFAULTS.odom_age_s, "Oldest odometry"),
+        command_age_s=seconds("command_age", DEFAULTS.command_age_s, "Oldest command"),
+        rate_tolerance=get(
+            "rate_tolerance", DEFAULTS.rate_tolerance, "Of both rates.", low=0.01, high=0.9
+        ),
+        e_stop_required=get("e_stop_required", False, needs_e_stop),
+        e_stop_silence_s=seconds("e_stop_silence", DEFAULTS.e_stop_silence_s, "Silence of e_stop"),
+        estimate_required=get("estimate_required", True, needs_estimate),
+        estimate_std=get(
+            "estimate_std", DEFAULTS.estimate_std, "Of the estimate [m, rad].", low=1e-3, high=1e3
+        ),
+        shield=_declare_shield(node, model),
+    )
+    home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
+    return GateParameters(config, lidar, Path(get("black_box", "", folder) or home / "black_box"))
+
+
+def _declare_shield(node: Node, model: SimulatorModel) -> ShieldConfig | None:
+    def get(name: str, default: float, description: str) -> float:
+        limits = {"low": 0.0, "high": 100.0}
+        return float(declare(node, name, default, description, read_only=True, **limits))
+
+    on = declare(node, "shield", False, "Whether to stop before obstacles.", read_only=True)
+    latency = get("shield_latency", 0.2, "Until the robot has taken up a command, measured [s].")
+    deceleration = get("shield_deceleration", 1.0, "Of the robot, measured [m/s^2].")
+    margin = get("shield_margin", 0.05, "Kept free around the footprint [m].")
+    if not on:
+        return None
+    if deceleration <= 0.0:
+        raise ConfigError("parameter 'shield_deceleration': must be greater than 0.")
+    return ShieldConfig(
+        latency_s=latency,
+        deceleration=deceleration,
+        margin=margin,
+        hold_s=DEFAULTS.gap_s,
+        footprint_radius=model.robot.footprint_radius,
+        wheelbase=wheelbase(model.robot),
+    )
+
+
+def wheelbase(robot: RobotSpec) -> float:
+    """Of a robot that is told a steering angle [m]; 0 for one that is told a turn rate.
+
+    Raises:
+        ConfigError: the robot's file does not tell.
+    """
+    if all(variable.unit != "rad" for variable in robot.command):
+        return 0.0
+    if "wheelbase" not in robot.parameters:
+        raise ConfigError(
+            f"robot {robot.name!r}: the shield needs the parameter 'wheelbase' of a car; add it "
+            "under `parameters:`."
+        )
+    return robot.parameters["wheelbase"]

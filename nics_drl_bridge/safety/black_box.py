@@ -1,0 +1,132 @@
+"""The black box: the last half minute of the gate, written at each stop, replayable."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from nics_drl_bridge.config import read_text
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import write_text
+from nics_drl_bridge.safety.gate import decide
+from nics_drl_bridge.safety.inputs import Input
+from nics_drl_bridge.safety.plain import from_plain, to_plain
+from nics_drl_bridge.safety.state import Decision, GateConfig, GateState
+
+FORMAT = "nics_drl_bridge/black_box/1"
+KEPT_S = 30.0
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One input of the gate.
+
+    Attributes:
+        now: steady time [s].
+        given: the input.
+        before: the state that it met.
+        decision: the answer.
+    """
+
+    now: float
+    given: Input
+    before: GateState
+    decision: Decision
+
+
+class BlackBox:
+    """Keeps the entries of the last time; states share what they hold, so it stays small.
+
+    Args:
+        config: of the gate.
+        kept_s: how much is kept [s].
+    """
+
+    def __init__(self, config: GateConfig, kept_s: float = KEPT_S) -> None:
+        self.config, self._kept_s = config, kept_s
+        self._entries: deque[Entry] = deque()
+
+    def note(self, entry: Entry) -> None:
+        """Adds an entry and forgets those that are too old."""
+        self._entries.append(entry)
+        while entry.now - self._entries[0].now > self._kept_s:
+            self._entries.popleft()
+
+    def copy(self) -> tuple[Entry, ...]:
+        """The entries now, oldest first."""
+        return tuple(self._entries)
+
+
+def write(config: GateConfig, entries: tuple[Entry, ...], path: Path) -> None:
+    """Writes entries (at least one) to a file, whole or not at all."""
+    lines = [{"format": FORMAT, "config": to_plain(config), "state": to_plain(entries[0].before)}]
+    for entry in entries:
+        parts = {"now": entry.now, "given": entry.given, "decision": entry.decision}
+        lines.append({key: to_plain(part) for key, part in parts.items()})
+    write_text(path, "".join(json.dumps(line) + "\n" for line in lines))
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What a black box holds, and what the gate of today makes of it.
+
+    Attributes:
+        entries: times and inputs, with the decisions that were recorded.
+        differing: indices of the entries that are decided otherwise now.
+    """
+
+    entries: tuple[Entry, ...]
+    differing: tuple[int, ...]
+
+    @property
+    def story(self) -> list[str]:
+        """A line for each change between passing and stopping, and one about the replay."""
+        if not self.entries:
+            return ["no inputs"]
+        end, lines, before = self.entries[-1].now, [], "nothing"
+        for entry in self.entries:
+            cause = entry.decision.cause
+            rule = "" if cause is None else cause.rule
+            if rule != before:
+                line = "commands pass" if cause is None else f"stopped by {cause.line}"
+                lines.append(f"{entry.now - end:+8.3f} s  {line}")
+            before = rule
+        total, other = len(self.entries), len(self.differing)
+        same = "all decided the same again"
+        verdict = same if not other else f"{other} decided otherwise, first {self.differing[0]}"
+        return [*lines, f"{total} inputs over {end - self.entries[0].now:.3f} s: {verdict}"]
+
+
+def replay(path: Path) -> Replay:
+    """Decides on everything in a file anew.
+
+    Raises:
+        ConfigError: the file is missing, damaged, or no black box.
+    """
+    head, *lines = _lines(path)
+    try:
+        config, state = from_plain(head["config"]), from_plain(head["state"])
+        given = [(line["now"], from_plain(line["given"]), line["decision"]) for line in lines]
+        recorded = [from_plain(decision) for *_, decision in given]
+    except (KeyError, TypeError, ValueError) as error:
+        raise ConfigError(f"{path}: is damaged ({error}); it can't be replayed.") from None
+    entries, differing = [], []
+    for index, ((now, event, plain), decision) in enumerate(zip(given, recorded, strict=True)):
+        entries.append(Entry(now, event, state, decision))
+        state, anew = decide(config, state, event, now)
+        if json.dumps(to_plain(anew)) != json.dumps(plain):
+            differing.append(index)
+    return Replay(tuple(entries), tuple(differing))
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
+    try:
+        lines = [json.loads(line) for line in read_text(path).splitlines()]
+    except json.JSONDecodeError:
+        raise ConfigError(f"{path}: is no JSON, line by line; it can't be replayed.") from None
+    if not lines or not isinstance(lines[0], dict) or lines[0].get("format") != FORMAT:
+        raise ConfigError(f"{path}: is no black box of the gate ({FORMAT}).")
+    return lines

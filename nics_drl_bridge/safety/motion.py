@@ -1,0 +1,52 @@
+"""From the policy's command to the motion that is published: saturate, follow, shield."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.safety import limits
+from nics_drl_bridge.safety.state import GateConfig, GateState
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A command on its way through the gate.
+
+    Attributes:
+        value: (C,) of the command.
+        slope: (C,) its change per second.
+        shielded: whether the shield cut it down.
+    """
+
+    value: Array
+    slope: Array
+    shielded: bool = False
+
+
+def asked(config: GateConfig, state: GateState) -> Motion:
+    """What the policy wants."""
+    size = len(config.fields)
+    wish = np.zeros(size) if state.command is None else state.command.twist[list(config.fields)]
+    return Motion(wish.astype(np.float64), np.zeros(size))
+
+
+def saturate(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
+    """Brings the value within its limits, see `limits.saturate`."""
+    if config.limits is None:
+        return Motion(np.zeros_like(motion.value), np.zeros_like(motion.slope))
+    return replace(motion, value=limits.saturate(motion.value, config.limits))
+
+
+def follow(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
+    """Limits rate and jerk, see `limits.follow`."""
+    if config.limits is None:
+        return motion
+    since = now - state.moved_s if math.isfinite(state.moved_s) else config.gap_s
+    value, slope = limits.follow(state.value, state.slope, motion.value, since, config.limits)
+    return replace(motion, value=value, slope=slope)

@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.safety.black_box import BlackBox, Entry, replay, write
+from nics_drl_bridge.safety.inputs import EStop
+from nics_drl_bridge.safety.plain import from_plain, to_plain
+from nics_drl_bridge.safety.state import ShieldConfig
+from safety.rig import NANO, TICK_S, Rig, config
+
+
+class Recorded(Rig):
+    """A rig whose black box sees all."""
+
+    def __init__(self, given, kept_s):
+        super().__init__(given)
+        self.box = BlackBox(given, kept_s)
+
+    def give(self, event, now=None):
+        before = self.state
+        decision = super().give(event, now)
+        self.box.note(Entry(self.now if now is None else now, event, before, decision))
+        return decision
+
+
+def stopped(path, kept_s=30.0):
+    shield = ShieldConfig(0.2, 1.0, 0.05, 0.02, 0.15, 0.2)
+    rig = Recorded(config(shield=shield), kept_s).drive()
+    rig.command([np.nan, 1.0, -0.0])
+    rig.run(0.3)
+    rig.now += TICK_S
+    rig.scan(stamp_ns=rig.stamp + 5 * NANO)
+    write(rig.config, rig.box.copy(), path)
+    return rig
+
+
+def test_a_stop_replays_to_the_same_decisions_bit_for_bit(tmp_path):
+    rig = stopped(tmp_path / "stop.jsonl")
+    again = replay(tmp_path / "stop.jsonl")
+    assert again.differing == ()
+    assert len(again.entries) == len(rig.box.copy())
+    assert again.entries[-1].decision.cause.rule == "stamps_jumped"
+    for held, read in zip(rig.box.copy(), again.entries, strict=True):
+        assert held.decision.twist.tobytes() == read.decision.twist.tobytes()
+        assert (held.now, type(held.given)) == (read.now, type(read.given))
+
+
+def test_the_story_of_a_replay_names_each_stop_and_when_it_was(tmp_path):
+    stopped(tmp_path / "stop.jsonl")
+    story = replay(tmp_path / "stop.jsonl").story
+    assert "stopped by disarmed" in story[0]
+    assert story[-2].startswith("  +0.000 s  stopped by stamps_jumped: topic=scan")
+    assert any("stopped by command_malformed: topic=cmd_vel_raw" in line for line in story)
+    assert story[-1].endswith("all decided the same again")
+
+
+def test_it_replays_from_the_middle_once_the_oldest_is_forgotten(tmp_path):
+    rig = stopped(tmp_path / "stop.jsonl", kept_s=0.5)
+    again = replay(tmp_path / "stop.jsonl")
+    assert again.entries[-1].now - again.entries[0].now <= 0.5
+    assert again.entries[0].before.armed
+    assert again.differing == ()
+    assert rig.box.copy()[0].now == again.entries[0].now
+
+
+def test_another_decision_than_the_recorded_one_is_found(tmp_path):
+    path = tmp_path / "stop.jsonl"
+    stopped(path)
+    lines = path.read_text(encoding="utf-8").splitlines()
+    last = json.loads(lines[-1])
+    last["decision"]["granted"] = True
+    path.write_text("\n".join([*lines[:-1], json.dumps(last)]), encoding="utf-8")
+    assert replay(path).differing == (len(lines) - 2,)
+
+
+def test_records_of_the_gate_become_plain_data_and_back(tmp_path):
+    rig = stopped(tmp_path / "stop.jsonl")
+    text = json.dumps(to_plain(rig.state))
+    assert json.dumps(to_plain(from_plain(json.loads(text)))) == text
+    assert from_plain(to_plain(EStop(True))) == EStop(True)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "is no black box"),
+        ("{}", "is no black box"),
+        ("{", "is no JSON"),
+        ('{"format": "nics_drl_bridge/black_box/1"}', "is damaged"),
+        ('{"format": "nics_drl_bridge/black_box/1", "config": {"kind": "Spy"}}', "is damaged"),
+    ],
+)
+def test_a_file_that_is_no_black_box_is_one_sentence(tmp_path, text, sentence):
+    path = tmp_path / "stop.jsonl"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=sentence):
+        replay(path)

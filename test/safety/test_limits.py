@@ -1,0 +1,166 @@
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nics_drl_bridge.config import find_config
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.safety.limits import follow, implausible, load_limits, saturate
+from safety.rig import Rig, config, driving
+
+ROBOTS = ("ackermann", "differential", "mecanum")
+LIMITS = {robot: load_limits(robot, load_robot(robot)) for robot in ROBOTS}
+TOLERANCE = 1e-6
+WISH = st.floats(-3.0, 3.0)
+
+
+@pytest.mark.parametrize("robot", ["differential", "mecanum"])
+def test_speeds_are_scaled_by_one_factor_so_that_the_curvature_stays(robot):
+    limits = LIMITS[robot]
+    command = np.array([0.9, 3.0]) if robot == "differential" else np.array([1.4, -0.7, 1.0])
+    out = saturate(command, limits)
+    assert out / out[0] == pytest.approx(command / command[0])
+    assert (np.abs(out) / limits.high).max() == pytest.approx(1.0)
+
+
+def test_a_car_keeps_its_steering_when_its_speed_is_cut():
+    assert saturate(np.array([3.0, 0.2]), LIMITS["ackermann"]).tolist() == [1.0, 0.2]
+    assert saturate(np.array([0.5, 0.9]), LIMITS["ackermann"]).tolist() == [0.5, 0.5]
+
+
+def test_what_a_robot_can_not_do_at_all_is_dropped_and_the_rest_stays():
+    assert saturate(np.array([-1e-9, 1.0]), LIMITS["differential"]).tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_a_command_within_the_limits_stays_as_it_is(robot):
+    limits = LIMITS[robot]
+    command = limits.low + 0.6 * (limits.high - limits.low)
+    assert saturate(command, limits).tolist() == command.tolist()
+    assert not implausible(command, limits)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    robot=st.sampled_from(ROBOTS),
+    steps=st.lists(st.tuples(WISH, WISH, WISH, st.floats(1e-3, 0.2)), min_size=5, max_size=60),
+)
+def test_no_wish_at_any_interval_exceeds_speed_rate_or_jerk(robot, steps):
+    limits = LIMITS[robot]
+    size = len(limits.low)
+    value, slope = np.zeros(size), np.zeros(size)
+    last_change = np.zeros(size)
+    for *wish, dt in steps:
+        before = value
+        value, slope = follow(value, slope, saturate(np.array(wish[:size]), limits), dt, limits)
+        change = (value - before) / dt
+        assert (value <= limits.high).all()
+        assert (value >= limits.low).all()
+        assert (np.abs(change) <= limits.rate * (1 + TOLERANCE)).all()
+        assert (np.abs(change - last_change) <= limits.jerk * dt * (1 + TOLERANCE) + 1e-9).all()
+        last_change = change
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_a_wish_that_lasts_is_reached_exactly_and_never_overshot(robot):
+    limits = LIMITS[robot]
+    wish = limits.low + 0.75 * (limits.high - limits.low)
+    value = slope = np.zeros(len(wish))
+    for _ in range(200):
+        value, slope = follow(value, slope, wish, 0.02, limits)
+        assert (np.sign(wish) * value <= np.sign(wish) * wish).all()
+    assert value.tolist() == wish.tolist()
+    assert np.abs(slope).max() < 1e-6
+
+
+def test_a_robot_that_speeds_up_is_on_its_curve_from_the_start():
+    limits, wish = LIMITS["differential"], np.array([0.8, 0.8])
+    value = slope = np.zeros(2)
+    for _ in range(30):
+        value, slope = follow(value, slope, wish, 0.02, limits)
+        assert value[1] == pytest.approx(value[0], rel=0.2)
+
+
+def test_the_gate_speeds_up_within_rate_and_jerk_and_cuts_what_is_too_fast():
+    rig = Rig()
+    rig.wish = np.array([5.0, 0.0, 0.9])
+    rig.run(1.5)
+    assert rig.arm().granted
+    rig.run(0.6)
+    rig.speed = 1.0
+    rig.run(0.5)
+    assert rig.decision.twist.tolist() == [1.0, 0.0, 0.5]
+    moving = np.array([(time, *twist) for time, twist in rig.published])
+    dt, change = np.diff(moving[:, 0]), np.diff(moving[:, [1, 3]], axis=0)
+    assert (np.abs(change) <= np.array([2.0, 4.0]) * dt[:, None] * (1 + TOLERANCE)).all()
+    jerk = np.abs(np.diff(change / dt[:, None], axis=0)) / dt[1:, None]
+    assert (jerk <= np.array([40.0, 80.0]) * (1 + TOLERANCE)).all()
+
+
+def test_a_motion_too_soon_after_the_last_is_not_published():
+    rig = driving()
+    rig.wish = np.array([0.1, 0.0, 0.0])
+    rig.command()
+    rig.now += 1e-4
+    assert not rig.tick().publish
+    assert rig.decision.twist.any()
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (("robot: ackermann", "robot: car"), "the limits are for 'car', not for 'ackermann'"),
+        (("speed_command:", "sped_command:"), "'commands.sped_command'; did you mean 'speed_comm"),
+        (("rate: 2.0, ", ""), "the key 'commands.speed_command.rate' is missing"),
+        ((", jerk: 40.0", ""), "the key 'commands.speed_command.jerk' is missing"),
+        (("max: 1.0", "max: .inf"), "finite"),
+        (("rate: 2.0", "rate: 0.0"), "greater than 0"),
+        (("min: 0.0, max: 1.0", "min: 0.0, max: 0.0"), "min must be less than max"),
+        (("min: 0.0, max: 1.0", "min: 0.2, max: 1.0"), "less than or equal to 0"),
+        (("jerk: 40.0}", "jerk: 40.0, snap: 1.0}"), "unknown key 'commands.speed_command.snap'"),
+    ],
+)
+def test_a_wrong_file_of_limits_is_one_sentence(tmp_path, change, sentence):
+    text = find_config("ackermann", "limits").read_text(encoding="utf-8")
+    path = tmp_path / "limits.yaml"
+    assert change[0] in text
+    path.write_text(text.replace(*change, 1), encoding="utf-8")
+    with pytest.raises(ConfigError, match=re.escape(sentence)):
+        load_limits(str(path), load_robot("ackermann"))
+
+
+def test_limits_that_leave_a_command_out_are_refused(tmp_path):
+    text = find_config("ackermann", "limits").read_text(encoding="utf-8")
+    path = tmp_path / "limits.yaml"
+    kept = [line for line in text.splitlines() if "steering_command" not in line]
+    path.write_text("\n".join(kept), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"'commands\.steering_command' is missing"):
+        load_limits(str(path), load_robot("ackermann"))
+
+
+def test_without_limits_nothing_is_armed():
+    rig = Rig(config(limits=None))
+    rig.run(1.5)
+    assert not rig.arm().granted
+    assert rig.decision.answer == "limits_set: no limits are set, name their file in `limits`"
+
+
+@pytest.mark.parametrize(
+    ("wish", "speed", "turn"),
+    [(2.0, 1.0, 0.5), (0.5, 0.25, 2.0)],
+    ids=["too fast", "turns too fast"],
+)
+def test_the_gate_cuts_what_is_too_much_and_keeps_the_curve(wish, speed, turn):
+    rig = Rig(config("differential"))
+    rig.wish = np.array([wish, 0.0, wish * turn / speed])
+    rig.run(1.5)
+    assert rig.arm().granted
+    rig.run(0.4)
+    rig.speed = speed
+    rig.run(1.0)
+    assert rig.decision.twist == pytest.approx([speed, 0.0, turn])

@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from shapely.geometry import LineString, Point
+
+from nics_drl_bridge.safety.shield import obstacles
+from nics_drl_bridge.safety.shield_kernels import free, place
+from nics_drl_bridge.safety.state import ShieldConfig
+from safety.rig import LIDAR, Rig, config
+
+CAR = ShieldConfig(
+    latency_s=0.15, deceleration=1.0, margin=0.05, hold_s=0.02, footprint_radius=0.15, wheelbase=0.2
+)
+FAR = np.full(LIDAR.beams, 3.0, np.float32)
+
+
+def ahead(width=0.6):
+    return np.abs(LIDAR.angles) < width / 2.0
+
+
+def ranges(value, where=None):
+    """A scan of open space with one value in some directions."""
+    out = FAR + np.float32(1e-4) * np.arange(LIDAR.beams, dtype=np.float32)
+    out[ahead() if where is None else where] = value
+    return out.astype(np.float32)
+
+
+class Faced(Rig):
+    """A car that wants to go straight on, and a scan that never changes but by noise."""
+
+    def __init__(self, seen, shield=CAR, wish=(1.0, 0.0, 0.0)):
+        super().__init__(config(shield=shield, frozen_distance=1e9))
+        self.ranges, self.frozen = seen, True
+        self.wish = np.array(wish)
+
+    def settles(self, seconds=1.5):
+        """What it drives at in the end, when odometry shows what it is told."""
+        self.run(1.5)
+        assert self.arm().granted
+        for _ in range(round(seconds / 0.02)):
+            self.speed = float(self.decision.twist[0])
+            self.run(0.02)
+        return float(self.decision.twist[0])
+
+
+def test_open_space_lets_the_robot_drive_at_full_speed():
+    assert Faced(FAR).settles() == 1.0
+
+
+def test_without_a_shield_nothing_is_cut():
+    assert Faced(ranges(0.3), shield=None).settles() == 1.0
+
+
+@pytest.mark.parametrize("distance", [0.4, 0.6, 0.8])
+def test_the_speed_is_such_that_the_robot_stops_before_what_lies_ahead(distance):
+    rig = Faced(ranges(distance))
+    speed = rig.settles()
+    room = distance - CAR.footprint_radius - CAR.margin
+    least = (CAR.latency_s + CAR.hold_s) * speed + speed**2 / (2.0 * CAR.deceleration)
+    assert least < room < 4.0 * least
+    assert rig.decision.cause is None
+    last = [twist[0] for _, twist in rig.published[-20:]]
+    assert np.ptp(last) < 0.1 * speed  # and does not jerk
+
+
+def test_a_robot_stands_before_what_it_must_not_come_nearer_to():
+    assert Faced(ranges(0.19)).settles() == 0.0
+
+
+def test_something_too_close_to_measure_counts_as_an_obstacle():
+    assert Faced(ranges(-np.inf)).settles() == 0.0
+
+
+def test_too_many_unknown_beams_ahead_count_as_an_obstacle():
+    assert Faced(ranges(np.nan)).settles() == 0.0
+
+
+def test_a_few_unknown_beams_do_not():
+    assert Faced(ranges(np.nan, where=np.arange(LIDAR.beams) % 5 == 0)).settles() == 1.0
+
+
+def test_no_return_is_free_space():
+    assert Faced(ranges(np.inf)).settles() == 1.0
+
+
+def test_what_lies_beside_or_behind_the_way_does_not_stop_the_robot():
+    beside = np.abs(np.abs(LIDAR.angles) - np.pi / 2) < 0.3
+    behind = np.abs(LIDAR.angles) > 2.8
+    assert Faced(ranges(0.3, where=beside)).settles() == 1.0
+    assert Faced(ranges(0.18, where=behind)).settles() == 1.0
+
+
+def test_a_scan_shows_its_returns_where_they_are():
+    given = config(shield=CAR, mount=(0.1, 0.0, np.pi / 2))
+    seen = np.full(LIDAR.beams, np.inf, np.float32)
+    seen[LIDAR.beams // 2] = 2.0  # straight ahead of the lidar, left of the robot
+    assert obstacles(given, seen) == pytest.approx(np.array([[0.1, 2.0]]), abs=1e-6)
+
+
+def test_the_sweep_agrees_with_geometry():
+    rng = np.random.default_rng(0)
+    room, step, unclear = 0.2, 0.005, 0
+    for _ in range(400):
+        twist = np.array([rng.uniform(-1, 1), rng.uniform(-1, 1), rng.uniform(-2, 2)])
+        duration, point = rng.uniform(0.1, 1.0), rng.uniform(-1.2, 1.2, 2)
+        path = LineString([place(twist, t) for t in np.linspace(0.0, duration, 400)])
+        away = path.distance(Point(point))
+        if abs(away - room) < step or np.hypot(*point) <= room:
+            unclear += 1
+            continue
+        swept_free = free(point[None], twist[None], np.array([duration]), room, step)
+        assert swept_free == (away > room)
+    assert unclear < 100
+
+
+@pytest.mark.parametrize(("speed", "may"), [(0.3, False), (-0.3, True)])
+def test_a_robot_in_the_margin_may_leave_and_not_come_nearer(speed, may):
+    near = np.array([[0.17, 0.02]])
+    assert free(near, np.array([[speed, 0.0, 0.0]]), np.array([0.5]), 0.2, 0.02) == may
