@@ -50,7 +50,6 @@ WIDE = World.model_validate(
     {
         "name": "wide",
         "size": [200.0, 200.0],
-        "obstacles": {"count": 0, "radii": [0.25], "gap": 0.3},
         "clearance": 0.1,
         "goal_distance": [1.0, 3.0],
     }

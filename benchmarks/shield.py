@@ -20,12 +20,16 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel, builtin_model
+from nics_drl_bridge.lidar.shapes import RADIUS, X, Y
 from nics_drl_bridge.safety.state import ShieldConfig
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import load_world, wall_distance
+from nics_drl_bridge.sim.space_kernels import wall_distance
+from nics_drl_bridge.sim.world import load_world
 
 Array = NDArray[np.float64]
 ROBOTS = ("ackermann", "differential", "mecanum")
+ROUND = [X, Y, RADIUS]
+"""All that there is to know about a round body."""
 ADVERSARIES = ("ram", "graze", "late", "jerk")
 WORLDS, STEPS, MARGIN = 50, 60, 0.05
 SPEEDS = (1.0, 0.5)
@@ -169,7 +173,7 @@ def episodes(model: SimulatorModel, braking: Braking | None, seeds: list[int]) -
         for n, (gate, foe, scene) in enumerate(zip(gates, foes, scenes, strict=True)):
             gate.now += period
             gate.sense(sim.data.ranges[n, 0], sim.data.odom[n, 0], sim.data.twist[n, 0])
-            wish = foe.act(sim.data.pose[n, 0], scene.circles, walls)
+            wish = foe.act(sim.data.pose[n, 0], scene.bodies[:, ROUND], walls)
             gate.command(robot.to_cmd_vel(wish))
             commands[n, 0] = robot.from_cmd_vel(gate.tick().twist)
         before = sim.data.pose[:, 0].copy()

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit, types
 from numba.experimental import structref
 
@@ -282,7 +283,7 @@ def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[n
                 if steps[n] == 0:
                     sensing.begin(past, n, m, pose, odom, twist)
         move_freely(low, high, pose, state, history, coefficient, delay, lanes, motion)
-        together = 0
+        together = np.int64(0)
         for n in range(low, high):
             steps[n] += 1
             move_world(
@@ -348,32 +349,28 @@ def begin(packed, chosen):  # type: ignore[no-untyped-def]
 
     Their moving obstacles draw what they need, and the robots take their first scans.
     """
-    fields, scene, view, motion, room = packed.content
+    fields, scene, view, _, room = packed.content
     bodies, seeds, marks = fields[3], fields[9], fields[17]
     moves, plans, half, _ = scene[5]
     if moves:
         for n in chosen:
             obstacles.begin(marks, n, bodies, plans, half, seeds[n])
-    _look(fields, scene, view, motion, room, chosen)
+    _look(fields, scene, view, room, chosen)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
-def _look(fields, scene, view, motion, room, chosen):  # type: ignore[no-untyped-def]
-    (
-        pose, _, _, bodies, _, _, ranges, _, steps, seeds, faults, _, _, age, _, velocity, past, _,
-    ) = fields  # fmt: skip
-    walls, scattered, sensors, (dt, substeps) = scene[0], scene[4], room[4], motion[4]
+def _look(fields, scene, view, room, chosen):  # type: ignore[no-untyped-def]
+    """Scans as the episodes begin: all stands still, so that no scan is older or skewed."""
+    pose, bodies, ranges, steps, seeds, faults, velocity = (
+        fields[0], fields[3], fields[6], fields[8], fields[9], fields[10], fields[15],
+    )  # fmt: skip
+    sensors = room[4]
+    for i in range(chosen.shape[0]):
+        sensors[1][i] = chosen[i]
+    sensing.look_together(
+        chosen.shape[0], pose, bodies, ranges, velocity.shape[1], scene[0], view, sensors
+    )
     for n in chosen:
-        if sensing.needs_own(n, age, faults):
-            if scattered:
-                crowd.sort_bodies(bodies, n, room[3][0])
-            sensing.look_alone(
-                n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, scattered,
-                view, sensors, room[3], dt, substeps,
-            )  # fmt: skip
-        else:
-            sensors[1][0] = n
-            sensing.look_together(1, pose, bodies, ranges, velocity.shape[1], walls, view, sensors)
         sensing.distort(n, n + 1, ranges, faults, steps, seeds, view)
 
 

@@ -238,26 +238,19 @@ def _look_alone(  # type: ignore[no-untyped-def]
     seen = sensors[2][: count * 7].reshape((1, count, 7))
     begin = (n * ranges.shape[1] + m) * beams
     scan = ranges.reshape(-1)[begin : begin + beams].reshape((1, 1, beams))
-    if skew == 0.0:
-        _render(scan, spot, none, seen, walls, view, sensors[8])
-        return
-    groups = slices.shape[0]
-    fault_kernels.slice_poses(slices, spot[0, 0], drive, sweep_time, skew)
-    for g in range(groups):
-        for i in range(3):
-            spot[0, 0, i] = slices[g, i]
-        _render(part, spot, none, seen, walls, view, sensors[8])
-        for i in range(g * beams // groups, (g + 1) * beams // groups):
-            scan[0, 0, i] = part[0, 0, i]
-
-
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
-def _render(scan, spot, none, seen, walls, view, scan_room):  # type: ignore[no-untyped-def]
-    """One scan (1, 1, B) from a pose (1, 1, 3) among the bodies (1, k, 7)."""
     sensor, map_arrays, exact = view[0], view[1], view[2]
-    scan_kernels.scan_worlds(scan, spot, none, seen, -1, walls, sensor, scan_room)
-    if map_arrays[0].size > 0:
-        scan_kernels.add_map(scan, spot, none, sensor, map_arrays, exact)
+    groups = 1 if skew == 0.0 else slices.shape[0]
+    if groups > 1:
+        fault_kernels.slice_poses(slices, spot[0, 0], drive, sweep_time, skew)
+    for g in range(groups):  # what is called below is large: once is enough to compile
+        out = scan if groups == 1 else part
+        for i in range(3 if groups > 1 else 0):
+            spot[0, 0, i] = slices[g, i]
+        scan_kernels.scan_worlds(out, spot, none, seen, -1, walls, sensor, sensors[8])
+        if map_arrays[0].size > 0:
+            scan_kernels.add_map(out, spot, none, sensor, map_arrays, exact)
+        for i in range(g * beams // groups, (g + 1) * beams // groups if groups > 1 else 0):
+            scan[0, 0, i] = part[0, 0, i]
 
 
 @njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
