@@ -34,28 +34,27 @@ def field(circles: list[list[float]], about: dict, substeps: int) -> dict:
 def steps(circles: list[list[float]], about: dict, repeats: int, substeps: int) -> float:
     """Seconds per step: the robot moves by a random command, and its lidar scans.
 
-    One that touched something begins anew, as in any environment; it would stand still, without a
-    scan. The time that this takes counts, as it does for us.
+    One that touched something begins anew, since it would stand still without a scan from then on.
+    The time that this takes does not count, though it does for us: they draw a picture anew.
     """
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "world.yaml"
         file.write_text(yaml.safe_dump(field(circles, about, substeps)))
         env = irsim.make(str(file), display=False, disable_all_plot=True, log_level="ERROR")
-    rng, begin, moved = np.random.default_rng(0), 0.0, False
+    rng, seconds, moved = np.random.default_rng(0), 0.0, False
     for k in range(WARM_UP + repeats):
-        if k == WARM_UP:
-            begin = time.perf_counter()
         action = np.array([[rng.uniform(0.0, 1.0)], [rng.uniform(-2.0, 2.0)]])
+        begin = time.perf_counter()
         for _ in range(substeps):
             env.step(action)
+        seconds += time.perf_counter() - begin if k >= WARM_UP else 0.0
         ranges, moved = env.robot.lidar.range_data, moved or bool(np.any(env.robot.state[:2]))
         if env.robot.collision_flag:
             env.reset()
-    seconds = (time.perf_counter() - begin) / repeats
     if len(ranges) != about["beams"] or not moved:
         raise SystemExit("the robot did not move, or its lidar did not scan")
     env.end(0)
-    return seconds
+    return seconds / repeats
 
 
 def main() -> None:
