@@ -11,7 +11,7 @@ from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.shapes import place
 
 Array = NDArray[np.float64]
-PLACES, SEED = 256, 0
+PLACES, SEED = 512, 0
 NO_WALLS = np.zeros((0, 4))
 
 
