@@ -165,8 +165,8 @@ def picture(
 def measure(scans: int, with_slam: bool, out: Path) -> dict[str, Any]:
     """Scans the path, compares the clouds, makes the map and the picture."""
     spec, truth = load_lidar("paper_12m"), path(scans)
-    exact = make_scanner(spec, OBSTACLES, "exact")
-    baked = Scanner(spec, exact.table, "baked")
+    baked = make_scanner(spec, OBSTACLES, "baked")
+    exact = Scanner(spec, baked.table, "exact")
     bodies = np.broadcast_to(exact.place(OBSTACLES, POSES), (scans, len(OBSTACLES), 7))
     ranges = {"exact": exact.scan(truth, bodies, WALLS), "baked": baked.scan(truth, bodies, WALLS)}
     missing = {}

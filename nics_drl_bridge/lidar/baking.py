@@ -17,13 +17,15 @@ from nics_drl_bridge.lidar.sensor_baking import apply_model
 from nics_drl_bridge.lidar.sensor_models import Function, SensorModel
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape, describe
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.lidar.table import Density, LidarTable, padding
+from nics_drl_bridge.lidar.table import MOST_WIDE, Density, LidarTable, padding
 
 TOUCHING = 1e-6
 """The nearest grid distance is this much more than the radius, as a part of it."""
 COARSE = np.radians(2.0)
 """What a shape does between grid rotations is looked at in steps of at most half of this [rad]."""
 MOST_NUMBERS = 2**31 - 2**20
+FIRST_BEAM = -(2**15)
+"""A row begins no farther to the right of the bearing."""
 MISS = 0.02
 """An edge that two corners would miss by so many beams is looked for along the hull."""
 Progress = Callable[[int, int], None]
@@ -69,7 +71,7 @@ def bake(
         The table.
 
     Raises:
-        ConfigError: the table would be too large.
+        ConfigError: the table would be too large, or a shape covers too many beams.
     """
     shapes = tuple(dict.fromkeys(shapes))
     density = density or Density.for_beams(spec.angle_increment)
@@ -77,7 +79,7 @@ def bake(
     grids = [grid_of(spec, outlines, h, density) for h in range(len(shapes))]
     cells = np.concatenate([np.zeros((0, 6), np.int64), *(g.cell.reshape(-1, 6) for g in grids)])
     ends = np.cumsum(cells[:, 1]) * density.phases
-    if len(cells) and (ends[-1] > MOST_NUMBERS or np.abs(cells).max() > 32_767):
+    if len(cells) and ends[-1] > MOST_NUMBERS:
         raise ConfigError(
             f"a lidar table of {len(cells)} cells with {spec.beams} beams is too large; lower "
             "`distances`, `rotations` or `phases`."
@@ -114,6 +116,8 @@ def with_shapes(spec: LidarSpec, table: LidarTable, shapes: Sequence[Shape]) -> 
     """The table itself if it holds all of these shapes, or one of the same density that does."""
     if set(shapes) <= set(table.shapes):
         return table
+    if not table.has_rows:
+        return LidarTable.without_rows(spec, (*table.shapes, *shapes))
     return bake(spec, (*table.shapes, *shapes), table.density, table.sensor_model)
 
 
@@ -148,8 +152,11 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
             far_off[:, 0] = True  # nearly touching, a rim says little of what lies within
             climb = _climbs(wound, parts, len(hull))
             cell[..., 2 + 2 * side : 4 + 2 * side][far_off] = climb[far_off]
-    if cell[..., 1].max() > 32_767:
-        raise ConfigError(f"{describe(shape)} with {spec.beams} beams: too many beams to bake.")
+    if cell[..., 1].max() > MOST_WIDE or cell[..., 0].min() < FIRST_BEAM:
+        raise ConfigError(
+            f"{describe(shape)} covers too many beams to be baked, as they are "
+            f"{spec.angle_increment:.2g} rad apart; scan with the renderer `exact`."
+        )
     return Grid(distances, np.arange(count) * unit, edges[parts // 2 :: parts], cell)
 
 

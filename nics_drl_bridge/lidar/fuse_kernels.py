@@ -126,7 +126,9 @@ def lower(ranges, k, limits, rows, wide, single, whole):  # type: ignore[no-unty
     at, points = np.int64(get(wide, k + AT)) + begin, (near, near2, far, far2)
     if hits <= 0:
         return
-    if min(begin, near, far) >= 0:
+    if (
+        min(begin, near, near2, far, far2) >= 0
+    ):  # the point after a row's last phase is in its first
         lower_block(ranges, at, rows, points, 0, weights, limits, (back, hits))
         lower_block(ranges, at, rows, points, BLOCK, weights, limits, (back, hits))
         for j in range(2 * BLOCK, hits, BLOCK):

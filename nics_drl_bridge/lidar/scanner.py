@@ -15,6 +15,7 @@ from nics_drl_bridge.errors import ConfigError, ModelError, nearest
 from nics_drl_bridge.lidar import intensity_kernels, scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import LANES, SINGLE, WHOLE, WIDE
 from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.lookup_error import lookup_error
 from nics_drl_bridge.lidar.maps_grid import NO_MAP, GridMap
 from nics_drl_bridge.lidar.sensor_models import Intensity, intensity_of
 from nics_drl_bridge.lidar.shapes import BODY, SHAPE, Shape, place
@@ -26,8 +27,11 @@ RENDERERS: tuple[Renderer, ...] = ("auto", "baked", "exact")
 Room = tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.int32]]
 Array = NDArray[np.float64]
 NO_WALLS = np.zeros((0, 4))
-FEW_CORNERS = 16
-"""A concave shape of so few corners is scanned exactly by `auto`."""
+GREATEST_ERROR = 0.01
+"""A concave shape is looked up by `auto` where its ranges have no greater RMSE [m]."""
+WIDEST_BEAMS = 0.2
+"""Beams farther apart than this are scanned exactly by `auto`: there are few, and a row of so few
+points says little [rad]."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +42,10 @@ class Scanner:
         spec: the lidar.
         table: of the shapes that may stand around.
         renderer: `baked` looks every shape up; `exact` computes every ray; `auto` looks up but for
-            shapes larger than the range, in whose circle the lidar nearly always is, and for
-            concave ones of few corners, whose notches a blended row blurs. Straight walls and a
-            body in whose circle the lidar is are computed in all.
+            shapes larger than the range, in whose circle the lidar nearly always is, for concave
+            ones whose notches a blended row blurs, see `GREATEST_ERROR`, and for beams wider than
+            `WIDEST_BEAMS`. Straight walls and a body in whose circle the lidar is are computed in
+            all.
         grid: a static map that stands in every world, if any.
     """
 
@@ -58,6 +63,11 @@ class Scanner:
             )
         if self.renderer == "exact" or not table.shapes:
             return
+        if not table.has_rows:
+            raise ModelError(
+                f"the lidar table has no rows to look up with the renderer {self.renderer!r}; scan "
+                "with `exact`, or bake one."
+            )
         if not math.isclose(table.beam_angle, spec.angle_increment, rel_tol=1e-9):
             raise ModelError(
                 f"the lidar table is for beams that are {table.beam_angle:.6g} rad apart, those of "
@@ -98,9 +108,16 @@ class Scanner:
             return np.zeros(len(radii), np.uint8)
         if self.renderer == "baked":
             return np.ones(len(radii), np.uint8)
-        corners, hulls = np.diff(self.table.outlines.corner), np.diff(self.table.outlines.hull) // 2
-        notched = (corners > hulls) & (corners <= FEW_CORNERS)
-        return np.asarray((radii < self.spec.range_max) & ~notched, np.uint8)
+        fit = (radii < self.spec.range_max) & (self.spec.angle_increment <= WIDEST_BEAMS)
+        for h in np.flatnonzero(fit & self.table.outlines.concave):
+            fit[h] = self._lookup_error(int(h)) <= GREATEST_ERROR
+        return np.asarray(fit, np.uint8)
+
+    def _lookup_error(self, shape: int) -> float:
+        """Of one shape [m], see `lookup_error`; measured in a moment, and the same every time."""
+        exact, baked = (replace(self, renderer=way, grid=None) for way in ("exact", "baked"))
+        radius, room = float(self.table.outlines.radii[shape]), self.room(1)
+        return lookup_error(exact.arguments, baked.arguments, room, shape, radius)
 
     def room(self, bodies: int) -> Room:
         """Scratch that one thread needs to scan a world, of however many bodies."""
@@ -263,5 +280,10 @@ def make_scanner(
     renderer: Renderer = "auto",
     grid: GridMap | None = None,
 ) -> Scanner:
-    """A scanner with a table for the given shapes, baked now, and a static map."""
-    return Scanner(spec, bake(spec, shapes), renderer, grid)
+    """A scanner with a table for the given shapes, baked now if need be, and a static map.
+
+    Raises:
+        ConfigError: the renderer is unknown, or the table would be too large.
+    """
+    table = LidarTable.without_rows(spec, shapes) if renderer == "exact" else bake(spec, shapes)
+    return Scanner(spec, table, renderer, grid)

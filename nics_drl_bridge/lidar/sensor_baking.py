@@ -49,7 +49,7 @@ def apply_model(
 
 def _ends(table: LidarTable) -> NDArray[np.int64]:
     """(cells,) where each row ends in `rows`."""
-    return table.start + table.cell[:, 1].astype(np.int64) * table.density.phases
+    return table.start + table.widths * table.density.phases
 
 
 def _cosines(table: LidarTable, grids: Sequence[Grid]) -> NDArray[np.float32]:

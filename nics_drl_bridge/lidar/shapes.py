@@ -264,6 +264,11 @@ class Outlines:
         )
 
     @property
+    def concave(self) -> NDArray[np.bool_]:
+        """(H,) whether an outline has corners that are not on its hull."""
+        return np.asarray(np.diff(self.corner) > np.diff(self.hull) // 2)
+
+    @property
     def arguments(self) -> tuple[Array, NDArray[np.int64]]:
         """What the exact kernels need: corners, and where each outline begins."""
         return self.corners, self.corner

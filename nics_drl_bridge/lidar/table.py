@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -36,11 +37,14 @@ from nics_drl_bridge.lidar.sensor_models import (
     intensity_of,
 )
 from nics_drl_bridge.lidar.shapes import SHAPES, Circle, Outlines, Shape
+from nics_drl_bridge.lidar.spec import LidarSpec
 
 FORMAT = "nics_drl_bridge/lidar_table/2"
 POINT_ANGLE = 0.01
 """By default the points of a row are no farther apart, as far as `MOST_PHASES` go [rad]."""
 MOST_PHASES = 8
+MOST_WIDE = 0xFFFF
+"""So many beams one row can have."""
 
 
 class Density(Schema):
@@ -94,7 +98,8 @@ class LidarTable:
         grid: (H, 3) greatest grid distance [m], grid rotations in the part of a turn after which
             the shape looks the same, first cell.
         start: (cells,) int32 where each row begins in `rows`.
-        cell: (cells, 6) int16 first beam of the row from the bearing, its width in beams; a corner
+        cell: (cells, 6) int16 first beam of the row from the bearing, its width in beams (without
+            a sign, see `widths`); a corner
             of the hull that can be the right edge within the cell, and the same corner, or the one
             other that can be it, or minus the stride with which to look around when there are
             more; the same two for the left edge.
@@ -113,6 +118,33 @@ class LidarTable:
     rows: NDArray[np.float32]
     sensor_model: tuple[SensorModel, ...] = ()
     reflectance: NDArray[np.float32] | None = None
+
+    @classmethod
+    def without_rows(cls, spec: LidarSpec, shapes: Sequence[Shape]) -> LidarTable:
+        """Shapes that are only scanned exactly: for a lidar of any beams, and at no cost."""
+        shapes = tuple(dict.fromkeys(shapes))
+        grid = np.ones((len(shapes), 3))
+        grid[:, 0] = [spec.range_max + 2.0 * shape.radius for shape in shapes]
+        return cls(
+            shapes,
+            Density(),
+            spec.angle_increment,
+            grid,
+            np.zeros(0, np.int32),
+            np.zeros((0, 6), np.int16),
+            np.zeros(0, np.float32),
+            spec.sensor_model,
+        )
+
+    @property
+    def has_rows(self) -> bool:
+        """Whether its shapes can be looked up."""
+        return len(self.cell) > 0 or not self.shapes
+
+    @property
+    def widths(self) -> NDArray[np.int64]:
+        """(cells,) of the rows, in beams."""
+        return self.cell[:, 1].astype(np.int64) & MOST_WIDE
 
     @cached_property
     def outlines(self) -> Outlines:
@@ -153,7 +185,7 @@ class LidarTable:
         right edge; those of the left one.
         """
         cell = self.cell.astype(np.int32)
-        pairs = (cell[:, [0, 3, 5]] << 16) | cell[:, [1, 2, 4]]
+        pairs = (cell[:, [0, 3, 5]] << 16) | (cell[:, [1, 2, 4]] & MOST_WIDE)
         return np.column_stack([self.start, pairs]).ravel()
 
     @property
@@ -256,7 +288,7 @@ class LidarTable:
             raise ValueError("the grid has no extent")
         if self.start.shape != (cells,) or self.cell.shape != (cells, 6) or self.rows.ndim != 1:
             raise ValueError("the number of cells does not fit the grid")
-        widths = self.cell[:, 1].astype(np.int64) * self.density.phases
+        widths = self.widths * self.density.phases
         ends = self.start + widths
         last = len(self.rows) - padding(self.beam_angle)
         if cells and (self.start.min() < 0 or widths.min() < 1 or ends.max() > last):

@@ -9,7 +9,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.baking import bake, with_shapes
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle, Polygon
-from nics_drl_bridge.lidar.table import Density, padding
+from nics_drl_bridge.lidar.table import Density, LidarTable, padding
 
 SPEC = lidar(beams=360, range_min=0.0)
 SMALL = Density(distances=12, rotations=16)
@@ -97,6 +97,20 @@ def test_the_points_of_a_row_are_near_each_other_whatever_the_beams():
 def test_a_shape_beyond_all_measure_is_refused():
     with pytest.raises(ConfigError, match=r"circle of radius 1e.17 m is too large to bake"):
         bake(SPEC, [Circle(radius=1e17)])
+
+
+def test_a_shape_that_covers_more_beams_than_a_row_has_is_refused_with_the_way_out():
+    narrow = lidar(beams=100_000, angle_min=-0.5, angle_max=0.7)
+    with pytest.raises(ConfigError, match=r"radius 0.2 m covers too many beams .* 1.2e-05 rad"):
+        bake(narrow, [Circle(radius=0.2)])
+
+
+def test_shapes_are_added_to_a_table_without_rows_at_no_cost():
+    table = LidarTable.without_rows(SPEC, [SQUARE, SQUARE])
+    assert table.shapes == (SQUARE,)
+    more = with_shapes(SPEC, table, [STRIP])
+    assert more.shapes == (SQUARE, STRIP)
+    assert not more.has_rows
 
 
 def flat(distance):

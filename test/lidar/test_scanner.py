@@ -395,3 +395,75 @@ def test_a_static_map_is_seen_beside_the_bodies_and_within_the_limits(renderer):
     bodies = scanner.place([SQUARE], [[-1.0, 0.05, 0.0]])
     ranges = scanner.scan([0.05, 0.05, 0.0], bodies)[0]
     assert ranges == pytest.approx([1.95, np.inf, 0.9, -np.inf], abs=1e-3)
+
+
+def star_of(corners, depth):
+    """Corners in turn on a circle of 0.4 m and inside of it."""
+    angles = 2.0 * np.pi / corners * np.arange(corners)
+    radii = 0.4 * (1.0 - depth * (np.arange(corners) % 2))
+    return Polygon(points=np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=1))
+
+
+@pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (0.3, -0.2, 2.5)])
+def test_auto_looks_up_a_concave_shape_of_any_corners_where_that_errs_little(mount):
+    spec = lidar(beams=360, angle_min=-1.0, angle_max=1.5, mount=mount)
+    rng = np.random.default_rng(3)
+    for shape, looked_up in ((star_of(40, 0.5), False), (star_of(40, 0.01), True)):
+        auto = make_scanner(spec, [shape])
+        poses = rng.uniform(-1.0, 1.0, (300, 1, 3)) * [2.5, 2.5, np.pi]
+        bodies, robots = auto.place([shape], poses), np.zeros((300, 3))
+        scans = {way: Scanner(spec, auto.table, way).scan(robots, bodies) for way in RENDERERS}
+        assert np.array_equal(scans["auto"], scans["baked" if looked_up else "exact"])
+        assert not np.array_equal(scans["baked"], scans["exact"])
+        both = np.isfinite(scans["auto"]) & np.isfinite(scans["exact"])
+        assert both.sum() > 1000
+        assert np.sqrt(np.square(scans["auto"][both] - scans["exact"][both]).mean()) < 0.012
+
+
+@pytest.mark.parametrize(
+    ("beams", "same"), [(1, "exact"), (7, "exact"), (30, "exact"), (60, "baked")]
+)
+def test_auto_computes_the_rays_of_few_and_wide_beams(beams, same):
+    spec = lidar(beams=beams)
+    auto = make_scanner(spec, [STRIP])
+    poses = np.random.default_rng(0).uniform(-1.0, 1.0, (300, 1, 3)) * [2.0, 2.0, np.pi]
+    scans = {
+        way: Scanner(spec, auto.table, way).scan(np.zeros((300, 3)), auto.place([STRIP], poses))
+        for way in RENDERERS
+    }
+    assert np.array_equal(scans["auto"], scans[same])
+    assert not np.array_equal(scans["baked"], scans["exact"])
+
+
+@pytest.mark.parametrize(
+    ("view", "few", "every"),
+    [((-np.pi, np.pi), 1000, 100), ((-0.5, 0.7), 370, 271), ((2.0, 4.0), 370, 271)],
+)
+def test_a_lidar_of_the_most_beams_scans_exactly_without_a_table(view, few, every):
+    spec = lidar(beams=100_000, angle_min=view[0], angle_max=view[1])
+    shapes = (Circle(radius=0.25), SQUARE, star_of(20, 0.5))
+    scanner = make_scanner(spec, shapes, "exact")
+    poses = np.array([(1.5, 0.2, 0.3), (-0.8, 0.4, 1.0), (-1.2, -0.9, 0.2)])
+    scene = Scene(np.zeros(3), shapes, poses, np.zeros((0, 4)))
+    expected, clear = by_plane_geometry(spec.model_copy(update={"beams": few}), scene)
+    assert scan(scanner, scene)[::every][clear] == pytest.approx(expected[clear], abs=1e-3)
+    assert np.isfinite(expected[clear]).sum() > 50
+    with pytest.raises(ModelError, match="has no rows to look up with the renderer 'baked'; scan"):
+        Scanner(spec, scanner.table, "baked")
+
+
+def test_a_full_circle_of_the_most_beams_can_be_looked_up():
+    spec = lidar(beams=100_000, range_min=0.0)
+    density = Density(distances=60, rotations=96, phases=1)
+    table = bake(spec, [SQUARE], density)
+    assert table.widths.max() > 2**15
+    baked, exact = Scanner(spec, table, "baked"), Scanner(spec, table, "exact")
+    rng = np.random.default_rng(0)
+    away, (bearing, heading) = rng.uniform(0.213, 0.6, 10), rng.uniform(-np.pi, np.pi, (2, 10))
+    poses = np.stack([away * np.cos(bearing), away * np.sin(bearing), heading], axis=1)
+    one, other = (
+        s.scan(np.zeros((10, 3)), s.place([SQUARE], poses[:, None])) for s in (baked, exact)
+    )
+    assert (np.isfinite(one) != np.isfinite(other)).sum() < 20
+    both = np.isfinite(one) & np.isfinite(other)
+    assert np.sqrt(np.square(one[both] - other[both]).mean()) < 0.02

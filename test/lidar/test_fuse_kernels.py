@@ -1,0 +1,51 @@
+"""What the look-up reads, where memory beside its table is forbidden."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+BETWEEN_FORBIDDEN_PAGES = """
+import ctypes, mmap, sys
+from dataclasses import replace
+import numpy as np
+from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.scanner import Scanner
+from nics_drl_bridge.lidar.shapes import Circle, Rectangle
+from nics_drl_bridge.lidar.spec import LidarSpec
+
+beams, side = int(sys.argv[1]), sys.argv[2]
+spec = LidarSpec(
+    beams=beams, angle_min=-np.pi, angle_max=np.pi, range_min=0.0, range_max=3.0, rate=10
+)
+shapes = Circle(radius=0.15), Rectangle(size=(0.6, 0.06))
+table = bake(spec, shapes)
+rows, page = table.lookup[3], mmap.PAGESIZE
+pages = -(-rows.nbytes // page)
+room = mmap.mmap(-1, (pages + 2) * page)
+begin = ctypes.addressof(ctypes.c_char.from_buffer(room))
+for forbidden in (begin, begin + (pages + 1) * page):
+    assert not ctypes.CDLL(None).mprotect(ctypes.c_void_p(forbidden), page, 0)
+at = page if side == "before" else (pages + 1) * page - rows.nbytes
+guarded = np.frombuffer(room, np.float32, rows.size, at)
+guarded[:] = rows
+scanner = Scanner(spec, replace(table, rows=guarded), "baked")
+assert scanner.table.lookup[3] is guarded
+rng = np.random.default_rng(0)
+for shape in shapes:
+    away = shape.radius + rng.uniform(0.0, 1.0, 20_000) ** 3 * 3.0
+    angle, heading = rng.uniform(-np.pi, np.pi, (2, 20_000))
+    poses = np.stack([away * np.cos(angle), away * np.sin(angle), heading], axis=1)
+    scanner.scan(np.zeros((20_000, 3)), scanner.place([shape], poses[:, None]))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forbids pages as Linux does")
+@pytest.mark.parametrize("side", ["before", "behind"])
+@pytest.mark.parametrize("beams", [36, 48, 180, 360, 720])
+def test_a_look_up_reads_nothing_outside_of_its_table(beams, side):
+    command = [sys.executable, "-c", BETWEEN_FORBIDDEN_PAGES, str(beams), side]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
