@@ -1,6 +1,6 @@
 """What an env step costs with more worlds, robots, obstacles and beams.
 
-One thread, differential robots, 10 kinematic substeps, observation, reward and autoreset, random
+Navigation on one thread, differential robots, 10 kinematic substeps, observation, reward and autoreset, random
 actions. Unless it is what grows: 256 worlds of one robot, 10 circles on 8 x 8 m, 720 beams.
 Robots and obstacles get a field that grows with them, so that as many as before are in range;
 what then grows faster than their number is the search for them.
@@ -12,7 +12,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import numpy as np
 from measuring.fields import field, side_of
 from measuring.rates import interleaved, medians
 
+from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.lidar.baking import bake
@@ -39,6 +40,21 @@ ROBOT_STEPS = 256
 """Robots of all worlds together while their number in each grows."""
 
 
+@dataclass(frozen=True)
+class Crowd(Navigation):
+    """The navigation task for each of several robots, which see each other by lidar alone.
+
+    So the observation of a robot is as long in a world of 64 as in a world of its own.
+    """
+
+    team: int = 1
+
+    @property
+    def robots(self) -> int:
+        """M."""
+        return self.team
+
+
 def environment(worlds: int, robots: int, world: World, beams: int) -> BridgeVectorEnv:
     """Worlds of robots that have to reach goals."""
     model = MODEL
@@ -46,10 +62,9 @@ def environment(worlds: int, robots: int, world: World, beams: int) -> BridgeVec
         lidar = model.lidar.model_copy(update={"beams": beams})
         lidar = type(lidar).model_validate(lidar.model_dump())
         model = replace(model, lidar=lidar, table=bake(lidar, model.table.shapes))
-    task = "navigation" if robots == 1 else "cooperative_reaching"
-    options = None if robots == 1 else {"robots": robots}
+    options = {"team": robots}
     return BridgeVectorEnv(
-        worlds, model, world, task=task, task_options=options, copy=False, max_episode_steps=300
+        worlds, model, world, task=Crowd, task_options=options, copy=False, max_episode_steps=300
     )
 
 

@@ -249,3 +249,18 @@ def test_the_pose_is_that_of_odometry_unless_an_estimator_is_asked_for():
 def test_what_the_topics_need_is_refused_where_there_are_none():
     with pytest.raises(ConfigError, match="'dds' always estimates and is never randomised"):
         BridgeEnv("dds", direct_model(), field(), estimator=False)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"start": (1.0, 0.0)}, r"reset option 'start', \(1.0, 0.0\): must be numbers of shape"),
+        ({"goal": (1.0, 0.0, 2.0)}, "reset option 'goal'.*: must be numbers of shape"),
+        ({"start": (0.0, 0.0, np.nan)}, "reset option 'start'.*: must be finite"),
+        ({"goal": "there"}, "reset option 'goal', 'there': must be numbers"),
+    ],
+)
+def test_a_reset_option_that_does_not_fit_is_refused_by_name(options, sentence):
+    for env in (BridgeEnv(), BridgeVectorEnv(2)):
+        with pytest.raises(ConfigError, match=sentence):
+            env.reset(seed=0, options=options)
