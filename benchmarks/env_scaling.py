@@ -36,6 +36,8 @@ SWEEPS: dict[str, tuple[int, ...]] = {
 }
 AREA_PER_ROBOT, AREA_PER_OBSTACLE = 12.0, 4.0
 """[m^2]"""
+FEWEST = 40
+"""Steps of which the median is taken, at least, unless fewer are asked for."""
 ROBOT_STEPS = 256
 """Robots of all worlds together while their number in each grows."""
 
@@ -102,7 +104,8 @@ def measure(name: str, values: Sequence[int], repeats: int) -> list[float]:
     costs = []
     for value in values:
         env = sweep(name, value)
-        seconds = medians(interleaved({value: stepper(env)}, max(5, repeats // env.num_envs)))
+        often = max(min(repeats, FEWEST), repeats // env.num_envs)
+        seconds = medians(interleaved({value: stepper(env)}, often))
         costs.append(1e6 * seconds[value] / env.num_envs)
         env.close()
     return costs
@@ -124,7 +127,7 @@ def draw(result: dict[str, Any], file: Path) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 3.2), layout="constrained")
-    for axes, name in zip(figure.subplots(1, len(SWEEPS)), SWEEPS, strict=True):
+    for axes, name in zip(figure.subplots(1, len(SWEEPS), sharey=True), SWEEPS, strict=True):
         costs = result["robots_us_per_robot" if name == "robots" else f"{name}_us"]
         axes.loglog(result[name], costs, "o-")
         axes.set_xlabel(name)
