@@ -57,14 +57,10 @@ def _check_options(found: type[Task], options: dict[str, Any]) -> None:
         if name not in known and not free:
             hint = nearest(name, set(known) - {"robot", "lidar"})
             raise ConfigError(f"task {found.__name__}: unknown task option {name!r}; {hint}")
-        kind = known[name].annotation if name in known else None
-        fits, word = KINDS.get(getattr(kind, "__name__", kind), (_anything, ""))
-        if not fits(value):
-            raise ConfigError(f"task option {name}={value!r}: must be {word}.")
-
-
-def _anything(value: object) -> bool:
-    return True
+        annotation = known[name].annotation if name in known else None
+        kind = str(getattr(annotation, "__name__", annotation))
+        if kind in KINDS and not KINDS[kind][0](value):
+            raise ConfigError(f"task option {name}={value!r}: must be {KINDS[kind][1]}.")
 
 
 def _is_flag(value: object) -> bool:

@@ -258,5 +258,6 @@ def _room_at(world: World, point: Sequence[float], static: bool = True) -> float
         rows, columns = world.grid.cells.shape
         if not (0 <= i < rows and 0 <= j < columns):
             return -1.0
+        # Between centres the distance may be more, by no more than the way.
         room = min(room, float(world.grid.distance_field[i, j]) + world.grid.resolution)
-    return room
+    return float(room)
