@@ -1,7 +1,8 @@
 """What an env step costs with more worlds, robots, obstacles and beams.
 
-Navigation on one thread, differential robots, 10 kinematic substeps, observation, reward and
-autoreset, random actions. Unless it is what grows: 256 worlds of one robot, 10 circles on 8 x 8 m, 720 beams.
+Navigation on one thread: differential robots, 10 kinematic substeps, observation, reward and
+autoreset, random actions. Unless it is what grows: 256 worlds of one robot, 10 circles on
+8 x 8 m, 720 beams.
 Robots and obstacles get a field that grows with them, so that as many as before are in range;
 what then grows faster than their number is the search for them.
 """
