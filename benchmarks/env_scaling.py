@@ -1,7 +1,8 @@
 """What an env step costs with more worlds, robots, obstacles and beams.
 
-One thread, differential robots, 10 kinematic substeps, observation, reward and autoreset, random
-actions. Unless it is what grows: 256 worlds of one robot, 10 circles on 8 x 8 m, 720 beams.
+Navigation on one thread: differential robots, 10 kinematic substeps, observation, reward and
+autoreset, random actions. Unless it is what grows: 256 worlds of one robot, 10 circles on
+8 x 8 m, 720 beams.
 Robots and obstacles get a field that grows with them, so that as many as before are in range;
 what then grows faster than their number is the search for them.
 """
@@ -11,8 +12,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ import numpy as np
 from measuring.fields import field, side_of
 from measuring.rates import interleaved, medians
 
+from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.lidar.baking import bake
@@ -35,8 +37,25 @@ SWEEPS: dict[str, tuple[int, ...]] = {
 }
 AREA_PER_ROBOT, AREA_PER_OBSTACLE = 12.0, 4.0
 """[m^2]"""
+FEWEST = 40
+"""Steps of which the median is taken, at least, unless fewer are asked for."""
 ROBOT_STEPS = 256
 """Robots of all worlds together while their number in each grows."""
+
+
+@dataclass(frozen=True)
+class Crowd(Navigation):
+    """The navigation task for each of several robots, which see each other by lidar alone.
+
+    So the observation of a robot is as long in a world of 64 as in a world of its own.
+    """
+
+    team: int = 1
+
+    @property
+    def robots(self) -> int:
+        """M."""
+        return self.team
 
 
 def environment(worlds: int, robots: int, world: World, beams: int) -> BridgeVectorEnv:
@@ -46,10 +65,9 @@ def environment(worlds: int, robots: int, world: World, beams: int) -> BridgeVec
         lidar = model.lidar.model_copy(update={"beams": beams})
         lidar = type(lidar).model_validate(lidar.model_dump())
         model = replace(model, lidar=lidar, table=bake(lidar, model.table.shapes))
-    task = "navigation" if robots == 1 else "cooperative_reaching"
-    options = None if robots == 1 else {"robots": robots}
+    options = {"team": robots}
     return BridgeVectorEnv(
-        worlds, model, world, task=task, task_options=options, copy=False, max_episode_steps=300
+        worlds, model, world, task=Crowd, task_options=options, copy=False, max_episode_steps=300
     )
 
 
@@ -82,22 +100,24 @@ def stepper(env: BridgeVectorEnv) -> Callable[[], None]:
     return step
 
 
-def measure(name: str, repeats: int) -> tuple[list[int], list[float]]:
-    """The values of a curve, and the cost of an env step at each [us]."""
+def measure(name: str, values: Sequence[int], repeats: int) -> list[float]:
+    """The cost of an env step at each point of a curve [us]."""
     costs = []
-    for value in SWEEPS[name]:
+    for value in values:
         env = sweep(name, value)
-        seconds = medians(interleaved({value: stepper(env)}, max(5, repeats // env.num_envs)))
+        often = max(min(repeats, FEWEST), repeats // env.num_envs)
+        seconds = medians(interleaved({value: stepper(env)}, often))
         costs.append(1e6 * seconds[value] / env.num_envs)
         env.close()
-    return list(SWEEPS[name]), costs
+    return costs
 
 
-def run(repeats: int) -> dict[str, Any]:
+def run(repeats: int, ends_only: bool) -> dict[str, Any]:
     """All curves: `NAME` and `NAME_us`; of robots also the cost per robot."""
     result: dict[str, Any] = {}
-    for name in SWEEPS:
-        result[name], result[f"{name}_us"] = measure(name, repeats)
+    for name, sizes in SWEEPS.items():
+        result[name] = [sizes[0], sizes[-1]] if ends_only else list(sizes)
+        result[f"{name}_us"] = measure(name, result[name], repeats)
     per_robot = np.array(result["robots_us"]) / np.array(result["robots"])
     result["robots_us_per_robot"] = per_robot.tolist()
     return result
@@ -108,7 +128,7 @@ def draw(result: dict[str, Any], file: Path) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 3.2), layout="constrained")
-    for axes, name in zip(figure.subplots(1, len(SWEEPS)), SWEEPS, strict=True):
+    for axes, name in zip(figure.subplots(1, len(SWEEPS), sharey=True), SWEEPS, strict=True):
         costs = result["robots_us_per_robot" if name == "robots" else f"{name}_us"]
         axes.loglog(result[name], costs, "o-")
         axes.set_xlabel(name)
@@ -134,8 +154,9 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--repeats", type=int, default=20_000, help="env steps of each point")
     parser.add_argument("--picture", type=Path, help="draw the curves into this file")
+    parser.add_argument("--ends-only", action="store_true", help="two points of each curve")
     given = parser.parse_args()
-    result = run(given.repeats)
+    result = run(given.repeats, given.ends_only)
     if given.picture:
         draw(result, given.picture)
     sys.stdout.write(json.dumps(result) + "\n" if given.json else table_of(result))

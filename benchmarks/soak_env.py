@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 
 PAGE = 4096
 LIMIT = 300
+ROUNDS = 20
 WORLDS = 256
 CASES: dict[str, dict[str, Any]] = {
     "arena": {"model": "differential", "world": "arena"},
@@ -62,13 +65,37 @@ def not_finite(*arrays: NDArray[Any]) -> int:
     return sum(int(np.count_nonzero(~np.isfinite(array))) for array in arrays)
 
 
-def soak(env: BridgeVectorEnv, steps: int, found: Findings, rng: np.random.Generator) -> None:
-    """Steps an environment that has been reset."""
+@dataclass
+class Case:
+    """An environment that has been reset, and what is counted from one turn to the next.
+
+    Attributes:
+        env: of N worlds with M robots.
+        length: (N,) steps of the running episodes.
+        still: (N, M) steps since a robot moved.
+        found: what was seen so far.
+    """
+
+    env: BridgeVectorEnv
+    length: NDArray[np.int64]
+    still: NDArray[np.int64]
+    found: Findings
+
+
+def begun(arguments: dict[str, Any], seed: int) -> Case:
+    """The environment of a case, reset."""
+    env = BridgeVectorEnv(WORLDS, max_episode_steps=LIMIT, **arguments)
+    env.reset(seed=seed)
+    zero = np.zeros((WORLDS, env.robots), np.int64)
+    return Case(env, zero[:, 0].copy(), zero, Findings())
+
+
+def soak(case: Case, steps: int, rng: np.random.Generator) -> None:
+    """Steps the environment of a case."""
+    env, found, length, still = case.env, case.found, case.length, case.still
     data = env.simulator.data
-    length = np.zeros(env.num_envs, np.int64)
-    still = np.zeros(data.collided.shape, np.int64)
     shape, kind = env.action_space.shape, env.action_space.dtype
-    for _ in range(max(1, steps // env.num_envs)):
+    for _ in range(math.ceil(steps / env.num_envs)):
         before = data.pose.copy()
         actions = rng.uniform(-1.0, 1.0, shape).astype(kind)
         seen, reward, terminated, truncated, _ = env.step(actions)
@@ -79,23 +106,21 @@ def soak(env: BridgeVectorEnv, steps: int, found: Findings, rng: np.random.Gener
         found.longest = max(found.longest, int(length.max()))
         length[over] = 0
         moved = (data.pose != before).any(axis=-1) | (data.collided != 0) | env.ended
-        still = np.where(moved | over[:, None], 0, still + 1)
+        still += 1
+        still[moved | over[:, None]] = 0
         found.still = max(found.still, int(still.max()))
         found.steps += env.num_envs
 
 
-def run(steps: int, seed: int) -> dict[str, Any]:
-    """All cases in turn, the first round to warm up and for the memory to settle."""
-    environments = {name: BridgeVectorEnv(WORLDS, **case) for name, case in CASES.items()}
-    found = {name: Findings() for name in CASES}
-    rng = np.random.default_rng(seed)
-    for k, env in enumerate(environments.values()):
-        env.reset(seed=seed + 1000 * k)
-    rounds, begin = 20, time.perf_counter()
+def run(steps: int, seed: int, names: Sequence[str]) -> dict[str, Any]:
+    """The cases in turn, the first round to warm up and for the memory to settle."""
+    cases = {name: begun(CASES[name], seed + 1000 * k) for k, name in enumerate(names)}
+    found = {name: case.found for name, case in cases.items()}
+    rng, begin = np.random.default_rng(seed), time.perf_counter()
     memory = []
-    for _ in range(rounds):
-        for name, env in environments.items():
-            soak(env, steps // (rounds * len(CASES)), found[name], rng)
+    for _ in range(ROUNDS):
+        for case in cases.values():
+            soak(case, math.ceil(steps / (ROUNDS * len(cases))), rng)
         memory.append(resident_mb())
     stuck = sum(one.longest > LIMIT + 1 or one.still > LIMIT for one in found.values())
     return {
@@ -129,8 +154,9 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--steps", type=int, default=20_000_000, help="env steps in all")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
     given = parser.parse_args()
-    result = run(given.steps, given.seed)
+    result = run(given.steps, given.seed, given.cases)
     sys.stdout.write(json.dumps(result) + "\n" if given.json else table_of(result))
 
 

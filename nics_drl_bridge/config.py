@@ -147,7 +147,7 @@ _SHORT.maxstring = _SHORT.maxother = 80
 def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
     details = error.errors(include_url=False)
     first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
-    key = ".".join(str(part) for part in first["loc"]) or "the file"
+    key = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
         known = _fields_at(schema, first["loc"][:-1])
         hint = nearest(str(first["loc"][-1]), known) if known else "remove it"
@@ -160,7 +160,10 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
     if first["type"] == "missing":
         return f"the key {key!r} is missing; add it."
     message = first["msg"].removeprefix("Value error, ").rstrip(".")
-    return f"key {key!r}: {message[0].lower() + message[1:]}, not {_SHORT.repr(first['input'])}."
+    message = message[0].lower() + message[1:]
+    if not key:  # of several keys, which the message names
+        return f"{message}."
+    return f"key {key!r}: {message}, not {_SHORT.repr(first['input'])}."
 
 
 def _fields_at(schema: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env.actions import check_action, still, team_space
 from nics_drl_bridge.env.sim_backend import SimBackend
-from nics_drl_bridge.env.task import Episodes, Memory, Task, override
+from nics_drl_bridge.env.task import Episodes, Memory, Task, give, override
 from nics_drl_bridge.env.tasks import make_task
 from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
@@ -178,7 +178,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         episode = int(episode_seed(self._seed, self._episode))
         self.scene = self._scene_of(episode)
         starts = np.array(self.scene.starts)
-        starts[...] = (options or {}).get("start", starts)
+        if options and "start" in options:
+            give(starts[None], "start", options["start"])
         self._view = self._lifted(self._backend.reset(Start(episode, self._row(starts))))
         goals = self.scene.goals[None]
         self.memory = self.task.reset(Episodes(np.array([episode]), starts[None], goals))

@@ -128,3 +128,24 @@ def distances(out, poses, points):  # type: ignore[no-untyped-def]
     for i in range(out.shape[0]):
         dx, dy = points[i, 0] - poses[i, 0], points[i, 1] - poses[i, 1]
         out[i] = math.sqrt(dx * dx + dy * dy)
+
+
+@njit(cache=True, nogil=True)
+def pair_bearings(out, poses, points):  # type: ignore[no-untyped-def]
+    """`bearing` (R, M, P, 3) of each of the points (R, P, 2) from each of the poses (R, M, 3)."""
+    for r in range(out.shape[0]):
+        for m in range(out.shape[1]):
+            for p in range(out.shape[2]):
+                x, y = points[r, p, 0], points[r, p, 1]
+                distance, out[r, m, p, 1], out[r, m, p, 2] = bearing(poses[r, m], x, y)
+                out[r, m, p, 0] = min(distance, LIMIT)
+
+
+@njit(cache=True, nogil=True)
+def pair_distances(out, poses, points):  # type: ignore[no-untyped-def]
+    """Distances (R, M, P) [m] from poses (R, M, 3) to points (R, P, 2)."""
+    for r in range(out.shape[0]):
+        for m in range(out.shape[1]):
+            for p in range(out.shape[2]):
+                dx, dy = points[r, p, 0] - poses[r, m, 0], points[r, p, 1] - poses[r, m, 1]
+                out[r, m, p] = math.sqrt(dx * dx + dy * dy)

@@ -125,8 +125,11 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         self._steps += 1
         late = self._steps >= self._limit
         index = {name: self.possible_agents.index(name) for name in self.agents}
-        told = {name: self._told(info | {"reward_terms": terms}, m) for name, m in index.items()}
-        rewards = {name: sum(one["reward_terms"].values()) for name, one in told.items()}
+        told = {name: self._told(info, m) for name, m in index.items()}
+        rewards = {}
+        for name, m in index.items():
+            told[name]["reward_terms"] = {key: float(term[m]) for key, term in terms.items()}
+            rewards[name] = sum(told[name]["reward_terms"].values())
         ended = {name: bool(self.env.ended[m]) for name, m in index.items()}
         cut = dict.fromkeys(self.agents, late)
         seen = {name: observation[m] for name, m in index.items()}
@@ -138,15 +141,17 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
 
     def _told(self, info: dict[str, Any], m: int) -> dict[str, Any]:
         """What concerns robot m of the env's `info`."""
-        told: dict[str, Any] = {}
-        for name, value in info.items():
-            if isinstance(value, dict):
-                told[name] = {key: float(term[m]) for key, term in value.items()}
-            elif name in ("goal", "bodies") or not isinstance(value, np.ndarray):
-                told[name] = value
-            else:
-                told[name] = value if self.env.robots == 1 else value[m]
-        return told
+        return {
+            name: value if name in ("goal", "bodies") else self._of(value, m)
+            for name, value in info.items()
+        }
+
+    def _of(self, value: Any, m: int) -> Any:
+        """Robot m's row of what is told of each robot; what is told of the world as it is."""
+        if isinstance(value, dict):
+            return {name: self._of(one, m) for name, one in value.items()}
+        each = self.env.robots > 1 and isinstance(value, np.ndarray)
+        return value[m] if each else value
 
     def render(self) -> Any:
         """The world as it is, drawn from above."""

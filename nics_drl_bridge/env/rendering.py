@@ -85,14 +85,20 @@ class Picture:
 
     def _robot(self, axes: Axes, pose: Array, ranges: NDArray[np.float32], colour: str) -> None:
         """The footprint, where it looks, and what it sees."""
-        lidar, radius = self._model.lidar, self._model.robot.footprint_radius
+        lidar, robot = self._model.lidar, self._model.robot
         mount = geometry.compose(pose, lidar.mount)
         there = np.isfinite(ranges)
         angles = mount[2] + lidar.angles[there]
         hits = mount[:2] + ranges[there, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         axes.plot(hits[:, 0], hits[:, 1], ".", color=SCAN, markersize=2.0)
-        axes.add_patch(Disc((pose[0], pose[1]), radius, color=colour))
-        front = pose[:2] + radius * np.array([np.cos(pose[2]), np.sin(pose[2])])
+        reach = robot.footprint_radius
+        if robot.footprint is None:
+            axes.add_patch(Disc((pose[0], pose[1]), reach, color=colour))
+        else:
+            corners = np.array(robot.footprint)
+            reach, outline = corners[:, 0].max(), geometry.rotate(corners, pose[2]) + pose[:2]
+            axes.add_patch(Outline(outline, closed=True, color=colour))
+        front = pose[:2] + reach * np.array([np.cos(pose[2]), np.sin(pose[2])])
         axes.plot([pose[0], front[0]], [pose[1], front[1]], color="white", linewidth=2.0)
 
     def _shown(self) -> NDArray[np.uint8] | None:

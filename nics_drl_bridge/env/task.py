@@ -237,4 +237,21 @@ def override(memory: Memory, options: Mapping[str, Any] | None) -> None:
     """Puts what `reset(options=...)` gives for a memory's name into all of its rows."""
     for name, rows in memory.items():
         if options and name in options:
-            rows[...] = options[name]
+            give(rows, name, options[name])
+
+
+def give(rows: NDArray[Any], name: str, value: Any) -> None:
+    """Puts what `reset(options=...)` gives for a name into rows (n, ...).
+
+    Raises:
+        ConfigError: it has another shape, or holds NaN or inf.
+    """
+    try:
+        rows[...] = value
+    except (TypeError, ValueError):
+        raise ConfigError(
+            f"reset option {name!r}, {value!r}: must be numbers of shape {rows.shape[1:]}, or of "
+            "its last dimensions."
+        ) from None
+    if not np.isfinite(rows).all():
+        raise ConfigError(f"reset option {name!r}, {value!r}: must be finite.")

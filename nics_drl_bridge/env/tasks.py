@@ -5,8 +5,11 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, nearest
@@ -38,11 +41,47 @@ def make_task(
     if isinstance(task, Task):
         return _checked(task, model, options)
     found = task if isinstance(task, type) else _class_of(task)
+    _check_options(found, options or {})
     try:
         return found(model.robot, model.lidar, **(options or {}))
     except TypeError as error:
         reason = str(error).removeprefix(f"{found.__name__}.__init__() ")
         raise ConfigError(f"task {found.__name__}, task_options {options}: {reason}.") from None
+
+
+def _check_options(found: type[Task], options: dict[str, Any]) -> None:
+    """Raises ConfigError for an option that the class has no field for, or not of its kind."""
+    known = signature(found).parameters
+    free = any(one.kind is Parameter.VAR_KEYWORD for one in known.values())
+    for name, value in options.items():
+        if name not in known and not free:
+            hint = nearest(name, set(known) - {"robot", "lidar"})
+            raise ConfigError(f"task {found.__name__}: unknown task option {name!r}; {hint}")
+        annotation = known[name].annotation if name in known else None
+        kind = str(getattr(annotation, "__name__", annotation))
+        if kind in KINDS and not KINDS[kind][0](value):
+            raise ConfigError(f"task option {name}={value!r}: must be {KINDS[kind][1]}.")
+
+
+def _is_flag(value: object) -> bool:
+    return isinstance(value, bool | np.bool_)
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, int | np.integer) and not _is_flag(value)
+
+
+def _is_finite(value: object) -> bool:
+    number = _is_whole(value) or isinstance(value, float | np.floating)
+    return number and bool(np.isfinite(value))  # type: ignore[call-overload]
+
+
+KINDS = {
+    "bool": (_is_flag, "True or False"),
+    "int": (_is_whole, "a whole number"),
+    "float": (_is_finite, "a finite number"),
+}
+"""Annotation of an option -> what fits it, and how errors call that."""
 
 
 def _checked(task: Task, model: SimulatorModel, options: dict[str, Any] | None) -> Task:

@@ -17,7 +17,7 @@ from nics_drl_bridge.env.actions import check_action, still, team_space
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
 from nics_drl_bridge.env.kernels import episode_seeds
 from nics_drl_bridge.env.sim_backend import NANO
-from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task
+from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, give, override
 from nics_drl_bridge.env.tasks import make_task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
@@ -187,15 +187,14 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         starts = None
         if options and "start" in options:
             starts = np.empty((len(worlds), self.robots, 3))
-            starts[...] = options["start"]
+            give(starts, "start", options["start"])
         scenes = self.simulator.reset(seeds, worlds, starts)
         self._bodies[worlds] = scenes.bodies
         data = self.simulator.data
         self._starts[worlds] = data.pose[worlds]
         fresh = self.task.reset(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))
+        override(fresh, options)
         for name, rows in fresh.items():
-            if options and name in options:
-                rows[...] = options[name]
             if name not in self.memory:
                 self.memory[name] = np.zeros((self.num_envs, *rows.shape[1:]), rows.dtype)
             self.memory[name][worlds] = rows

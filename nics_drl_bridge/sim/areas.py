@@ -13,7 +13,7 @@ from scipy import ndimage
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.maps_grid import OCCUPIED, GridMap
 from nics_drl_bridge.sim import space_kernels as kernels
-from nics_drl_bridge.sim.world import Goals, Starts, World
+from nics_drl_bridge.sim.world import Goals, Starts, World, check_places
 
 CELL = 0.1
 """Side of the cells of a field without a map [m]; a large one has larger, a small one smaller."""
@@ -53,6 +53,7 @@ def areas_of(world: World, footprint: float) -> Areas:
     Raises:
         ConfigError: there is no room for a start and a goal, which names the key.
     """
+    check_places(world)
     cells, frame, solid = _grid_of(world)
     walls, bounds = world.all_walls(), np.array([-np.inf, -np.inf, np.inf, np.inf])
     distance = cells.copy()

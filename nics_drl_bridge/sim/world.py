@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -10,11 +11,13 @@ from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.lidar.maps import load_map
 from nics_drl_bridge.lidar.maps_grid import GridMap
 from nics_drl_bridge.lidar.shapes import Shape
-from nics_drl_bridge.sim.motion import Motion
+from nics_drl_bridge.sim.motion import Motion, Patrol
+from nics_drl_bridge.sim.space_kernels import wall_distance
 
 Array = NDArray[np.float64]
 Pose = tuple[float, float, float]
@@ -205,5 +208,56 @@ def load_world(name: str) -> World:
     if world.map is not None and Path(world.map).suffix in (".yaml", ".yml"):
         world = world.model_copy(update={"map": str(path.parent / world.map)})
     world._file = str(path)
-    _ = world.grid  # a wrong map is found now, not in the first episode
+    _ = world.grid  # a wrong map, too, is found now, not in the first episode
+    check_places(world)
     return world
+
+
+def check_places(world: World) -> None:
+    """Sees whether obstacles and waypoints whose places the file gives lie where they can be.
+
+    Raises:
+        ConfigError: an obstacle of `at` stands outside, or a patrol can't get to a waypoint.
+    """
+    for g, group in enumerate(world.obstacles):
+        for n, at in enumerate(group.at):
+            if _room_at(world, at, static=False) < 0.0:
+                raise ConfigError(
+                    f"{world.source}: key 'obstacles.{g}.at.{n}': {list(at)} is outside of the "
+                    "world; move it."
+                )
+        if not isinstance(group.motion, Patrol):
+            continue
+        radius = max(shape.radius for shape in group.shapes)
+        for n, point in enumerate(group.motion.waypoints):
+            if _room_at(world, point) < radius:
+                raise ConfigError(
+                    f"{world.source}: key 'obstacles.{g}.motion.waypoints.{n}': an obstacle of "
+                    f"radius {radius:g} m does not fit there, at {list(point)}; move it."
+                )
+
+
+def _room_at(world: World, point: Sequence[float], static: bool = True) -> float:
+    """Free space around a point [m], negative outside of the world.
+
+    Args:
+        world: where.
+        point: x, y [m].
+        static: whether walls within and a map's solid cells count, or the outside alone.
+    """
+    x, y = point[:2]
+    x1, y1, x2, y2 = world.extent
+    room = min(x - x1, x2 - x, y - y1, y2 - y)
+    if not static or room < 0.0:
+        return room
+    if world.size is None:
+        room = np.inf  # a map has no sides but its cells
+    room = min(room, wall_distance(x, y, world.all_walls()))
+    if world.grid is not None:
+        i, j = world.grid.world_to_cell([x, y])
+        rows, columns = world.grid.cells.shape
+        if not (0 <= i < rows and 0 <= j < columns):
+            return -1.0
+        # Between centres the distance may be more, by no more than the way.
+        room = min(room, float(world.grid.distance_field[i, j]) + world.grid.resolution)
+    return float(room)

@@ -11,6 +11,7 @@ from robots import direct_model, field
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.registration import MAX_EPISODE_STEPS, NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import SimBackend
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, ModelError
 from nics_drl_bridge.interface import Backend
 
@@ -249,3 +250,18 @@ def test_the_pose_is_that_of_odometry_unless_an_estimator_is_asked_for():
 def test_what_the_topics_need_is_refused_where_there_are_none():
     with pytest.raises(ConfigError, match="'dds' always estimates and is never randomised"):
         BridgeEnv("dds", direct_model(), field(), estimator=False)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"start": (1.0, 0.0)}, r"reset option 'start', \(1.0, 0.0\): must be numbers of shape"),
+        ({"goal": (1.0, 0.0, 2.0)}, "reset option 'goal'.*: must be numbers of shape"),
+        ({"start": (0.0, 0.0, np.nan)}, "reset option 'start'.*: must be finite"),
+        ({"goal": "there"}, "reset option 'goal', 'there': must be numbers"),
+    ],
+)
+def test_a_reset_option_that_does_not_fit_is_refused_by_name(options, sentence):
+    for env in (BridgeEnv(), BridgeVectorEnv(2)):
+        with pytest.raises(ConfigError, match=sentence):
+            env.reset(seed=0, options=options)

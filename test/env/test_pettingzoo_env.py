@@ -10,6 +10,7 @@ from robots import direct_model, field
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.pettingzoo_env import BridgeParallelEnv
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.sim.randomisation import Randomisation
 
 TASKS = (
     ("cooperative_reaching", {}),
@@ -93,3 +94,18 @@ def test_an_agent_without_an_action_is_named():
     parallel.reset(seed=0)
     with pytest.raises(ConfigError, match="no action for robot_1, robot_2"):
         parallel.step({"robot_0": np.zeros(3, np.float32)})
+
+
+@pytest.mark.parametrize("task", ["navigation", "cooperative_reaching"])
+def test_each_agent_is_told_what_the_randomisation_drew_for_it(task):
+    drawn = Randomisation.model_validate(
+        {"name": "both", "action_latency": [0.0, 1.0], "obstacles": {"count": [1, 3]}}
+    )
+    parallel = BridgeParallelEnv(direct_model(), field(8.0, 2), task, randomisation=drawn)
+    _, infos = parallel.reset(seed=3)
+    _, info = parallel.env.reset(seed=3)
+    latency = np.atleast_1d(info["randomisation"]["action_latency_s"])
+    for m, name in enumerate(parallel.possible_agents):
+        told = infos[name]["randomisation"]
+        assert told["action_latency_s"] == latency[m]
+        assert told["obstacles.count"] == info["randomisation"]["obstacles.count"]

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -10,6 +11,7 @@ from robots import direct_model, field
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.kinematics.spec import RobotSpec
 
 BLUE = np.array([0x1F, 0x6F, 0xB2])
 
@@ -83,3 +85,17 @@ def test_a_world_that_is_a_map_is_drawn_to_its_edges():
     assert max(picture.shape) == 500
     dark = (picture.max(axis=-1) < 80).sum()
     assert dark > 500  # the walls of the map
+
+
+def test_a_footprint_of_corners_is_drawn_with_its_corners():
+    model = direct_model()
+    long = [(-0.8, -0.1), (0.8, -0.1), (0.8, 0.1), (-0.8, 0.1)]
+    about = model.robot.model_dump() | {"footprint": long}
+    about.pop("footprint_radius")
+    model = replace(model, robot=RobotSpec.model_validate(about))
+    shown = BridgeEnv(model=model, world=field(count=0), render_mode="rgb_array")
+    shown.reset(seed=0, options={"start": (0.0, 0.0, np.pi / 2.0)})
+    rows, columns = np.nonzero((np.abs(shown.render().astype(int) - BLUE) < 3).all(axis=-1))
+    scale = 500 / 6.6  # pixels per metre
+    assert np.ptp(rows) == pytest.approx(1.6 * scale, abs=4)
+    assert np.ptp(columns) == pytest.approx(0.2 * scale, abs=4)

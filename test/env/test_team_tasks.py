@@ -8,7 +8,8 @@ from robots import DIRECT, FOOTPRINT, direct_model, field, lidar
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.cooperative_reaching import CooperativeReaching
 from nics_drl_bridge.env.pursuit_evasion import PursuitEvasion
-from nics_drl_bridge.env.task import Episodes
+from nics_drl_bridge.env.task import Episodes, bearing, distance
+from nics_drl_bridge.env.teams import distances, others, seen
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import RobotView
 
@@ -178,3 +179,15 @@ def test_a_team_gets_an_action_for_each_robot():
     env.step(REST)
     with pytest.raises(gymnasium.error.InvalidAction, match=r"must be of shape \(3, 3\)"):
         env.step(REST[0])
+
+
+@pytest.mark.parametrize(("lead", "robots"), [((), 2), ((3,), 5), ((2, 2), 3)])
+def test_pairs_are_seen_as_each_would_be_alone(lead, robots):
+    rng = np.random.default_rng(0)
+    pose, points = rng.normal(size=(*lead, robots, 3)), rng.normal(size=(*lead, 4, 2))
+    pairs = pose[..., :, None, :], points[..., None, :, :]
+    assert np.array_equal(seen(pose, points), bearing(*pairs))
+    assert np.array_equal(distances(pose, points), distance(*pairs))
+    of_all = rng.normal(size=(*lead, robots, robots, 2))
+    expected = [np.delete(of_all[..., m, :, :], m, axis=-2) for m in range(robots)]
+    assert np.array_equal(others(of_all), np.stack(expected, axis=-3))

@@ -130,6 +130,23 @@ def test_it_gives_the_numbers_of_the_simulator_in_process(simulator, model, aren
     assert truth < 1e-12  # a quaternion rounds its heading
 
 
+@pytest.mark.parametrize("name", ["crowd", "room"])
+def test_moving_obstacles_and_maps_are_the_same_over_topics(launch, domain_id, model, name):
+    launch("simulator_node", domain_id, mode="lockstep", world=name)
+    options = {"domain_id": domain_id, "truth": True, "timeout_s": TIMEOUT_S}
+    here = BridgeEnv("sim", model, name, estimator=True)
+    there = BridgeEnv("dds", model, name, backend_options=options)
+    try:
+        told_here = episodes(here, (7, 8), 15, np.random.default_rng(0))
+        told_there = episodes(there, (7, 8), 15, np.random.default_rng(0))
+    finally:
+        there.close()
+    assert np.array_equal(here.scene.bodies, there.scene.bodies)
+    *seen, truth = (np.abs(a - b).max() for a, b in zip(told_here, told_there, strict=True))
+    assert seen == [0.0] * 4
+    assert truth < 1e-12
+
+
 def test_each_view_is_of_the_step_and_one_control_period_after_the_last(connect, model):
     backend = connect()
     assert backend.reset(START).pose == pytest.approx(START.pose)

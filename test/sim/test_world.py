@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import re
 import shutil
 
@@ -129,3 +130,46 @@ def test_a_world_that_cant_be_is_refused_in_one_sentence(changes, sentence):
     assert str(caught.value).startswith("world.yaml: ")
     assert "\n" not in str(caught.value)
     assert not re.search(r"\.\S*\. ", str(caught.value))
+
+
+def patrolled(*waypoints):
+    motion = {"kind": "patrol", "waypoints": list(waypoints), "speed": 0.5}
+    return {"shapes": [CIRCLE], "count": 1, "motion": motion}
+
+
+@pytest.mark.parametrize(
+    ("group", "sentence"),
+    [
+        ({"shapes": [CIRCLE], "at": [[0, 0, 0], [9, 0, 0]]}, "'obstacles.0.at.1': [9.0, 0.0, 0.0]"),
+        (patrolled([0, 0], [9, 0]), "'obstacles.0.motion.waypoints.1': an obstacle of radius 0.2"),
+        (patrolled([-1.9, 0], [0, 0]), "'obstacles.0.motion.waypoints.0'"),
+        (patrolled([0, 0], [0.1, 1]), "'obstacles.0.motion.waypoints.1'"),
+    ],
+    ids=["at", "outside", "at a side", "at a wall"],
+)
+def test_a_place_where_an_obstacle_cant_be_is_refused_by_name_at_load(tmp_path, group, sentence):
+    file = tmp_path / "own.yaml"
+    wall = [0.0, 0.5, 0.0, 1.5]
+    about = {"name": "own", "size": [4, 4], "walls": [wall], "goal_distance": [1, 2]}
+    file.write_text(json.dumps(about | {"obstacles": [group]}))
+    with pytest.raises(ConfigError) as caught:
+        load_world(str(file))
+    assert str(caught.value).startswith(f"{file}: key {sentence}")
+
+
+def test_a_waypoint_within_the_solid_of_a_map_is_refused(own_world):
+    about = {"name": "own", "map": "maps/room.yaml", "goal_distance": [1, 2]}
+    grid = load_map("room")
+    solid = grid.cell_to_world(np.argwhere(grid.distance_field == 0.0)[-1]).tolist()
+    open_ = grid.cell_to_world(
+        np.unravel_index(np.argmax(grid.distance_field), grid.cells.shape)
+    ).tolist()
+    own_world.write_text(json.dumps(about | {"obstacles": [patrolled(open_, solid)]}))
+    with pytest.raises(ConfigError, match=r"'obstacles.0.motion.waypoints.1'"):
+        load_world(str(own_world))
+
+
+def test_what_concerns_several_keys_is_said_without_the_whole_file():
+    with pytest.raises(ConfigError) as caught:
+        validate(field().model_dump(mode="json") | {"size": [-1.0, 3.0]}, World, "world.yaml")
+    assert str(caught.value) == "world.yaml: size must be greater than 0."
