@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from nics_drl_bridge.env import vector_info
 from nics_drl_bridge.env.actions import check_action, still, team_space
@@ -19,6 +19,7 @@ from nics_drl_bridge.env.kernels import episode_seeds
 from nics_drl_bridge.env.sim_backend import NANO
 from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, give, override
 from nics_drl_bridge.env.tasks import make_task
+from nics_drl_bridge.env.vector_parts import chosen_worlds, joined, mode_of, over_robots
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import RobotView
@@ -33,7 +34,6 @@ Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Rows = slice | NDArray[np.intp]
 EVERY = slice(None)
-MODES = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
 
 
 class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
@@ -98,7 +98,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         check_render_mode(render_mode, self.metadata)
         self.num_envs, self.render_mode = num_envs, render_mode
         self._limit, self.copy = max_episode_steps, copy
-        self._mode = _mode(autoreset_mode)
+        self._mode = mode_of(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.model = open_model(model) if isinstance(model, str) else model
         self.world = load_world(world) if isinstance(world, str) else world
@@ -141,7 +141,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             ConfigError: wrong number of seeds, or a wrong mask.
         """
         super().reset(seed=seed if isinstance(seed, int) else None)
-        chosen = _chosen(options, self.num_envs)
+        chosen = chosen_worlds(options, self.num_envs)
         self._seed(seed, chosen)
         if self.memory and not chosen.all():  # the others see what they saw
             self.task.observe_into(self._out, self._view(slice(None)), self.memory)
@@ -218,7 +218,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         outcome = self._all_parts(lambda part: self._advance(part, given[part], out, begun))
         terminated = self.ended.all(axis=1) & ~begun
         truncated = (self.simulator.data.steps >= self._limit) & ~begun
-        reward = np.where(begun, 0.0, _over_robots(self._reward))
+        reward = np.where(begun, 0.0, over_robots(self._reward))
         over = terminated | truncated
         infos: dict[str, Any] = {}
         facts = self._facts(outcome)
@@ -232,7 +232,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def _all_parts(self, advance: Callable[[slice], Outcome]) -> Outcome:
         """Runs every part of the simulator's worlds and puts what they came to together."""
         done = self.simulator.run_parts(advance)
-        return done[0] if len(done) == 1 else _joined(done)
+        return done[0] if len(done) == 1 else joined(done)
 
     def _advance(
         self, part: slice, actions: NDArray[Any], out: Observation, begun: Flags
@@ -351,40 +351,3 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """Closes the pictures."""
         for picture in self._pictures:
             picture.close()
-
-
-def _over_robots(rewards: Array) -> Array:
-    """(N,) sums of rewards (N, M), robot by robot as a single env does."""
-    total = rewards[:, 0].copy()
-    for m in range(1, rewards.shape[1]):
-        total += rewards[:, m]
-    return total
-
-
-def _joined(parts: Sequence[Outcome]) -> Outcome:
-    def join(one: Callable[[Outcome], dict[str, Any]]) -> dict[str, Any]:
-        return {name: np.concatenate([one(part)[name] for part in parts]) for name in one(parts[0])}
-
-    ended = np.concatenate([part.ended for part in parts])
-    return Outcome(join(lambda part: part.terms), ended, join(lambda part: part.info))
-
-
-def _mode(mode: str | AutoresetMode) -> AutoresetMode:
-    value = mode.value if isinstance(mode, AutoresetMode) else mode
-    if value not in MODES:
-        raise ConfigError(f"autoreset_mode {value!r}: must be one of {', '.join(MODES)}.")
-    return MODES[value]
-
-
-def _chosen(options: dict[str, Any] | None, count: int) -> Flags:
-    """(N,) which worlds a reset is for."""
-    if not options or "reset_mask" not in options:
-        return np.ones(count, np.bool_)
-    mask: ArrayLike = options["reset_mask"]
-    chosen = np.asarray(mask)
-    if chosen.shape != (count,) or chosen.dtype != np.bool_ or not chosen.any():
-        raise ConfigError(
-            f"options['reset_mask'] of shape {chosen.shape}, {chosen.dtype}: must be ({count},) "
-            "bool with at least one True."
-        )
-    return chosen.copy()
