@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from nics_drl_bridge.calibration.calibration import Calibration
@@ -89,3 +91,13 @@ def field(size: float = 6.0, count: int = 0, **changes) -> World:
         "goal_distance": [1.0, 3.0],
     }
     return World.model_validate(data | changes)
+
+
+def open_field(folder: Path) -> str:
+    """The file of a world with room for a drive: 20 x 20 m, and robots begin in the middle."""
+    file = folder / "open_field.yaml"
+    file.write_text(
+        "name: open field\nsize: [20.0, 20.0]\ngoal_distance: [1.0, 3.0]\n"
+        "starts: {at: [[0.0, 0.0, 0.0]]}\n"
+    )
+    return str(file)

@@ -208,7 +208,7 @@ def test_the_e_stop_by_topic_stops_and_a_reset_alone_does_not_move(robot):
     robot.topics["e_stop"].publish(Bool(data=True))
     robot.stops()
     assert not robot.call("arm").success
-    assert robot.call("reset").success
+    robot.peer.until(lambda: robot.call("reset").success, "the e-stop is heard to be released")
     known = len(robot.passed)
     robot.peer.until(lambda: len(robot.passed) > known + 20, "20 more commands")
     assert set(map(str, robot.passed[known:])) == {str(Twist())}

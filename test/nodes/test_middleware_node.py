@@ -12,6 +12,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import Odometry
+from robots import open_field
 from sensor_msgs.msg import Imu, LaserScan
 from std_srvs.srv import Trigger
 
@@ -25,9 +26,10 @@ VARIANCE = (1e-4,) * 4
 
 
 @pytest.fixture(scope="module")
-def driven(launch, meet, module_domain_id):
+def driven(launch, meet, module_domain_id, tmp_path_factory):
     """A middleware beside a simulator that the test drives, and all that is said."""
-    simulator = launch("simulator_node", module_domain_id, mode="lockstep", world="empty")
+    world = open_field(tmp_path_factory.mktemp("world"))
+    simulator = launch("simulator_node", module_domain_id, mode="lockstep", world=world)
     middleware = launch("middleware_node", module_domain_id, map_frame="site", base_frame="car")
     peer = meet(module_domain_id)
     said = {

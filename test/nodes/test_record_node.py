@@ -14,6 +14,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from robots import open_field
 
 from nics_drl_bridge.calibration.identify import identify
 from nics_drl_bridge.generator import builtin_model, save_model
@@ -246,7 +247,11 @@ def test_a_recorded_drive_of_a_simulator_generates_it_again(
 ):
     save_model(builtin_model(name), tmp_path / "model")
     namespace = "bot" if "bot" in options else ""
-    parameters = {"model": str(tmp_path / "model"), "world": "empty", "rate": rate}
+    parameters = {
+        "model": str(tmp_path / "model"),
+        "world": open_field(tmp_path),
+        "rate": rate,
+    }
     launch("simulator_node", domain_id, namespace, **parameters)
     peer = meet(domain_id, namespace)
     odom, heard = peer.listen(Odometry, "odom"), peer.listen(Twist, "cmd_vel", qos.COMMAND)
