@@ -225,8 +225,8 @@ def _with_room(world: World, most: int) -> World:
     at_random = [group for group in world.obstacles if not group.at]
     if most and not at_random:
         raise ConfigError(
-            f"{world.source}: key 'obstacles': {most} are asked for at random, but no group has a "
-            "`count`; add one."
+            f"{world.source}: key 'obstacles': the randomisation draws up to {most}, but no group "
+            "has a `count`; add one, or leave `obstacles.count` out of the randomisation."
         )
     total = sum(group.counts[1] for group in at_random)
     if total >= most:
