@@ -245,3 +245,18 @@ class Middleware:
         if self._clock_jumps:
             noticed["clock: jump"] = self._clock_jumps
         return Health(topics, cache.rejected | rejected, noticed, self._timeline.replayed)
+
+
+def rehearse(model: SimulatorModel) -> RobotView:
+    """Runs a middleware through two periods of a robot that stands still; its last view.
+
+    Nothing then remains to be compiled while the robot moves: that can take seconds.
+    """
+    middleware, period_ns = Middleware(model), round(model.control_period * 1e9)
+    middleware.reset(0, np.zeros(3))
+    still, free = np.zeros(3), np.full(model.lidar.beams, np.inf, np.float32)
+    for stamp_ns in (period_ns, 2 * period_ns):
+        middleware.command(stamp_ns - period_ns, model.robot.from_cmd_vel(still))
+        middleware.odometry(stamp_ns, stamp_ns, still, still)
+        middleware.scan(stamp_ns, stamp_ns, free)
+    return middleware.view(2 * period_ns)

@@ -13,6 +13,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.middleware.health import Health
+from nics_drl_bridge.middleware.view import rehearse
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.nodes.runner import declare, declare_model, run_node
@@ -35,6 +36,7 @@ class MiddlewareNode(Node):
     def __init__(self, context: Context) -> None:
         super().__init__("middleware_node", context=context)
         model = declare_model(self)
+        rehearse(model)
         declare(self, "map_frame", "map", "Frame id of the estimate.")
         declare(self, "base_frame", "base_link", "Frame id of the robot.")
         self._filtered = self.create_publisher(Odometry, "odometry/filtered", qos.SENSOR_RELIABLE)

@@ -10,6 +10,8 @@ from rclpy.node import Node
 
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.middleware.view import rehearse
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.nodes.runner import declare, declare_model, last_word, run_node
@@ -47,6 +49,9 @@ class PolicyNode(Node):
         self._goal: NDArray[np.float64] = np.array(goal, dtype=np.float64)
         self._raw = self.create_publisher(TwistStamped, "cmd_vel_raw", qos.COMMAND)
         self.create_subscription(PoseStamped, "goal_pose", self._on_goal, qos.COMMAND)
+        view = rehearse(model)
+        self._task.judge(view, {"goal": np.zeros(2)})
+        self._command(view, np.zeros(2))
         self._topics = RobotTopics(self, model, on_odometry=self._act, on_scan=self._act)
         self._acted_ns = 0
 
@@ -79,7 +84,11 @@ class PolicyNode(Node):
             why = "touching something, stopped" if verdict.touched else "goal reached"
             self.get_logger().info(why, throttle_duration_sec=5.0)
             return np.zeros(3)
-        action = self._policy.act(self._task.observation(view, memory))
+        return self._command(view, self._goal)
+
+    def _command(self, view: RobotView, goal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the policy wants (3,)."""
+        action = self._policy.act(self._task.observation(view, {"goal": goal}))
         return self._task.robot.to_cmd_vel(self._task.command(action))
 
     def _message(self, twist: NDArray[np.float64], stamp_ns: int) -> TwistStamped:

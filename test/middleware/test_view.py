@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from robots import direct_model
 
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.middleware.view import Middleware, rehearse
 
 SECOND = 1_000_000_000
 PERIOD = SECOND // 10
@@ -183,3 +184,12 @@ def test_health_tells_rates_ages_refusals_and_innovations(middleware):
 def test_without_data_nothing_is_healthy_or_ill(middleware):
     health = middleware.health(SECOND)
     assert (health.topics, health.rejected, health.noticed, health.replayed) == ({}, {}, {}, 0)
+
+
+def test_a_rehearsal_ends_with_a_robot_that_stands_still_in_the_open():
+    model = builtin_model("ackermann")
+    view = rehearse(model)
+    assert np.allclose(view.pose, 0.0, atol=1e-9)
+    assert np.allclose(view.twist, 0.0, atol=1e-9)
+    assert np.isposinf(view.ranges).all()
+    assert view.scan_age_s == view.odom_age_s == 0.0

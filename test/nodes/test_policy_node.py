@@ -107,7 +107,7 @@ def test_with_a_pose_sensor_it_waits_until_it_knows_where_in_the_map_it_is(launc
     raw = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
     scans = peer.listen(LaserScan, "scan")
     poses = peer.speak(PoseStamped, "pose")
-    peer.until(lambda: len(raw) >= 5, "commands")
+    peer.until(lambda: len(raw) >= 5 and scans, "commands and scans")
     assert all(each.twist == Twist() for each in raw)
     pose = PoseStamped(header=scans[-1].header)
     pose.pose.position.x, pose.pose.orientation.w = -3.0, 1.0
