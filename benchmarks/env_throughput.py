@@ -195,7 +195,7 @@ def main() -> None:
     """Prints a table, or one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--worlds", type=int, default=1024, help="of the vector env")
+    parser.add_argument("--worlds", type=int, default=2048, help="of the vector env")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--repeats", type=int, default=10, help="timed chunks of steps")
     parser.add_argument("--without-peers", action="store_true", help="install nothing")
