@@ -27,16 +27,19 @@ def _share(seed, robot, group, place):  # type: ignore[no-untyped-def]
     return random.uniform(seed, random.RANDOMISATION_STREAM, counter)
 
 
+@njit(cache=True)
+def _between(low, high, seed, robot, group, place):  # type: ignore[no-untyped-def]
+    """A number between `low` and `high`; the very number where they are the same."""
+    return low if high == low else low + _share(seed, robot, group, place) * (high - low)
+
+
 @njit(cache=True, nogil=True)
 def draw_between(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
     """Fills out (n, M, Q) evenly between low (Q,) and high (Q,)."""
     for n in range(out.shape[0]):
         for m in range(out.shape[1]):
             for q in range(out.shape[2]):
-                value = low[q]
-                if high[q] != value:
-                    value += _share(seeds[n], m, group, q) * (high[q] - value)
-                out[n, m, q] = value
+                out[n, m, q] = _between(low[q], high[q], seeds[n], m, group, q)
 
 
 @njit(cache=True, nogil=True)
@@ -45,9 +48,7 @@ def draw_whole(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
     for n in range(out.shape[0]):
         for m in range(out.shape[1]):
             for q in range(out.shape[2]):
-                value = low[q]
-                if high[q] != value:
-                    value += _share(seeds[n], m, group, q) * (high[q] - value)
+                value = _between(low[q], high[q], seeds[n], m, group, q)
                 out[n, m, q] = np.int64(math.floor(value))
 
 

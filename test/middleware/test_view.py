@@ -4,33 +4,9 @@ import numpy as np
 import pytest
 from robots import direct_model
 
+from middleware.rig import PERIOD, RANGES, SECOND, STILL, assert_same, refused, state
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.middleware.view import Middleware, rehearse
-
-SECOND = 1_000_000_000
-PERIOD = SECOND // 10
-STILL = (np.zeros(3), np.zeros(3))
-RANGES = np.arange(72, dtype=np.float32)
-
-
-@pytest.fixture
-def middleware():
-    started = Middleware(direct_model())
-    started.reset(SECOND, [1.0, 2.0, 0.5])
-    return started
-
-
-def refused(middleware):
-    return sum(middleware.cache.rejected.values())
-
-
-def state(middleware, now=20 * SECOND):
-    view = middleware.view(now)
-    return [view.pose, view.twist, view.ranges, middleware.estimator.covariance]
-
-
-def assert_same(one, other):
-    assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True))
 
 
 def test_before_any_datum_the_view_says_that_nothing_is_known(middleware):
