@@ -37,7 +37,14 @@ EXTRAS = {
     "mujoco": ["mujoco>=3.3"],
     "multi": ["pettingzoo>=1.25,<1.28"],
     # Of torch's releases for Linux only some are small, as this one is: no CUDA packages.
-    "train": ["stable-baselines3>=2.7,<2.10", "torch>=2.3,<2.14"],
+    "train": [
+        "onnx>=1.16",
+        "onnxscript>=0.1",
+        "stable-baselines3>=2.7,<2.10",
+        "tensorboard>=2.16",
+        "torch>=2.3,<2.14",
+    ],
+    "deploy": ["onnxruntime>=1.18"],
     "test": [
         "build",
         "colcon-bash",

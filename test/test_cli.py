@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import typer
 
-from nics_drl_bridge import __version__, cli
+from nics_drl_bridge import __version__
+from nics_drl_bridge.commands import console
 from nics_drl_bridge.generator import load_model
 from nics_drl_bridge.kinematics import textbook
 from nics_drl_bridge.kinematics.recording import save_recording
@@ -195,8 +196,8 @@ def test_bake_without_shapes_or_with_nonsense_is_refused(tmp_path):
 
 
 def test_ctrl_c_in_a_compiled_function_is_an_interruption_and_another_fault_is_not():
-    with pytest.raises(typer.Exit) as caught, cli._one_sentence():
+    with pytest.raises(typer.Exit) as caught, console.one_sentence():
         raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
     assert caught.value.exit_code == 130
-    with pytest.raises(SystemError, match="of another kind"), cli._one_sentence():
+    with pytest.raises(SystemError, match="of another kind"), console.one_sentence():
         raise SystemError("of another kind")

@@ -26,6 +26,7 @@ LAYERS = (
     ("report",),
     ("nodes",),
     ("demo", "bake_order"),
+    ("commands",),
     ("cli",),
 )
 
@@ -39,7 +40,7 @@ HOMES = {
     "filterpy": ("middleware/ekf.py",),
     "matplotlib": ("report/*", "env/rendering.py"),
     "yaml": ("config.py",),
-    "typer": ("cli.py",),
+    "typer": ("cli.py", "commands/*"),
     "gymnasium": ("env/*", "policy/*", "demo.py"),
     "numba": ("*kernels.py", "lidar/scanner.py"),
     "PIL": ("lidar/maps.py",),

@@ -1,0 +1,1 @@
+"""What `nics` can do, a module for each command."""

@@ -1,0 +1,73 @@
+"""What the commands share: options, one sentence for what is wrong, a bar of progress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nics_drl_bridge.errors import BridgeError
+
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+
+RobotOption = Annotated[str, typer.Option(help="A shipped robot (ackermann) or a YAML file.")]
+WorldOption = Annotated[
+    str, typer.Option("--world", "--scene", help="A shipped world (arena) or a YAML file.")
+]
+TopicsOption = Annotated[
+    Path | None, typer.Option(help="YAML file that says which topic of a bag plays which role.")
+]
+TopicOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ROLE=TOPIC",
+        help="The same for one role, as cmd_vel=/car/drive; may be given several times. Roles: "
+        "cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.",
+    ),
+]
+
+
+@contextmanager
+def one_sentence() -> Iterator[None]:
+    """What the user got wrong becomes one sentence and exit code 2, never a traceback."""
+    try:
+        yield
+    except BridgeError as error:
+        typer.echo(f"nics: {error}", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from None
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        typer.echo(f"nics: {place}{error.strerror or error}; choose another place.", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from None
+    except (KeyboardInterrupt, SystemError) as error:
+        # Ctrl-C in a compiled function comes out of it as a SystemError.
+        if not isinstance(error.__cause__ or error, KeyboardInterrupt):
+            raise
+        typer.echo("nics: interrupted; everything that was started has ended.", err=True)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
+    """Gives a function that moves a bar on a terminal: what is done, how much, of how much.
+
+    Where standard error is no terminal it shows nothing; a total of 0 is not known yet.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as progress:
+        task = progress.add_task("", total=None)
+        yield lambda what, done, total: progress.update(
+            task, description=what, completed=done, total=total or None
+        )
