@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
+import ctypes
+import errno
 import hashlib
-import io
 import os
 import shutil
-import struct
 import tempfile
-import tokenize
-import zipfile
-import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
-
-import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
 
-_LOCAL_HEADER = struct.Struct("<4s5H3L2H")
-"""Of a zip entry; the last two are the lengths of its name and of its further fields."""
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
 
 def _fsync(path: Path) -> None:
@@ -123,7 +115,10 @@ def whole_folder(path: Path, marker: str) -> Iterator[Path]:
 
 
 def _swap(new: Path, path: Path) -> None:
-    """Puts `new` at `path`; the old folder is moved away first and removed last."""
+    """Puts `new` at `path`, in one step; what was there before is then removed."""
+    if path.exists() and _exchange(new, path):
+        _fsync(path.parent)
+        return
     old = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.old."))
     try:
         if path.exists():
@@ -139,97 +134,24 @@ def _swap(new: Path, path: Path) -> None:
         shutil.rmtree(old, ignore_errors=True)
 
 
+def _exchange(one: Path, other: Path) -> bool:
+    """Lets two paths change places in one step, so that no moment is without either.
+
+    Returns:
+        False where the system or the file system can't (renameat2 is Linux's).
+    """
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if rename is None:
+        return False
+    ends = os.fsencode(one), os.fsencode(other)
+    if rename(_AT_FDCWD, ends[0], _AT_FDCWD, ends[1], _RENAME_EXCHANGE) == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOENT):
+        return False
+    raise OSError(code, os.strerror(code), str(other))
+
+
 def sha256(data: bytes) -> str:
     """The SHA-256 of some bytes, in hexadecimal."""
     return hashlib.sha256(data).hexdigest()
-
-
-DAMAGE = (
-    AttributeError,  # a plain `.npy` file
-    EOFError,
-    KeyError,
-    MemoryError,
-    NotImplementedError,
-    OSError,
-    OverflowError,
-    RuntimeError,
-    SyntaxError,
-    TypeError,
-    struct.error,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
-"""What reading a damaged `.npz` file may raise besides ValueError."""
-ALIGNMENT = 64
-_PADDING = 0xD935
-"""Id of a zip entry's field that only fills up, the one that Android's zipalign takes."""
-
-
-def npz_bytes(arrays: Mapping[str, NDArray[Any]], packed: bool = True) -> bytes:
-    """The content of an `.npz` file; equal arrays give equal bytes, unlike `numpy.savez`.
-
-    Args:
-        arrays: by name.
-        packed: compressed; otherwise aligned so that `npz_mapped` can map them.
-    """
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
-        for name, array in arrays.items():
-            member = zipfile.ZipInfo(f"{name}.npy")  # dated 1980, not today
-            member.compress_type = zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED
-            content = io.BytesIO()
-            np.lib.format.write_array(content, np.asanyarray(array), allow_pickle=False)
-            if not packed:
-                begin = buffer.tell() + _LOCAL_HEADER.size + len(member.filename) + 4
-                fill = -begin % ALIGNMENT
-                member.extra = struct.pack("<HH", _PADDING, fill) + bytes(fill)
-            archive.writestr(member, content.getvalue())
-    return buffer.getvalue()
-
-
-def npz_mapped(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an `.npz` file, mapped into memory: processes that map it share its pages.
-
-    They are copied when written to, the file stays. What is compressed is read instead.
-
-    Raises:
-        ValueError: the file is damaged.
-    """
-    arrays = {}
-    try:
-        with zipfile.ZipFile(path) as archive, path.open("rb") as file:
-            for member in archive.infolist():
-                name = member.filename.removesuffix(".npy")
-                if member.compress_type != zipfile.ZIP_STORED:
-                    content = io.BytesIO(archive.read(member))
-                    arrays[name] = np.lib.format.read_array(content, allow_pickle=False)
-                    continue
-                file.seek(member.header_offset)
-                fields = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
-                file.seek(fields[-2] + fields[-1], os.SEEK_CUR)
-                version = np.lib.format.read_magic(file)
-                shape, fortran, dtype = _array_header(file, version)
-                size = int(np.prod(shape)) * dtype.itemsize
-                if fortran or dtype.hasobject or file.tell() + size > path.stat().st_size:
-                    raise ValueError(f"the array {name!r} is of a wrong kind or cut off")
-                mapped = np.memmap(path, dtype, "c", file.tell(), shape) if size else None
-                arrays[name] = np.zeros(shape, dtype) if mapped is None else np.asarray(mapped)
-    except DAMAGE as error:
-        raise ValueError(str(error) or type(error).__name__) from None
-    return arrays
-
-
-def _array_header(file: BinaryIO, version: tuple[int, int]) -> tuple[Any, bool, np.dtype[Any]]:
-    if version == (1, 0):
-        return np.lib.format.read_array_header_1_0(file)
-    return np.lib.format.read_array_header_2_0(file)
-
-
-def npz_arrays(data: bytes) -> dict[str, NDArray[Any]]:
-    """The arrays of an `.npz` file's content. Raises ValueError when it is damaged."""
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except DAMAGE as error:
-        raise ValueError(str(error) or type(error).__name__) from None

@@ -39,7 +39,7 @@ __all__ = [
     "save_model",
 ]
 
-FORMAT = "nics_drl_bridge/simulator_model/2"
+FORMAT = "nics_drl_bridge/simulator_model/3"
 MODEL_FILE, TABLE_FILE, REPORT_FILE = "model.yaml", "lidar_table.npz", "report.txt"
 CONTROL_PERIOD_S = 0.1
 DEFAULT_LIDAR = "paper"
@@ -129,6 +129,8 @@ class _File(Schema):
     lidar: LidarSpec
     noise: Noise
     lidar_table_sha256: str
+    report_sha256: str
+    sha256: str | None = None
 
 
 def generate(
@@ -214,9 +216,15 @@ def save_model(model: SimulatorModel, folder: Path) -> None:
         ConfigError: the folder holds something else.
     """
     with whole_folder(folder, MODEL_FILE) as temporary:
-        write_text(temporary / MODEL_FILE, model.text)
+        text = f"{model.text}report_sha256: {sha256(model.report.encode())}\n"
+        write_text(temporary / MODEL_FILE, f"{text}{_seal(text)}")
         write_bytes(temporary / TABLE_FILE, model.table.dump())
         write_text(temporary / REPORT_FILE, model.report)
+
+
+def _seal(text: str) -> str:
+    """The last line of `model.yaml`, for the text before it."""
+    return f"sha256: {sha256(text.encode())}\n"
 
 
 def load_model(folder: Path) -> SimulatorModel:
@@ -228,16 +236,22 @@ def load_model(folder: Path) -> SimulatorModel:
     path = folder / MODEL_FILE
     if not path.is_file():
         raise ModelError(f"{folder}: holds no {MODEL_FILE}; make a model with `nics generate`.")
-    data = parse_yaml(read_text(path), str(path))
+    text = read_text(path)
+    data = parse_yaml(text, str(path))
     if data.get("format") != FORMAT:
         raise ModelError(
             f"{path}: key 'format' is {data.get('format')!r}, not {FORMAT!r}; generate the model "
             "anew."
         )
     file = validate(data, _File, str(path))
+    report = read_text(folder / REPORT_FILE)
+    if sha256(report.encode()) != file.report_sha256:
+        raise ModelError(
+            f"{folder / REPORT_FILE}: does not match its checksum; generate the model anew."
+        )
     table = LidarTable.load(folder / TABLE_FILE, file.lidar_table_sha256)
     try:
-        return SimulatorModel(
+        model = SimulatorModel(
             file.robot,
             TaylorModel.from_dict(file.kinematics),
             Calibration.from_dict(file.calibration),
@@ -245,7 +259,13 @@ def load_model(folder: Path) -> SimulatorModel:
             table,
             file.noise,
             file.control_period,
-            read_text(folder / REPORT_FILE),
+            report,
         )
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from None
+    if file.sha256 is not None and text != (rest := text[: -len(_seal(""))]) + _seal(rest):
+        raise ModelError(
+            f"{path}: does not match its checksum; generate the model anew. If you changed the "
+            "file yourself, remove its line sha256."
+        )
+    return model

@@ -17,11 +17,14 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.files import npz_arrays, npz_bytes, write_bytes
+from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.npz import is_sealed, npz_arrays, npz_bytes
 
 Array = NDArray[np.float64]
-FORMAT = "nics_drl_bridge/recording/1"
+FORMAT = "nics_drl_bridge/recording/2"
+UNSEALED_FORMAT = "nics_drl_bridge/recording/1"
+"""Of files without a checksum, which are still read."""
 LARGEST_TURN = 1.5
 """More than this between neighbouring samples [rad] is no robot."""
 TOO_FAST = 20.0
@@ -240,9 +243,12 @@ def load_npz(path: Path) -> Recording:
         RecordingError: no such file, not an `.npz`, damaged, or a stream is missing.
     """
     try:
-        arrays = npz_arrays(path.read_bytes())
+        data = path.read_bytes()
+        sealed, arrays = is_sealed(data), npz_arrays(data, seal_needed=False)
         meta = json.loads(str(arrays["meta"]))
-        if meta["format"] != FORMAT:
+        if meta["format"] == FORMAT and not sealed:
+            raise ValueError("there is no checksum at its end")
+        if meta["format"] not in (FORMAT, UNSEALED_FORMAT):
             raise RecordingError(
                 f"{path}: format {meta['format']!r} is not {FORMAT!r}; record it anew or use the "
                 "version of the package that wrote it."

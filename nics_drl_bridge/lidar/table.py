@@ -17,7 +17,7 @@ from pydantic import Field, field_validator
 
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ModelError
-from nics_drl_bridge.files import npz_bytes, npz_mapped, sha256
+from nics_drl_bridge.files import sha256
 from nics_drl_bridge.lidar.baked_kernels import (
     ABOUT,
     CELLS_PER_PART,
@@ -38,8 +38,9 @@ from nics_drl_bridge.lidar.sensor_models import (
 )
 from nics_drl_bridge.lidar.shapes import SHAPES, Circle, Outlines, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.npz import npz_bytes, npz_mapped
 
-FORMAT = "nics_drl_bridge/lidar_table/2"
+FORMAT = "nics_drl_bridge/lidar_table/3"
 POINT_ANGLE = 0.01
 """By default the points of a row are no farther apart, as far as `MOST_PHASES` go [rad]."""
 MOST_PHASES = 8

@@ -10,13 +10,13 @@ from typing import Any
 
 from nics_drl_bridge.config import read_text
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import write_text
+from nics_drl_bridge.files import sha256, write_text
 from nics_drl_bridge.safety.gate import decide
 from nics_drl_bridge.safety.inputs import Input
 from nics_drl_bridge.safety.plain import from_plain, to_plain
 from nics_drl_bridge.safety.state import Decision, GateConfig, GateState
 
-FORMAT = "nics_drl_bridge/black_box/1"
+FORMAT = "nics_drl_bridge/black_box/2"
 KEPT_S = 30.0
 
 
@@ -66,7 +66,13 @@ def write(config: GateConfig, entries: tuple[Entry, ...], path: Path) -> None:
     for entry in entries:
         parts = {"now": entry.now, "given": entry.given, "decision": entry.decision}
         lines.append({key: to_plain(part) for key, part in parts.items()})
-    write_text(path, "".join(json.dumps(line) + "\n" for line in lines))
+    text = "".join(json.dumps(line) + "\n" for line in lines)
+    write_text(path, text + _seal(text))
+
+
+def _seal(text: str) -> str:
+    """The last line of a file, for the text before it."""
+    return json.dumps({"sha256": sha256(text.encode())}) + "\n"
 
 
 @dataclass(frozen=True)
@@ -123,10 +129,13 @@ def replay(path: Path) -> Replay:
 
 
 def _lines(path: Path) -> list[dict[str, Any]]:
+    text = read_text(path)
     try:
-        lines = [json.loads(line) for line in read_text(path).splitlines()]
+        lines = [json.loads(line) for line in text.splitlines()]
     except json.JSONDecodeError:
         raise ConfigError(f"{path}: is no JSON, line by line; it can't be replayed.") from None
     if not lines or not isinstance(lines[0], dict) or lines[0].get("format") != FORMAT:
         raise ConfigError(f"{path}: is no black box of the gate ({FORMAT}).")
-    return lines
+    if text != (rest := text[: -len(_seal(""))]) + _seal(rest):
+        raise ConfigError(f"{path}: is damaged (its checksum does not fit); it can't be replayed.")
+    return lines[:-1]

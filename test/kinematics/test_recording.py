@@ -8,7 +8,6 @@ import pytest
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.files import npz_bytes
 from nics_drl_bridge.kinematics.recording import (
     FORMAT,
     Recording,
@@ -19,6 +18,7 @@ from nics_drl_bridge.kinematics.recording import (
     save_recording,
 )
 from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.npz import npz_bytes
 
 
 @pytest.fixture

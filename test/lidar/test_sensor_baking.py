@@ -5,13 +5,14 @@ import pytest
 from robots import lidar
 
 from nics_drl_bridge.errors import ModelError
-from nics_drl_bridge.files import npz_arrays, npz_bytes, write_bytes
+from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.lidar.baking import bake, with_shapes
 from nics_drl_bridge.lidar.budget import choose, expected_rmse, table_bytes
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.sensor_models import IncidenceDropout, Intensity
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle
 from nics_drl_bridge.lidar.table import Density, LidarTable
+from nics_drl_bridge.npz import npz_arrays, npz_bytes
 
 SPEC = lidar(beams=720, range_min=0.0)
 SMALL = Density(distances=12, rotations=16)

@@ -10,11 +10,12 @@ import pytest
 from robots import lidar
 
 from nics_drl_bridge.errors import ModelError
-from nics_drl_bridge.files import npz_arrays, npz_bytes, sha256, write_bytes
+from nics_drl_bridge.files import sha256, write_bytes
 from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, Circle, Polygon
 from nics_drl_bridge.lidar.table import Density, LidarTable
+from nics_drl_bridge.npz import npz_arrays, npz_bytes
 
 SPEC = lidar(beams=90)
 ARRAYS = ("grid", "start", "cell", "rows")
@@ -169,7 +170,7 @@ def changed(table, **changes):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda t: {"format": "nics_drl_bridge/lidar_table/1"}, "its format is"),
+        (lambda t: {"format": "nics_drl_bridge/lidar_table/2"}, "its format is"),
         (lambda t: {"rows": t.rows[:-1]}, "a row lies outside"),
         (lambda t: {"rows": t.rows.astype(np.float64)}, "an array has another"),
         (lambda t: {"rows": t.rows + np.float32(1.0)}, "its numbers were damaged"),

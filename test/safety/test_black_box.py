@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import hashlib
 import json
 
 import numpy as np
@@ -71,10 +72,24 @@ def test_another_decision_than_the_recorded_one_is_found(tmp_path):
     path = tmp_path / "stop.jsonl"
     stopped(path)
     lines = path.read_text(encoding="utf-8").splitlines()
-    last = json.loads(lines[-1])
+    last = json.loads(lines[-2])
     last["decision"]["granted"] = True
-    path.write_text("\n".join([*lines[:-1], json.dumps(last)]), encoding="utf-8")
-    assert replay(path).differing == (len(lines) - 2,)
+    text = "\n".join([*lines[:-2], json.dumps(last), ""])
+    seal = {"sha256": hashlib.sha256(text.encode()).hexdigest()}
+    path.write_text(f"{text}{json.dumps(seal)}\n", encoding="utf-8")
+    assert replay(path).differing == (len(lines) - 3,)
+
+
+def test_every_flipped_bit_is_refused(tmp_path):
+    path = tmp_path / "stop.jsonl"
+    stopped(path)
+    data, rng = path.read_bytes(), np.random.default_rng(0)
+    for _ in range(100):
+        damaged = bytearray(data)
+        damaged[rng.integers(len(data))] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged)
+        with pytest.raises(ConfigError, match=r"stop\.jsonl"):
+            replay(path)
 
 
 def test_records_of_the_gate_become_plain_data_and_back(tmp_path):
@@ -90,8 +105,8 @@ def test_records_of_the_gate_become_plain_data_and_back(tmp_path):
         ("", "is no black box"),
         ("{}", "is no black box"),
         ("{", "is no JSON"),
-        ('{"format": "nics_drl_bridge/black_box/1"}', "is damaged"),
-        ('{"format": "nics_drl_bridge/black_box/1", "config": {"kind": "Spy"}}', "is damaged"),
+        ('{"format": "nics_drl_bridge/black_box/2"}', "is damaged"),
+        ('{"format": "nics_drl_bridge/black_box/2", "config": {"kind": "Spy"}}', "is damaged"),
     ],
 )
 def test_a_file_that_is_no_black_box_is_one_sentence(tmp_path, text, sentence):

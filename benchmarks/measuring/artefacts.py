@@ -1,0 +1,180 @@
+"""What the package writes, killed while it is written and damaged before it is read."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from measuring.gates import Gate, gate_config
+from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.generator import builtin_model, load_model, save_model
+from nics_drl_bridge.kinematics import textbook
+from nics_drl_bridge.kinematics.recording import load_npz, save_recording
+from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.lidar.spec import load_lidar
+from nics_drl_bridge.lidar.table import LidarTable
+from nics_drl_bridge.safety import black_box
+from nics_drl_bridge.safety.inputs import Tick
+
+LONGEST_S = 0.05
+"""A writer is killed within this time after it began."""
+
+
+@dataclass(frozen=True)
+class Artefact:
+    """Something that is written and read back.
+
+    Attributes:
+        name: of the file or folder.
+        write: writes version 0 or 1 to a path.
+        version: reads it and tells which version it is; raises BridgeError when it is damaged.
+    """
+
+    name: str
+    write: Callable[[Path, int], None]
+    version: Callable[[Path], int]
+
+
+def artefacts() -> list[Artefact]:
+    """All that the package writes and reads back."""
+    return [_recording(), _model(), _table(), _black_box()]
+
+
+def _recording() -> Artefact:
+    robot = load_robot("differential")
+    drives = [textbook.record(robot, np.random.default_rng(seed)) for seed in (0, 1)]
+
+    def version(path: Path) -> int:
+        return _which(load_npz(path).pose.values, [drive.pose.values for drive in drives])
+
+    def write(path: Path, n: int) -> None:
+        save_recording(drives[n], path)
+
+    return Artefact("drive.npz", write, version)
+
+
+def _model() -> Artefact:
+    models = [builtin_model("differential")]
+    models.append(replace(models[0], report="another report\n"))
+
+    def version(path: Path) -> int:
+        return [model.report for model in models].index(load_model(path).report)
+
+    return Artefact("model", lambda path, n: save_model(models[n], path), version)
+
+
+def _table() -> Artefact:
+    tables = [builtin_model(name).table for name in ("differential", "ackermann")]
+    contents = [table.dump() for table in tables]
+
+    def version(path: Path) -> int:
+        return _which(LidarTable.load(path).rows, [table.rows for table in tables])
+
+    return Artefact("table.npz", lambda path, n: write_bytes(path, contents[n]), version)
+
+
+def _black_box() -> Artefact:
+    lidar = load_lidar("paper")
+    config = gate_config(load_robot("differential"), lidar)
+    boxes = [_entries(config, lidar, ticks) for ticks in (5, 9)]
+
+    def version(path: Path) -> int:
+        return [len(box) for box in boxes].index(len(black_box.replay(path).entries))
+
+    def write(path: Path, n: int) -> None:
+        black_box.write(config, boxes[n], path)
+
+    return Artefact("stop.jsonl", write, version)
+
+
+def _entries(config: Any, lidar: Any, ticks: int) -> tuple[black_box.Entry, ...]:
+    box, gate = black_box.BlackBox(config), Gate(config, lidar)
+    for _ in range(ticks):
+        before, gate.now = gate.state, gate.now + 0.02
+        box.note(black_box.Entry(gate.now, Tick(), before, gate.tick()))
+    return box.copy()
+
+
+def _which(found: NDArray[Any], versions: list[NDArray[Any]]) -> int:
+    """Which of the versions an array is, to the bit."""
+    return [np.array_equal(found, version) for version in versions].index(True)
+
+
+def torn(artefact: Artefact, kills: int, rng: np.random.Generator, folder: Path) -> int:
+    """How often something was left that is neither the old nor the new version, whole.
+
+    Each time a process that writes both in turn is killed with SIGKILL at a random moment.
+    """
+    path, bad = folder / artefact.name, 0
+    artefact.write(path, 0)
+    for _ in range(kills):
+        child = os.fork()
+        if child == 0:
+            _write_for_ever(artefact, path)
+        time.sleep(rng.uniform(0.0, LONGEST_S))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        try:
+            artefact.version(path)
+        except (BridgeError, ValueError):
+            bad += 1
+            artefact.write(path, 0)
+        for rest in folder.glob(f".{artefact.name}.*"):
+            shutil.rmtree(rest) if rest.is_dir() else rest.unlink()
+    return bad
+
+
+def _write_for_ever(artefact: Artefact, path: Path) -> None:
+    """In a process of its own; ends with it."""
+    try:
+        while True:
+            artefact.write(path, 1)
+            artefact.write(path, 0)
+    finally:
+        os._exit(1)
+
+
+def accepted(artefact: Artefact, flips: int, rng: np.random.Generator, folder: Path) -> int:
+    """How often a file with one flipped bit was read as if nothing were wrong."""
+    path, good = folder / artefact.name, 0
+    artefact.write(path, 0)
+    files = sorted(file for file in path.rglob("*") if file.is_file()) or [path]
+    for _ in range(flips):
+        file = files[int(rng.integers(len(files)))]
+        whole = file.read_bytes()
+        damaged = bytearray(whole)
+        damaged[int(rng.integers(len(whole)))] ^= 1 << int(rng.integers(8))
+        file.write_bytes(damaged)
+        try:
+            artefact.version(path)
+            good += 1
+        except BridgeError:
+            pass
+        finally:
+            file.write_bytes(whole)
+    return good
+
+
+def measure(kills: int, flips: int, seed: int) -> dict[str, Any]:
+    """Both figures over all artefacts, and by artefact."""
+    rng, by_artefact = np.random.default_rng(seed), {}
+    for artefact in artefacts():
+        with tempfile.TemporaryDirectory() as folder:
+            by_artefact[artefact.name] = {
+                "torn": torn(artefact, kills, rng, Path(folder)),
+                "accepted_corrupt": accepted(artefact, flips, rng, Path(folder)),
+            }
+    keys = ("torn", "accepted_corrupt")
+    total = {key: sum(one[key] for one in by_artefact.values()) for key in keys}
+    return {**total, "artefacts": by_artefact}
