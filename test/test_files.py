@@ -239,3 +239,23 @@ def test_a_link_stays_a_link_and_its_folder_is_replaced(old):
 def test_the_checksum_is_sha_256():
     empty = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
     assert sha256(b"") == empty
+
+
+FULL = """
+import resource, sys
+from pathlib import Path
+from nics_drl_bridge.files import write_bytes
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+try:
+    write_bytes(Path(sys.argv[1]), bytes(100_000))
+except OSError as error:
+    print(error.strerror)
+"""
+
+
+def test_a_disk_that_takes_no_more_leaves_the_old_file_and_no_other(tmp_path):
+    path = tmp_path / "file"
+    write_bytes(path, b"old")
+    run = subprocess.run([sys.executable, "-c", FULL, str(path)], capture_output=True, text=True)
+    assert run.stdout == "File too large\n", run.stderr
+    assert tree(tmp_path) == {"file": b"old"}
