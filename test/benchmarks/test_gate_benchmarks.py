@@ -37,7 +37,7 @@ def test_no_adversary_makes_a_shielded_robot_touch_anything():
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("fault", ["scan silent", "e-stop pressed"])
+@pytest.mark.parametrize("fault", ["scan_silent", "e_stop", "policy_hung"])
 def test_a_fault_around_a_real_gate_leads_to_zero(fault):
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
     done = subprocess.run(
@@ -45,8 +45,9 @@ def test_a_fault_around_a_real_gate_leads_to_zero(fault):
          "--fault", fault],
         capture_output=True, text=True, check=False, timeout=250,
     )  # fmt: skip
-    result = json.loads(done.stdout)["faults"][fault]
-    assert 0.0 < result["worst_s"] < 5.0  # a busy machine may be late; the benchmark says how late
+    result = json.loads(done.stdout)[fault]
+    assert result["n"] == 1
+    assert 0.0 < result["max_s"] < 5.0  # a busy machine may be late; the benchmark says how late
 
 
 def test_a_rule_that_is_taken_out_is_missed_by_a_test(monkeypatch):

@@ -1,0 +1,161 @@
+"""A robot's topics around a gate, whole or broken, published over DDS at 10 Hz."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
+
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.runner import open_context
+
+ROBOT, PERIOD_S, SPEED = "ackermann", 0.1, 0.5
+PATIENCE_S = 60.0
+NANO = conversions.NANO
+ALL = frozenset({"scan", "odom", "odometry/filtered", "cmd_vel_raw", "e_stop"})
+
+
+class Robot:
+    """A robot's topics, whole or broken. It does what `cmd_vel` says, unless it is stuck.
+
+    Attributes:
+        silent: topics that say nothing.
+        change: alters messages by topic before they are sent.
+        stuck: odometry shows no motion.
+        heard: times [s] and twists (3,) of `cmd_vel`.
+        last: the message that each topic sent last; of `cmd_vel_raw`, also what the policy sent.
+        republished: whether the last command of the policy is sent again and again, as it was.
+        sent_s: when each topic sent a good one last [s].
+    """
+
+    def __init__(self, domain_id: int, policy: bool) -> None:
+        self._lidar = builtin_model(ROBOT).lidar
+        self._context = open_context(domain_id=domain_id)
+        self.node = Node("robot", context=self._context, start_parameter_services=False)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        kinds = {
+            "odom": Odometry, "scan": LaserScan, "e_stop": Bool, "cmd_vel_raw": TwistStamped,
+            "odometry/filtered": Odometry,
+        }  # fmt: skip
+        self._topics = {
+            name: self.node.create_publisher(kind, name, qos.COMMAND)
+            for name, kind in kinds.items()
+        }
+        self.heard: list[tuple[float, np.ndarray]] = []
+        self._policy = policy
+        self.node.create_subscription(Twist, "cmd_vel", self._hear, qos.COMMAND)
+        self.node.create_subscription(TwistStamped, "cmd_vel_raw", self._hear_policy, qos.COMMAND)
+        self._clients = {
+            service: self.node.create_client(Trigger, f"command_gate/{service}")
+            for service in ("arm", "reset", "e_stop")
+        }
+        self.node.create_timer(PERIOD_S, self._send)
+        self._now_ns, self._x, self.sent_s = time.time_ns(), 0.0, dict.fromkeys(ALL, 0.0)
+        self.last: dict[str, Any] = {}
+        self.mend()
+
+    def mend(self) -> None:
+        """Everything is well again."""
+        self.silent: set[str] = set()
+        self.change: dict[str, Callable[[Any], Any]] = {}
+        self.stuck, self.republished, self.jump_ns = False, False, 0
+
+    def _hear(self, message: Twist) -> None:
+        self.heard.append((time.monotonic(), conversions.twist_from_ros(message)))
+
+    def _hear_policy(self, message: TwistStamped) -> None:
+        if self._policy and not self.republished:
+            self.last["cmd_vel_raw"] = message
+
+    def _send(self) -> None:
+        speed = self.heard[-1][1][0] if self.heard and not self.stuck else 0.0
+        self._now_ns += round(PERIOD_S * NANO)
+        self._x += speed * PERIOD_S
+        stamp = self._now_ns + self.jump_ns
+        odometry = conversions.odometry_to_ros(
+            [self._x, 0.0, 0.0], [speed, 0.0, 0.0], stamp, ("odom", "base_link"), (1e-4,) * 4
+        )
+        ranges = np.full(self._lidar.beams, 2.0 + 0.1 * np.sin(self._now_ns * 1e-9), np.float32)
+        self._say("odom", odometry)
+        self._say("odometry/filtered", odometry)
+        self._say("scan", conversions.scan_to_ros(self._lidar, ranges, stamp, "laser"))
+        self._say("e_stop", Bool(data=False))
+        if self._policy:
+            if self.republished:
+                self._topics["cmd_vel_raw"].publish(self.last["cmd_vel_raw"])
+            return
+        command = TwistStamped(twist=conversions.twist_to_ros([SPEED, 0.0, 0.1]))
+        if "scan" in self.last:  # what a policy acts on is the scan that it got
+            command.header.stamp = self.last["scan"].header.stamp
+        self._say("cmd_vel_raw", command)
+
+    def _say(self, name: str, message: Any) -> None:
+        if name in self.silent or name not in self._topics:
+            return
+        if name in self.change:
+            message = self.change[name](message)
+        elif not self.jump_ns:
+            self.sent_s[name] = time.monotonic()
+        self._topics[name].publish(message)
+        self.last[name] = message
+
+    def press(self) -> None:
+        """Presses the emergency stop, by its topic."""
+        self._topics["e_stop"].publish(Bool(data=True))
+
+    def until(self, condition: Callable[[], object], seconds: float, what: str = "") -> None:
+        """Lives on until something is the case; raises after the time, if it is to be named."""
+        end = time.monotonic() + seconds
+        while not condition():
+            if time.monotonic() > end:
+                if what:
+                    raise RuntimeError(f"not within {seconds} s: {what}")
+                return
+            self._executor.spin_once(timeout_sec=0.01)
+
+    def call(self, service: str) -> Trigger.Response:
+        """Asks the gate for something."""
+        client = self._clients[service]
+        self.until(client.service_is_ready, PATIENCE_S, service)
+        future = client.call_async(Trigger.Request())
+        self.until(future.done, PATIENCE_S, service)
+        return future.result()
+
+    @property
+    def moves(self) -> bool:
+        """Whether the newest command moves it."""
+        return bool(self.heard) and bool(self.heard[-1][1].any())
+
+    def drive(self) -> None:
+        """Arms the gate and drives, so that a fault finds the robot in motion."""
+        self.mend()
+        self.until(lambda: False, 3 * PERIOD_S)  # of good data
+        self.call("reset")
+        answers = [""]
+
+        def armed() -> bool:
+            self.until(lambda: False, PERIOD_S)
+            response = self.call("arm")
+            answers.append(response.message)
+            return bool(response.success)
+
+        self.until(armed, PATIENCE_S, f"arming ({answers[-1]})")
+        self.until(lambda: self.moves, PATIENCE_S, "motion")
+        self.until(lambda: False, 0.5)
+
+    def close(self) -> None:
+        """Leaves the graph."""
+        self._executor.shutdown(timeout_sec=1.0)
+        self.node.destroy_node()
+        self._context.try_shutdown()
