@@ -70,6 +70,7 @@ class NodeProcess:
         domain_id: DDS domain.
         namespace: of the node.
         remap: names, from -> to.
+        discovery: how far it looks for others: LOCALHOST or SUBNET.
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class NodeProcess:
         domain_id: int,
         namespace: str = "",
         remap: Mapping[str, str] | None = None,
+        discovery: str = "LOCALHOST",
     ) -> None:
         self.node = node
         folder.mkdir(parents=True, exist_ok=True)
@@ -94,7 +96,7 @@ class NodeProcess:
             command += ["-r", f"{old}:={new}"]
         environment = os.environ | {
             "ROS_DOMAIN_ID": str(domain_id),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": discovery,
         }
         with self.log.open("wb") as log:
             # A session of its own: Ctrl-C in the terminal reaches the parent alone, which then
