@@ -3,7 +3,12 @@
 The navigation task of the differential robot: 10 kinematic substeps per step, a lidar of 720
 beams among ten circles, observation, reward, autoreset, random actions. Beside the vector env on
 one thread and on all, and the single env of `gymnasium.make` without and with the estimator, two
-other simulators step the same scene in the same run: their robot moves and their lidar scans.
+other simulators do the same task in the same scenes in the same run, autoreset included.
+
+What they offer to users moves and scans in one step, so that ten kinematic substeps are ten of
+their steps: `peers`. `peers_with_one_scan` moves nine times past that, by their inner functions,
+and scans at the end only, as ours does. (irsim-x can also step many robots at once, but all in
+one scene, without a new one as each episode ends.)
 """
 
 from __future__ import annotations
@@ -24,7 +29,8 @@ import numpy as np
 from lidar_peers import PEERS
 from measuring.environments import NotInstalledError, python_with, run
 
-from nics_drl_bridge.env.registration import NAVIGATION, register_envs
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.registration import MAX_EPISODE_STEPS, NAVIGATION, register_envs
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.sim.scenes import sample_scene
@@ -44,8 +50,10 @@ WORLD = World.model_validate(
         "goal_distance": [2.0, 4.0],
     }
 )
+GOAL_RADIUS = Navigation(MODEL.robot, MODEL.lidar).goal_radius
 VECTOR_BAR, SINGLE_BAR, ESTIMATOR_BAR = 3e5, 2e4, 4e3
-SUBSTEPS = (1, MODEL.timing[1])
+SCENES = 50
+"""That the peers go through, one for each episode."""
 ACTIONS, CHUNK, SINGLE_CHUNK = 64, 50, 500
 
 
@@ -108,19 +116,14 @@ def memory_per_env(worlds: int) -> float:
 
 
 def theirs(name: str, scenes: int, repeats: int) -> dict[str, float]:
-    """Steps per second of a peer, by the number of its own steps in one. Raises NotInstalledError.
-
-    One step of the whole control period is the least it can do; ten are as fine as ours, but then
-    it scans ten times, too.
-    """
+    """Steps per second of a peer, by how it scans. Raises NotInstalledError."""
     footprint = MODEL.robot.footprint_radius
     drawn = [sample_scene(WORLD, footprint, seed) for seed in range(scenes)]
-    # Seen from the start, since their robot begins at the origin.
-    side = np.array([-1.0, -1.0, 1.0, 1.0]) * np.tile(np.array(WORLD.size) / 2.0, 2)
     fields = [
         {
-            "circles": (one.bodies[:, :2] - one.starts[0, :2]).tolist(),
-            "walls": (side - np.tile(one.starts[0, :2], 2)).tolist(),
+            "circles": one.bodies[:, :2].tolist(),
+            "start": one.starts[0].tolist(),
+            "goal": one.goals[0].tolist(),
         }
         for one in drawn
     ]
@@ -130,15 +133,17 @@ def theirs(name: str, scenes: int, repeats: int) -> dict[str, float]:
         "range_min": MODEL.lidar.range_min,
         "range_max": MODEL.lidar.range_max,
         "radius": RADIUS,
+        "half": (np.array(WORLD.size) / 2.0).tolist(),
         "footprint": footprint,
         "period": MODEL.control_period,
+        "substeps": MODEL.timing[1],
+        "goal_radius": GOAL_RADIUS,
+        "limit": MAX_EPISODE_STEPS,
     }
     python = python_with(name, PEERS[name])
     with tempfile.TemporaryDirectory() as folder:
         asked = Path(folder) / "task.json"
-        asked.write_text(
-            json.dumps({"about": about, "scenes": fields, "repeats": repeats, "substeps": SUBSTEPS})
-        )
+        asked.write_text(json.dumps({"about": about, "scenes": fields, "repeats": repeats}))
         printed = run(python, SCRIPT, str(asked))
     return dict(json.loads(printed.strip().splitlines()[-1]))
 
@@ -156,15 +161,14 @@ def run_all(worlds: int, threads: int, repeats: int, peers: tuple[str, ...]) -> 
         "single_env_gym_steps_per_s": alone["plain"],
         "single_env_with_estimator_steps_per_s": alone["estimator"],
         "peers": dict.fromkeys(PEERS),
-        "peers_with_our_substeps": dict.fromkeys(PEERS),
+        "peers_with_one_scan": dict.fromkeys(PEERS),
         "memory_bytes_per_env": memory_per_env(worlds),
     }
     for name in peers:
         try:
-            rates_of = theirs(name, 3, 10 * repeats)
-            once, often = (rates_of[str(n)] for n in SUBSTEPS)
-            result["peers"][name] = once
-            result["peers_with_our_substeps"][name] = often
+            rates_of = theirs(name, SCENES, repeats)
+            result["peers"][name] = rates_of["whole_steps"]
+            result["peers_with_one_scan"][name] = rates_of["one_scan"]
         except NotInstalledError as error:
             sys.stderr.write(f"{error}\n")
     return result
@@ -183,7 +187,7 @@ def table_of(result: dict[str, Any]) -> str:
     text = row.format("", "env-steps/s", "bar")
     for title, key, bar in lines:
         text += row.format(title, f"{result[key]:.3g}", "" if bar is None else f"{bar:.0e}")
-    for key, how in (("peers", ""), ("peers_with_our_substeps", f" x {SUBSTEPS[1]} steps")):
+    for key, how in (("peers", ""), ("peers_with_one_scan", ", one scan")):
         for name, rate in result[key].items():
             shown = "-" if rate is None else f"{rate:.3g}"
             ratio = "" if rate is None else f", {fast / rate:.0f} times slower than ours"

@@ -26,6 +26,7 @@ SIZE, RESOLUTION = 20.0, 0.05
 CELLS = round(SIZE / RESOLUTION)
 LIDARS = ("paper", "paper_12m")
 SCANS, REPEATS, CLEARANCE = 1000, 7, 0.2
+SCRATCH = max(map_kernels.FLOATS, map_kernels.INTS) * map_kernels.LANES
 
 
 def cells(metres: float) -> int:
@@ -84,11 +85,11 @@ def batch(kernel: Callable[..., None]) -> Callable[..., None]:
     """A compiled loop over scans."""
 
     @njit(error_model="numpy")
-    def run(out, directions, beams, at, range_max, arrays):
+    def run(out, directions, beams, at, range_max, arrays, room):
         for n in range(at.shape[0]):
             out[n] = np.inf
             x, y, c, s = at[n]
-            kernel(out[n], directions, beams, x, y, c, s, range_max, arrays)
+            kernel(out[n], directions, beams, x, y, c, s, range_max, arrays, room)
 
     return run
 
@@ -107,6 +108,7 @@ def timed(run: Callable[..., None], *arguments: Any) -> tuple[NDArray[np.float32
 
 def measure(seed: int) -> dict[str, Any]:
     """One row per map and lidar."""
+    room = tuple(np.zeros(SCRATCH, kind) for kind in (np.float64, np.float32, np.int32))
     walk, jump = batch(map_kernels.exact_map_into), batch(map_kernels.map_into)
     rows = []
     for name, make in MAPS.items():
@@ -119,7 +121,7 @@ def measure(seed: int) -> dict[str, Any]:
             spec = load_lidar(lidar)
             beams = np.array([spec.angle_min, spec.angle_increment, float(spec.full_circle)])
             at = poses(grid, seed + 1)
-            arguments = (spec.directions, beams, at, spec.range_max, grid.arrays)
+            arguments = (spec.directions, beams, at, spec.range_max, grid.arrays, room)
             exact, exact_speed = timed(walk, *arguments)
             baked, baked_speed = timed(jump, *arguments)
             error = baked.astype(np.float64) - exact

@@ -56,8 +56,16 @@ def action_space(robot: RobotSpec, actions: Actions) -> gymnasium.Space[Any]:
 
 
 def team_space(space: gymnasium.Space[Any], robots: int) -> gymnasium.Space[Any]:
-    """A space of M robots side by side; that of one robot as it is."""
-    return space if robots == 1 else gymnasium.vector.utils.batch_space(space, robots)
+    """One space of M robots, one after the other: a vector, as algorithms want it.
+
+    Of Boxes (L,) a Box (M L,), of Discrete a MultiDiscrete (M,); that of one robot as it is.
+    """
+    if robots == 1:
+        return space
+    several = gymnasium.vector.utils.batch_space(space, robots)
+    if not isinstance(several, gymnasium.spaces.Box):
+        return several
+    return gymnasium.spaces.Box(several.low.ravel(), several.high.ravel(), dtype=np.float32)
 
 
 def scaled(action: ArrayLike, robot: RobotSpec) -> Array:

@@ -48,14 +48,15 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     Of one robot, `Box(-1, 1, (C,), float32)`: each command of the robot, scaled between its
     limits, for the Ackermann robot speed [m/s] and steering angle [rad]; or `Discrete` with
-    `task_options={"actions": "discrete"}`, see `env.actions.DRIVES`. Of M robots,
-    `Box(-1, 1, (M, C), float32)` or `MultiDiscrete`.
+    `task_options={"actions": "discrete"}`, see `env.actions.DRIVES`. Of M robots, one after the
+    other, `Box(-1, 1, (M C,), float32)` or `MultiDiscrete`.
 
     ## Observation Space
 
-    `Box((O,), float32)`, or `Box((M, O), float32)` of a team; the docstring of the task's class
-    (`Navigation`, `CooperativeReaching`, `PursuitEvasion`) has the parts with their units. Those
-    of the navigation task, B beams:
+    `Box((O,), float32)`, or `Box((M O,), float32)` of a team, robot by robot, which
+    `observation.reshape(M, O)` takes apart; the docstring of the task's class (`Navigation`,
+    `CooperativeReaching`, `PursuitEvasion`) has the parts with their units. Those of the
+    navigation task, B beams:
 
     | Num | Observation | Min | Max | Unit |
     |---|---|---|---|---|
@@ -136,6 +137,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._view: RobotView | None = None  # always as the batch of one that a task expects
         self._true_pose: Array = np.zeros((self.robots, 3))
         self._shape = (1, self.robots, self.task.observation_space.shape[0])
+        self._each = (1, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
         self._seed, self._episode = 0, -1
         self._picture: Any = None
@@ -194,7 +196,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         observation = self.task.observation(self._view, self.memory)[0]
         if self.render_mode == "human":
             self.render()
-        return self._row(observation), self._info(self._view, facts)
+        return observation.reshape(-1), self._info(self._view, facts)
 
     def _scene_of(self, episode: int) -> Scene:
         if isinstance(self._backend, SimBackend):
@@ -224,7 +226,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         info["reward_terms"] = {name: v[0] for name, v in values.items()} if alone else terms
         if self.render_mode == "human":
             self.render()
-        return self._row(observation), reward, bool(self.ended.all()), False, info
+        return observation.reshape(-1), reward, bool(self.ended.all()), False, info
 
     def advance(
         self, action: NDArray[Any]
@@ -236,7 +238,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         """
         if self._view is None:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
-        command = self.task.command(check_action(action, self.action_space, "action"))
+        given = check_action(action, self.action_space, "action")
+        command = self._row(self.task.command(given.reshape(self._each))[0])
         waiting = self.robots > 1 and bool(self.ended.any())
         if waiting:
             command = np.where(self.ended[:, None], self._still, command)

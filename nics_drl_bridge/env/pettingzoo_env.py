@@ -96,7 +96,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         """Begins an episode with all agents; see PettingZoo."""
         observation, info = self.env.reset(seed=seed, options=options)
         self.agents, self._steps = list(self.possible_agents), 0
-        seen = dict(zip(self.agents, self._rows(observation), strict=True))
+        seen = dict(zip(self.agents, observation.reshape(len(self.agents), -1), strict=True))
         return seen, {name: self._told(info, m) for m, name in enumerate(self.agents)}
 
     def step(
@@ -116,10 +116,8 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         rest: Any = np.zeros(space.shape or (), space.dtype)
         # Those who left are told to stand still, whatever stands here.
         joint = [actions[n] if n in self.agents else rest for n in self.possible_agents]
-        if self.env.robots == 1:
-            observation, terms, info = self.env.advance(joint[0])
-        else:
-            observation, terms, info = self.env.advance(np.array(joint, space.dtype))
+        told_all = joint[0] if self.env.robots == 1 else np.array(joint, space.dtype).ravel()
+        observation, terms, info = self.env.advance(told_all)
         if self.render_mode == "human":
             self.env.render()
         self._steps += 1
@@ -135,9 +133,6 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         seen = {name: observation[m] for name, m in index.items()}
         self.agents = [] if late else [name for name in self.agents if not ended[name]]
         return seen, rewards, ended, cut, told
-
-    def _rows(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        return observation[None] if self.env.robots == 1 else observation
 
     def _told(self, info: dict[str, Any], m: int) -> dict[str, Any]:
         """What concerns robot m of the env's `info`."""

@@ -19,7 +19,7 @@ from nics_drl_bridge.env.kernels import episode_seeds
 from nics_drl_bridge.env.sim_backend import NANO
 from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, give, override
 from nics_drl_bridge.env.tasks import make_task
-from nics_drl_bridge.env.vector_parts import chosen_worlds, joined, mode_of, over_robots
+from nics_drl_bridge.env.vector_parts import chosen_worlds, flat, joined, mode_of, over_robots
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import RobotView
@@ -95,6 +95,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         randomisation: str | Randomisation | None = None,
         render_mode: str | None = None,
     ) -> None:
+        self._pictures: list[Any] = []  # what `close` needs, also where something below is refused
         check_render_mode(render_mode, self.metadata)
         self.num_envs, self.render_mode = num_envs, render_mode
         self._limit, self.copy = max_episode_steps, copy
@@ -111,6 +112,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self.simulator = FastSimulator(
             self.model, self.world, num_envs, self.robots, renderer, threads, randomisation
         )
+        self._each = (num_envs, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
         self._period_ns = round(self.model.control_period * NANO)
         self._allocate()
@@ -126,7 +128,6 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._episode: NDArray[np.int64] = np.full(count, -1)
         self._starts: Array = np.zeros((count, robots, 3))
         self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
-        self._pictures: list[Any] = []
         self.memory: Memory = {}
 
     def reset(
@@ -150,7 +151,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         infos: dict[str, Any] = {}
         facts = self._known(rows) | self._beginnings(rows)
         vector_info.put_rows(infos, facts, rows, self.num_envs)
-        return self._row(self._out.copy() if self.copy else self._out), infos
+        return flat(self._out.copy() if self.copy else self._out), infos
 
     def _seed(self, seed: int | Sequence[int | None] | None, chosen: Flags) -> None:
         """Names the next episode of the chosen worlds."""
@@ -212,7 +213,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """One control period in every world; see Gymnasium."""
         if not self.memory:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
-        given = check_action(actions, self.action_space, "actions")
+        given = check_action(actions, self.action_space, "actions").reshape(self._each)
         out = np.empty_like(self._out) if self.copy else self._out
         begun = self._over.copy()  # these ignore their action and begin anew
         outcome = self._all_parts(lambda part: self._advance(part, given[part], out, begun))
@@ -227,7 +228,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         else:
             self._over = over
             self._tell(infos, facts, begun)
-        return self._row(out), reward, terminated, truncated, infos
+        return flat(out), reward, terminated, truncated, infos
 
     def _all_parts(self, advance: Callable[[slice], Outcome]) -> Outcome:
         """Runs every part of the simulator's worlds and puts what they came to together."""
@@ -241,9 +242,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
         Those in `begun` (N,) begin anew instead.
         """
-        data, count = self.simulator.data, part.stop - part.start
-        ended = self.ended[part]
-        command = self.task.command(actions).reshape(count, self.robots, -1)
+        data, ended = self.simulator.data, self.ended[part]
+        command = self.task.command(actions)
         if self.robots > 1 and ended.any():
             command = np.where(ended[..., None], self._still, command)
         ranges = data.ranges[part]
@@ -268,7 +268,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """SAME_STEP: the worlds that ended begin anew; what they ended with goes into `infos`."""
         rows = np.flatnonzero(over)
         if len(rows):
-            infos.update(vector_info.finals(self._row(out), rows))
+            infos.update(vector_info.finals(flat(out), rows))
             final: dict[str, Any] = {}
             known = self._known(rows) | vector_info.rows_of(facts, rows)
             vector_info.put_rows(final, known, rows, self.num_envs)

@@ -14,7 +14,13 @@ from nics_drl_bridge.errors import ConfigError
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Observation = NDArray[np.float32]
 MODES = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
+
+
+def flat(observations: Observation) -> Observation:
+    """(N, M O) what the robots of each world see, one after the other; no copy."""
+    return observations.reshape(len(observations), -1)
 
 
 def over_robots(rewards: Array) -> Array:

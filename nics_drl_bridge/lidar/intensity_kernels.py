@@ -111,7 +111,9 @@ def walls(scan, directions, beams, place, lines, surface):  # type: ignore[no-un
 
 
 @njit(cache=True, error_model="numpy")
-def grid(scan, directions, beams, place, range_max, surface, map_arrays, exact):  # type: ignore[no-untyped-def]
+def grid(  # type: ignore[no-untyped-def]
+    scan, directions, beams, place, range_max, surface, map_arrays, exact, room
+):
     """A static map: its surfaces are sides of cells, and the beam ends at the nearer line."""
     nearest, light, before = scan
     squares, frame = map_arrays
@@ -120,9 +122,11 @@ def grid(scan, directions, beams, place, range_max, surface, map_arrays, exact):
     sx, sy, c, s = place
     keep(before, nearest)
     if exact:
-        map_kernels.exact_map_into(nearest, directions, beams, sx, sy, c, s, range_max, map_arrays)
+        map_kernels.exact_map_into(
+            nearest, directions, beams, sx, sy, c, s, range_max, map_arrays, room
+        )
     else:
-        map_kernels.map_into(nearest, directions, beams, sx, sy, c, s, range_max, map_arrays)
+        map_kernels.map_into(nearest, directions, beams, sx, sy, c, s, range_max, map_arrays, room)
     u, v, gc, gs = map_kernels.to_grid(sx, sy, c, s, frame)
     for i in range(nearest.shape[0]):
         if nearest[i] < before[i]:
@@ -238,7 +242,7 @@ def intensities_of_worlds(  # type: ignore[no-untyped-def]
                         scan, directions, beams, place, bodies[n, k], corners, corner, surface, high
                     )
             walls(scan, directions, beams, place, lines, plain)
-            grid(scan, directions, beams, place, high, plain, map_arrays, exact)
+            grid(scan, directions, beams, place, high, plain, map_arrays, exact, room)
             report(intensities[n, m], ranges[n, m], scan, device, limits[0])
 
 

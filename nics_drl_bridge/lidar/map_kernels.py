@@ -124,7 +124,7 @@ def to_grid(sx, sy, c, s, frame):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def exact_map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays):  # type: ignore[no-untyped-def]
+def exact_map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays, room):  # type: ignore[no-untyped-def]
     """Fuses a map into a scan (B,) from (sx, sy, c, s), cell by cell in float64; see `ray`."""
     squares, frame = map_arrays
     if squares.size == 0:
@@ -139,8 +139,8 @@ def exact_map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays):
             out[i] = value
 
 
-@njit(cache=True, error_model="numpy", _nrt=True)
-def map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy", _nrt=False)
+def map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays, room):  # type: ignore[no-untyped-def]
     """Fuses a map into a scan (B,) float32 from (sx, sy, c, s), by jumps; see the module.
 
     Args:
@@ -151,6 +151,7 @@ def map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays):  # ty
         c, s: cosine and sine of its heading.
         range_max: farther is not looked [m].
         map_arrays: see the module; arrays of size 0 are no map.
+        room: see `scanner.Scanner.room`.
     """
     squares, frame = map_arrays
     if squares.size == 0:
@@ -160,13 +161,12 @@ def map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays):  # ty
     x, y = math.floor(u), math.floor(v)
     inside = 0.0 <= x < columns - 2 and 0.0 <= y < rows - 2
     if not inside or squares[int(y) + 1, int(x) + 1] == 0:
-        exact_map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays)
+        exact_map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays, room)
         return
     flat = squares.reshape(-1)
     here = (int(y) + 1) * columns + int(x) + 1
     limit = np.float32(range_max / frame[4] * SLACK)
-    floats = np.empty(FLOATS * LANES, np.float32)
-    ints = np.empty(INTS * LANES, np.int32)
+    _, floats, ints = room
     for first in range(0, out.shape[0], LANES):
         last = min(first + LANES, out.shape[0])
         _start(floats, ints, directions[first:last], u - x, v - y, gc, gs, columns)

@@ -64,8 +64,8 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
     fuse_kernels.look_up(found, ranges, beams, limits, lookup, room)
 
 
-@njit(cache=True)
-def add_map(ranges, poses, chosen, sensor, map_arrays, exact):  # type: ignore[no-untyped-def]
+@njit(cache=True, error_model="numpy", _nrt=False)
+def add_map(ranges, poses, chosen, sensor, map_arrays, exact, room):  # type: ignore[no-untyped-def]
     """Fuses a static map into the scans of some worlds.
 
     Args:
@@ -75,6 +75,7 @@ def add_map(ranges, poses, chosen, sensor, map_arrays, exact):  # type: ignore[n
         sensor: see `scanner.Scanner.arguments`.
         map_arrays: see `maps_grid.GridMap.arrays`.
         exact: whether to walk from cell to cell.
+        room: see `scanner.Scanner.room`.
     """
     mount, directions, beams, limits = sensor[0], sensor[1], sensor[2], sensor[3]
     for n in chosen:
@@ -83,8 +84,10 @@ def add_map(ranges, poses, chosen, sensor, map_arrays, exact):  # type: ignore[n
             out = ranges[n, m]
             if exact:
                 map_kernels.exact_map_into(
-                    out, directions, beams, sx, sy, c, s, limits[1], map_arrays
+                    out, directions, beams, sx, sy, c, s, limits[1], map_arrays, room
                 )
             else:
-                map_kernels.map_into(out, directions, beams, sx, sy, c, s, limits[1], map_arrays)
+                map_kernels.map_into(
+                    out, directions, beams, sx, sy, c, s, limits[1], map_arrays, room
+                )
             kernels.finish(out, limits[0], limits[1])

@@ -120,7 +120,10 @@ class Scanner:
         return lookup_error(exact.arguments, baked.arguments, room, shape, radius)
 
     def room(self, bodies: int) -> Room:
-        """Scratch that one thread needs to scan a world, of however many bodies."""
+        """Scratch that one thread needs to scan a world, of however many bodies.
+
+        Of doubles, singles and whole numbers; what looks up in maps needs fewer than these.
+        """
         return (
             np.zeros(WIDE * LANES),
             np.zeros(SINGLE * LANES, np.float32),
@@ -181,7 +184,7 @@ class Scanner:
         if self.grid is not None:
             scan_kernels.add_map(
                 out[:, None], poses[:, None], worlds, self.arguments, self.grid.arrays,
-                self.renderer == "exact",
+                self.renderer == "exact", room,
             )  # fmt: skip
         return out
 

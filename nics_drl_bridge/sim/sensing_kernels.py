@@ -198,7 +198,7 @@ def look_together(together, pose, bodies, ranges, first, walls, view, sensors): 
     sensor, map_arrays, exact = view[0], view[1], view[2]
     scan_kernels.scan_worlds(ranges, pose, chosen, bodies, first, walls, sensor, scan_room)
     if map_arrays[0].size > 0:
-        scan_kernels.add_map(ranges, pose, chosen, sensor, map_arrays, exact)
+        scan_kernels.add_map(ranges, pose, chosen, sensor, map_arrays, exact, scan_room)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
@@ -248,7 +248,7 @@ def _look_alone(  # type: ignore[no-untyped-def]
             spot[0, 0, i] = slices[g, i]
         scan_kernels.scan_worlds(out, spot, none, seen, -1, walls, sensor, sensors[8])
         if map_arrays[0].size > 0:
-            scan_kernels.add_map(out, spot, none, sensor, map_arrays, exact)
+            scan_kernels.add_map(out, spot, none, sensor, map_arrays, exact, sensors[8])
         for i in range(g * beams // groups, (g + 1) * beams // groups if groups > 1 else 0):
             scan[0, 0, i] = part[0, 0, i]
 

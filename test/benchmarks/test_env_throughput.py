@@ -23,7 +23,7 @@ def test_the_throughput_of_envs_is_one_json_object_with_every_figure():
         "single_env_gym_steps_per_s",
         "single_env_with_estimator_steps_per_s",
         "peers",
-        "peers_with_our_substeps",
+        "peers_with_one_scan",
         "memory_bytes_per_env",
     }
     assert found["peers"] == {"ir_sim": None, "irsim_x": None}

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,11 +13,15 @@ from nics_drl_bridge.env.pettingzoo_env import BridgeParallelEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.sim.randomisation import Randomisation
 
+OWN = Path(__file__).resolve().parents[2] / "examples" / "own_task.py"
 TASKS = (
     ("cooperative_reaching", {}),
     ("cooperative_reaching", {"actions": "discrete", "robots": 2}),
     ("pursuit_evasion", {}),
+    ("pursuit_evasion", {"actions": "discrete"}),
     ("navigation", {}),
+    ("navigation", {"actions": "discrete"}),
+    (f"{OWN}:Patrol", {}),
 )
 
 
@@ -43,18 +48,18 @@ def test_pettingzoos_checkers_find_nothing_to_warn_of(task, options):
 def test_its_rewards_sum_to_the_teams_and_its_rows_are_the_teams(task):
     each, team = env(task), BridgeEnv(model=direct_model(), world=field(8.0), task=task)
     (seen, _), (rows, _) = each.reset(seed=5), team.reset(seed=5)
-    assert np.array_equal(np.stack(list(seen.values())), rows)
+    assert np.array_equal(np.concatenate(list(seen.values())), rows)
     moves = sampled(each)
     while each.agents:
         before, actions = list(each.agents), next(moves)
         rest = np.zeros(3, np.float32)
-        joint = np.stack([actions.get(name, rest) for name in each.possible_agents])
+        joint = np.concatenate([actions.get(name, rest) for name in each.possible_agents])
         seen, rewards, *_ = each.step(actions)
         rows, reward, terminated, _, info = team.step(joint)
         assert sum(rewards.values()) == pytest.approx(reward)
         for name in before:
             m = each.possible_agents.index(name)
-            assert np.array_equal(seen[name], rows[m])
+            assert np.array_equal(seen[name], rows.reshape(3, -1)[m])
         assert reward == pytest.approx(sum(term.sum() for term in info["reward_terms"].values()))
         assert not (terminated and each.agents)
 

@@ -23,7 +23,7 @@ OWN = Path(__file__).resolve().parents[2] / "examples" / "own_task.py"
 PATROL = f"{OWN}:Patrol"
 
 
-@pytest.mark.parametrize("name", [name for name in ENVIRONMENTS if name != TASK])
+@pytest.mark.parametrize("name", ENVIRONMENTS)
 @pytest.mark.parametrize("actions", ["continuous", "discrete"])
 def test_gymnasiums_checker_finds_nothing_to_warn_of_in_any_task(name, actions):
     with warnings.catch_warnings():

@@ -8,15 +8,25 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils import env_checker as checking
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.registration import ENVIRONMENTS, NAVIGATION, TASK
+from nics_drl_bridge.env.registration import ENVIRONMENTS, NAVIGATION
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 
+CHECKS = [
+    getattr(checking, f"check_{name}")
+    for name in (
+        "seed_deprecation", "reset_return_info_deprecation", "reset_return_type",
+        "reset_seed_determinism", "reset_options", "returned_data_not_reused",
+    )
+    if hasattr(checking, f"check_{name}")  # Gymnasium 1.2 has not all of them
+]  # fmt: skip
+"""Those parts of Gymnasium's `check_env` that a vector env, which it refuses, can be given to."""
 MODES = ("NextStep", "SameStep")
 TASKS = (
     {"task": "navigation"},
@@ -191,7 +201,28 @@ def test_start_and_goal_can_be_given_to_all_worlds():
     assert info["goal"] == pytest.approx(np.array([[-1.0, 1.0]] * 2))
 
 
-@pytest.mark.parametrize("name", [name for name in ENVIRONMENTS if name != TASK])
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+@pytest.mark.parametrize("actions", ["continuous", "discrete"])
+@pytest.mark.parametrize("mode", MODES)
+def test_gymnasiums_checks_of_an_env_find_nothing_to_warn_of_in_a_vector(name, actions, mode):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make_vec(
+            name, 3, model=model(), world=field(), autoreset_mode=mode,
+            task_options={"actions": actions},
+        ).unwrapped  # fmt: skip
+        for check in CHECKS:
+            check(env)
+        for space in (env.observation_space, env.single_observation_space):
+            checking.check_observation_space(space)
+        for space in (env.action_space, env.single_action_space):
+            checking.check_action_space(space)
+            checking.check_space_limit(space, "action")
+        env.close()
+        env.close()
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
 @pytest.mark.parametrize("mode", MODES)
 def test_make_vec_gives_the_native_env_without_a_warning(name, mode):
     with warnings.catch_warnings():

@@ -9,6 +9,7 @@ from nics_drl_bridge.lidar.maps_grid import NO_MAP, GridMap
 
 BEAMS = 37
 EDGE = 1e-6  # beams that pass a corner this closely [m] may go either way
+ROOM = tuple(np.zeros(10_000, kind) for kind in (np.float64, np.float32, np.int32))
 KERNELS = {"exact": map_kernels.exact_map_into, "baked": map_kernels.map_into}
 
 
@@ -24,7 +25,7 @@ def scan(kernel, grid, pose, range_max=100.0, rays=None, before=np.inf):
     c, s = np.cos(pose[2]), np.sin(pose[2])
     arrays = grid if isinstance(grid, tuple) else grid.arrays
     beams = np.array([-np.pi, 2.0 * np.pi / len(rays), 1.0])
-    KERNELS[kernel](out, rays, beams, *pose[:2], c, s, range_max, arrays)
+    KERNELS[kernel](out, rays, beams, *pose[:2], c, s, range_max, arrays, ROOM)
     return out
 
 

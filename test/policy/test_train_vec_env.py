@@ -5,13 +5,12 @@ import warnings
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.wrappers import FlattenObservation
 from robots import direct_model, field
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-from nics_drl_bridge.env.registration import ENVIRONMENTS, TASK
+from nics_drl_bridge.env.registration import ENVIRONMENTS
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
@@ -29,17 +28,16 @@ def vector(count=4, **arguments):
     )
 
 
-@pytest.mark.parametrize("name", [name for name in ENVIRONMENTS if name != TASK])
+@pytest.mark.parametrize("name", ENVIRONMENTS)
 @pytest.mark.parametrize("actions", ["continuous", "discrete"])
 def test_stable_baselines3s_checker_finds_nothing_to_warn_of(name, actions):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env = gymnasium.make(
             name, model=direct_model(), world=field(), task_options={"actions": actions}
-        ).unwrapped
-        if env.robots > 1:  # it takes vectors only, and a team's observation is (M, O)
-            env = FlattenObservation(env)
+        )
         check_env(env)
+        check_env(env.unwrapped)
 
 
 def test_it_feeds_what_a_vec_env_of_single_envs_feeds():

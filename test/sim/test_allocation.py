@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import tracemalloc
+
+import numpy as np
+import pytest
+from numba.core.runtime import _nrt_python, rtsys
+from robots import circles, direct_model, field, lidar
+
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world import load_world
+
+STEPS, WARM_UP = 1000, 50
+BOOKKEEPING = 20_000
+"""Python's own objects that a step makes and drops, whatever the number of worlds [bytes]."""
+GROWTH = 20_000
+FEW = 8
+MOVING = {**circles(3), "motion": {"kind": "wander", "speed": [0.2, 0.5]}}
+SCENES = {
+    "circles": (lambda: field(6.0, 5), 1),
+    "map": (lambda: load_world("room"), 1),
+    "moving obstacles": (lambda: field(6.0, obstacles=[MOVING]), 1),
+    "several robots": (lambda: field(10.0, 5), 8),
+}
+
+
+def noisy_model():
+    return direct_model(latency=0.03, odometry=(0.05, 0.03), sensor=lidar(noise_std=0.01))
+
+
+def taken(step, steps=STEPS):
+    """Bytes that some steps leave behind, and the most that they take meanwhile.
+
+    numpy tells tracemalloc of its arrays; numba counts those of compiled code, see `compiled`.
+    """
+    for _ in range(WARM_UP):
+        step()
+    tracemalloc.start()
+    try:
+        step()
+        begin = tracemalloc.get_traced_memory()[0]
+        tracemalloc.reset_peak()
+        for _ in range(steps):
+            step()
+        end, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    return end - begin, peak - begin
+
+
+def compiled(step, steps=100):
+    """How often compiled code allocates in a step: some per array that it is handed."""
+    _nrt_python.memsys_enable_stats()
+    try:
+        step()
+        begin = rtsys.get_allocation_stats().alloc
+        for _ in range(steps):
+            step()
+        return (rtsys.get_allocation_stats().alloc - begin) / steps
+    finally:
+        _nrt_python.memsys_disable_stats()
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("worlds", [1, 64])
+def test_a_simulator_allocates_nothing_per_step_however_many_worlds_it_has(scene, worlds):
+    world, robots = SCENES[scene]
+    model = noisy_model()
+    simulator = FastSimulator(model, world(), worlds, robots)
+    simulator.reset(range(worlds))
+    low, high = model.robot.command_low, model.robot.command_high
+    commands = np.random.default_rng(0).uniform(low, high, (worlds, robots, len(low)))
+    grown, most = taken(lambda: simulator.step(commands))
+    assert compiled(lambda: simulator.step(commands)) < FEW
+    assert grown < GROWTH
+    assert most < BOOKKEEPING
+    assert simulator.data.ranges.nbytes * 64 // worlds > BOOKKEEPING  # an array would be seen
+
+
+@pytest.mark.parametrize("task", ["navigation", "cooperative_reaching"])
+def test_the_memory_of_a_vector_env_does_not_grow_with_its_steps(task):
+    env = BridgeVectorEnv(
+        16, noisy_model(), field(8.0, 5), task, max_episode_steps=20, autoreset_mode="SameStep"
+    )
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(16)]
+    count = [0]
+
+    def step():
+        env.step(actions[count[0] % len(actions)])
+        count[0] += 1
+
+    grown, _ = taken(step)
+    assert grown < GROWTH
