@@ -8,7 +8,7 @@ import math
 import threading
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -236,8 +236,13 @@ class DdsBackend:
             BackendError: somebody else moved the simulator, or it is not in lock-step.
             StaleDataError: the data do not arrive.
         """
+        self.send(command)
+        return self.receive()
+
+    def send(self, command: Array) -> None:
+        """The first half of a step: checks and publishes a command (C,)."""
         self._check_open()
-        try:
+        with self._zero_after_an_error():
             self._check_alone()
             # Data that are there before the command would be taken for its answer.
             self._check_stamps({topic: self._mail.stamp_ns(topic) for topic in self._topics})
@@ -245,7 +250,16 @@ class DdsBackend:
             self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
             self._commands.publish(conversions.twist_to_ros(twist))
             self._now_ns += self._period_ns
+
+    def receive(self) -> tuple[RobotView, dict[str, Any]]:
+        """The second half: waits for the data after the command, and for `info` about them."""
+        with self._zero_after_an_error():
             return self._measure(self._timeout_s)
+
+    @contextlib.contextmanager
+    def _zero_after_an_error(self) -> Iterator[None]:
+        try:
+            yield
         except BaseException:
             self._commands.publish(Twist())
             raise
