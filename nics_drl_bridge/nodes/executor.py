@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Any
 
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import (
+    ExternalShutdownException,
+    SingleThreadedExecutor,
+    TimeoutException,
+)
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.waitable import NumberOfEntities
 
 NANO = 1_000_000_000
-OTHERS = ("guard_condition", "timer", "client", "service")
 
 
 class StandingExecutor(SingleThreadedExecutor):
@@ -53,7 +57,15 @@ class StandingExecutor(SingleThreadedExecutor):
                 subscription.callback(taken[0])
         if ends.others_ready():
             self._changed = True  # whoever adds an end to a node triggers a guard condition
-            super().spin_once(0.0)
+            self._handle_others()
+
+    def _handle_others(self) -> None:
+        """Lets rclpy handle all that is ready now."""
+        with contextlib.suppress(TimeoutException):
+            while True:
+                task, _, _ = self.wait_for_ready_callbacks(timeout_sec=0.0)
+                task()
+                task.result()  # raises what the callback did
 
     def _gathered(self) -> _Ends:
         """The ends that there are, in a new wait set if they are others than before."""
@@ -83,30 +95,32 @@ class _Ends:
     def __init__(self, nodes: Sequence[Node], guards: Sequence[Any], context: Context) -> None:
         self.all = _all_ends(nodes)
         subscriptions, others, timers, clients, services, self._waitables = self.all
-        self._kinds = subscriptions, (*guards, *others), timers, clients, services
+        kinds = subscriptions, (*guards, *others), timers, clients, services
         self._open = ExitStack()
-        self._handles = [[end.handle for end in ends] for ends in self._kinds]
-        for held in (*itertools.chain(*self._handles), *self._waitables, context.handle):
+        for held in (*(end.handle for end in itertools.chain(*kinds)), *self._waitables):
             self._open.enter_context(held)
-        room = NumberOfEntities(*(len(handles) for handles in self._handles))
+        self._open.enter_context(context.handle)
+        room = NumberOfEntities(*(len(ends) for ends in kinds))
         for waitable in self._waitables:
             room += waitable.get_num_entities()
         self._wait_set = rclpy_implementation.WaitSet(
             room.num_subscriptions, room.num_guard_conditions, room.num_timers,
             room.num_clients, room.num_services, room.num_events, context.handle,
         )  # fmt: skip
-
-    def wait(self, timeout_ns: int) -> None:
-        """Waits until something is ready; for ever if the timeout is negative."""
-        self._wait_set.clear_entities()
-        add = self._wait_set
+        add: Any = self._wait_set
         adders = (
             add.add_subscription, add.add_guard_condition, add.add_timer, add.add_client,
             add.add_service,
         )  # fmt: skip
-        for handles, adder in zip(self._handles, adders, strict=True):
-            for handle in handles:
-                adder(handle)
+        self._adding = [
+            (adder, end.handle) for adder, ends in zip(adders, kinds, strict=True) for end in ends
+        ]
+
+    def wait(self, timeout_ns: int) -> None:
+        """Waits until something is ready; for ever if the timeout is negative."""
+        self._wait_set.clear_entities()  # each wait forgets those that were not ready
+        for add, handle in self._adding:
+            add(handle)
         for waitable in self._waitables:
             waitable.add_to_wait_set(self._wait_set)
         self._wait_set.wait(timeout_ns)
@@ -114,15 +128,16 @@ class _Ends:
     def subscriptions_ready(self) -> list[Any]:
         """Subscriptions that have a message."""
         is_ready = self._wait_set.is_ready
-        return [s for i, s in enumerate(self._kinds[0]) if is_ready("subscription", i)]
+        return [s for i, s in enumerate(self.all[0]) if is_ready("subscription", i)]
 
     def others_ready(self) -> bool:
         """Whether anything else is ready."""
-        for guard in self._kinds[1][2:]:
-            # Waiting has reset it; rclpy's executor triggers it anew.
-            if guard.handle.pointer in self._wait_set.get_ready_entities("guard_condition"):
-                guard._executor_triggered = True
-        return any(self._wait_set.get_ready_entities(kind) for kind in OTHERS) or any(
+        ready = self._wait_set.get_ready_entities
+        triggered = ready("guard_condition")
+        for guard in self.all[1]:
+            if guard.handle.pointer in triggered:
+                guard._executor_triggered = True  # waiting has reset it; rclpy sets it anew
+        return bool(triggered or ready("timer") or ready("client") or ready("service")) or any(
             waitable.is_ready(self._wait_set) for waitable in self._waitables
         )
 

@@ -14,12 +14,13 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from nics_drl_bridge.errors import BackendError, BridgeError
 from nics_drl_bridge.generator import SimulatorModel, open_model
+from nics_drl_bridge.nodes.executor import StandingExecutor
 
 SPIN_S = 0.1
 DELIVERY_S = 0.5
@@ -74,7 +75,7 @@ def run_node(make: Callable[[Context], Node], args: Sequence[str] | None = None)
         node = make(context)
         if hasattr(node, "start"):
             node.start()
-        executor = SingleThreadedExecutor(context=context)
+        executor = StandingExecutor(context)
         executor.add_node(node)
         with contextlib.suppress(ExternalShutdownException):
             while context.ok() and not stopping.is_set():
