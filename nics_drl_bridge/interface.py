@@ -1,12 +1,13 @@
-"""The seams between what knows about robots and what learns: RobotView and Backend."""
+"""The seams: RobotView and Backend to what learns, Simulator to what moves robots."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 
 @dataclass(frozen=True)
@@ -33,13 +34,25 @@ class RobotView:
     odom_age_s: float
 
 
+def stacked(views: Sequence[RobotView]) -> RobotView:
+    """Views of M robots as one with a leading (M,); the ages are the greatest."""
+    return RobotView(
+        np.stack([view.pose for view in views]),
+        np.stack([view.twist for view in views]),
+        np.stack([view.ranges for view in views]),
+        max(view.stamp_s for view in views),
+        max(view.scan_age_s for view in views),
+        max(view.odom_age_s for view in views),
+    )
+
+
 @dataclass(frozen=True)
 class Start:
     """How an episode begins.
 
     Attributes:
         seed: names the episode; a simulator draws its scene and its noise from it.
-        pose: (3,) where the robot stands: x [m], y [m], heading [rad] in `map`.
+        pose: (3,) where the robot stands: x [m], y [m], heading [rad] in `map`; (M, 3) of a team.
     """
 
     seed: int
@@ -68,4 +81,60 @@ class Backend(Protocol):
 
     def close(self) -> None:
         """Leaves the robot with a zero command and frees everything."""
+        ...
+
+
+class RobotStates(Protocol):
+    """What a simulator knows of its M robots after a step; the leading 1 is its one world."""
+
+    @property
+    def pose(self) -> NDArray[np.float64]:
+        """(1, M, 3) true pose of `base_link` in `map`."""
+        ...
+
+    @property
+    def twist(self) -> NDArray[np.float64]:
+        """(1, M, 3) measured body twist."""
+        ...
+
+    @property
+    def state(self) -> NDArray[np.float64]:
+        """(1, M, S) true state, in the order of the RobotSpec."""
+        ...
+
+    @property
+    def odom(self) -> NDArray[np.float64]:
+        """(1, M, 3) pose by odometry, which drifts; it begins at the start pose."""
+        ...
+
+    @property
+    def ranges(self) -> NDArray[np.float32]:
+        """(1, M, B) scan, REP-117."""
+        ...
+
+    @property
+    def collided(self) -> NDArray[np.uint8]:
+        """(1, M) 1 once a robot has touched something."""
+        ...
+
+    @property
+    def steps(self) -> NDArray[np.int64]:
+        """(1,) control periods since the reset."""
+        ...
+
+
+class Simulator(Protocol):
+    """One world of M robots that anything may stand behind; `FastSimulator` is one."""
+
+    @property
+    def data(self) -> RobotStates:
+        """The present; a step may write into the same arrays."""
+        ...
+
+    def reset(self, seeds: ArrayLike, *, starts: ArrayLike | None = None) -> Any:
+        """Begins the episode of a seed (1,), at poses (1, M, 3) if they are given."""
+        ...
+
+    def step(self, commands: ArrayLike) -> None:
+        """Moves the robots by one control period; commands (1, M, C) as in the RobotSpec."""
         ...
