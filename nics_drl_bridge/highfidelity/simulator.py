@@ -73,11 +73,7 @@ class MujocoSimulator:
         self._machine, self._rest = alone.machine, alone.rest
         self._twist = textbook(model.robot).twist
         self._driven = DrivenSimulator(model, world, robots, renderer)
-        self._simulation: Any = None
-        self._data: Any = None
-        self._rigs: list[Rig] = []
-        self._mocap: list[tuple[int, int]] = []
-        self._bumper_of: NDArray[np.int64] = np.zeros(0, np.int64)
+        self.reset([0])
 
     @property
     def data(self) -> Worlds:
@@ -148,14 +144,12 @@ class MujocoSimulator:
 
         Raises:
             ConfigError: the commands have another shape.
-            BackendError: there was no reset, a command is NaN, or a robot has fallen over.
+            BackendError: a command is NaN, or a robot has fallen over.
         """
         commands = np.asarray(commands, dtype=np.float64)
         shape = (1, self.data.pose.shape[1], len(self.model.robot.command))
         if commands.shape != shape:
             raise ConfigError(f"commands are {commands.shape}; they must be {shape}.")
-        if self._data is None:
-            raise BackendError("call reset() before step().")
         for rig, command in zip(self._rigs, commands[0], strict=True):
             rig.command(self._data, command)
         self._driven.begin_period()
