@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 BACKENDS = {
     "sim": "nics_drl_bridge.env.sim_backend:SimBackend",
-    "dds": "nics_drl_bridge.nodes.dds_backend:DdsBackend",
+    "dds": "nics_drl_bridge.nodes.backends:dds_backend",
 }
 """Where each backend lives. Named as text, so that an env in process never imports ROS 2."""
 RENDER_FPS = 10

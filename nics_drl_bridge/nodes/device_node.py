@@ -4,36 +4,39 @@ from __future__ import annotations
 
 import json
 import time
+import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Twist
-from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock as SteadyClock
 from rclpy.clock import ClockType
 from rclpy.context import Context
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool, Trigger
 
-from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import BridgeError, ConfigError, nearest
+from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Simulator
-from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.runner import declare, declare_model
+from nics_drl_bridge.nodes import conversions, device_parameters, qos
+from nics_drl_bridge.nodes.command_inlet import CommandInlet
+from nics_drl_bridge.nodes.device_parameters import declare_device
+from nics_drl_bridge.nodes.outbox import Outbox
+from nics_drl_bridge.nodes.pace import Pace, RealTime
+from nics_drl_bridge.nodes.robot_port import RobotPort
+from nics_drl_bridge.nodes.runner import declare_model
+from nics_drl_bridge.nodes.transforms import Transforms
+from nics_drl_bridge.sim.device_world import DeviceWorld
+from nics_drl_bridge.sim.validity import OutsideValidityWarning
 from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]
-MODES = ("realtime", "lockstep", "as_fast_as_possible")
-COVARIANCE_GROWTH_S = 1.0
-"""An odometry pose is given the variance of this many seconds of drift at least."""
-
+WATCH_S = 2.0
+LONGEST_TICK_S = 0.005
+"""How often it is looked whether something late is due."""
 
 MakeSimulator = Callable[[Node, SimulatorModel, World, int], Simulator]
 """Makes the simulator of so many robots; may declare parameters of its own at the node. The control
@@ -41,11 +44,13 @@ period that it steps by is the given model's."""
 
 
 class DeviceNode(Node):
-    """Takes `cmd_vel`, publishes `scan`, `odom`, `joint_states`, `ground_truth` and `/clock`.
+    """Takes `cmd_vel`; publishes `scan`, `odom`, `joint_states`, `ground_truth`, `/clock`, `/tf`.
 
-    Stamps are simulated time, as on `/clock`: it begins at the system's time and never runs
-    backwards, also not at a reset. `~/reset` begins the episode of the parameters
-    `episode_seed` and `episode_start`; its answer is JSON with the stamp of the first data.
+    With the parameter `robots` it is a fleet in one world, each robot in a namespace below the
+    node's own. Stamps are simulated time, as on `/clock`: it begins at the system's time and never
+    runs backwards, also not at a reset. `~/reset` begins the episode of the parameters
+    `episode_seed` and `episode_start`; its answer is JSON with the stamp of the first data. In
+    lock-step the world moves when each robot has a command.
 
     Args:
         name: of the node.
@@ -56,114 +61,134 @@ class DeviceNode(Node):
     def __init__(self, name: str, context: Context, make: MakeSimulator) -> None:
         super().__init__(name, context=context)
         model = declare_model(self)
-        self._declare(model.lidar.frame)
-        world = load_world(self._text("world"))
-        self._mode = choice(self, "mode", MODES)
-        self._model = model
-        self._simulator = make(self, model, world, 1)
+        declare_device(self, model.lidar.frame)
+        self._time = device_parameters.timing(self, model)
+        self._names = device_parameters.namespaces(self)
+        world = load_world(str(self.get_parameter("world").value))
         self._identity = {"model": model.fingerprint, "world": world.fingerprint}
-        self._period_ns = round(model.control_period * conversions.NANO)
-        self._now_ns = time.time_ns() // self._period_ns * self._period_ns
-        self._command, self._command_ns = np.zeros(len(model.robot.command)), 0
+        model = device_parameters.timed_model(self, model, self._time)
+        simulator = make(self, model, world, len(self._names))
+        self._world = DeviceWorld(simulator, model, len(self._names))
+        self._now_ns = time.time_ns() // self._time.step_ns * self._time.step_ns
+        self._command_ns = np.zeros(len(self._names), np.int64)
+        self._heard = np.zeros(len(self._names), np.bool_)
         self._paused = False
-        self._simulator.step(self._command[None, None])  # compiled before anybody waits for it
-        self._open_topics()
+        self._world.advance()  # compiled before anybody waits for it
+        self._open_topics(model)
+        self._start_time()
         self._begin()
 
-    def _declare(self, laser_frame: str) -> None:
-        # First, so that it also judges the values that the node is started with.
-        self.add_on_set_parameters_callback(self._check_parameters)
-        world = "World file, or the name of a shipped world."
-        declare(self, "world", "arena", world, read_only=True)
-        declare(self, "mode", "realtime", f"How time runs: {', '.join(MODES)}.", read_only=True)
-        rate = "Simulated seconds per second in realtime."
-        declare(self, "rate", 1.0, rate, low=0.01, high=1000.0, read_only=True)
-        silence = "Stops after this silence on cmd_vel [simulated s]; not in lockstep."
-        declare(self, "command_timeout", 0.5, silence, low=0.0, high=3600.0)
-        for frame, default in (
-            ("map", "map"),
-            ("odom", "odom"),
-            ("base", "base_link"),
-            ("laser", laser_frame),
-        ):
-            declare(self, f"{frame}_frame", default, f"Frame id of {default}.")
-        declare(self, "episode_seed", 0, "Seed of the episode that ~/reset begins.")
-        declare(self, "episode_start", [0.0, 0.0, 0.0], "Start x, y, heading of that episode.")
-        declare(
-            self, "episode_start_given", False, "Whether episode_start holds, or the seed's own."
-        )
-
-    def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        for parameter in parameters:
-            if parameter.name == "episode_start":
-                values = np.array(parameter.value, dtype=np.float64)
-                if values.shape != (3,) or not np.isfinite(values).all():
-                    return SetParametersResult(
-                        successful=False,
-                        reason="episode_start must be three finite numbers: x, y, heading.",
-                    )
-            if parameter.name == "episode_seed" and parameter.value < 0:
-                return SetParametersResult(
-                    successful=False, reason="episode_seed must be 0 or more."
-                )
-        return SetParametersResult(successful=True)
-
-    def _text(self, name: str) -> str:
-        return str(self.get_parameter(name).value)
-
-    def _open_topics(self) -> None:
-        self._scan_topic = self.create_publisher(LaserScan, "scan", qos.SENSOR_RELIABLE)
-        self._odom_topic = self.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
-        self._truth_topic = self.create_publisher(Odometry, "ground_truth", qos.SENSOR_RELIABLE)
-        self._joint_topic = self.create_publisher(JointState, "joint_states", qos.SENSOR_RELIABLE)
+    def _open_topics(self, model: SimulatorModel) -> None:
+        self._outbox = Outbox(self._time.jitter_ns)
         self._clock_topic = self.create_publisher(Clock, "/clock", qos.SENSOR_RELIABLE)
-        commands = qos.EVERY_COMMAND if self._mode == "lockstep" else qos.COMMAND
-        self.create_subscription(Twist, "cmd_vel", self._on_command, commands)
+        self._clock_message = Clock()
+        self._transforms = Transforms(self)
+        spaces = [f"{name}/" if name else "" for name in self._names]
+        frames = [device_parameters.frames(self, name) for name in self._names]
+        self._ports = [
+            RobotPort(self, space, model, frame, self._time)
+            for space, frame in zip(spaces, frames, strict=True)
+        ]
+        self._transforms.tell_fixed([port.mount() for port in self._ports])
+        commands = qos.EVERY_COMMAND if self._time.lockstep else qos.COMMAND
+        self._inlets = [
+            CommandInlet(
+                self, space, model.robot, commands, partial(self._on_command, k), self._too_old
+            )
+            for k, space in enumerate(spaces)
+        ]
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
-        if self._mode == "realtime":
-            period = self._model.control_period / float(self.get_parameter("rate").value)
-        elif self._mode == "as_fast_as_possible":
-            period = 0.0
-        else:
-            return
-        # Steady: not the node's clock, which with use_sim_time would wait for this very node.
-        self.create_timer(
-            period, self._on_time, clock=SteadyClock(clock_type=ClockType.STEADY_TIME)
-        )
 
-    def _on_command(self, message: Twist) -> None:
-        twist = conversions.twist_from_ros(message)
-        if not np.isfinite(twist).all():
-            self.get_logger().warning("cmd_vel: NaN or inf ignored", throttle_duration_sec=1.0)
-            return
-        self._command, self._command_ns = self._model.robot.from_cmd_vel(twist), self._now_ns
-        if self._mode == "lockstep" and not self._paused:
-            self._advance()
+    def _start_time(self) -> None:
+        # Steady: not the node's clock, which with use_sim_time would wait for this very node.
+        steady = SteadyClock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(WATCH_S, self._watch, clock=steady)
+        step_ns = self._time.step_ns
+        self._odom_pace, self._scan_pace = (
+            Pace(period_ns, step_ns) for period_ns in (self._time.odom_ns, self._time.scan_ns)
+        )
+        self._real_time = RealTime(step_ns, self._time.rate)
+        self._timer = None
+        if self._time.mode == "realtime":
+            period = step_ns / conversions.NANO / self._time.rate
+            # A tick of which the step is a multiple.
+            ticks = max(1.0, np.ceil(period / LONGEST_TICK_S)) if self._time.late else 1.0
+            self._timer = self.create_timer(period / ticks, self._on_time, clock=steady)
+        elif not self._time.lockstep:
+            self.create_timer(0.0, self._on_free_time, clock=steady)
+
+    def _watch(self) -> None:
+        for inlet in self._inlets:
+            inlet.watch()
+
+    def _timeout_ns(self) -> int:
+        return int(float(self.get_parameter("command_timeout").value or 0.0) * conversions.NANO)
+
+    def _too_old(self, stamp_ns: int) -> bool:
+        return not self._time.lockstep and self._now_ns - stamp_ns > self._timeout_ns()
+
+    def _on_command(self, robot: int, command: Array) -> None:
+        self._world.commands[robot], self._command_ns[robot] = command, self._now_ns
+        if self._time.lockstep and not self._paused:
+            self._heard[robot] = True
+            if self._heard.all():
+                self._advance()
 
     def _on_time(self) -> None:
         if self._paused:
             return
-        timeout = float(self.get_parameter("command_timeout").value)
-        if self._now_ns - self._command_ns > timeout * conversions.NANO:
-            self._command = np.zeros_like(self._command)
-        self._advance()
+        steady_ns = time.monotonic_ns()
+        if self._real_time.lost(steady_ns, self._now_ns):
+            self.get_logger().warning(
+                "this machine does not keep up with real time; ask for a smaller rate, scan_rate "
+                "or odom_rate, or fewer robots",
+                throttle_duration_sec=5.0,
+            )
+            self._real_time.begin(steady_ns, self._now_ns + self._time.step_ns)
+        for _ in range(self._real_time.behind(steady_ns, self._now_ns)):
+            self._stop_the_silent()
+            self._advance()
+        self._outbox.flush(max(self._now_ns, self._real_time.time_at(steady_ns)))
+
+    def _on_free_time(self) -> None:
+        if not self._paused:
+            self._stop_the_silent()
+            self._advance()
+            self._outbox.flush(self._now_ns)
+
+    def _stop_the_silent(self) -> None:
+        self._world.commands[self._now_ns - self._command_ns > self._timeout_ns()] = 0.0
 
     def _advance(self) -> None:
-        before = self._simulator.data.pose[0, 0].copy()
-        self._simulator.step(self._command[None, None])
-        self._now_ns += self._period_ns
-        moved = geometry.log(geometry.between(before, self._simulator.data.pose[0, 0]))
-        self._publish(moved / self._model.control_period)
+        with warnings.catch_warnings(record=True) as raised:
+            warnings.simplefilter("always", OutsideValidityWarning)
+            self._world.advance()
+        for warning in raised:
+            self.get_logger().warning(str(warning.message))
+        self._heard[:] = False
+        self._now_ns += self._time.step_ns
+        self._publish()
 
     def _begin(self) -> None:
+        """Begins an episode. Raises BridgeError where the parameters do not fit the world."""
         given = bool(self.get_parameter("episode_start_given").value)
         start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
-        seed = int(self.get_parameter("episode_seed").value)
-        self._simulator.reset([seed], starts=start[None, None] if given else None)
-        self._command = np.zeros_like(self._command)
-        self._now_ns += self._period_ns
-        self._publish(np.zeros(3))
+        seed = int(self.get_parameter("episode_seed").value or 0)
+        self._world.begin(seed, start if given else None)
+        self._outbox.clear()
+        self._heard[:] = False
+        self._now_ns += self._time.step_ns
+        self._odom_pace.begin(self._now_ns)
+        self._scan_pace.begin(self._now_ns)
+        self._go_on()
+        self._publish()
+
+    def _go_on(self) -> None:
+        """Lets real time begin anew at the present."""
+        self._real_time.begin(time.monotonic_ns(), self._now_ns)
+        if self._timer is not None:
+            self._timer.reset()
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
@@ -178,38 +203,28 @@ class DeviceNode(Node):
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._paused = bool(request.data)
+        if not self._paused:
+            self._go_on()
         response.success, response.message = True, "paused" if self._paused else "running"
         return response
 
-    def _publish(self, true_twist: Array) -> None:
-        """Publishes the present data; `true_twist` (3,) is the mean of the period before."""
-        data, now = self._simulator.data, self._now_ns
-        map_frame, odom_frame, base, laser = (
-            self._text(f"{name}_frame") for name in ("map", "odom", "base", "laser")
-        )
-        linear, angular = (std * std for std in self._model.noise.odometry)
-        drift = max(float(data.steps[0]) * self._model.control_period, COVARIANCE_GROWTH_S)
-        variance = (linear * drift, angular * drift, linear, angular)
-        pose, twist = data.odom[0, 0], data.twist[0, 0]
-        self._clock_topic.publish(Clock(clock=conversions.stamp_to_ros(now)))
-        self._odom_topic.publish(
-            conversions.odometry_to_ros(pose, twist, now, (odom_frame, base), variance)
-        )
-        self._joint_topic.publish(
-            conversions.joints_to_ros(self._model.robot, data.state[0, 0], now)
-        )
-        self._scan_topic.publish(
-            conversions.scan_to_ros(self._model.lidar, data.ranges[0, 0], now, laser)
-        )
-        truth = conversions.odometry_to_ros(
-            data.pose[0, 0], true_twist, now, (map_frame, base), (0.0,) * 4
-        )
-        self._truth_topic.publish(truth)
-
-
-def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
-    """A parameter that must be one of some words. Raises ConfigError with the nearest."""
-    value = str(node.get_parameter(name).value)
-    if value not in valid:
-        raise ConfigError(f"parameter {name!r}: unknown value {value!r}; {nearest(value, valid)}")
-    return value
+    def _publish(self) -> None:
+        """Publishes what is due of the present."""
+        now_ns, outbox = self._now_ns, self._outbox
+        now = conversions.stamp_to_ros(now_ns)
+        self._clock_message.clock = now
+        self._clock_topic.publish(self._clock_message)
+        odom_due, scan_due = self._odom_pace.due(now_ns), self._scan_pace.due(now_ns)
+        if not (odom_due or scan_due):
+            return
+        moving = []
+        for k, port in enumerate(self._ports):
+            sensed = self._world.sensed(k)
+            if odom_due:
+                port.tell_odometry(now, sensed, outbox, now_ns)
+                if self._transforms.published:
+                    moving += port.moving(now, sensed)
+            if scan_due:
+                port.tell_scan(now, sensed, outbox, now_ns)
+        if moving:
+            self._transforms.tell(moving, outbox, now_ns, self._time.latency_ns[1])

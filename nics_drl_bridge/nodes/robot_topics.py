@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, LaserScan
@@ -27,19 +29,31 @@ ANYWHERE = (100.0, 100.0, np.pi)
 """How well odometry alone tells where a robot is in the map of a pose sensor [m, rad]."""
 
 
+def declare_sensors(node: Node) -> None:
+    """Declares which sensors a robot has beside scan and odometry."""
+    about = f"Type of `{POSE}`, in the map frame: {NO_POSE}, {', '.join(POSE_TYPES)}."
+    declare(node, "pose_type", NO_POSE, about, read_only=True)
+    declare(node, "use_imu", False, "Whether to use the yaw rate of `imu`.", read_only=True)
+    stamped = f"Whether `{CMD_VEL}` is a TwistStamped."
+    declare(node, "enable_stamped_cmd_vel", False, stamped, read_only=True)
+
+
 class RobotTopics:
     """Subscribes to a robot's topics and keeps the middleware up to date.
 
     These are `scan`, `odom` and `cmd_vel`, and if the node's parameters `pose_type` and `use_imu`
-    say so, `pose` and `imu`. Data are used at their own stamps; a command, which has none, at
-    the stamp of the newest datum before it. The first odometry fixes where `map` is, unless there
-    is a pose sensor: then the first pose does.
+    say so, `pose` and `imu`. `declare_sensors` declares these two, and whether `cmd_vel` is
+    stamped, before. Whoever reads from another thread than the one that spins holds `lock`.
+    Data are used at their own stamps; a command, which has none, at the stamp of the newest datum
+    before it. The first odometry fixes where `map` is, unless there is a pose sensor: then the
+    first pose does.
 
     Args:
         node: whose topics they are.
         model: of the robot.
         on_odometry: called with the stamp [ns] after each odometry that is the newest.
         on_scan: called with the stamp [ns] after each scan that was used.
+        now_ns: the clock of arrivals [ns]; the node's by default.
 
     Raises:
         ConfigError: no such `pose_type`.
@@ -51,21 +65,30 @@ class RobotTopics:
         model: SimulatorModel,
         on_odometry: Callable[[int], None] | None = None,
         on_scan: Callable[[int], None] | None = None,
+        now_ns: Callable[[], int] | None = None,
     ) -> None:
         self._node, self._robot, self._lidar = node, model.robot, model.lidar
+        self._clock_ns = now_ns
+        self.lock = threading.RLock()
         self.middleware = Middleware(model)
         self.restart()
         self._on_odometry, self._on_scan = on_odometry, on_scan
-        node.create_subscription(LaserScan, SCAN, self._take_scan, qos.SENSOR)
-        node.create_subscription(Odometry, ODOM, self._take_odometry, qos.SENSOR)
-        node.create_subscription(Twist, CMD_VEL, self._take_command, qos.COMMAND)
+        stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
+        command = (TwistStamped, self._take_stamped) if stamped else (Twist, self._take_command)
+        self._subscriptions = [
+            node.create_subscription(kind, topic, self._guarded(take), quality)
+            for kind, topic, take, quality in (
+                (LaserScan, SCAN, self._take_scan, qos.SENSOR),
+                (Odometry, ODOM, self._take_odometry, qos.SENSOR),
+                (command[0], CMD_VEL, command[1], qos.COMMAND),
+            )
+        ]
         self.expected = (SCAN, ODOM, *self._subscribe_optional())
 
     def _subscribe_optional(self) -> list[str]:
         """The topics that the parameters ask for."""
-        node, asked = self._node, []
-        about = f"Type of `{POSE}`, in the map frame: {NO_POSE}, {', '.join(POSE_TYPES)}."
-        pose_type = str(declare(node, "pose_type", NO_POSE, about, read_only=True))
+        node, asked = self._node, {}
+        pose_type = str(node.get_parameter("pose_type").value)
         self._posed = pose_type != NO_POSE
         if self._posed:
             if pose_type not in POSE_TYPES:
@@ -73,18 +96,36 @@ class RobotTopics:
                     f"parameter 'pose_type': there is no {pose_type!r}; "
                     f"{nearest(pose_type, (NO_POSE, *POSE_TYPES))}"
                 )
-            kind = POSE_TYPES[pose_type]
-            node.create_subscription(kind, POSE, self._take_pose, qos.SENSOR)
-            asked.append(POSE)
-        if declare(node, "use_imu", False, "Whether to use the yaw rate of `imu`.", read_only=True):
-            node.create_subscription(Imu, IMU, self._take_imu, qos.SENSOR)
-            asked.append(IMU)
-        return asked
+            asked[POSE] = (POSE_TYPES[pose_type], self._take_pose)
+        if node.get_parameter("use_imu").value:
+            asked[IMU] = (Imu, self._take_imu)
+        for topic, (kind, take) in asked.items():
+            self._subscriptions.append(
+                node.create_subscription(kind, topic, self._guarded(take), qos.SENSOR)
+            )
+        return list(asked)
+
+    def _guarded(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
+        def locked(message: Any) -> None:
+            with self.lock:
+                take(message)
+
+        return locked
+
+    def close(self) -> None:
+        """Listens no more."""
+        while self._subscriptions:
+            self._node.destroy_subscription(self._subscriptions.pop())
 
     def restart(self) -> None:
         """Forgets everything; the next odometry begins anew."""
-        self._started = False
+        self._started, self._since_ns = False, 0
         self.middleware.reset(0, np.zeros(3))
+
+    def begin(self, stamp_ns: int, pose: conversions.Array) -> None:
+        """Forgets everything before a stamp [ns], at which the robot stands at a pose (3,)."""
+        self._started, self._since_ns = True, stamp_ns
+        self.middleware.reset(stamp_ns, pose)
 
     @property
     def newest_ns(self) -> int:
@@ -102,10 +143,14 @@ class RobotTopics:
 
     def now_ns(self) -> int:
         """The time on the clock of arrivals [ns]."""
+        if self._clock_ns is not None:
+            return self._clock_ns()
         return int(self._node.get_clock().now().nanoseconds)
 
     def _take_scan(self, message: LaserScan) -> None:
         stamp = conversions.stamp_from_ros(message.header.stamp)
+        if stamp < self._since_ns:
+            return
         ranges = conversions.scan_from_ros(self._lidar, message)
         used = self.middleware.scan(stamp, self.now_ns(), ranges)
         if used and self._on_scan is not None:
@@ -143,6 +188,22 @@ class RobotTopics:
             return
         self.middleware.imu(stamp, self.now_ns(), *measured)
 
+    def _take_stamped(self, message: TwistStamped) -> None:
+        self._take_command(message.twist)
+
     def _take_command(self, message: Twist) -> None:
         command = self._robot.from_cmd_vel(conversions.twist_from_ros(message))
         self.middleware.command(None, command)
+
+
+def data_facts(middleware: Middleware, now_ns: int) -> dict[str, Any]:
+    """For `info`: number, stamp [ns] and silence [s] of the newest datum of each topic.
+
+    The silence is the time since it came, on the receiver's clock, on which `now_ns` is.
+    """
+    facts: dict[str, Any] = {}
+    for topic, datum in middleware.cache.newest.items():
+        facts[f"{topic}_sequence"] = datum.sequence
+        facts[f"{topic}_stamp_ns"] = datum.stamp_ns
+        facts[f"{topic}_silence_s"] = (now_ns - datum.arrival_ns) * 1e-9
+    return facts

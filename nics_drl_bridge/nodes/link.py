@@ -1,0 +1,215 @@
+"""Link: a process's own end of a robot's topics, which never leaves the robot moving."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+from geometry_msgs.msg import Twist, TwistStamped
+from numpy.typing import ArrayLike
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+
+from nics_drl_bridge.errors import BackendError
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.executor import StandingExecutor
+from nics_drl_bridge.nodes.runner import last_word, open_context
+
+SPIN_S = 0.2
+POLL_S = 0.002
+
+
+class Link:
+    """A node of its own in a context of its own, one executor thread, and the command topic.
+
+    `close`, an error inside `zero_after_an_error`, garbage collection and the end of the process
+    leave a zero command behind, also when that end is SIGTERM. SIGKILL can't be answered:
+    `command_gate` and the base's own timeout are for that.
+
+    Args:
+        namespace: of the robot.
+        domain_id: DDS domain; the environment's by default.
+        command_topic: where commands go.
+        stamped: whether they are TwistStamped.
+        parameters: of the node.
+    """
+
+    def __init__(
+        self,
+        namespace: str = "",
+        domain_id: int | None = None,
+        command_topic: str = "cmd_vel",
+        stamped: bool = False,
+        parameters: Mapping[str, Any] | None = None,
+    ) -> None:
+        _end_orderly_on_sigterm()
+        self._context = open_context(domain_id=domain_id)
+        overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
+        self.node = Node(
+            "bridge_env", namespace=namespace, context=self._context,
+            start_parameter_services=False, parameter_overrides=overrides,
+        )  # fmt: skip
+        self._kind = TwistStamped if stamped else Twist
+        self.commands = self.node.create_publisher(self._kind, command_topic, qos.COMMAND)
+        self._closing: weakref.finalize[Any, Any] | None = None
+
+    def begin(self) -> None:
+        """Starts the executor's thread; to be called when all subscriptions are there."""
+        thread = threading.Thread(
+            target=_spin, args=(self._context, self.node), daemon=True, name="dds_backend"
+        )
+        thread.start()
+        self._closing = weakref.finalize(
+            self, _shut_down, self._context, self.commands, self._kind, thread
+        )
+
+    def send(self, twist: ArrayLike, stamp_ns: int = 0) -> None:
+        """Publishes linear.x, linear.y, angular.z (3,), stamped if the topic is."""
+        message = conversions.twist_to_ros(twist)
+        if self._kind is TwistStamped:
+            message = TwistStamped(twist=message)
+            message.header.stamp = conversions.stamp_to_ros(stamp_ns)
+            message.header.frame_id = "base_link"
+        self.commands.publish(message)
+
+    def halt(self) -> None:
+        """Publishes a zero command."""
+        if self._context.ok():
+            self.commands.publish(self._kind())
+
+    @contextlib.contextmanager
+    def zero_after_an_error(self) -> Iterator[None]:
+        """Publishes a zero command when what is inside ends by any exception."""
+        try:
+            yield
+        except BaseException:
+            self.halt()
+            raise
+
+    def check_open(self) -> None:
+        """Raises BackendError when it is closed."""
+        if self._closing is None or not self._closing.alive:
+            raise BackendError("this backend is closed; make another one.")
+
+    def call(self, client: Any, request: Any, timeout_s: float) -> Any:
+        """Calls a service; the executor's thread completes the future. Raises BackendError."""
+        done = threading.Event()
+        future = client.call_async(request)
+        future.add_done_callback(lambda _: done.set())
+        if not done.wait(timeout_s):
+            client.remove_pending_request(future)
+            raise BackendError(
+                f"service {client.srv_name}: no answer within {timeout_s:g} s; look at the "
+                "simulator node's log."
+            )
+        return future.result()
+
+    def others_command(self) -> bool:
+        """Whether somebody else publishes commands too."""
+        return bool(self.node.count_publishers(self.commands.topic_name) > 1)
+
+    def check_alone(self) -> None:
+        """Raises BackendError with the name of whoever else publishes commands."""
+        if not self.others_command():
+            return
+        topic = self.commands.topic_name
+        ends = self.node.get_publishers_info_by_topic(topic)
+        names = sorted(f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends)
+        with contextlib.suppress(ValueError):
+            names.remove(self.node.get_fully_qualified_name())
+        # A node's name travels apart from its publishers, and may not be here yet.
+        known = [name for name in names if "_UNKNOWN_" not in name]
+        raise BackendError(f"{', '.join(known) or 'somebody'} publishes {topic} too; stop it.")
+
+    def wait_for_peers(self, topics: Sequence[str], clients: Sequence[Any], patience_s: float,
+                       advice: str) -> None:  # fmt: skip
+        """Waits until every end is matched. Raises BackendError with what is missing."""
+        resolve, service = self.node.resolve_topic_name, self.node.resolve_service_name
+        needed: dict[str, Callable[[], bool]] = {
+            f"subscriber of {self.commands.topic_name}": lambda: (
+                self.commands.get_subscription_count() > 0
+            )
+        }
+        for topic in topics:
+            name = resolve(topic)
+            needed[f"publisher of {name}"] = lambda name=name: (  # type: ignore[misc]
+                self.node.count_publishers(name) > 0
+            )
+        for client in clients:
+            needed[f"service {service(client.srv_name)}"] = client.service_is_ready
+        deadline = time.monotonic() + patience_s
+        while missing := [name for name, there in needed.items() if not there()]:
+            if time.monotonic() > deadline:
+                raise BackendError(
+                    f"after {patience_s:g} s there is still no {', no '.join(missing)}; {advice}"
+                )
+            time.sleep(POLL_S)
+        # Somebody who was killed stays in the graph for a while.
+        while self.others_command() and time.monotonic() < deadline:
+            time.sleep(POLL_S)
+        self.check_alone()
+
+    def close(self) -> None:
+        """Publishes a zero command and ends the node."""
+        if self._closing is not None:
+            self._closing()
+
+
+def _spin(context: Context, node: Node) -> None:
+    executor = StandingExecutor(context)
+    executor.add_node(node)
+    try:
+        while context.ok():
+            executor.spin_once(timeout_sec=SPIN_S)
+    except ExternalShutdownException:
+        pass
+    finally:
+        executor.shutdown(timeout_sec=1.0)
+        node.destroy_node()
+
+
+def _shut_down(context: Context, commands: Publisher, kind: Any, thread: threading.Thread) -> None:
+    """Leaves a zero command behind and ends the thread; knows nothing of the link."""
+    with _deaf_to_interrupts():
+        if context.ok():
+            last_word(commands, kind())
+            context.try_shutdown()
+        # Garbage may be collected in any thread, also in that one.
+        if thread is not threading.current_thread():
+            thread.join(timeout=2.0)
+
+
+@contextlib.contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """Lets no second Ctrl-C cut a shutdown short.
+
+    The interpreter would end beside a thread inside the middleware's library, which aborts.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGINT, before)
+
+
+def _end_orderly_on_sigterm() -> None:
+    """Makes SIGTERM end Python as an exception does, unless the program handles it itself."""
+    in_main = threading.current_thread() is threading.main_thread()
+    if in_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, _end)
+
+
+def _end(number: int, _: Any) -> None:
+    raise SystemExit(128 + number)

@@ -1,0 +1,215 @@
+"""RealtimeBackend: a vehicle, or a simulator on the wall clock, as the same synchronous backend."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.config import validate
+from nics_drl_bridge.errors import BackendError, StaleDataError
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import RobotView, Start
+from nics_drl_bridge.middleware.measurement import SCAN
+from nics_drl_bridge.middleware.view import rehearse
+from nics_drl_bridge.nodes.episodes import Episodes
+from nics_drl_bridge.nodes.link import Link
+from nics_drl_bridge.nodes.realtime_options import RealtimeOptions
+from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_sensors
+from nics_drl_bridge.sim.world import World
+
+Array = NDArray[np.float64]
+NANO = 1_000_000_000
+POLL_S = 0.01
+SAY_EVERY_S = 2.0
+STILL = (0.02, 0.05)
+"""A robot that is slower stands [m/s, rad/s]."""
+ADVICE = (
+    "start the robot, or `simulator_node` with mode:=realtime, in the same ROS_DOMAIN_ID and "
+    "namespace."
+)
+
+
+class RealtimeBackend:
+    """One robot behind its topics, stepped at a fixed period of the steady clock.
+
+    A step publishes its command at once, waits until the period is over, and returns the newest
+    view. Whoever comes late misses deadlines, which are counted and not made up for: the next
+    step again ends on the grid of periods. Data feed the middleware as they come, in one executor
+    thread; late and disordered ones are put in their place there.
+
+    Args:
+        model: of the robot; a simulator must run the same.
+        world: likewise.
+        options: see `RealtimeOptions`.
+
+    Raises:
+        ConfigError: an option can't be used.
+        BackendError: nobody is there.
+    """
+
+    def __init__(self, model: SimulatorModel, world: World, **options: Any) -> None:
+        chosen = validate(options, RealtimeOptions, "backend_options")
+        self._options, self._robot = chosen, model.robot
+        self._period_ns = round((chosen.period_s or model.control_period) * NANO)
+        self._deadline_ns = self._misses = 0
+        rehearse(model)
+        self._link = Link(
+            chosen.namespace, chosen.domain_id, chosen.command_topic,
+            stamped=chosen.stamped or chosen.gated,
+            parameters={
+                "pose_type": chosen.pose_type,
+                "use_imu": chosen.use_imu,
+                "enable_stamped_cmd_vel": chosen.stamped,
+            },
+        )  # fmt: skip
+        try:
+            declare_sensors(self._link.node)
+            self._topics = RobotTopics(self._link.node, model, now_ns=time.monotonic_ns)
+            self._episodes = Episodes(self._link, chosen.simulator, model, world)
+            self._link.begin()
+            clients = self._episodes.clients if chosen.vehicle is False else []
+            self._link.wait_for_peers(self._topics.expected, clients, chosen.timeout_s, ADVICE)
+        except BaseException:
+            self.close()
+            raise
+
+    def reset(self, start: Start) -> RobotView:
+        """Begins an episode: a simulator's service does, or a vehicle has to stand there.
+
+        Raises:
+            BackendError: the simulator refuses, or the vehicle does not come to stand there.
+            StaleDataError: its data do not arrive.
+        """
+        self._link.check_open()
+        with self._link.zero_after_an_error():
+            self._link.halt()
+            vehicle = self._options.vehicle
+            if vehicle or (vehicle is None and not self._episodes.there):
+                self._await_start(start)
+            else:
+                self._begin(start)
+            self._misses, self._deadline_ns = 0, time.monotonic_ns() + self._period_ns
+            return self._fresh_view()[0]
+
+    def _begin(self, start: Start) -> None:
+        timeout_s = self._options.timeout_s
+        self._episodes.choose(start, timeout_s)
+        stamp_ns = self._episodes.begin(timeout_s)
+        with self._topics.lock:
+            self._topics.begin(stamp_ns, start.pose)
+        deadline = time.monotonic() + timeout_s
+        while math.isinf((late := self._oldest())[1]):
+            if time.monotonic() > deadline:
+                raise StaleDataError(*late, timeout_s)
+            time.sleep(POLL_S)
+
+    def _await_start(self, start: Start) -> None:
+        """Waits until a vehicle stands at its start, and says what is missing."""
+        say = self._options.say or self._link.node.get_logger().info
+        began, said = time.monotonic(), -math.inf
+        while missing := self._missing(start):
+            now = time.monotonic()
+            if now - began > self._options.start_timeout_s:
+                raise BackendError(
+                    f"after {self._options.start_timeout_s:g} s the robot is not ready: {missing}; "
+                    "place it there, or choose start='present'."
+                )
+            if now - said >= SAY_EVERY_S:
+                say(f"waiting for the robot: {missing}")
+                said = now
+            time.sleep(POLL_S)
+
+    def _missing(self, start: Start) -> str:
+        """What is missing until an episode may begin, as a clause; empty when nothing is."""
+        topic, silence_s = self._oldest()
+        if math.isinf(silence_s):
+            return f"no {topic} yet"
+        if silence_s > self._options.stale_after_s:
+            return f"no {topic} for {silence_s:.1f} s"
+        with self._topics.lock:
+            view = self._topics.view()
+        if abs(view.twist[2]) > STILL[1] or math.hypot(*view.twist[:2]) > STILL[0]:
+            return "it is still moving"
+        if self._options.start == "present":
+            return ""
+        off = geometry.between(view.pose, start.pose)
+        distance, turn = math.hypot(*off[:2]), math.degrees(abs(off[2]))
+        if distance <= self._options.tolerance[0] and abs(off[2]) <= self._options.tolerance[1]:
+            return ""
+        x, y, heading = start.pose
+        return (
+            f"it is {distance:.2f} m and {turn:.0f} deg off its start "
+            f"({x:.2f} m, {y:.2f} m, {math.degrees(heading):.0f} deg)"
+        )
+
+    def _oldest(self) -> tuple[str, float]:
+        """The topic with the oldest datum, and how old that is [s]; inf when there is none.
+
+        A datum is as old as it is silent, or as its stamp is behind the newest of all topics.
+        """
+        with self._topics.lock:
+            newest, now = dict(self._topics.middleware.cache.newest), time.monotonic_ns()
+        latest = max((datum.stamp_ns for datum in newest.values()), default=0)
+        ages = {
+            topic: max(now - newest[topic].arrival_ns, latest - newest[topic].stamp_ns) / NANO
+            if topic in newest
+            else math.inf
+            for topic in self._topics.expected
+        }
+        oldest = max(ages, key=lambda topic: ages[topic])
+        return oldest, ages[oldest]
+
+    def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
+        """Publishes a command, waits until the period is over; see `interface.Backend`.
+
+        Raises:
+            StaleDataError: the newest datum of a topic is older than `stale_after_s`.
+        """
+        self.send(command)
+        return self.receive()
+
+    def send(self, command: Array) -> None:
+        """The first half of a step: publishes a command (C,)."""
+        self._link.check_open()
+        with self._link.zero_after_an_error():
+            stamp_ns = 0
+            if self._options.stamped or self._options.gated:
+                with self._topics.lock:
+                    stamp_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
+            self._link.send(self._robot.to_cmd_vel(command), stamp_ns)
+
+    def receive(self) -> tuple[RobotView, dict[str, Any]]:
+        """The second half: waits until the period is over, and returns what is known then."""
+        with self._link.zero_after_an_error():
+            late_ns = time.monotonic_ns() - self._deadline_ns
+            if late_ns > 0:
+                missed = late_ns // self._period_ns + 1
+                self._misses += missed
+                self._deadline_ns += missed * self._period_ns
+            while (left_ns := self._deadline_ns - time.monotonic_ns()) > 0:
+                time.sleep(left_ns / NANO)
+            self._deadline_ns += self._period_ns
+            return self._fresh_view()
+
+    def _fresh_view(self) -> tuple[RobotView, dict[str, Any]]:
+        """The newest view, with facts. Raises StaleDataError when it is too old."""
+        topic, age_s = self._oldest()
+        if age_s > self._options.stale_after_s:
+            raise StaleDataError(topic, age_s, self._options.stale_after_s)
+        with self._topics.lock:
+            facts = data_facts(self._topics.middleware, time.monotonic_ns())
+            view, stamp_ns = self._topics.view(), self._topics.newest_ns
+        return view, {"stamp_ns": stamp_ns, "deadline_misses": self._misses, **facts}
+
+    def halt(self) -> None:
+        """Publishes a zero command."""
+        self._link.halt()
+
+    def close(self) -> None:
+        """Publishes a zero command and ends the node."""
+        self._link.close()
