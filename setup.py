@@ -107,6 +107,7 @@ setup(
         "console_scripts": [
             f"nics = {PACKAGE}.cli:main",
             f"simulator_node = {PACKAGE}.nodes.start:simulator_node",
+            f"mujoco_node = {PACKAGE}.nodes.start:mujoco_node",
             f"middleware_node = {PACKAGE}.nodes.start:middleware_node",
             f"policy_node = {PACKAGE}.nodes.start:policy_node",
             f"command_gate = {PACKAGE}.nodes.start:command_gate",

@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 TORQUE_RESERVE = 1.5
 """Torque limit of a motor, as a multiple of what the greatest acceleration of all takes."""
 
+SERVO_LAG_S = 0.005
+"""Of a motor behind its set point."""
+
 
 @dataclass(frozen=True)
 class Physics:
@@ -69,21 +72,25 @@ class Machine:
 class Motor:
     """A motor under a velocity servo: torque = gain x (wanted - actual speed), up to a limit.
 
-    A DC motor on a voltage does the same by itself; it gives way a little under load.
+    The wanted speed follows the command by a first-order lag, as the set point of a motor
+    controller does, so that the servo is stiff and the speed holds under load.
 
     Attributes:
         gain: [N m s/rad].
         torque: limit [N m].
+        lag: of the set point [s].
     """
 
     gain: float
     torque: float
+    lag: float
 
     def mjcf(self, transmission: str) -> str:
         """The MJCF of the motor at a `joint="NAME"` or a `tendon="NAME"`."""
         return f"""
-    <velocity {transmission} kv="{self.gain:.8g}"
-              forcerange="{-self.torque:.8g} {self.torque:.8g}"/>"""
+    <general {transmission} dyntype="filterexact" dynprm="{self.lag:.8g}" gainprm="{self.gain:.8g}"
+             biastype="affine" biasprm="0 0 {-self.gain:.8g}"
+             forcerange="{-self.torque:.8g} {self.torque:.8g}"/>"""
 
 
 def motor(inertia: float, lag: float, radius: float, step: float, physics: Physics) -> Motor:
@@ -101,7 +108,7 @@ def motor(inertia: float, lag: float, radius: float, step: float, physics: Physi
     """
     lag = max(lag, step / physics.acceleration)
     limit = TORQUE_RESERVE * physics.acceleration
-    return Motor(inertia / lag, inertia * limit / radius)
+    return Motor(inertia / SERVO_LAG_S, inertia * limit / radius, lag - SERVO_LAG_S)
 
 
 def document(name: str, physics: Physics, height: float, robot: str, actuators: str) -> str:

@@ -26,6 +26,11 @@ def simulator_node() -> None:
     _start("simulator_node")
 
 
+def mujoco_node() -> None:
+    """Runs `mujoco_node`."""
+    _start("mujoco_node")
+
+
 def middleware_node() -> None:
     """Runs `middleware_node`."""
     _start("middleware_node")

@@ -269,7 +269,7 @@ def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[n
         high = min(low + block, end)
         for n in range(low, high):
             if movers[0]:
-                _steer(
+                steer_world(
                     n, velocity, marks, bodies, pose, past, steps[n], walls, movers, seeds[n],
                     dt * substeps, robot[4],
                 )  # fmt: skip
@@ -321,7 +321,7 @@ def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[n
 
 
 @njit(cache=True, nogil=True)
-def _steer(n, velocity, marks, bodies, pose, past, step, walls, movers, seed, period, speeds):  # type: ignore[no-untyped-def]
+def steer_world(n, velocity, marks, bodies, pose, past, step, walls, movers, seed, period, speeds):  # type: ignore[no-untyped-def]
     """Sets the velocities of the obstacles of world n for the period that begins.
 
     Args:

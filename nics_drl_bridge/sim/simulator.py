@@ -106,7 +106,7 @@ class FastSimulator:
         self._crew = Crew(len(self.parts))
 
     @cached_property
-    def _packed(self) -> dict[int, Any]:
+    def packed(self) -> dict[int, Any]:
         """What the kernels take, by the first world of each part."""
         walls, motions = self.world.all_walls(), self.sampler.motions
         moves = any(motion is not None for motion in motions)
@@ -118,7 +118,7 @@ class FastSimulator:
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what a copy has to make anew."""
-        return {name: value for name, value in vars(self).items() if name != "_packed"}
+        return {name: value for name, value in vars(self).items() if name != "packed"}
 
     def reset(
         self,
@@ -154,7 +154,7 @@ class FastSimulator:
             of_part = chosen[(chosen >= part.start) & (chosen < part.stop)]
             if len(of_part):
                 self._boxes[part.start].begin()
-                kernels.begin(self._packed[part.start], of_part)
+                kernels.begin(self.packed[part.start], of_part)
         return scenes
 
     def scenes(self, seeds: ArrayLike) -> Scenes:
@@ -212,11 +212,11 @@ class FastSimulator:
         self._check_shape(commands, len(self.data.steps))
         self._boxes[0].check(commands)
         if len(self.parts) == 1:
-            kernels.step_worlds(self._packed[0], commands, 0)
+            kernels.step_worlds(self.packed[0], commands, 0)
         else:
             self.run_parts(
                 lambda part: kernels.step_worlds(
-                    self._packed[part.start], commands[part], part.start
+                    self.packed[part.start], commands[part], part.start
                 )
             )
 
@@ -234,7 +234,7 @@ class FastSimulator:
         commands = np.ascontiguousarray(commands, dtype=np.float64)
         self._check_shape(commands, part.stop - part.start)
         self._boxes[part.start].check(commands)
-        kernels.step_worlds(self._packed[part.start], commands, part.start)
+        kernels.step_worlds(self.packed[part.start], commands, part.start)
 
     def _check_shape(self, commands: Array, worlds: int) -> None:
         """Raises ConfigError where the kernels would read beyond the commands."""

@@ -11,7 +11,8 @@ from nics_drl_bridge.highfidelity.drive import record
 from nics_drl_bridge.highfidelity.library import load_mujoco
 from nics_drl_bridge.highfidelity.machine import Physics
 from nics_drl_bridge.highfidelity.machines import build_machine
-from nics_drl_bridge.highfidelity.robot import MujocoRobot, Reading
+from nics_drl_bridge.highfidelity.rig import Reading
+from nics_drl_bridge.highfidelity.robot import MujocoRobot
 from nics_drl_bridge.highfidelity.rollers import roller_size
 from nics_drl_bridge.kinematics.recording import check
 from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
