@@ -1,4 +1,4 @@
-"""The seams between what knows about robots and what learns: RobotView and Backend."""
+"""The seams: RobotView and Backend to what learns, Simulator to what moves robots."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 
 @dataclass(frozen=True)
@@ -68,4 +68,60 @@ class Backend(Protocol):
 
     def close(self) -> None:
         """Leaves the robot with a zero command and frees everything."""
+        ...
+
+
+class RobotStates(Protocol):
+    """What a simulator knows of its M robots after a step; the leading 1 is its one world."""
+
+    @property
+    def pose(self) -> NDArray[np.float64]:
+        """(1, M, 3) true pose of `base_link` in `map`."""
+        ...
+
+    @property
+    def twist(self) -> NDArray[np.float64]:
+        """(1, M, 3) measured body twist."""
+        ...
+
+    @property
+    def state(self) -> NDArray[np.float64]:
+        """(1, M, S) true state, in the order of the RobotSpec."""
+        ...
+
+    @property
+    def odom(self) -> NDArray[np.float64]:
+        """(1, M, 3) pose by odometry, which drifts; it begins at the start pose."""
+        ...
+
+    @property
+    def ranges(self) -> NDArray[np.float32]:
+        """(1, M, B) scan, REP-117."""
+        ...
+
+    @property
+    def collided(self) -> NDArray[np.uint8]:
+        """(1, M) 1 once a robot has touched something."""
+        ...
+
+    @property
+    def steps(self) -> NDArray[np.int64]:
+        """(1,) control periods since the reset."""
+        ...
+
+
+class Simulator(Protocol):
+    """One world of M robots that anything may stand behind; `FastSimulator` is one."""
+
+    @property
+    def data(self) -> RobotStates:
+        """The present; a step may write into the same arrays."""
+        ...
+
+    def reset(self, seeds: ArrayLike, *, starts: ArrayLike | None = None) -> Any:
+        """Begins the episode of a seed (1,), at poses (1, M, 3) if they are given."""
+        ...
+
+    def step(self, commands: ArrayLike) -> None:
+        """Moves the robots by one control period; commands (1, M, C) as in the RobotSpec."""
         ...

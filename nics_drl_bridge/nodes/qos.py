@@ -27,3 +27,14 @@ replacing the first one's."""
 
 COMMAND = _keep_last(1, ReliabilityPolicy.RELIABLE)
 """Commands: only the newest counts, and it has to arrive."""
+
+TRANSFORMS = _keep_last(100, ReliabilityPolicy.RELIABLE)
+"""`/tf`: as tf2's own broadcasters, whose listeners ask for reliable."""
+
+FIXED_TRANSFORMS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+"""`/tf_static`: told once, and again to everybody who comes later."""

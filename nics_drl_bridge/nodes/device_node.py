@@ -1,0 +1,230 @@
+"""DeviceNode: a simulator of any kind behind the topics of the hardware."""
+
+from __future__ import annotations
+
+import json
+import time
+import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.clock import Clock as SteadyClock
+from rclpy.clock import ClockType
+from rclpy.context import Context
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import SetBool, Trigger
+
+from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import Simulator
+from nics_drl_bridge.nodes import conversions, device_parameters, qos
+from nics_drl_bridge.nodes.command_inlet import CommandInlet
+from nics_drl_bridge.nodes.device_parameters import declare_device
+from nics_drl_bridge.nodes.outbox import Outbox
+from nics_drl_bridge.nodes.pace import Pace, RealTime
+from nics_drl_bridge.nodes.robot_port import RobotPort
+from nics_drl_bridge.nodes.runner import declare_model
+from nics_drl_bridge.nodes.transforms import Transforms
+from nics_drl_bridge.sim.device_world import DeviceWorld
+from nics_drl_bridge.sim.validity import OutsideValidityWarning
+from nics_drl_bridge.sim.world import World, load_world
+
+Array = NDArray[np.float64]
+WATCH_S = 2.0
+LONGEST_TICK_S = 0.005
+"""How often it is looked whether something late is due."""
+
+MakeSimulator = Callable[[Node, SimulatorModel, World, int], Simulator]
+"""Makes the simulator of so many robots; may declare parameters of its own at the node. The control
+period that it steps by is the given model's."""
+
+
+class DeviceNode(Node):
+    """Takes `cmd_vel`; publishes `scan`, `odom`, `joint_states`, `ground_truth`, `/clock`, `/tf`.
+
+    With the parameter `robots` it is a fleet in one world, each robot in a namespace below the
+    node's own. Stamps are simulated time, as on `/clock`: it begins at the system's time and never
+    runs backwards, also not at a reset. `~/reset` begins the episode of the parameters
+    `episode_seed` and `episode_start`; its answer is JSON with the stamp of the first data. In
+    lock-step the world moves when each robot has a command.
+
+    Args:
+        name: of the node.
+        context: to live in.
+        make: makes what moves the robots.
+    """
+
+    def __init__(self, name: str, context: Context, make: MakeSimulator) -> None:
+        super().__init__(name, context=context)
+        model = declare_model(self)
+        declare_device(self, model.lidar.frame)
+        self._time = device_parameters.timing(self, model)
+        self._names = device_parameters.namespaces(self)
+        world = load_world(str(self.get_parameter("world").value))
+        self._identity = {"model": model.fingerprint, "world": world.fingerprint}
+        model = device_parameters.timed_model(self, model, self._time)
+        simulator = make(self, model, world, len(self._names))
+        self._world = DeviceWorld(simulator, model, len(self._names))
+        self._now_ns = time.time_ns() // self._time.step_ns * self._time.step_ns
+        self._command_ns = np.zeros(len(self._names), np.int64)
+        self._heard = np.zeros(len(self._names), np.bool_)
+        self._paused = False
+        self._world.advance()  # compiled before anybody waits for it
+        self._open_topics(model)
+        self._start_time()
+        self._begin()
+
+    def _open_topics(self, model: SimulatorModel) -> None:
+        self._outbox = Outbox(self._time.jitter_ns)
+        self._clock_topic = self.create_publisher(Clock, "/clock", qos.SENSOR_RELIABLE)
+        self._clock_message = Clock()
+        self._transforms = Transforms(self)
+        spaces = [f"{name}/" if name else "" for name in self._names]
+        frames = [device_parameters.frames(self, name) for name in self._names]
+        self._ports = [
+            RobotPort(self, space, model, frame, self._time)
+            for space, frame in zip(spaces, frames, strict=True)
+        ]
+        self._transforms.tell_fixed([port.mount() for port in self._ports])
+        commands = qos.EVERY_COMMAND if self._time.lockstep else qos.COMMAND
+        self._inlets = [
+            CommandInlet(
+                self, space, model.robot, commands, partial(self._on_command, k), self._too_old
+            )
+            for k, space in enumerate(spaces)
+        ]
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(SetBool, "~/pause", self._on_pause)
+
+    def _start_time(self) -> None:
+        # Steady: not the node's clock, which with use_sim_time would wait for this very node.
+        steady = SteadyClock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(WATCH_S, self._watch, clock=steady)
+        step_ns = self._time.step_ns
+        self._odom_pace, self._scan_pace = (
+            Pace(period_ns, step_ns) for period_ns in (self._time.odom_ns, self._time.scan_ns)
+        )
+        self._real_time = RealTime(step_ns, self._time.rate)
+        self._timer = None
+        if self._time.mode == "realtime":
+            period = step_ns / conversions.NANO / self._time.rate
+            # A tick of which the step is a multiple.
+            ticks = max(1.0, np.ceil(period / LONGEST_TICK_S)) if self._time.late else 1.0
+            self._timer = self.create_timer(period / ticks, self._on_time, clock=steady)
+        elif not self._time.lockstep:
+            self.create_timer(0.0, self._on_free_time, clock=steady)
+
+    def _watch(self) -> None:
+        for inlet in self._inlets:
+            inlet.watch()
+
+    def _timeout_ns(self) -> int:
+        return int(float(self.get_parameter("command_timeout").value or 0.0) * conversions.NANO)
+
+    def _too_old(self, stamp_ns: int) -> bool:
+        return not self._time.lockstep and self._now_ns - stamp_ns > self._timeout_ns()
+
+    def _on_command(self, robot: int, command: Array) -> None:
+        self._world.commands[robot], self._command_ns[robot] = command, self._now_ns
+        if self._time.lockstep and not self._paused:
+            self._heard[robot] = True
+            if self._heard.all():
+                self._advance()
+
+    def _on_time(self) -> None:
+        if self._paused:
+            return
+        steady_ns = time.monotonic_ns()
+        if self._real_time.lost(steady_ns, self._now_ns):
+            self.get_logger().warning(
+                "this machine does not keep up with real time; ask for a smaller rate, scan_rate "
+                "or odom_rate, or fewer robots",
+                throttle_duration_sec=5.0,
+            )
+            self._real_time.begin(steady_ns, self._now_ns + self._time.step_ns)
+        for _ in range(self._real_time.behind(steady_ns, self._now_ns)):
+            self._stop_the_silent()
+            self._advance()
+        self._outbox.flush(max(self._now_ns, self._real_time.time_at(steady_ns)))
+
+    def _on_free_time(self) -> None:
+        if not self._paused:
+            self._stop_the_silent()
+            self._advance()
+            self._outbox.flush(self._now_ns)
+
+    def _stop_the_silent(self) -> None:
+        self._world.commands[self._now_ns - self._command_ns > self._timeout_ns()] = 0.0
+
+    def _advance(self) -> None:
+        with warnings.catch_warnings(record=True) as raised:
+            warnings.simplefilter("always", OutsideValidityWarning)
+            self._world.advance()
+        for warning in raised:
+            self.get_logger().warning(str(warning.message))
+        self._heard[:] = False
+        self._now_ns += self._time.step_ns
+        self._publish()
+
+    def _begin(self) -> None:
+        """Begins an episode. Raises BridgeError where the parameters do not fit the world."""
+        given = bool(self.get_parameter("episode_start_given").value)
+        start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
+        seed = int(self.get_parameter("episode_seed").value or 0)
+        self._world.begin(seed, start if given else None)
+        self._outbox.clear()
+        self._heard[:] = False
+        self._now_ns += self._time.step_ns
+        self._odom_pace.begin(self._now_ns)
+        self._scan_pace.begin(self._now_ns)
+        self._go_on()
+        self._publish()
+
+    def _go_on(self) -> None:
+        """Lets real time begin anew at the present."""
+        self._real_time.begin(time.monotonic_ns(), self._now_ns)
+        if self._timer is not None:
+            self._timer.reset()
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            self._begin()
+        except BridgeError as error:
+            response.success, response.message = False, str(error)
+            return response
+        response.success = True
+        answer: dict[str, Any] = {"stamp_ns": self._now_ns, **self._identity}
+        response.message = json.dumps(answer)
+        return response
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._paused = bool(request.data)
+        if not self._paused:
+            self._go_on()
+        response.success, response.message = True, "paused" if self._paused else "running"
+        return response
+
+    def _publish(self) -> None:
+        """Publishes what is due of the present."""
+        now_ns, outbox = self._now_ns, self._outbox
+        now = conversions.stamp_to_ros(now_ns)
+        self._clock_message.clock = now
+        self._clock_topic.publish(self._clock_message)
+        odom_due, scan_due = self._odom_pace.due(now_ns), self._scan_pace.due(now_ns)
+        if not (odom_due or scan_due):
+            return
+        moving = []
+        for k, port in enumerate(self._ports):
+            sensed = self._world.sensed(k)
+            if odom_due:
+                port.tell_odometry(now, sensed, outbox, now_ns)
+                if self._transforms.published:
+                    moving += port.moving(now, sensed)
+            if scan_due:
+                port.tell_scan(now, sensed, outbox, now_ns)
+        if moving:
+            self._transforms.tell(moving, outbox, now_ns, self._time.latency_ns[1])

@@ -1,0 +1,201 @@
+"""Parameters of a device node: what it simulates, how its time runs, and how it tells of it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.nodes.pace import NANO, common_step
+from nics_drl_bridge.nodes.runner import declare
+
+LOCKSTEP = "lockstep"
+MODES = ("realtime", LOCKSTEP, "as_fast_as_possible")
+MODELS_OWN = -1.0
+GREATEST_FLEET = 256
+NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How the time of a device runs; lock-step is exact, without any of the delays.
+
+    Attributes:
+        mode: one of `MODES`.
+        rate: simulated seconds per second in realtime.
+        step_ns: by which the world moves.
+        odom_ns: between two odometries.
+        scan_ns: between two scans.
+        latency_ns: by which scan, odometry are told later than they were measured.
+        jitter_ns: greatest further delay.
+    """
+
+    mode: str
+    rate: float
+    step_ns: int
+    odom_ns: int
+    scan_ns: int
+    latency_ns: tuple[int, int]
+    jitter_ns: int
+
+    @property
+    def lockstep(self) -> bool:
+        """Whether the world waits for commands."""
+        return self.mode == LOCKSTEP
+
+    @property
+    def late(self) -> bool:
+        """Whether anything is told later than it was measured."""
+        return any((*self.latency_ns, self.jitter_ns))
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Frame ids of one robot, and of the map that all share."""
+
+    map: str
+    odom: str
+    base: str
+    laser: str
+
+
+def declare_device(node: Node, laser_frame: str) -> None:
+    """Declares all but what belongs to the kind of simulator, and checks what can be set later."""
+    # First, so that it also judges the values that the node is started with.
+    node.add_on_set_parameters_callback(_check_episode)
+    world = "World file, or the name of a shipped world."
+    declare(node, "world", "arena", world, read_only=True)
+    about = "How many robots, named robot1, robot2, ..., or their namespaces; 1 has none."
+    fleet = ParameterDescriptor(description=about, read_only=True, dynamic_typing=True)
+    node.declare_parameter("robots", 1, fleet)
+    _declare_time(node)
+    stamped = "Whether cmd_vel is a TwistStamped; a Twist otherwise."
+    declare(node, "enable_stamped_cmd_vel", False, stamped, read_only=True)
+    silence = "Stops after this silence on cmd_vel [simulated s]; not in lockstep."
+    declare(node, "command_timeout", 0.5, silence, low=0.0, high=3600.0)
+    prefix = "Put before the frames of the robot; in a fleet before its namespace there."
+    declare(node, "frame_prefix", "", prefix, read_only=True)
+    for frame, default in (
+        ("map", "map"), ("odom", "odom"), ("base", "base_link"), ("laser", laser_frame),
+    ):  # fmt: skip
+        declare(node, f"{frame}_frame", default, f"Frame id of {default}.", read_only=True)
+    truth = "Whether to publish the true map -> odom on /tf, in place of a localiser."
+    declare(node, "publish_map_to_odom", False, truth, read_only=True)
+    declare(node, "episode_seed", 0, "Seed of the episode that ~/reset begins.")
+    start = "Start x, y, heading of that episode, of each robot."
+    declare(node, "episode_start", [0.0, 0.0, 0.0], start)
+    given = "Whether episode_start holds, or the seed's own."
+    declare(node, "episode_start_given", False, given)
+
+
+def _declare_time(node: Node) -> None:
+    declare(node, "mode", "realtime", f"How time runs: {', '.join(MODES)}.", read_only=True)
+    for name, default, low, high, about in (
+        ("rate", 1.0, 0.01, 1000.0, "Simulated seconds per second in realtime."),
+        ("odom_rate", 0.0, 0.0, 1000.0, "Of odom [Hz]; 0 for one per control period."),
+        ("scan_rate", 0.0, 0.0, 1000.0, "Of scan [Hz]; 0 for the lidar's own."),
+        ("scan_latency", 0.0, 0.0, 10.0, "From the stamp of a scan to its publication [s]."),
+        ("odom_latency", 0.0, 0.0, 10.0, "From the stamp of odom to its publication [s]."),
+        ("latency_jitter", 0.0, 0.0, 10.0, "Greatest further delay of both, drawn evenly [s]."),
+        ("command_latency", MODELS_OWN, MODELS_OWN, 10.0,
+         "From a command to its effect [s]; -1 for the measured one of the model."),
+    ):  # fmt: skip
+        declare(node, name, default, about, low=low, high=high, read_only=True)
+
+
+def timing(node: Node, model: SimulatorModel) -> Timing:
+    """How time runs, as the parameters say; in lock-step as the model alone says."""
+    mode = choice(node, "mode", MODES)
+    value = {
+        name: float(node.get_parameter(name).value or 0.0)
+        for name in (
+            "rate", "odom_rate", "scan_rate", "scan_latency", "odom_latency", "latency_jitter"
+        )
+    }  # fmt: skip
+    if mode == LOCKSTEP:
+        period = round(model.control_period * NANO)
+        return Timing(mode, 1.0, period, period, period, (0, 0), 0)
+    odom = 1.0 / value["odom_rate"] if value["odom_rate"] else model.control_period
+    scan = 1.0 / (value["scan_rate"] or model.lidar.rate)
+    dt = model.timing[0]
+    step = common_step(dt, (odom, scan)) * dt
+    nanoseconds = [
+        round(seconds * NANO)
+        for seconds in (step, odom, scan, value["scan_latency"], value["odom_latency"],
+                        value["latency_jitter"])
+    ]  # fmt: skip
+    step_ns, odom_ns, scan_ns, scan_late_ns, odom_late_ns, jitter_ns = nanoseconds
+    latency = (scan_late_ns, odom_late_ns)
+    return Timing(mode, value["rate"], step_ns, odom_ns, scan_ns, latency, jitter_ns)
+
+
+def timed_model(node: Node, model: SimulatorModel, time: Timing) -> SimulatorModel:
+    """The model with the step that the world moves by and the latency that was asked for."""
+    latency = float(node.get_parameter("command_latency").value or 0.0)
+    if time.lockstep:
+        return model
+    if latency >= 0.0:
+        calibration = replace(model.calibration, command_latency_s=latency)
+        model = replace(model, calibration=calibration)
+    dt = model.timing[0]
+    steps = round(time.step_ns / NANO / dt)
+    return model if steps == model.timing[1] else replace(model, control_period=steps * dt)
+
+
+def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
+    """A parameter that must be one of some words. Raises ConfigError with the nearest."""
+    value = str(node.get_parameter(name).value)
+    if value not in valid:
+        raise ConfigError(f"parameter {name!r}: unknown value {value!r}; {nearest(value, valid)}")
+    return value
+
+
+def namespaces(node: Node) -> tuple[str, ...]:
+    """The namespace of each robot below the node's own; one empty name for a robot alone.
+
+    Raises:
+        ConfigError: `robots` is neither a count nor a list of different names.
+    """
+    value: Any = node.get_parameter("robots").value
+    if isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= GREATEST_FLEET:
+        return ("",) if value == 1 else tuple(f"robot{k + 1}" for k in range(value))
+    names = tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else ()
+    valid = all(isinstance(name, str) and NAMESPACE.fullmatch(name) for name in names)
+    if not names or not valid or len(set(names)) < len(names) or len(names) > GREATEST_FLEET:
+        raise ConfigError(
+            f"parameter 'robots' is {value!r}; give a count from 1 to {GREATEST_FLEET}, or a list "
+            "of different namespaces, as in [robot1, robot2]."
+        )
+    return names
+
+
+def frames(node: Node, namespace: str) -> Frames:
+    """The frames of a robot: those of a fleet begin with its namespace, but for the shared map."""
+    prefix = str(node.get_parameter("frame_prefix").value) + (f"{namespace}/" if namespace else "")
+    name = {
+        each: str(node.get_parameter(f"{each}_frame").value)
+        for each in ("map", "odom", "base", "laser")
+    }
+    return Frames(name["map"], prefix + name["odom"], prefix + name["base"], prefix + name["laser"])
+
+
+def _check_episode(parameters: list[Parameter]) -> SetParametersResult:
+    for parameter in parameters:
+        reason = ""
+        if parameter.name == "episode_start":
+            values = np.array(parameter.value, dtype=np.float64)
+            if not values.size or values.size % 3 or not np.isfinite(values).all():
+                reason = "episode_start must be three finite numbers: x, y, heading; of each robot."
+        elif parameter.name == "episode_seed" and parameter.value < 0:
+            reason = "episode_seed must be 0 or more."
+        if reason:
+            return SetParametersResult(successful=False, reason=reason)
+    return SetParametersResult(successful=True)

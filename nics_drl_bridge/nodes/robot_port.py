@@ -1,0 +1,126 @@
+"""RobotPort: what one simulated robot tells, in messages that are made once and filled anew."""
+
+from __future__ import annotations
+
+import array
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TransformStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.node import Node
+from sensor_msgs.msg import JointState, LaserScan
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.rep117 import to_device
+from nics_drl_bridge.nodes import conversions, qos, transforms
+from nics_drl_bridge.nodes.device_parameters import Frames, Timing
+from nics_drl_bridge.nodes.outbox import Outbox
+from nics_drl_bridge.sim.dead_reckoning import LEAST_VARIANCE, variances
+from nics_drl_bridge.sim.device_world import Sensed
+
+Array = NDArray[np.float64]
+PLANAR = np.array([0, 1, 5])
+DIAGONAL = np.arange(0, 36, 7)
+
+
+class RobotPort:
+    """Publishes `scan`, `odom`, `joint_states` and `ground_truth` of one robot.
+
+    The last two cost nothing while nobody listens.
+
+    Args:
+        node: that publishes.
+        namespace: of the robot below the node's, empty or with a slash at its end.
+        model: of the robot.
+        frames: of the robot.
+        time: how it runs.
+    """
+
+    def __init__(
+        self, node: Node, namespace: str, model: SimulatorModel, frames: Frames, time: Timing
+    ) -> None:
+        self._model, self._time, self.frames = model, time, frames
+        quality = qos.SENSOR_RELIABLE
+        self._scans = node.create_publisher(LaserScan, f"{namespace}scan", quality)
+        self._odoms = node.create_publisher(Odometry, f"{namespace}odom", quality)
+        self._truths = node.create_publisher(Odometry, f"{namespace}ground_truth", quality)
+        self._joints = node.create_publisher(JointState, f"{namespace}joint_states", quality)
+        self._scan = scan_message(model, frames.laser, time)
+        # Beam 0 of a device that turns counter-clockwise was measured first.
+        self._sweep_ns = round(
+            max(0.0, self._scan.time_increment) * (model.lidar.beams - 1) * conversions.NANO
+        )
+        self._odom = odometry_message(frames.odom, frames.base)
+        self._odom.twist.covariance[DIAGONAL[PLANAR]] = variances(model.noise.odometry)
+        self._truth = odometry_message(frames.map, frames.base)
+        for covariance in (self._truth.pose.covariance, self._truth.twist.covariance):
+            covariance[DIAGONAL[PLANAR]] = LEAST_VARIANCE
+        self._moving = [transforms.transform_message(frames.odom, frames.base)]
+        if node.get_parameter("publish_map_to_odom").value:
+            self._moving.append(transforms.transform_message(frames.map, frames.odom))
+
+    def mount(self) -> TransformStamped:
+        """base_link -> laser."""
+        message = transforms.transform_message(self.frames.base, self.frames.laser)
+        return transforms.fill(message, self._model.lidar.mount, Time())
+
+    def moving(self, now: Time, sensed: Sensed) -> list[TransformStamped]:
+        """Odom -> base_link; and map -> odom where that was asked for."""
+        transforms.fill(self._moving[0], sensed.odom, now)
+        for message in self._moving[1:]:
+            # That which takes the pose by odometry to the true one.
+            home = geometry.between(sensed.odom, np.zeros(3))
+            transforms.fill(message, geometry.compose(sensed.pose, home), now)
+        return self._moving
+
+    def tell_odometry(self, now: Time, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
+        """Publishes where the robot takes itself to be, and what only a simulator knows."""
+        latency_ns = self._time.latency_ns[1]
+        fill_odometry(self._odom, sensed.odom, sensed.twist, now)
+        self._odom.pose.covariance.reshape(6, 6)[conversions.PLANAR] = sensed.covariance
+        outbox.send(self._odoms, self._odom, now_ns, latency_ns)
+        if self._joints.get_subscription_count():
+            joints = conversions.joints_to_ros(self._model.robot, sensed.state, now_ns)
+            outbox.send(self._joints, joints, now_ns, latency_ns)
+        if self._truths.get_subscription_count():
+            fill_odometry(self._truth, sensed.pose, sensed.true_twist, now)
+            self._truths.publish(self._truth)
+
+    def tell_scan(self, now: Time, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
+        """Publishes what the robot's lidar sees, stamped with the time of beam 0."""
+        message, sweep = self._scan, 0 if self._time.lockstep else self._sweep_ns
+        message.header.stamp = conversions.stamp_to_ros(now_ns - sweep) if sweep else now
+        message.ranges = array.array("f", to_device(sensed.ranges, self._model.lidar).tobytes())
+        outbox.send(self._scans, message, now_ns, self._time.latency_ns[0])
+
+
+def scan_message(model: SimulatorModel, frame: str, time: Timing) -> LaserScan:
+    """A scan whose ranges and stamp are still to be filled in."""
+    message = LaserScan()
+    message.header.frame_id = frame
+    for field, value in model.lidar.header._asdict().items():
+        setattr(message, field, value)
+    message.scan_time = time.scan_ns / conversions.NANO
+    return message
+
+
+def odometry_message(parent: str, child: str) -> Odometry:
+    """An odometry whose numbers are still to be filled in; what a plane lacks is unknown."""
+    message = Odometry(child_frame_id=child)
+    message.header.frame_id = parent
+    for covariance in (message.pose.covariance, message.twist.covariance):
+        covariance[DIAGONAL] = conversions.UNUSED_VARIANCE
+    return message
+
+
+def fill_odometry(message: Odometry, pose: Array, twist: Array, now: Time) -> None:
+    """Writes pose (3,) and body twist (3,) into an odometry."""
+    x, y, heading = pose.tolist()
+    message.header.stamp = now
+    message.pose.pose.position.x, message.pose.pose.position.y = x, y
+    message.pose.pose.orientation = conversions.heading_to_ros(heading)
+    velocity = message.twist.twist
+    velocity.linear.x, velocity.linear.y, velocity.angular.z = twist.tolist()

@@ -1,0 +1,104 @@
+"""DeviceWorld: one world of a simulator as the devices in it know it, whatever moves them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import Simulator
+from nics_drl_bridge.sim.dead_reckoning import propagate, step_covariance
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sensed:
+    """What one robot knows and is at a time.
+
+    Attributes:
+        odom: (3,) pose by odometry.
+        covariance: (3, 3) of it.
+        twist: (3,) measured body twist.
+        state: (S,) true state.
+        ranges: (B,) scan.
+        pose: (3,) true pose in `map`.
+        true_twist: (3,) mean of the step before.
+    """
+
+    odom: Array
+    covariance: Array
+    twist: Array
+    state: Array
+    ranges: NDArray[np.float32]
+    pose: Array
+    true_twist: Array
+
+
+class DeviceWorld:
+    """Keeps the last command of each robot, and how far odometry may be trusted.
+
+    Args:
+        simulator: what moves the robots.
+        model: of the robots, with the step of the simulator.
+        robots: M.
+
+    Attributes:
+        commands: (M, C) that the next step takes.
+    """
+
+    def __init__(self, simulator: Simulator, model: SimulatorModel, robots: int) -> None:
+        self._simulator, self._period = simulator, model.control_period
+        self._added = step_covariance(model.noise.odometry, self._period)
+        self.commands: Array = np.zeros((robots, len(model.robot.command)))
+        self._covariance = np.tile(self._added, (robots, 1, 1))
+        self._true_twist = np.zeros((robots, 3))
+
+    @property
+    def robots(self) -> int:
+        """M."""
+        return len(self.commands)
+
+    def begin(self, seed: int, starts: Array | None) -> None:
+        """Begins the episode of a seed, at x, y, heading of each robot (3 M,) if they are given.
+
+        Raises:
+            ConfigError: the starts are of another number of robots.
+        """
+        if starts is not None and starts.size != 3 * self.robots:
+            raise ConfigError(
+                f"episode_start has {starts.size} numbers; {self.robots} robots need "
+                f"{3 * self.robots}: x, y, heading of each."
+            )
+        placed = None if starts is None else starts.reshape(1, self.robots, 3)
+        self._simulator.reset([seed], starts=placed)
+        self.commands[:] = 0.0
+        self._covariance[:] = self._added
+        self._true_twist[:] = 0.0
+
+    def advance(self) -> None:
+        """Moves all robots by one step."""
+        data = self._simulator.data
+        pose, odom = data.pose[0].copy(), data.odom[0].copy()
+        self._simulator.step(self.commands[None])
+        data = self._simulator.data
+        moved = geometry.log(geometry.between(pose, data.pose[0]))
+        self._true_twist = moved / self._period
+        self._covariance = propagate(self._covariance, odom, data.odom[0], self._added)
+
+    def sensed(self, robot: int) -> Sensed:
+        """The present of one robot; the next step may write over it."""
+        data = self._simulator.data
+        return Sensed(
+            data.odom[0, robot],
+            self._covariance[robot],
+            data.twist[0, robot],
+            data.state[0, robot],
+            data.ranges[0, robot],
+            data.pose[0, robot],
+            self._true_twist[robot],
+        )
