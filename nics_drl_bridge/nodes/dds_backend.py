@@ -30,38 +30,64 @@ ADVICE = "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID a
 
 
 class _Mailbox:
-    """The newest message of each topic, handed from the executor's thread to the caller's."""
+    """The newest message of each topic, handed from the executor's thread to the caller's.
 
-    def __init__(self) -> None:
+    The caller is woken once, when all that it waits for is there: each waking costs as much as a
+    good part of a step.
+
+    Args:
+        topics: that the caller waits for.
+    """
+
+    def __init__(self, topics: tuple[str, ...]) -> None:
+        self._topics = topics
         self._messages: dict[str, Any] = {}
-        self._arrivals: dict[str, float] = {}
-        self._changed = threading.Condition()
+        self._stamps = dict.fromkeys(topics, -1)
+        self._arrivals: dict[str, int] = {}
+        self._lock, self._complete = threading.Lock(), threading.Event()
+        self._awaited_ns = -1
 
     def put(self, topic: str, message: Any) -> None:
-        with self._changed:
-            self._messages[topic], self._arrivals[topic] = message, time.monotonic()
-            self._changed.notify_all()
+        stamp_ns = conversions.stamp_from_ros(message.header.stamp)
+        with self._lock:
+            self._messages[topic], self._stamps[topic] = message, stamp_ns
+            self._arrivals[topic] = time.monotonic_ns()
+            if self._late() is None:
+                self._complete.set()
+
+    def _late(self) -> str | None:
+        """The first topic whose newest message is older than what is waited for."""
+        for topic in self._topics:
+            if self._stamps[topic] < self._awaited_ns:
+                return topic
+        return None
 
     def stamp_ns(self, topic: str) -> int:
         """Of the newest message; -1 when there is none."""
-        message = self._messages.get(topic)
-        return -1 if message is None else conversions.stamp_from_ros(message.header.stamp)
+        return self._stamps[topic]
 
     def age_s(self, topic: str) -> float:
         """Seconds since the newest message arrived; inf when there is none."""
-        return time.monotonic() - self._arrivals.get(topic, -math.inf)
+        arrival_ns = self._arrivals.get(topic)
+        return math.inf if arrival_ns is None else (time.monotonic_ns() - arrival_ns) * 1e-9
 
-    def wait(self, topics: tuple[str, ...], stamp_ns: int, timeout_s: float) -> dict[str, Any]:
-        """The messages once each is at least as new as a stamp. Raises StaleDataError."""
-        deadline = time.monotonic() + timeout_s
-        with self._changed:
-            for topic in topics:
-                if not self._changed.wait_for(
-                    lambda topic=topic: self.stamp_ns(topic) >= stamp_ns,  # type: ignore[misc]
-                    max(0.0, deadline - time.monotonic()),
-                ):
-                    raise StaleDataError(topic, self.age_s(topic), timeout_s)
-            return dict(self._messages)
+    def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, tuple[Any, int]]:
+        """Message and arrival [ns] of each topic, once each is at least as new as a stamp.
+
+        Raises:
+            StaleDataError: one does not come.
+        """
+        with self._lock:
+            self._awaited_ns = stamp_ns
+            self._complete.clear()
+            late = self._late()
+        if late is not None and not self._complete.wait(timeout_s):
+            with self._lock:
+                late = self._late()
+            if late is not None:
+                raise StaleDataError(late, self.age_s(late), timeout_s)
+        with self._lock:
+            return {t: (message, self._arrivals[t]) for t, message in self._messages.items()}
 
 
 class DdsBackend:
@@ -100,7 +126,7 @@ class DdsBackend:
         self._middleware = Middleware(model)
         self._period_ns = round(model.control_period * conversions.NANO)
         self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *((TRUTH,) if truth else ()))
-        self._now_ns, self._mail = 0, _Mailbox()
+        self._now_ns, self._mail = 0, _Mailbox(self._topics)
         self._link = Link(namespace, domain_id)
         types = {SCAN: LaserScan, ODOM: Odometry, TRUTH: Odometry}
         for topic in self._topics:
@@ -132,6 +158,7 @@ class DdsBackend:
     def choose(self, start: Start) -> None:
         """The first part of a reset: says which episode `begin` begins."""
         self._link.check_open()
+        self._link.check_alone()
         self._episodes.choose(start, self.timeout_s)
 
     def begin(self) -> int:
@@ -158,12 +185,13 @@ class DdsBackend:
         """The first half of a step: checks and publishes a command (C,)."""
         self._link.check_open()
         with self._link.zero_after_an_error():
-            self._link.check_alone()
             # Data that are there before the command would be taken for its answer.
-            self._check_stamps({topic: self._mail.stamp_ns(topic) for topic in self._topics})
+            self._check_stamps()
             twist = self._robot.to_cmd_vel(command)
-            self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
             self._link.send(twist)
+            # The rest while the simulator is at work.
+            self._link.check_alone()
+            self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
             self._now_ns += self._period_ns
 
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
@@ -171,11 +199,11 @@ class DdsBackend:
         with self._link.zero_after_an_error():
             return self._measure(self.timeout_s)
 
-    def _check_stamps(self, stamps: dict[str, int]) -> None:
-        """Raises BackendError when data are not stamped with the present step."""
-        for topic, stamp in stamps.items():
-            if stamp != self._now_ns:
-                off_s = (stamp - self._now_ns) / conversions.NANO
+    def _check_stamps(self) -> None:
+        """Raises BackendError when the newest data are not stamped with the present step."""
+        for topic in self._topics:
+            off_s = (self._mail.stamp_ns(topic) - self._now_ns) / conversions.NANO
+            if off_s:
                 raise BackendError(
                     f"topic {topic!r}: stamped {off_s:+.3f} s off the step; start the simulator "
                     "with mode:=lockstep, and move it from here alone."
@@ -184,18 +212,18 @@ class DdsBackend:
     def _measure(self, timeout_s: float) -> tuple[RobotView, dict[str, Any]]:
         """The view at the present stamp. Raises BackendError when the data are of another one."""
         now = self._now_ns
-        messages = self._mail.wait(self._topics, now, timeout_s)
-        self._link.check_alone()
-        self._check_stamps(
-            {t: conversions.stamp_from_ros(messages[t].header.stamp) for t in self._topics}
-        )
-        arrival = time.monotonic_ns()
-        pose, twist = conversions.odometry_from_ros(messages[ODOM])
-        self._middleware.odometry(now, arrival, pose, twist)
-        self._middleware.scan(now, arrival, conversions.scan_from_ros(self._lidar, messages[SCAN]))
-        facts: dict[str, Any] = {"stamp_ns": now, **data_facts(self._middleware, arrival)}
+        messages = self._mail.wait(now, timeout_s)
+        self._check_stamps()
+        message, arrival = messages[ODOM]
+        self._middleware.odometry(now, arrival, *conversions.odometry_from_ros(message))
+        message, arrival = messages[SCAN]
+        self._middleware.scan(now, arrival, conversions.scan_from_ros(self._lidar, message))
+        facts: dict[str, Any] = {
+            "stamp_ns": now,
+            **data_facts(self._middleware, time.monotonic_ns()),
+        }
         if TRUTH in self._topics:
-            facts["true_pose"] = conversions.odometry_from_ros(messages[TRUTH])[0]
+            facts["true_pose"] = conversions.odometry_from_ros(messages[TRUTH][0])[0]
         return self._middleware.view(now), facts
 
     def halt(self) -> None:

@@ -212,8 +212,9 @@ class DeviceNode(Node):
         """Publishes what is due of the present."""
         now_ns, outbox = self._now_ns, self._outbox
         now = conversions.stamp_to_ros(now_ns)
-        self._clock_message.clock = now
-        self._clock_topic.publish(self._clock_message)
+        if self._clock_topic.get_subscription_count():
+            self._clock_message.clock = now
+            self._clock_topic.publish(self._clock_message)
         odom_due, scan_due = self._odom_pace.due(now_ns), self._scan_pace.due(now_ns)
         if not (odom_due or scan_due):
             return

@@ -108,7 +108,7 @@ def zero_follows(commands_heard, step, act):
 def complaint(backend):
     """What a backend says about others on its topic; the name of a node may come late."""
     try:
-        backend._check_alone()
+        backend._link.check_alone()
     except BackendError as error:
         return str(error)
     return ""
@@ -248,7 +248,7 @@ def test_somebody_else_who_moves_the_simulator_is_found_out(connect, commands_he
     intruder = peer.speak(Twist, "cmd_vel", subscribers=2)  # the simulator, and the listener
     try:
         with monkeypatch.context() as patch:  # first by its deeds alone
-            patch.setattr(backend, "_others_command", lambda: False)
+            patch.setattr(backend._link, "others_command", lambda: False)
             backend.reset(START)
             intruder.publish(Twist())
             peer.until(lambda: backend._mail.stamp_ns("odom") > backend._now_ns, "its effect")
@@ -262,7 +262,7 @@ def test_somebody_else_who_moves_the_simulator_is_found_out(connect, commands_he
             backend.step(np.array([0.5, 0.0]))
     finally:
         peer.node.destroy_publisher(intruder)
-    peer.until(lambda: not backend._others_command(), "the intruder is gone")
+    peer.until(lambda: not backend._link.others_command(), "the intruder is gone")
     drive(backend)
 
 

@@ -1,0 +1,210 @@
+"""How many env steps per second go over ROS 2 in lock-step, beside a bare pair of nodes?
+
+The env is that of `gymnasium.make`: a command to a simulator node in a process of its own, its
+720-beam scan among ten obstacles and its odometry back, the estimator, observation and reward. The
+bare echo is what ROS 2 itself allows: two processes of rclpy's own executor that exchange the same
+messages, made once, and do nothing else. Both are measured in turns, chunk by chunk, so that
+whatever else the machine does falls on both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import array
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import LaserScan
+
+from nics_drl_bridge.config import dump_yaml
+from nics_drl_bridge.env.registration import NAVIGATION, register_envs
+from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.sim.world import World
+
+ROBOT, BEAMS = "ackermann", 720
+WORLD = {
+    "name": "ten circles",
+    "size": [6.0, 6.0],
+    "obstacles": [{"shapes": [{"kind": "circle", "radius": 0.15}], "count": 10, "gap": 0.3}],
+    "clearance": 0.3,
+    "goal_distance": [2.0, 4.0],
+}
+DEPTH, PATIENCE_S = 10, 60.0
+Exchange = Callable[[], Callable[[], object] | None]
+
+
+class Bare:
+    """One node and rclpy's executor."""
+
+    def __init__(self, name: str, namespace: str) -> None:
+        self.context = Context()
+        self.context.init(None)
+        self.node = Node(
+            name, namespace=namespace, context=self.context, start_parameter_services=False
+        )
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+
+    def spin_until(self, done: Callable[[], bool]) -> None:
+        """Spins in place. Raises TimeoutError."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not done():
+            if time.monotonic() > deadline:
+                raise TimeoutError("the bare pair does not answer")
+            self._executor.spin_once(timeout_sec=1.0)
+
+
+def answer(namespace: str) -> None:
+    """The far end of the bare echo: answers each Twist by an Odometry and a LaserScan."""
+    end, parent = Bare("far_end", namespace), os.getppid()
+    odometry, scan = Odometry(), LaserScan()
+    scan.ranges = array.array("f", [1.0] * BEAMS)
+    odometry_topic = end.node.create_publisher(Odometry, "odom", DEPTH)
+    scan_topic = end.node.create_publisher(LaserScan, "scan", DEPTH)
+
+    def echo(_: Twist) -> None:
+        odometry_topic.publish(odometry)
+        scan_topic.publish(scan)
+
+    end.node.create_subscription(Twist, "cmd_vel", echo, DEPTH)
+    while os.getppid() == parent:
+        end._executor.spin_once(timeout_sec=1.0)
+
+
+@contextmanager
+def bare_echo(domain_id: int) -> Iterator[Exchange]:
+    """A function that makes one round trip between two processes."""
+    os.environ["ROS_DOMAIN_ID"] = str(domain_id)
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    namespace = f"bare_{os.getpid()}"
+    far = subprocess.Popen([sys.executable, __file__, "--answer", namespace])
+    try:
+        end = Bare("near_end", namespace)
+        received: list[object] = []
+        end.node.create_subscription(Odometry, "odom", received.append, DEPTH)
+        end.node.create_subscription(LaserScan, "scan", received.append, DEPTH)
+        commands = end.node.create_publisher(Twist, "cmd_vel", DEPTH)
+        names = [end.node.resolve_topic_name(topic) for topic in ("odom", "scan")]
+        end.spin_until(
+            lambda: (
+                commands.get_subscription_count() > 0
+                and all(end.node.count_publishers(name) > 0 for name in names)
+            )
+        )
+        command = Twist()
+
+        def exchange() -> None:
+            received.clear()
+            commands.publish(command)
+            end.spin_until(lambda: len(received) >= 2)
+
+        settle(exchange)
+        yield exchange
+        end.context.try_shutdown()
+    finally:
+        far.terminate()
+        far.wait()
+
+
+def settle(exchange: Exchange) -> None:
+    """The first answers may be lost, while the far end does not yet know of the near one."""
+    time.sleep(1.0)
+    exchange()
+
+
+@contextmanager
+def lockstep_env(domain_id: int, folder: Path) -> Iterator[Exchange]:
+    """A function that makes one step of the env, and gives its `reset` at an episode's end."""
+    register_envs()
+    file = folder / "world.yaml"
+    file.write_text(dump_yaml(World.model_validate(WORLD).model_dump(mode="json")))
+    parameters = {"model": ROBOT, "world": str(file), "mode": "lockstep"}
+    namespace = f"lockstep_{os.getpid()}"  # whoever else may be in that domain
+    with NodeProcess("simulator_node", folder, parameters, domain_id, namespace):
+        options = {"domain_id": domain_id, "namespace": namespace, "timeout_s": PATIENCE_S}
+        env = gymnasium.make(
+            NAVIGATION, backend="dds", model=ROBOT, world=str(file), backend_options=options
+        )
+        env.reset(seed=0)
+        actions = np.random.default_rng(0)
+
+        def step() -> Callable[[], object] | None:
+            action = actions.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
+            _, _, ended, cut, _ = env.step(action)
+            return env.reset if ended or cut else None
+
+        yield step
+        env.close()
+
+
+def chunk(exchange: Exchange, count: int) -> list[float]:
+    """Seconds of each of so many exchanges; what one gives to be called after it is not timed."""
+    times = []
+    for _ in range(count):
+        begin = time.perf_counter()
+        afterwards = exchange()
+        times.append(time.perf_counter() - begin)
+        if afterwards is not None:
+            afterwards()
+    return times
+
+
+def measure(chunks: int, size: int) -> dict[str, float]:
+    """Steps and echoes per second over all chunks, and how long a step takes."""
+    domain_id = free_domain_id()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        lockstep_env(domain_id, Path(folder)) as step,
+        bare_echo(domain_id) as echo,
+    ):
+        chunk(step, size), chunk(echo, size)  # as warm as they get
+        steps, echoes = [], []
+        for _ in range(chunks):
+            steps += chunk(step, size)
+            echoes += chunk(echo, size)
+    rate, bare = len(steps) / sum(steps), len(echoes) / sum(echoes)
+    p50, p99 = np.quantile(steps, [0.5, 0.99]) * 1e3
+    return {
+        "steps_per_s": round(rate, 1),
+        "bare_echo_per_s": round(bare, 1),
+        "ratio": round(rate / bare, 3),
+        "p50_ms": round(float(p50), 3),
+        "p99_ms": round(float(p99), 3),
+    }
+
+
+def main() -> None:
+    """Prints a table, or one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--chunks", type=int, default=40)
+    parser.add_argument("--size", type=int, default=100, help="steps in a chunk")
+    parser.add_argument("--answer", metavar="NAMESPACE", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.answer:
+        answer(given.answer)
+        return
+    result = measure(given.chunks, given.size)
+    if given.json:
+        sys.stdout.write(json.dumps(result) + "\n")
+    else:
+        for key, value in result.items():
+            sys.stdout.write(f"{key:<20}{value}\n")
+
+
+if __name__ == "__main__":
+    main()
