@@ -27,7 +27,7 @@ def watched(domain_id, meet, capfd):
 
     def warned() -> str:
         executor.spin_once(timeout_sec=0.05)
-        lines.extend(line for line in capfd.readouterr().err.splitlines() if "WARN" in line)
+        lines.extend(line for line in capfd.readouterr().err.splitlines() if "[car.gate]" in line)
         return lines[-1] if lines else ""
 
     yield node, peer, warned
