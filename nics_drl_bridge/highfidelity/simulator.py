@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -167,7 +166,9 @@ class MujocoSimulator:
             self._mujoco.mj_step(self._simulation, data, nstep=self._steps)
             touched[self._touching()] = True
             before, turned = turned, [rig.encoders(data) for rig in rigs]
-            state = [r.mean_state(*two, part_s) for r, *two in zip(rigs, before, turned, strict=True)]
+            state = [
+                r.mean_state(*two, part_s) for r, *two in zip(rigs, before, turned, strict=True)
+            ]
             counted = self._twist(np.array(state))
             wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
         readings = [rig.read(data) for rig in rigs]

@@ -26,6 +26,7 @@ from nics_drl_bridge.nodes.command_inlet import CommandInlet
 from nics_drl_bridge.nodes.device_parameters import declare_device
 from nics_drl_bridge.nodes.outbox import Outbox
 from nics_drl_bridge.nodes.pace import Pace, RealTime
+from nics_drl_bridge.nodes.qos_watch import QosWatch
 from nics_drl_bridge.nodes.robot_port import RobotPort
 from nics_drl_bridge.nodes.runner import declare_model
 from nics_drl_bridge.nodes.transforms import Transforms
@@ -43,7 +44,7 @@ MakeSimulator = Callable[[Node, SimulatorModel, World, int], Simulator]
 period that it steps by is the given model's."""
 
 
-class DeviceNode(Node):
+class DeviceNode(QosWatch):
     """Takes `cmd_vel`; publishes `scan`, `odom`, `joint_states`, `ground_truth`, `/clock`, `/tf`.
 
     With the parameter `robots` it is a fleet in one world, each robot in a namespace below the
