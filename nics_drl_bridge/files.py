@@ -114,8 +114,7 @@ def whole_folder(path: Path, marker: str) -> Iterator[Path]:
     temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
     try:
         yield temporary
-        for file in temporary.rglob("*"):
-            _fsync(file)
+        sync_folder(temporary)
         temporary.chmod(0o755)
         _swap(temporary, path)
     finally:
@@ -137,6 +136,12 @@ def _swap(new: Path, path: Path) -> None:
         _fsync(path.parent)
     finally:
         shutil.rmtree(old, ignore_errors=True)
+
+
+def sync_folder(folder: Path) -> None:
+    """Makes sure that a folder and all in it are on the disk."""
+    for file in (*folder.rglob("*"), folder):
+        _fsync(file)
 
 
 def sha256(data: bytes) -> str:

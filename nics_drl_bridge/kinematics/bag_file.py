@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from nics_drl_bridge.errors import BridgeError, RecordingError
 from nics_drl_bridge.kinematics.bag_messages import typestore
+from nics_drl_bridge.kinematics.mcap_check import check_mcap
+from nics_drl_bridge.kinematics.mcap_records import Damage
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -75,8 +77,8 @@ def opened(path: Path) -> Iterator[BagFile]:
         place = _place(path)
         _check_name(place)
         with Reader(place) as reader:
-            for database in _databases(reader):
-                _check_database(path, database)
+            for file in _storages(reader):
+                _check_storage(path, file)
             _check_summary(path, reader)
             yield BagFile(reader, str(path))
     except BridgeError:
@@ -125,10 +127,23 @@ def _place(path: Path) -> Path:
     return file
 
 
-def _databases(reader: Reader) -> list[Path]:
-    """The SQLite files of an open bag, unpacked where they were compressed."""
+def _storages(reader: Reader) -> list[Path]:
+    """The files of an open bag, unpacked where they were compressed."""
     storages = getattr(reader.storage, "storages", [reader.storage])
-    return [Path(str(s.path)) for s in storages if Path(str(s.path)).suffix == DATABASE]
+    return [Path(str(storage.path)) for storage in storages]
+
+
+def _check_storage(path: Path, file: Path) -> None:
+    if file.suffix == DATABASE:
+        _check_database(path, file)
+        return
+    try:
+        check_mcap(file)
+    except Damage as damage:
+        raise RecordingError(
+            f"{path}: {file.name} is damaged at {damage}; save the rest with `nics bag salvage`, "
+            "or record anew."
+        ) from None
 
 
 def _check_database(path: Path, database: Path) -> None:
