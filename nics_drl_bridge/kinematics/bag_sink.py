@@ -6,13 +6,13 @@ import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.files import check_above, sync_folder
 from nics_drl_bridge.kinematics.bag_messages import typestore
+from nics_drl_bridge.kinematics.bag_qos import Offer, profile_of
 from nics_drl_bridge.kinematics.mcap_records import seal
 
 if TYPE_CHECKING:
@@ -23,21 +23,8 @@ Storage = Literal["mcap", "sqlite3"]
 
 NO_HASH = f"RIHS01_{'0' * 64}"
 """Of a type that is known by its text alone."""
-
-
-@dataclass(frozen=True)
-class Offer:
-    """The quality of service that a publisher offers.
-
-    Attributes:
-        depth: of its history.
-        reliable: or best effort.
-        transient_local: late subscribers get what was sent before; or volatile.
-    """
-
-    depth: int = 10
-    reliable: bool = True
-    transient_local: bool = False
+CHUNK_BYTES = 1 << 16
+"""A damage costs the chunk that it is in, because a checksum is of a whole chunk."""
 
 
 class BagSink:
@@ -76,7 +63,7 @@ class BagSink:
         given = {} if known else {"msgdef": definition or "", "rihs01": NO_HASH}
         self._connections[topic] = self._writer.add_connection(
             topic, kind, typestore=self._store, **given,
-            offered_qos_profiles=[_profile(offer) for offer in offers],
+            offered_qos_profiles=[profile_of(offer) for offer in offers],
         )  # fmt: skip
         self.counts[topic] = 0
 
@@ -91,6 +78,9 @@ class BagSink:
         """Writes a serialized message."""
         self._writer.write(self._connections[topic], receive_ns, data)
         self.counts[topic] += 1
+        storage: Any = self._writer.storage
+        if hasattr(storage, "close_chunk") and storage.chunk.bio.tell() > CHUNK_BYTES:
+            storage.close_chunk()
 
     def flush(self) -> None:
         """Puts on disk what was written, so that no crash of this process loses it."""
@@ -149,27 +139,3 @@ def _remove(folder: Path) -> None:
     for file in sorted(folder.rglob("*"), reverse=True):
         file.rmdir() if file.is_dir() else file.unlink()
     folder.rmdir()
-
-
-def _profile(offer: Offer) -> Any:
-    from rosbags.interfaces import (
-        Qos,
-        QosDurability,
-        QosHistory,
-        QosLiveliness,
-        QosReliability,
-        QosTime,
-    )
-
-    forever = QosTime(9223372036, 854775807)
-    return Qos(
-        QosHistory.KEEP_LAST,
-        offer.depth,
-        QosReliability.RELIABLE if offer.reliable else QosReliability.BEST_EFFORT,
-        QosDurability.TRANSIENT_LOCAL if offer.transient_local else QosDurability.VOLATILE,
-        forever,
-        forever,
-        QosLiveliness.AUTOMATIC,
-        forever,
-        False,
-    )

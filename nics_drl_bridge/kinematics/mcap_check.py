@@ -18,6 +18,7 @@ from nics_drl_bridge.kinematics.mcap_records import (
     HEADER,
     INSIDE,
     MAGIC,
+    MESSAGE_INDEX,
     PREFIX,
     SCHEMA,
     STATISTICS,
@@ -27,11 +28,9 @@ from nics_drl_bridge.kinematics.mcap_records import (
     chunk_of,
     inner_records,
     mapped,
+    message_index_of,
     records,
 )
-
-UNTIMED = (1 << 63) - 1
-"""What a file without messages may have as its first time."""
 
 
 @dataclass
@@ -43,6 +42,7 @@ class _Walk:
     chunks: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
     indexed: list[tuple[int, int, int, int]] = field(default_factory=list)
     statistics: Record | None = None
+    places: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
 
 
 def check_mcap(path: Path) -> None:
@@ -88,20 +88,34 @@ def _data(walk: _Walk, record: Record) -> None:
     if record.op in INSIDE:
         walk.data.see(record)
     elif record.op == CHUNK:
-        chunk = chunk_of(record)
-        before, inside = walk.data.counts.total(), Told(walk.data.schemas, walk.data.channels)
-        for inner in inner_records(record):
-            inside.see(inner)
-        span = inside.span
-        if span is not None and span != (chunk.start_ns, chunk.end_ns):
-            raise Damage(record.offset, "a chunk's messages are not of the time that it names")
-        walk.data.counts.update(inside.counts)
-        if span is not None and walk.data.counts.total() > before:
-            first, last = walk.data.span or span
-            walk.data.span = min(first, span[0]), max(last, span[1])
-        walk.chunks[record.offset, record.end - record.offset] = chunk.start_ns, chunk.end_ns
+        try:
+            _chunk(walk, record)
+        except Damage as damage:
+            raise Damage(record.offset, damage.what) from None
+    elif record.op == MESSAGE_INDEX:
+        channel, entries = message_index_of(record)
+        if sorted(entries) != sorted(walk.places.pop(channel, [])):
+            raise Damage(record.offset, "the index of a chunk does not fit its messages")
     elif record.op in (FOOTER, CHUNK_INDEX, STATISTICS):
         raise Damage(record.offset, "the summary begins before the data end")
+
+
+def _chunk(walk: _Walk, record: Record) -> None:
+    """Goes through a chunk; its index follows it."""
+    chunk, inside = chunk_of(record), Told(walk.data.schemas, walk.data.channels)
+    walk.places = {}
+    for inner in inner_records(record):
+        message = inside.see(inner)
+        if message is not None:
+            entries = walk.places.setdefault(message.channel, [])
+            entries.append((message.time_ns, inner.offset))
+    if inside.span is not None:
+        if inside.span != (chunk.start_ns, chunk.end_ns):
+            raise Damage(record.offset, "a chunk's messages are not of the time that it names")
+        first, last = walk.data.span or inside.span
+        walk.data.span = min(first, inside.span[0]), max(last, inside.span[1])
+    walk.data.counts.update(inside.counts)
+    walk.chunks[record.offset, record.end - record.offset] = chunk.start_ns, chunk.end_ns
 
 
 def _summary(walk: _Walk, record: Record) -> None:

@@ -40,7 +40,7 @@ class Damage(ValueError):
 
     def __init__(self, offset: int, what: str) -> None:
         super().__init__(f"byte {offset}: {what}")
-        self.offset = offset
+        self.offset, self.what = offset, what
 
 
 class Record(NamedTuple):
@@ -262,7 +262,7 @@ def _decompress(chunk: Chunk) -> Bytes:
 
 
 def inner_records(record: Record) -> Iterator[Record]:
-    """The records of a chunk.
+    """The records of a chunk, with their places in it.
 
     Raises:
         Damage: it is damaged, or holds what no chunk may hold.
@@ -271,7 +271,19 @@ def inner_records(record: Record) -> Iterator[Record]:
     for inner in records(plain, 0, len(plain)):
         if inner.op not in INSIDE:
             raise Damage(record.offset, f"a chunk holds a record of kind {inner.op}")
-        yield Record(record.offset, inner.op, inner.content)
+        yield inner
+
+
+def message_index_of(record: Record) -> tuple[int, list[tuple[int, int]]]:
+    """Channel, and time [ns] and place in the chunk of each of its messages."""
+    fields = _Fields(record)
+    (channel,) = fields.numbers("H")
+    inner, entries = fields.inner(), []
+    while inner.more:
+        time_ns, place = inner.numbers("QQ")
+        entries.append((time_ns, place))
+    fields.done()
+    return channel, entries
 
 
 def mapped(path: Path, access: int = ACCESS_READ) -> memoryview:
