@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from nics_drl_bridge import __version__
+from nics_drl_bridge.commands.bag import bag
 from nics_drl_bridge.commands.bake import bake
 from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.generate import generate
@@ -41,6 +42,7 @@ def _options(
 
 for command in (generate, bake, record, replay, demo):
     app.command()(command)
+app.add_typer(bag, name="bag")
 
 
 def main() -> None:

@@ -84,9 +84,7 @@ def _foreign(source: Path, path: Path, compression: str) -> None:
     writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
     with Reader(source) as reader, writer:
         connections = {
-            c.id: writer.add_connection(
-                c.topic, c.msgtype, msgdef=c.msgdef.data, rihs01=c.digest
-            )
+            c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, rihs01=c.digest)
             for c in reader.connections
         }
         for connection, ns, data in reader.messages():

@@ -18,7 +18,7 @@ from nics_drl_bridge.errors import BridgeError, RecordingError
 from nics_drl_bridge.kinematics.bag_messages import typestore
 from nics_drl_bridge.kinematics.bag_qos import Offer, offers_of
 from nics_drl_bridge.kinematics.mcap_check import check_mcap
-from nics_drl_bridge.kinematics.mcap_records import Damage
+from nics_drl_bridge.kinematics.mcap_records import DamageError
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -140,7 +140,7 @@ def _check_storage(path: Path, file: Path) -> None:
         return
     try:
         check_mcap(file)
-    except Damage as damage:
+    except DamageError as damage:
         raise RecordingError(
             f"{path}: {file.name} is damaged at {damage}; save the rest with `nics bag salvage`, "
             "or record anew."

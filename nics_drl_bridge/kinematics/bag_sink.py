@@ -98,7 +98,7 @@ def bag_sink(path: Path, storage: Storage = "mcap") -> Iterator[BagSink]:
     """Gives a bag to write into, which stands at `path` when the block ends well.
 
     It is written into a hidden folder `.NAME.*` beside it. After an error nothing is left; a
-    killed process leaves that folder, from which `salvage` saves what was flushed.
+    killed process or a full disk leaves that folder, from which `salvage` saves what was flushed.
 
     Args:
         path: folder to make.
@@ -131,8 +131,15 @@ def bag_sink(path: Path, storage: Storage = "mcap") -> Iterator[BagSink]:
         if path.exists():
             raise RecordingError(f"{path}: was made meanwhile; give the name of a new folder.")
         os.rename(unfinished, path)
-    finally:
+    except OSError as error:
+        raise RecordingError(
+            f"{path}: {error.strerror or error}; what was written until then lies in {unfinished}, "
+            "save it with `nics bag salvage` where there is room."
+        ) from None
+    except BaseException:
         _remove(beside)
+        raise
+    _remove(beside)
 
 
 def _remove(folder: Path) -> None:

@@ -22,7 +22,7 @@ from nics_drl_bridge.kinematics.mcap_records import (
     PREFIX,
     SCHEMA,
     STATISTICS,
-    Damage,
+    DamageError,
     Record,
     Told,
     chunk_of,
@@ -49,33 +49,35 @@ def check_mcap(path: Path) -> None:
     """Walks a file from its first byte to its last.
 
     Raises:
-        Damage: it is cut off, or two of its parts do not agree.
+        DamageError: it is cut off, or two of its parts do not agree.
     """
     if path.stat().st_size < len(MAGIC):
-        raise Damage(0, "the file is empty or ends at once")
+        raise DamageError(0, "the file is empty or ends at once")
     try:
         _check(mapped(path))
     except struct.error:
-        raise Damage(0, "a record is shorter than its fields") from None
+        raise DamageError(0, "a record is shorter than its fields") from None
 
 
 def _check(data: memoryview) -> None:
     if data[: len(MAGIC)] != MAGIC:
-        raise Damage(0, "it does not begin as an MCAP file")
+        raise DamageError(0, "it does not begin as an MCAP file")
     end = len(data) - len(MAGIC)
     if end <= len(MAGIC) or data[end:] != MAGIC:
-        raise Damage(len(data), "it does not end as an MCAP file: it is cut off or was not closed")
+        raise DamageError(
+            len(data), "it does not end as an MCAP file: it is cut off or was not closed"
+        )
     walk, section = _Walk(), 0
     for record in records(data, len(MAGIC), end):
         if record.offset == len(MAGIC) and record.op != HEADER:
-            raise Damage(record.offset, "the header is missing")
+            raise DamageError(record.offset, "the header is missing")
         if record.op == DATA_END:
             if section:
-                raise Damage(record.offset, "its data end twice")
+                raise DamageError(record.offset, "its data end twice")
             section = record.end
             (crc,) = struct.unpack_from("<I", record.content)
             if crc and crc32(data[: record.offset]) != crc:
-                raise Damage(record.offset, "the checksum of its data is wrong")
+                raise DamageError(record.offset, "the checksum of its data is wrong")
         elif section:
             _summary(walk, record)
         else:
@@ -90,14 +92,14 @@ def _data(walk: _Walk, record: Record) -> None:
     elif record.op == CHUNK:
         try:
             _chunk(walk, record)
-        except Damage as damage:
-            raise Damage(record.offset, damage.what) from None
+        except DamageError as damage:
+            raise DamageError(record.offset, damage.what) from None
     elif record.op == MESSAGE_INDEX:
         channel, entries = message_index_of(record)
         if sorted(entries) != sorted(walk.places.pop(channel, [])):
-            raise Damage(record.offset, "the index of a chunk does not fit its messages")
+            raise DamageError(record.offset, "the index of a chunk does not fit its messages")
     elif record.op in (FOOTER, CHUNK_INDEX, STATISTICS):
-        raise Damage(record.offset, "the summary begins before the data end")
+        raise DamageError(record.offset, "the summary begins before the data end")
 
 
 def _chunk(walk: _Walk, record: Record) -> None:
@@ -111,7 +113,7 @@ def _chunk(walk: _Walk, record: Record) -> None:
             entries.append((message.time_ns, inner.offset))
     if inside.span is not None:
         if inside.span != (chunk.start_ns, chunk.end_ns):
-            raise Damage(record.offset, "a chunk's messages are not of the time that it names")
+            raise DamageError(record.offset, "a chunk's messages are not of the time that it names")
         first, last = walk.data.span or inside.span
         walk.data.span = min(first, inside.span[0]), max(last, inside.span[1])
     walk.data.counts.update(inside.counts)
@@ -127,18 +129,18 @@ def _summary(walk: _Walk, record: Record) -> None:
     elif record.op == STATISTICS:
         walk.statistics = record
     elif record.op in (CHUNK, *INSIDE):
-        raise Damage(record.offset, "there are data behind their end")
+        raise DamageError(record.offset, "there are data behind their end")
 
 
 def _footer(data: memoryview, end: int, section: int) -> None:
     place = end - FOOTER_BYTES
     if not section or struct.unpack_from("<BQ", data, place) != (FOOTER, 20):
-        raise Damage(place, "its end has no footer")
+        raise DamageError(place, "its end has no footer")
     summary, _, crc = struct.unpack_from("<QQI", data, place + PREFIX)
     if summary and not section <= summary <= place:
-        raise Damage(place, "the footer points to no summary")
+        raise DamageError(place, "the footer points to no summary")
     if summary and crc and crc32(data[summary : end - 4]) != crc:
-        raise Damage(place, "the checksum of its summary is wrong")
+        raise DamageError(place, "the checksum of its summary is wrong")
 
 
 def _agree(walk: _Walk, place: int) -> None:
@@ -149,14 +151,14 @@ def _agree(walk: _Walk, place: int) -> None:
         ("channels", told.channels, summary.channels),
     ):
         if theirs and any(theirs.get(key) != value for key, value in ours.items()):
-            raise Damage(place, f"the {name} of its summary are not those of its data")
+            raise DamageError(place, f"the {name} of its summary are not those of its data")
     for channel in told.channels.values():
         if channel.schema and channel.schema not in told.schemas:
-            raise Damage(place, f"the channel {channel.topic!r} has no schema")
+            raise DamageError(place, f"the channel {channel.topic!r} has no schema")
     if walk.indexed:
         wanted = {(at, size, *span) for (at, size), span in walk.chunks.items()}
         if set(walk.indexed) != wanted:
-            raise Damage(place, "the index of its chunks does not fit them")
+            raise DamageError(place, "the index of its chunks does not fit them")
     if walk.statistics is not None:
         _statistics(walk, walk.statistics)
 
@@ -172,4 +174,4 @@ def _statistics(walk: _Walk, record: Record) -> None:
         and walk.data.span in (None, (first, last))
     )
     if not fits:
-        raise Damage(record.offset, "its statistics do not fit its messages")
+        raise DamageError(record.offset, "its statistics do not fit its messages")

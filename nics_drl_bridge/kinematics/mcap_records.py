@@ -35,7 +35,7 @@ INSIDE = (SCHEMA, CHANNEL, MESSAGE)
 """What may stand in a chunk."""
 
 
-class Damage(ValueError):
+class DamageError(ValueError):
     """What is wrong in a file, and at which byte."""
 
     def __init__(self, offset: int, what: str) -> None:
@@ -119,15 +119,17 @@ class Told:
         if record.op == SCHEMA:
             key, schema = schema_of(record)
             if self.schemas.setdefault(key, schema) != schema:
-                raise Damage(record.offset, f"a second schema with the id {key}")
+                raise DamageError(record.offset, f"a second schema with the id {key}")
         elif record.op == CHANNEL:
             key, channel = channel_of(record)
             if self.channels.setdefault(key, channel) != channel:
-                raise Damage(record.offset, f"a second channel with the id {key}")
+                raise DamageError(record.offset, f"a second channel with the id {key}")
         elif record.op == MESSAGE:
             message = message_of(record)
             if message.channel not in self.channels:
-                raise Damage(record.offset, f"a message of the unknown channel {message.channel}")
+                raise DamageError(
+                    record.offset, f"a message of the unknown channel {message.channel}"
+                )
             first, last = self.span or (message.time_ns, message.time_ns)
             self.span = min(first, message.time_ns), max(last, message.time_ns)
             self.counts[message.channel] += 1
@@ -147,7 +149,7 @@ class _Fields:
 
     def take(self, size: int) -> memoryview:
         if self._at + size > len(self._content):
-            raise Damage(self._offset, "a record is shorter than its fields")
+            raise DamageError(self._offset, "a record is shorter than its fields")
         self._at += size
         return self._content[self._at - size : self._at]
 
@@ -156,7 +158,7 @@ class _Fields:
         try:
             return str(self.take(size), "utf-8")
         except UnicodeDecodeError:
-            raise Damage(self._offset, "a text is not UTF-8") from None
+            raise DamageError(self._offset, "a text is not UTF-8") from None
 
     def inner(self) -> _Fields:
         """The fields of a map or an array."""
@@ -172,23 +174,23 @@ class _Fields:
 
     def done(self) -> None:
         if self.more:
-            raise Damage(self._offset, "a record is longer than its fields")
+            raise DamageError(self._offset, "a record is longer than its fields")
 
 
 def records(data: memoryview, start: int, end: int, base: int = 0) -> Iterator[Record]:
     """The records from `start` to `end`; `base` is added to the places that errors name.
 
     Raises:
-        Damage: one does not end where the next should begin, or is of a kind that there is not.
+        DamageError: one does not end where the next should begin, or is of an unknown kind.
     """
     while start < end:
         if start + PREFIX > end:
-            raise Damage(base + start, "a record is cut off")
+            raise DamageError(base + start, "a record is cut off")
         op, size = struct.unpack_from("<BQ", data, start)
         if start + PREFIX + size > end:
-            raise Damage(base + start, "a record is cut off")
+            raise DamageError(base + start, "a record is cut off")
         if not HEADER <= op <= DATA_END and op < PRIVATE:
-            raise Damage(base + start, f"there is no record of kind {op}")
+            raise DamageError(base + start, f"there is no record of kind {op}")
         content = data[start + PREFIX : start + PREFIX + size]
         yield Record(base + start, op, content)
         start += PREFIX + size
@@ -237,19 +239,19 @@ def unpacked(record: Record) -> Bytes:
     """The records of a chunk, decompressed, with size and checksum compared.
 
     Raises:
-        Damage: they do not agree.
+        DamageError: they do not agree.
     """
     chunk = chunk_of(record)
     if chunk.compression not in COMPRESSIONS:
-        raise Damage(record.offset, f"there is no compression {chunk.compression!r}")
+        raise DamageError(record.offset, f"there is no compression {chunk.compression!r}")
     try:
         plain = _decompress(chunk)
     except Exception as error:  # noqa: BLE001 - a damaged chunk breaks the library in any way
-        raise Damage(record.offset, f"a chunk can't be unpacked ({error})") from None
+        raise DamageError(record.offset, f"a chunk can't be unpacked ({error})") from None
     if len(plain) != chunk.size:
-        raise Damage(record.offset, "a chunk is not as long as it says")
+        raise DamageError(record.offset, "a chunk is not as long as it says")
     if chunk.crc and crc32(plain) != chunk.crc:
-        raise Damage(record.offset, "a chunk's checksum is wrong")
+        raise DamageError(record.offset, "a chunk's checksum is wrong")
     return plain
 
 
@@ -265,12 +267,12 @@ def inner_records(record: Record) -> Iterator[Record]:
     """The records of a chunk, with their places in it.
 
     Raises:
-        Damage: it is damaged, or holds what no chunk may hold.
+        DamageError: it is damaged, or holds what no chunk may hold.
     """
     plain = memoryview(unpacked(record))
     for inner in records(plain, 0, len(plain)):
         if inner.op not in INSIDE:
-            raise Damage(record.offset, f"a chunk holds a record of kind {inner.op}")
+            raise DamageError(record.offset, f"a chunk holds a record of kind {inner.op}")
         yield inner
 
 

@@ -17,7 +17,7 @@ from nics_drl_bridge.kinematics.mcap_records import (
     MESSAGE,
     PREFIX,
     STATISTICS,
-    Damage,
+    DamageError,
     Message,
     Record,
     Told,
@@ -64,7 +64,7 @@ def intact(path: Path) -> Intact:
                 waiting.append(record)
             elif record.op == STATISTICS:
                 promised = _promised(record)
-        except (Damage, struct.error):
+        except (DamageError, struct.error):
             waiting += _cut_chunk(data, place)
             place = _next_chunk(data, place + 1, len(data))
             continue
@@ -100,7 +100,7 @@ def _until_damage(inner: Iterator[Record], first_ns: int, last_ns: int) -> list[
     while True:
         try:
             each = next(inner, None)
-        except Damage:
+        except DamageError:
             return found
         if each is None or each.op not in INSIDE:
             return found
@@ -117,7 +117,7 @@ def _messages(told: Told, waiting: list[Record]) -> list[Message]:
     for record in sorted(waiting, key=lambda each: each.op == MESSAGE):
         try:
             message = told.see(record)
-        except (Damage, struct.error):
+        except (DamageError, struct.error):
             continue
         if message is not None:
             messages.append(message)
