@@ -10,6 +10,7 @@ from nics_drl_bridge import __version__
 from nics_drl_bridge.commands.bag import bag
 from nics_drl_bridge.commands.bake import bake
 from nics_drl_bridge.commands.demo import demo
+from nics_drl_bridge.commands.doctor import doctor
 from nics_drl_bridge.commands.generate import generate
 from nics_drl_bridge.commands.record import record
 from nics_drl_bridge.commands.replay import replay
@@ -40,7 +41,7 @@ def _options(
     """Options of every command."""
 
 
-for command in (generate, bake, record, replay, demo):
+for command in (generate, bake, record, replay, doctor, demo):
     app.command()(command)
 app.add_typer(bag, name="bag")
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -111,8 +112,6 @@ class BagRecorder(Node):
         self._heard: dict[str, _Heard] = {}
         self.skipped: dict[str, str] = {}
         self._began = self._flushed = time.monotonic()
-        from rclpy.clock import Clock, ClockType
-
         self.create_timer(LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._look()
 
@@ -133,7 +132,7 @@ class BagRecorder(Node):
         publishers = self.get_publishers_info_by_topic(topic)
         if not publishers or topic in self.skipped:
             return
-        offers = [_offer(info.qos_profile) for info in publishers]
+        offers = [offer_of(info.qos_profile) for info in publishers]
         profile = all(o.reliable for o in offers), all(o.transient_local for o in offers)
         known = self._heard.get(topic)
         if known is not None and (known.profile == profile or known.profile == (False, False)):
@@ -174,7 +173,8 @@ class BagRecorder(Node):
         return int(info.get("received_timestamp") or time.time_ns())
 
 
-def _offer(profile: QoSProfile) -> Offer:
+def offer_of(profile: QoSProfile) -> Offer:
+    """What a publisher offers, or a subscriber asks for."""
     return Offer(
         max(profile.depth, 1),
         profile.reliability != ReliabilityPolicy.BEST_EFFORT,
