@@ -7,8 +7,10 @@ from typing import Annotated
 import typer
 
 from nics_drl_bridge import __version__
+from nics_drl_bridge.commands.bag import bag
 from nics_drl_bridge.commands.bake import bake
 from nics_drl_bridge.commands.demo import demo
+from nics_drl_bridge.commands.doctor import doctor
 from nics_drl_bridge.commands.generate import generate
 from nics_drl_bridge.commands.record import record
 from nics_drl_bridge.commands.replay import replay
@@ -40,8 +42,9 @@ def _options(
     """Options of every command."""
 
 
-for command in (generate, bake, record, replay, urdf, demo):
+for command in (generate, bake, record, replay, doctor, urdf, demo):
     app.command()(command)
+app.add_typer(bag, name="bag")
 
 
 def main() -> None:

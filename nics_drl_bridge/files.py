@@ -106,8 +106,7 @@ def whole_folder(path: Path, marker: str) -> Iterator[Path]:
     temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
     try:
         yield temporary
-        for file in temporary.rglob("*"):
-            _fsync(file)
+        sync_folder(temporary)
         temporary.chmod(0o755)
         _swap(temporary, path)
     finally:
@@ -150,6 +149,12 @@ def _exchange(one: Path, other: Path) -> bool:
     if code in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOENT):
         return False
     raise OSError(code, os.strerror(code), str(other))
+
+
+def sync_folder(folder: Path) -> None:
+    """Makes sure that a folder and all in it are on the disk."""
+    for file in (*folder.rglob("*"), folder):
+        _fsync(file)
 
 
 def sha256(data: bytes) -> str:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -51,6 +51,35 @@ def one_sentence() -> Iterator[None]:
             raise
         typer.echo("nics: interrupted; everything that was started has ended.", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+@contextmanager
+def needs_ros(what: str) -> Iterator[None]:
+    """Around an import of the nodes: that ROS 2 is missing becomes one sentence."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("nics_drl_bridge"):
+            raise
+        raise ConfigError(f"{what} {MISSING_ROS.format(module=error.name)}") from None
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table for people; on what is no terminal no cell is cut or wrapped."""
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    made = Table(*heads, box=SIMPLE, pad_edge=False)
+    for row in rows:
+        made.add_row(*(Text(cell, overflow="fold") for cell in row))
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=console.measure(made).maximum, color_system=None)
+    with console.capture() as captured:
+        console.print(made)
+    return captured.get().rstrip()
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -39,6 +40,10 @@ def generate(
     budget: Annotated[
         str | None, typer.Option(help="Greatest size of the lidar table, as 8MB; see nics bake.")
     ] = None,
+    salvage: Annotated[
+        bool,
+        typer.Option("--salvage", help="Take what is intact of a damaged bag; tell the rest."),
+    ] = False,
     pictures: Annotated[
         bool, typer.Option(help="Draw the fit into the folder pictures of the model.")
     ] = False,
@@ -47,6 +52,7 @@ def generate(
     with one_sentence():
         from nics_drl_bridge.generator import check_place, save_model
         from nics_drl_bridge.generator import generate as generate_model
+        from nics_drl_bridge.kinematics.bag_salvage import salvaged
         from nics_drl_bridge.kinematics.dof import parse_alpha
         from nics_drl_bridge.kinematics.readers import read_recording
         from nics_drl_bridge.kinematics.spec import load_robot
@@ -59,7 +65,11 @@ def generate(
         spec, sensor, threshold = load_robot(robot), load_lidar(lidar), parse_alpha(alpha)
         shapes = load_world(world).shapes
         size = None if budget is None else parse_size(budget)
-        drive = read_recording(recording, spec, topic_roles(topics, topic or ()))
+        with salvaged(recording, salvage) as (whole, lines):
+            for line in lines:
+                typer.echo(line, err=True)
+            drive = read_recording(whole, spec, topic_roles(topics, topic or ()))
+        drive = replace(drive, source=str(recording))
         model, identified = generate_model(
             drive, spec, sensor, shapes, order, threshold, assume_textbook, strict, size
         )

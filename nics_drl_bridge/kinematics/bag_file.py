@@ -16,6 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 from nics_drl_bridge.errors import BridgeError, RecordingError
 from nics_drl_bridge.kinematics.bag_messages import typestore
+from nics_drl_bridge.kinematics.bag_qos import Offer, offers_of
+from nics_drl_bridge.kinematics.mcap_check import check_mcap
+from nics_drl_bridge.kinematics.mcap_records import DamageError
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -44,11 +47,12 @@ class Message:
 def is_bag(path: Path) -> bool:
     """Whether a path is a rosbag2 recording: its folder, or one of its files."""
     if path.is_dir():
-        return (path / METADATA).is_file() or any(_is_storage(p) for p in path.iterdir())
-    return _is_storage(path)
+        return (path / METADATA).is_file() or any(is_storage(p) for p in path.iterdir())
+    return is_storage(path)
 
 
-def _is_storage(path: Path) -> bool:
+def is_storage(path: Path) -> bool:
+    """Whether a file's name is that of a bag's file, compressed or not."""
     plain = path.with_suffix("") if path.suffix in COMPRESSED else path
     return plain.suffix in SUFFIXES
 
@@ -75,8 +79,8 @@ def opened(path: Path) -> Iterator[BagFile]:
         place = _place(path)
         _check_name(place)
         with Reader(place) as reader:
-            for database in _databases(reader):
-                _check_database(path, database)
+            for storage in _storages(reader):
+                _check_storage(path, Path(str(storage.path)))
             _check_summary(path, reader)
             yield BagFile(reader, str(path))
     except BridgeError:
@@ -84,7 +88,7 @@ def opened(path: Path) -> Iterator[BagFile]:
     except Exception as error:  # noqa: BLE001 - a damaged file breaks the reader in any way
         raise RecordingError(
             f"{path}: can't be read as a bag ({_reason(error)}); it is damaged or was not closed: "
-            "try `ros2 bag reindex`, or record anew."
+            "save the rest with `nics bag salvage`, try `ros2 bag reindex`, or record anew."
         ) from None
 
 
@@ -108,7 +112,7 @@ def _place(path: Path) -> Path:
     if not path.exists():
         raise RecordingError(f"{path}: no such bag; check the path.")
     folder = path if path.is_dir() else path.absolute().parent
-    files = [p for p in sorted(folder.iterdir()) if _is_storage(p)]
+    files = [p for p in sorted(folder.iterdir()) if is_storage(p)]
     if (folder / METADATA).is_file() and (path.is_dir() or len(files) == 1):
         return folder
     if path.is_dir() and len(files) != 1:
@@ -125,10 +129,22 @@ def _place(path: Path) -> Path:
     return file
 
 
-def _databases(reader: Reader) -> list[Path]:
-    """The SQLite files of an open bag, unpacked where they were compressed."""
-    storages = getattr(reader.storage, "storages", [reader.storage])
-    return [Path(str(s.path)) for s in storages if Path(str(s.path)).suffix == DATABASE]
+def _storages(reader: Reader) -> list[Any]:
+    """The readers of an open bag's files, which are unpacked where they were compressed."""
+    return list(getattr(reader.storage, "storages", [reader.storage]))
+
+
+def _check_storage(path: Path, file: Path) -> None:
+    if file.suffix == DATABASE:
+        _check_database(path, file)
+        return
+    try:
+        check_mcap(file)
+    except DamageError as damage:
+        raise RecordingError(
+            f"{path}: {file.name} is damaged at {damage}; save the rest with `nics bag salvage`, "
+            "or record anew."
+        ) from None
 
 
 def _check_database(path: Path, database: Path) -> None:
@@ -140,14 +156,23 @@ def _check_database(path: Path, database: Path) -> None:
         )
     place = f"{database.absolute().as_uri()}?mode=ro&immutable=1"
     with closing(sqlite3.connect(place, uri=True)) as base:
-        (verdict,) = base.execute("PRAGMA quick_check(1)").fetchone()
+        (verdict,) = base.execute("PRAGMA integrity_check(1)").fetchone()
     if verdict != "ok":
         reason = " ".join(verdict.split())
-        raise RecordingError(f"{path}: is damaged ({reason:.200}); record the drive anew.")
+        raise RecordingError(
+            f"{path}: is damaged ({reason:.200}); save the rest with `nics bag salvage`, or "
+            "record the drive anew."
+        )
 
 
 def _check_summary(path: Path, reader: Reader) -> None:
     counted = sum(connection.msgcount for connection in reader.connections)
+    held = sum(storage.metadata.message_count for storage in _storages(reader))
+    if held != counted:
+        raise RecordingError(
+            f"{path}: its summary speaks of {counted} messages, its files hold {held}; it is "
+            "damaged: save the rest with `nics bag salvage`, or record anew."
+        )
     if reader.message_count != counted:
         raise RecordingError(
             f"{path}: its summary speaks of {reader.message_count} messages, those of its topics "
@@ -179,27 +204,51 @@ class BagFile:
             topic for topic, some in self._connections.items() if not sum(c.msgcount for c in some)
         )
 
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last time of receipt that the bag's summary gives [ns]."""
+        return self._reader.start_time, self._reader.end_time - 1
+
+    def offers(self, topic: str) -> tuple[Offer, ...]:
+        """What its publishers offered, as far as the bag tells."""
+        found = (offers_of(c.ext.offered_qos_profiles) for c in self._connections[topic])  # type: ignore[union-attr]
+        return tuple(offer for some in found for offer in some)
+
+    def knows(self, topic: str) -> bool:
+        """Whether messages of the topic can be decoded."""
+        return self.types[topic] in self._store.fielddefs
+
     def messages(self, topic: str) -> list[Message]:
         """All messages of a topic, with count and time span held against the bag's summary.
 
         Raises:
             RecordingError: messages are missing, outside of the time span, or damaged.
         """
+        raw = self._raw(topic)
+        return [Message(ns, self._decoded(topic, k, t, d)) for k, (t, ns, d) in enumerate(raw)]
+
+    def serialized(self, topic: str) -> list[tuple[int, bytes]]:
+        """The same as they were recorded: time of receipt [ns] and bytes."""
+        return [(ns, bytes(data)) for _, ns, data in self._raw(topic)]
+
+    def _raw(self, topic: str) -> list[tuple[str, int, bytes]]:
         connections = self._connections[topic]
         raw = [(c.msgtype, ns, data) for c, ns, data in self._reader.messages(connections)]
         promised = sum(connection.msgcount for connection in connections)
         if len(raw) != promised:
             raise RecordingError(
                 f"{self.place}: topic {topic!r} has {len(raw)} messages where the bag's summary "
-                f"promises {promised}; the bag is cut off or damaged: record the drive anew."
+                f"promises {promised}; the bag is cut off or damaged: save the rest with "
+                "`nics bag salvage`, or record the drive anew."
             )
-        first, last = self._reader.start_time, self._reader.end_time
-        if any(not first <= ns < last for _, ns, _ in raw):
+        first, last = self.span_ns
+        if any(not first <= ns <= last for _, ns, _ in raw):
             raise RecordingError(
                 f"{self.place}: topic {topic!r} has messages outside of the time span that the "
-                "bag's summary gives; the bag is damaged: record the drive anew."
+                "bag's summary gives; the bag is damaged: save the rest with `nics bag salvage`, "
+                "or record the drive anew."
             )
-        return [Message(ns, self._decoded(topic, k, t, d)) for k, (t, ns, d) in enumerate(raw)]
+        return raw
 
     def _decoded(self, topic: str, k: int, kind: str, data: bytes) -> Any:
         try:
@@ -207,5 +256,6 @@ class BagFile:
         except Exception as error:  # noqa: BLE001 - damaged bytes break the decoder in any way
             raise RecordingError(
                 f"{self.place}: topic {topic!r}: message {k} can't be decoded as {kind} "
-                f"({_reason(error)}); it is damaged: record the drive anew."
+                f"({_reason(error)}); it is damaged: save the rest with `nics bag "
+                "salvage`, or record the drive anew."
             ) from None

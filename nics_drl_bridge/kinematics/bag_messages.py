@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from nics_drl_bridge.kinematics import topic_roles
 
@@ -68,8 +67,8 @@ def quaternion(message: Any) -> tuple[float, float, float, float]:
 def pose_row(message: Any) -> Row:
     """Position x, y [m] and heading [rad]."""
     position, q = _place(message)
-    heading = np.arctan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y**2 + q.z**2))
-    return position.x, position.y, float(heading)
+    heading = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+    return position.x, position.y, heading
 
 
 def twist_row(message: Any) -> Row:

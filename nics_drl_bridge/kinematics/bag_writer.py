@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.kinematics import topic_roles
+from nics_drl_bridge.kinematics.bag_sink import Storage, bag_sink
 from nics_drl_bridge.kinematics.joints import POSITION_UNITS, WHEELS
 from nics_drl_bridge.kinematics.recording import Recording, Stream
 from nics_drl_bridge.kinematics.spec import RobotSpec
@@ -25,7 +24,6 @@ Make = Callable[[Any, Array], Any]
 NANO = 1_000_000_000
 START_NS = 1_700_000_000 * NANO
 """What second 0 of the commands' clock becomes."""
-VERSION: Literal[8] = 8
 FRAMES = ("odom", "base_link")
 
 
@@ -33,7 +31,7 @@ def write_bag(
     recording: Recording,
     path: Path,
     spec: RobotSpec,
-    storage: Literal["mcap", "sqlite3"] = "mcap",
+    storage: Storage = "mcap",
 ) -> None:
     """Writes a recording as a bag that `load_bag` reads back.
 
@@ -50,32 +48,17 @@ def write_bag(
     Raises:
         RecordingError: the folder is there already, or rosbags is not installed.
     """
-    try:
-        from rosbags.rosbag2 import StoragePlugin, Writer
+    with bag_sink(path, storage) as sink:
         from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise RecordingError(
-            f"{path}: writing a bag needs the library rosbags; install it with "
-            "pip install 'nics_drl_bridge[bags]'."
-        ) from None
-    if path.exists():
-        raise RecordingError(f"{path}: is there already; give the name of a new folder.")
-    store = get_typestore(Stores.ROS2_JAZZY)
-    messages = _Messages(store)
-    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as beside:
-        unfinished = Path(beside) / path.name
-        with Writer(unfinished, version=VERSION, storage_plugin=plugin) as writer:
-            for topic, kind, stream, make in _topics(recording, spec, messages):
-                connection = writer.add_connection(topic, kind, typestore=store)
-                stamps = np.round(stream.t * NANO).astype(np.int64) + START_NS
-                receive = stamps + _to_commands_clock(recording, stream)
-                for k, values in enumerate(stream.values):
-                    message = make(messages.header(int(stamps[k])), values)
-                    raw = store.serialize_cdr(message, kind)
-                    writer.write(connection, int(receive[k]), raw)
-        unfinished.rename(path)
+
+        store = get_typestore(Stores.ROS2_JAZZY)
+        for topic, kind, stream, make in _topics(recording, spec, messages := _Messages(store)):
+            sink.add_topic(topic, kind)
+            stamps = np.round(stream.t * NANO).astype(np.int64) + START_NS
+            receive = stamps + _to_commands_clock(recording, stream)
+            for k, values in enumerate(stream.values):
+                message = make(messages.header(int(stamps[k])), values)
+                sink.write(topic, int(receive[k]), bytes(store.serialize_cdr(message, kind)))
 
 
 def _topics(

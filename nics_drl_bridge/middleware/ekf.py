@@ -39,6 +39,8 @@ FARTHEST = 1e8
 """Nothing that is off by more than this [m, rad, m/s, rad/s] is ever believed."""
 START_STD = 1e-3
 """How well the pose is known at a reset [m, rad]."""
+ANYWHERE = (100.0, 100.0, np.pi)
+"""How well odometry alone tells where a robot is in the map of a pose sensor [m, rad]."""
 LONGEST_GAP_S = 10.0
 """Over a longer silence, as when a clock jumps, the robot is taken to have stood still."""
 NANO = 1_000_000_000

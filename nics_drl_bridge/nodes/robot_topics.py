@@ -15,6 +15,7 @@ from sensor_msgs.msg import Imu, LaserScan
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.middleware.ekf import ANYWHERE
 from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.view import Middleware
 from nics_drl_bridge.nodes import conversions, qos
@@ -25,8 +26,6 @@ POSE_TYPES = {
     "PoseStamped": PoseStamped,
     "PoseWithCovarianceStamped": PoseWithCovarianceStamped,
 }
-ANYWHERE = (100.0, 100.0, np.pi)
-"""How well odometry alone tells where a robot is in the map of a pose sensor [m, rad]."""
 
 
 def declare_sensors(node: Node) -> None:

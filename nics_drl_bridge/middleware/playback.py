@@ -1,0 +1,248 @@
+"""Runs a recorded drive through the middleware: the same bag gives the same estimate, bit for bit.
+
+The order is that of receipt, and of equal times that of the topics' names; time is the bag's, so
+that nothing depends on the machine or on how busy it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.errors import RecordingError, nearest
+from nics_drl_bridge.files import npz_bytes, sha256, write_bytes, write_text
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.kinematics import topic_roles
+from nics_drl_bridge.kinematics.bag_file import BagFile, Message, opened
+from nics_drl_bridge.kinematics.bag_messages import command_row, pose_row, stamp, twist_row
+from nics_drl_bridge.lidar.rep117 import from_device
+from nics_drl_bridge.middleware.ekf import ANYWHERE
+from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
+from nics_drl_bridge.middleware.view import Middleware
+
+Array = NDArray[np.float64]
+
+SCAN_TYPE = "sensor_msgs/msg/LaserScan"
+TYPES: Mapping[str, tuple[str, ...]] = {
+    SCAN: (SCAN_TYPE,),
+    ODOM: (topic_roles.ODOMETRY,),
+    CMD_VEL: topic_roles.TYPES["cmd_vel"],
+    POSE: (topic_roles.POSE, topic_roles.POSE_COVARIANCE),
+    IMU: (topic_roles.IMU,),
+}
+ALWAYS = (SCAN, ODOM, CMD_VEL)
+"""Topics that are used when the bag has them; the others only when they are asked for."""
+APART_S = 1.0
+"""Stamps of one clock are no farther apart than this at any time [s]."""
+COLUMNS = ("x", "y", "heading", "vx", "vy", "wz")
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the middleware made of a drive, after each odometry that was the newest.
+
+    Attributes:
+        stamp_ns: (T,) of the estimates [ns].
+        pose: (T, 3) x [m], y [m], heading [rad] in `map`.
+        twist: (T, 3) vx [m/s], vy [m/s], wz [rad/s] in `base_link`.
+        covariance: (T, 3, 3) of the pose.
+        rejected: reason -> how many data were not used.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    pose: Array
+    twist: Array
+    covariance: Array
+    rejected: Mapping[str, int]
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of all numbers, to compare two runs bit for bit."""
+        arrays = (self.stamp_ns, self.pose, self.twist, self.covariance)
+        return sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
+
+
+def estimate(path: Path, model: SimulatorModel, topics: Mapping[str, str]) -> Estimate:
+    """Runs a bag through the middleware, in process.
+
+    Args:
+        path: of the bag.
+        model: of the robot.
+        topics: role (`scan`, `odom`, `cmd_vel`, `pose`, `imu`) -> topic; see `chosen`.
+
+    Returns:
+        The estimate, the same whenever and wherever it is computed with the same versions.
+
+    Raises:
+        RecordingError: the bag is damaged, a topic is missing or of a wrong type, or its data
+            are stamped by several clocks.
+    """
+    with opened(path) as bag:
+        roles = chosen(bag, topics)
+        messages = {role: bag.messages(topic) for role, topic in roles.items()}
+    _check_clocks(str(path), roles, messages)
+    return _Playback(model, POSE in roles).run(messages)
+
+
+def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
+    """The topic of each role that is played.
+
+    Args:
+        bag: that has them.
+        topics: what the user said; `scan`, `odom` and `cmd_vel` are by default the topics of
+            these names, `pose` and `imu` are left out.
+
+    Raises:
+        RecordingError: there is no such topic, or it is of a wrong type; or no `odom`.
+    """
+    roles = {}
+    for role, kinds in TYPES.items():
+        topic = topics.get(role) or (f"/{role}" if f"/{role}" in bag.types else "")
+        if role not in topics and (role not in ALWAYS or not topic or topic in bag.empty):
+            continue
+        if topic not in bag.types:
+            raise RecordingError(
+                f"{bag.place}: has no topic {topic!r} ({role}); {nearest(topic, bag.types)}"
+            )
+        if bag.types[topic] not in kinds or topic in bag.empty:
+            is_now = "empty" if topic in bag.empty else f"of type {bag.types[topic]}"
+            raise RecordingError(
+                f"{bag.place}: the topic {topic!r} is {is_now}; {role} needs messages of "
+                f"{' or '.join(kinds)}."
+            )
+        roles[role] = topic
+    if ODOM not in roles:
+        raise RecordingError(
+            f"{bag.place}: has no odometry; say which topic it is, as in --topic odom=/wheel_odom; "
+            f"its topics are {', '.join(sorted(bag.types))}."
+        )
+    return roles
+
+
+def _check_clocks(
+    place: str, roles: Mapping[str, str], messages: Mapping[str, list[Message]]
+) -> None:
+    """Raises RecordingError when the stamps are not of one clock."""
+    stamps = {
+        role: np.array([(m.receive_ns, stamp(m.content)) for m in some], dtype=np.int64)
+        for role, some in messages.items()
+        if hasattr(some[0].content, "header")
+    }
+    for role, times in stamps.items():
+        if not times[:, 1].any():
+            if role == CMD_VEL:
+                continue
+            raise RecordingError(
+                f"{place}: topic {roles[role]!r}: its messages are not stamped; have the driver "
+                "stamp them, the middleware orders data by their stamps."
+            )
+        clock = stamps[ODOM]
+        there = clock[0, 1] + np.interp(times[:, 0], clock[:, 0], clock[:, 1] - clock[0, 1])
+        apart = float(np.median(times[:, 1] - there)) * 1e-9
+        if abs(apart) > APART_S:
+            raise RecordingError(
+                f"{place}: the stamps of {roles[role]!r} are {apart:+.3f} s off those of "
+                f"{roles[ODOM]!r}, so they are of two clocks; synchronise the clocks (NTP, or "
+                "use_sim_time on all nodes or none) and record anew, or leave the topic out."
+            )
+
+
+class _Playback:
+    """Feeds the middleware as the nodes do."""
+
+    def __init__(self, model: SimulatorModel, posed: bool) -> None:
+        self._model, self._middleware, self._posed = model, Middleware(model), posed
+        self._started = False
+        self._rows: list[tuple[int, Array, Array, Array]] = []
+
+    def run(self, messages: Mapping[str, list[Message]]) -> Estimate:
+        takes = {
+            SCAN: self._scan, ODOM: self._odometry, CMD_VEL: self._command,
+            POSE: self._pose, IMU: self._imu,
+        }  # fmt: skip
+        for role, message in _in_order(messages):
+            takes[role](message.receive_ns, message.content)
+        if not self._rows:
+            raise RecordingError(
+                "no odometry of the bag could be used; look at it with `nics bag info`."
+            )
+        stamps, poses, twists, covariances = zip(*self._rows, strict=True)
+        return Estimate(
+            np.array(stamps, dtype=np.int64), np.array(poses), np.array(twists),
+            np.array(covariances), dict(self._middleware.cache.rejected),
+        )  # fmt: skip
+
+    def _scan(self, arrival_ns: int, message: Any) -> None:
+        ranges = from_device(message.ranges, self._model.lidar)
+        self._middleware.scan(stamp(message), arrival_ns, ranges)
+
+    def _odometry(self, arrival_ns: int, message: Any) -> None:
+        stamp_ns, pose = stamp(message), np.array(pose_row(message))
+        if not self._started and np.isfinite(pose).all():
+            if self._posed:
+                self._middleware.reset(stamp_ns, pose, ANYWHERE)
+            else:
+                self._middleware.reset(stamp_ns, pose)
+            self._started = True
+        twist = np.array(twist_row(message))
+        used = self._middleware.odometry(stamp_ns, arrival_ns, pose, twist)
+        if used and self._middleware.cache.newest[ODOM].stamp_ns == stamp_ns:
+            self._note(stamp_ns)
+
+    def _note(self, stamp_ns: int) -> None:
+        estimator = self._middleware.estimator
+        stamp_ns = max(stamp_ns, estimator.time_ns)
+        view = self._middleware.view(stamp_ns)
+        self._rows.append((stamp_ns, view.pose, view.twist, estimator.covariance[:3, :3]))
+
+    def _command(self, _: int, message: Any) -> None:
+        command = self._model.robot.from_cmd_vel(np.array(command_row(message)))
+        stamp_ns = stamp(message) if hasattr(message, "header") else 0
+        self._middleware.command(stamp_ns or None, command)
+
+    def _pose(self, arrival_ns: int, message: Any) -> None:
+        covariance = None
+        if hasattr(message.pose, "covariance"):
+            six = np.reshape(message.pose.covariance, (6, 6))
+            covariance = six[np.ix_([0, 1, 5], [0, 1, 5])]
+        self._middleware.pose(stamp(message), arrival_ns, pose_row(message), covariance)
+
+    def _imu(self, arrival_ns: int, message: Any) -> None:
+        covariance = message.angular_velocity_covariance
+        if covariance[0] == -1.0:
+            self._middleware.cache.reject(f"{IMU}: no angular velocity")
+            return
+        rate, variance = float(message.angular_velocity.z), float(covariance[8])
+        self._middleware.imu(stamp(message), arrival_ns, rate, variance)
+
+
+def _in_order(messages: Mapping[str, list[Message]]) -> Iterator[tuple[str, Message]]:
+    """All messages with their roles, in the order of receipt."""
+    every = [
+        (message.receive_ns, place, k, role, message)
+        for place, (role, some) in enumerate(sorted(messages.items()))
+        for k, message in enumerate(some)
+    ]
+    for _, _, _, role, message in sorted(every, key=lambda each: each[:3]):
+        yield role, message
+
+
+def write_estimate(made: Estimate, path: Path) -> None:
+    """Writes an estimate as `.npz`, or else as CSV whose numbers read back exactly."""
+    if path.suffix == ".npz":
+        arrays = {
+            "stamp_ns": made.stamp_ns, "pose": made.pose, "twist": made.twist,
+            "covariance": made.covariance,
+        }  # fmt: skip
+        write_bytes(path, npz_bytes(arrays))
+        return
+    lines = [",".join(("stamp_ns", *COLUMNS))]
+    for ns, pose, twist in zip(made.stamp_ns, made.pose, made.twist, strict=True):
+        lines.append(",".join((str(ns), *(repr(float(v)) for v in (*pose, *twist)))))
+    write_text(path, "\n".join(lines) + "\n")

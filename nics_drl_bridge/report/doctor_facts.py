@@ -1,0 +1,188 @@
+"""What was heard of a robot, live or out of a bag: the facts that the doctor judges."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.kinematics.bag_file import opened
+from nics_drl_bridge.kinematics.bag_qos import Offer
+
+Array = NDArray[np.float64]
+Nanoseconds = NDArray[np.int64]
+
+SCAN, ODOM, CMD_VEL, CLOCK = "scan", "odom", "cmd_vel", "/clock"
+SCAN_TYPE, ODOM_TYPE = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
+TWIST_TYPE, TWIST_STAMPED_TYPE = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
+MOST_SCANS = 200
+"""Ranges are kept of so many scans; of the others only the time."""
+NANO = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Endpoints:
+    """Who speaks and who listens on a topic.
+
+    Attributes:
+        types: of the messages, by what the publishers say.
+        offers: quality of service of each publisher.
+        asks: that each subscriber asks for; the doctor's own is left out.
+    """
+
+    types: tuple[str, ...]
+    offers: tuple[Offer, ...] = ()
+    asks: tuple[Offer, ...] = ()
+
+
+@dataclass
+class TopicFacts:
+    """The messages of a topic.
+
+    Attributes:
+        arrivals_ns: when each came [ns].
+        stamps_ns: of the headers [ns].
+        frames: ids of the headers.
+        children: ids of the child frames.
+    """
+
+    arrivals_ns: list[int] = field(default_factory=list)
+    stamps_ns: list[int] = field(default_factory=list)
+    frames: set[str] = field(default_factory=set)
+    children: set[str] = field(default_factory=set)
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Messages per second between the first and the last; None below three."""
+        span = (self.arrivals_ns[-1] - self.arrivals_ns[0]) / NANO if self.arrivals_ns else 0.0
+        return (len(self.arrivals_ns) - 1) / span if len(self.arrivals_ns) > 2 and span else None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The beams of a scan, as its header tells them, see `ScanHeader`."""
+
+    beams: int
+    angle_min: float
+    angle_max: float
+    angle_increment: float
+    range_min: float
+    range_max: float
+
+
+@dataclass
+class Facts:
+    """All that was heard.
+
+    Attributes:
+        source: where, for people.
+        live: over DDS, or out of a bag.
+        topics: of the robot and what became of each: name -> who is there.
+        heard: role (`scan`, `odom`, `cmd_vel`, `/clock`) -> messages.
+        names: role -> topic.
+        end_ns: when listening ended, on the clock of arrivals [ns].
+        layouts: of the scans, each different one once.
+        ranges: of up to 200 scans [m].
+        poses: of odometry, rows x, y [m], heading [rad].
+        twists: of odometry, rows vx, vy [m/s], wz [rad/s].
+        lengths: of odometry's quaternions.
+        uncovered: odometries whose covariance of pose and twist is all zeros.
+        commands: rows vx, vy [m/s], wz [rad/s].
+        clock_ns: content of `/clock` [ns].
+    """
+
+    source: str
+    live: bool
+    names: dict[str, str]
+    topics: dict[str, Endpoints] = field(default_factory=dict)
+    heard: dict[str, TopicFacts] = field(default_factory=dict)
+    end_ns: int = 0
+    layouts: list[Layout] = field(default_factory=list)
+    ranges: list[NDArray[np.float32]] = field(default_factory=list)
+    poses: list[tuple[float, float, float]] = field(default_factory=list)
+    twists: list[tuple[float, float, float]] = field(default_factory=list)
+    lengths: list[float] = field(default_factory=list)
+    uncovered: int = 0
+    commands: list[tuple[float, float, float]] = field(default_factory=list)
+    clock_ns: list[int] = field(default_factory=list)
+
+    def take(self, role: str, arrival_ns: int, message: Any) -> None:
+        """Notes a message, of ROS or of a bag: both have the same fields."""
+        heard = self.heard.setdefault(role, TopicFacts())
+        heard.arrivals_ns.append(arrival_ns)
+        if hasattr(message, "header"):
+            time = message.header.stamp
+            heard.stamps_ns.append(int(time.sec) * NANO + int(time.nanosec))
+            heard.frames.add(str(message.header.frame_id))
+        if role == SCAN:
+            self._scan(message)
+        elif role == ODOM:
+            heard.children.add(str(message.child_frame_id))
+            self._odometry(message)
+        elif role == CMD_VEL:
+            self.commands.append(_twist(getattr(message, "twist", message)))
+        else:
+            self.clock_ns.append(int(message.clock.sec) * NANO + int(message.clock.nanosec))
+
+    def _scan(self, message: Any) -> None:
+        layout = Layout(
+            len(message.ranges), float(message.angle_min), float(message.angle_max),
+            float(message.angle_increment), float(message.range_min), float(message.range_max),
+        )  # fmt: skip
+        if layout not in self.layouts:
+            self.layouts.append(layout)
+        if len(self.ranges) < MOST_SCANS:
+            self.ranges.append(np.array(message.ranges, dtype=np.float32))
+
+    def _odometry(self, message: Any) -> None:
+        pose = message.pose.pose
+        q = pose.orientation
+        heading = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+        self.lengths.append(math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w))
+        self.poses.append((float(pose.position.x), float(pose.position.y), heading))
+        self.twists.append(_twist(message.twist.twist))
+        covariances = np.asarray(message.pose.covariance), np.asarray(message.twist.covariance)
+        self.uncovered += any(not one.any() for one in covariances)
+
+
+def _twist(twist: Any) -> tuple[float, float, float]:
+    return float(twist.linear.x), float(twist.linear.y), float(twist.angular.z)
+
+
+def names_in(namespace: str) -> dict[str, str]:
+    """Role -> topic of a robot in a namespace."""
+    space = f"/{namespace.strip('/')}" if namespace.strip("/") else ""
+    return {role: f"{space}/{role}" for role in (SCAN, ODOM, CMD_VEL)} | {CLOCK: CLOCK}
+
+
+KINDS: dict[str, Sequence[str]] = {
+    SCAN: (SCAN_TYPE,),
+    ODOM: (ODOM_TYPE,),
+    CMD_VEL: (TWIST_TYPE, TWIST_STAMPED_TYPE),
+    CLOCK: (CLOCK_TYPE,),
+}
+"""The message types of each role; what is of another is not looked into."""
+
+
+def facts_of_bag(path: Path, namespace: str = "") -> Facts:
+    """What a bag tells of a robot.
+
+    Raises:
+        RecordingError: the bag is damaged.
+    """
+    facts = Facts(str(path), False, names_in(namespace))
+    with opened(path) as bag:
+        facts.end_ns = bag.span_ns[1]
+        for topic, kind in bag.types.items():
+            facts.topics[topic] = Endpoints(tuple(kind.split(" and ")), bag.offers(topic))
+        for role, topic in facts.names.items():
+            if bag.types.get(topic) in KINDS[role]:
+                for message in bag.messages(topic):
+                    facts.take(role, message.receive_ns, message.content)
+    return facts
