@@ -10,6 +10,7 @@ from nics_drl_bridge import __version__
 from nics_drl_bridge.commands.bake import bake
 from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.generate import generate
+from nics_drl_bridge.commands.policy import policy
 from nics_drl_bridge.commands.record import record
 from nics_drl_bridge.commands.replay import replay
 
@@ -41,6 +42,7 @@ def _options(
 
 for command in (generate, bake, record, replay, demo):
     app.command()(command)
+app.add_typer(policy, name="policy")
 
 
 def main() -> None:
