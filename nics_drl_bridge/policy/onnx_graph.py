@@ -54,6 +54,7 @@ def parse(data: bytes, source: str) -> Any:
         raise PolicyError(source, "file", reason) from None
     if not model.HasField("graph"):
         raise PolicyError(source, "file", "is no ONNX model, or is cut off; copy it again.")
+    metadata(model, source)
     check_graph(model, source)
     return model
 
