@@ -44,7 +44,7 @@ EXTRAS = {
         "tensorboard>=2.16",
         "torch>=2.3,<2.14",
     ],
-    "deploy": ["onnxruntime>=1.18"],
+    "deploy": ["onnx>=1.16", "onnxruntime>=1.18"],
     "test": [
         "build",
         "colcon-bash",

@@ -12,6 +12,7 @@ from nics_drl_bridge.commands.bake import bake
 from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.doctor import doctor
 from nics_drl_bridge.commands.generate import generate
+from nics_drl_bridge.commands.policy import policy
 from nics_drl_bridge.commands.record import record
 from nics_drl_bridge.commands.replay import replay
 from nics_drl_bridge.commands.urdf import urdf
@@ -45,6 +46,7 @@ def _options(
 for command in (generate, bake, record, replay, doctor, urdf, demo):
     app.command()(command)
 app.add_typer(bag, name="bag")
+app.add_typer(policy, name="policy")
 
 
 def main() -> None:

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import RecordingError, nearest
-from nics_drl_bridge.files import npz_bytes, sha256, write_bytes, write_text
+from nics_drl_bridge.files import sha256, write_bytes, write_text
+from nics_drl_bridge.npz import npz_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.kinematics import topic_roles
 from nics_drl_bridge.kinematics.bag_file import BagFile, Message, opened

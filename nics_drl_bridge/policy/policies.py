@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy.go_to_goal import GoToGoal
 
 
@@ -24,8 +27,28 @@ class Policy(Protocol):
 POLICIES: dict[str, Callable[[Navigation], Policy]] = {"go_to_goal": GoToGoal}
 
 
-def make_policy(name: str, task: Navigation) -> Policy:
-    """A policy by name. Raises ConfigError for an unknown one, with the nearest."""
-    if name not in POLICIES:
-        raise ConfigError(f"unknown policy {name!r}; {nearest(name, POLICIES)}")
-    return POLICIES[name](task)
+SUFFIX = ".onnx"
+
+
+def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None) -> Policy:
+    """A policy by name.
+
+    Args:
+        name: of one in `POLICIES`, of a shipped policy file, or the path of a policy file.
+        task: whose observations and actions it speaks.
+        model: of the robot; a policy file is then checked against it, and against the task.
+
+    Raises:
+        ConfigError: an unknown name, with the nearest.
+        PolicyError: the file can't be used, or does not fit; the field is named.
+    """
+    if name in POLICIES:
+        return POLICIES[name](task)
+    files = [file.stem for file in (share_folder() / "config" / "policies").glob(f"*{SUFFIX}")]
+    if not name.endswith(SUFFIX) and name not in files:
+        known = nearest(name, (*POLICIES, *files))
+        raise ConfigError(f"unknown policy {name!r}; {known} Or give the path of an .onnx file.")
+    # Imported here: the others need neither onnx nor onnxruntime.
+    policy: Policy = import_module("nics_drl_bridge.policy.policy_file").load_policy(name)
+    policy.check_fits(model, task)  # type: ignore[attr-defined]
+    return policy
