@@ -12,6 +12,7 @@ from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.generate import generate
 from nics_drl_bridge.commands.record import record
 from nics_drl_bridge.commands.replay import replay
+from nics_drl_bridge.commands.train import train
 
 app = typer.Typer(
     help="From a recording of a robot to a fast simulator, and back to the robot over ROS 2.",
@@ -39,7 +40,7 @@ def _options(
     """Options of every command."""
 
 
-for command in (generate, bake, record, replay, demo):
+for command in (generate, bake, record, replay, train, demo):
     app.command()(command)
 
 

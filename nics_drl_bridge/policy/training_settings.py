@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
-from nics_drl_bridge.config import Schema, find_config, load_yaml, share_folder
+from nics_drl_bridge.config import Schema, find_config, load_yaml, share_folder, validate
 
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1)]
@@ -101,16 +101,15 @@ class TrainingSettings(Schema):
         return options
 
     @property
+    def title(self) -> str:
+        """What a folder of its runs may be called."""
+        task = self.task.rpartition(":")[2]
+        return f"{task}_{Path(self.robot).stem}_{self.algorithm}"
+
+    @property
     def num_envs(self) -> int:
         """N, worlds of all kinds together."""
         return sum(self.worlds.values())
-
-
-def training_name(task: str, robot: str) -> str:
-    """The shipped settings for a task and a robot; those of `default` where there are none."""
-    name = f"{task}_{robot}"
-    folder = share_folder() / "config" / "training"
-    return name if (folder / f"{Path(name).name}.yaml").is_file() else "default"
 
 
 def load_training(name: str) -> TrainingSettings:
@@ -120,3 +119,34 @@ def load_training(name: str) -> TrainingSettings:
         ConfigError: no such file, or something in it is wrong.
     """
     return load_yaml(find_config(name, "training"), TrainingSettings)
+
+
+def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> TrainingSettings:
+    """Settings as a user chose them.
+
+    Args:
+        task: to learn.
+        name: of shipped settings, or a YAML file; by default those of task and robot, and where
+            none are shipped, the defaults.
+        changes: further keys of `TrainingSettings`; and `world`, names that share the worlds
+            among them.
+
+    Raises:
+        ConfigError: an unknown name or a wrong value.
+    """
+    robot = str(changes.get("robot", "differential"))
+    if name is not None:
+        base = load_training(name)
+    elif f"{task}_{robot}" in _shipped():
+        base = load_training(f"{task}_{robot}")
+    else:
+        base = TrainingSettings(task=task, robot=robot)
+    changed = base.model_dump(mode="json") | changes
+    if worlds := changed.pop("world", None):
+        each = max(1, base.num_envs // len(worlds))
+        changed["worlds"] = dict.fromkeys(worlds, each)
+    return validate(changed, TrainingSettings, "training settings")
+
+
+def _shipped() -> list[str]:
+    return [path.stem for path in (share_folder() / "config" / "training").glob("*.yaml")]
