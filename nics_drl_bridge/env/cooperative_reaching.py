@@ -25,8 +25,8 @@ class CooperativeReaching(Task):
 
     ## Observation Space
 
-    Of one robot, `Box((B + 4 M + 3 (M - 1) + 3,), float32)`, B beams. The robots tell each other
-    where they are.
+    Of one robot, `Box((B + 4 M + 3 (M - 1) + 3,), float32)`, B beams or
+    sectors. The robots tell each other where they are.
 
     | Num | Observation | Min | Max | Unit |
     |---|---|---|---|---|

@@ -2,8 +2,8 @@
 
 What one robot does is a scalar function; the batched loops call it, so that a robot alone and
 one of thousands get the same bits. Shapes: R robots of any worlds, B beams, C commands, O parts
-of an observation. numpy's functions over a batch round its remainder differently from its body
-where they are vectorised, so that angles are turned here.
+of an observation, the first P of them a scan. numpy's functions over a batch round its remainder
+differently from its body where they are vectorised, so that angles are turned here.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import math
 import numpy as np
 from numba import njit
 
+from nics_drl_bridge.lidar.canonical_kernels import resample
 from nics_drl_bridge.random_kernels import episode_seed
 
 LIMIT = 1000.0
@@ -67,6 +68,26 @@ def look(shares, ranges, per_metre, leaves):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def look_by_sector(shares, ranges, sensor):  # type: ignore[no-untyped-def]
+    """Writes the nearest returns in sectors (S,) in shares; says whether something is too near.
+
+    That is judged of the beams (B,) themselves. `sensor` holds per_metre and leaves of `look`,
+    and how beams fill the sectors, see `canonical.Plan.arguments`.
+    """
+    per_metre, leaves, plan = sensor
+    zero, one = np.float32(0.0), np.float32(1.0)
+    resample(shares, ranges, plan)
+    for s in range(shares.shape[0]):
+        share = shares[s] * per_metre
+        share = share if share > zero else zero
+        shares[s] = share if share < one else one
+    hits = np.int32(0)
+    for b in range(ranges.shape[0]):
+        hits |= np.int32(ranges[b] < leaves[b])
+    return hits != 0
+
+
+@njit(cache=True, nogil=True)
 def bearing(pose, x, y):  # type: ignore[no-untyped-def]
     """Distance [m] from a pose (3,) to a point, and cosine and sine of its bearing."""
     dx, dy = x - pose[0], y - pose[1]
@@ -87,10 +108,13 @@ def bearings(out, poses, points):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def looks(shares, touched, ranges, per_metre, leaves):  # type: ignore[no-untyped-def]
-    """Scans of R robots: `look` for each; touched (R,) is the answer."""
+def looks(shares, touched, ranges, sensor):  # type: ignore[no-untyped-def]
+    """Scans of R robots: `look` for each, or `look_by_sector`; touched (R,) is the answer."""
     for i in range(ranges.shape[0]):
-        touched[i] = look(shares[i], ranges[i], per_metre, leaves)
+        if sensor[2][0].shape[0] == 0:
+            touched[i] = look(shares[i], ranges[i], sensor[0], sensor[1])
+        else:
+            touched[i] = look_by_sector(shares[i], ranges[i], sensor)
 
 
 @njit(cache=True, nogil=True)
@@ -98,28 +122,30 @@ def navigate(out, approach, reached, touched, before, pose, twist, ranges, goals
     """Observations of the navigation task, and what the robots came to.
 
     Args:
-        out: (R, B + 6) float32, result, see `navigation.Navigation`.
+        out: (R, P + 6) float32, result, see `navigation.Navigation`; P parts of a scan.
         approach: (R,) by how much nearer the goal is than before [m], result.
         reached, touched: (R,) bool, whether a robot is at its goal, or at something; results.
         before: (R, 3) poses before the step.
         pose, twist: (R, 3).
         ranges: (R, B) float32.
         goals: (R, 2) [m].
-        sensor: per_metre and leaves of `look`.
+        sensor: see `look_by_sector`; with a plan of no sectors, beams are seen as they are.
         radius: of a goal [m].
     """
-    per_metre, leaves = sensor
-    beams = ranges.shape[1]
+    parts = out.shape[1] - 6
     for i in range(out.shape[0]):
-        touched[i] = look(out[i, :beams], ranges[i], per_metre, leaves)
+        if sensor[2][0].shape[0] == 0:
+            touched[i] = look(out[i, :parts], ranges[i], sensor[0], sensor[1])
+        else:
+            touched[i] = look_by_sector(out[i, :parts], ranges[i], sensor)
         distance, c, s = bearing(pose[i], goals[i, 0], goals[i, 1])
         dx, dy = goals[i, 0] - before[i, 0], goals[i, 1] - before[i, 1]
         approach[i] = math.sqrt(dx * dx + dy * dy) - distance
         reached[i] = distance < radius
-        out[i, beams] = min(distance, LIMIT)
-        out[i, beams + 1], out[i, beams + 2] = c, s
+        out[i, parts] = min(distance, LIMIT)
+        out[i, parts + 1], out[i, parts + 2] = c, s
         for k in range(3):
-            out[i, beams + 3 + k] = min(max(twist[i, k], -LIMIT), LIMIT)
+            out[i, parts + 3 + k] = min(max(twist[i, k], -LIMIT), LIMIT)
 
 
 @njit(cache=True, nogil=True)

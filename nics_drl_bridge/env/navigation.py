@@ -39,7 +39,7 @@ class Navigation(Task):
 
     ## Observation Space
 
-    `Box((B + 6,), float32)`, B beams, counter-clockwise:
+    `Box((B + 6,), float32)`, B beams, counter-clockwise, or sectors if `scan` says so:
 
     | Num | Observation | Min | Max | Unit |
     |---|---|---|---|---|
@@ -97,7 +97,7 @@ class Navigation(Task):
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
         """The observation (..., B + 6) of a view, for goals (..., 2) in `map`."""
-        width = self.lidar.beams + GOAL_PARTS + TWIST_PARTS
+        width = self.scan_parts + GOAL_PARTS + TWIST_PARTS
         out = np.empty((*view.pose.shape[:-1], width), np.float32)
         self._see(out, view.pose, view, memory)
         return out
@@ -145,13 +145,9 @@ class Navigation(Task):
             approach.reshape(-1), reached.reshape(-1), touched.reshape(-1), before.reshape(-1, 3),
             view.pose.reshape(-1, 3), view.twist.reshape(-1, 3),
             view.ranges.reshape(-1, view.ranges.shape[-1]), memory["goal"].reshape(-1, 2),
-            self._sensor, self.goal_radius,
+            self.sensor, self.goal_radius,
         )  # fmt: skip
         return approach, Verdict(reached, touched)
-
-    @cached_property
-    def _sensor(self) -> tuple[np.float32, NDArray[np.float32]]:
-        return self.per_metre, self.contact_ranges
 
     def _terms(self, approach: Array, verdict: Verdict) -> dict[str, Array]:
         time = np.empty_like(approach)

@@ -27,8 +27,8 @@ class PursuitEvasion(Task):
 
     ## Observation Space
 
-    Of one robot, `Box((B + 5 (M - 1) + 1 + 3,), float32)`, B beams. All robots are in sight of
-    each other.
+    Of one robot, `Box((B + 5 (M - 1) + 1 + 3,), float32)`, B beams or
+    sectors. All robots are in sight of each other.
 
     | Num | Observation | Min | Max | Unit |
     |---|---|---|---|---|

@@ -19,6 +19,7 @@ from nics_drl_bridge.env.kernels import LIMIT
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.lidar.canonical import NO_PLAN, Plan, ScanLayout, plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
 
 Array = NDArray[np.float64]
@@ -60,6 +61,21 @@ class Outcome:
 
 
 @dataclass(frozen=True)
+class Sight:
+    """What the parts of a scan in an observation mean.
+
+    Attributes:
+        angles: (P,) of each part, counter-clockwise, in `base_link` [rad].
+        origin: (2,) where they are seen from, in `base_link` [m].
+        range_max: what a share of 1 stands for [m].
+    """
+
+    angles: Array
+    origin: Array
+    range_max: float
+
+
+@dataclass(frozen=True)
 class Task(ABC):
     """Observation, action, reward and end of a task: pure functions over leading dimensions.
 
@@ -71,9 +87,12 @@ class Task(ABC):
 
     Attributes:
         robot: gives commands, their limits, and the footprint.
-        lidar: gives the scan's layout.
+        lidar: what gives the scan.
         actions: `continuous` (Box) or `discrete` (the paper's drives, see `actions.DRIVES`).
         contact_margin: a return this close to the footprint counts as a touch [m].
+        scan: the sectors that observations hold instead of the lidar's beams, so that they mean
+            the same for any lidar; None holds the beams as they are. Touches are always judged
+            of the beams.
         keeps_last_scan: whether `before.ranges` is wanted in `reward`, `update` or `step_into`;
             without it they are the new ones, which spares a copy.
         shown: names of the memory that `info` always holds.
@@ -86,11 +105,13 @@ class Task(ABC):
     lidar: LidarSpec
     actions: Actions = "continuous"
     contact_margin: float = 0.02
+    scan: ScanLayout | None = None
 
     def __post_init__(self) -> None:
         if self.actions not in ("continuous", "discrete"):
             known = nearest(str(self.actions), ("continuous", "discrete"))
             raise ConfigError(f"task option actions={self.actions!r}: no such actions; {known}")
+        _ = self.plan  # a lidar that can't fill the layout is refused here
 
     @property
     def robots(self) -> int:
@@ -159,17 +180,20 @@ class Task(ABC):
     # What tasks are made of.
 
     def box(self, low: ArrayLike, high: ArrayLike) -> gymnasium.spaces.Box:
-        """The space of a scan in shares (B parts), then of parts with these limits."""
-        beams = self.lidar.beams
+        """The space of a scan in shares (P parts), then of parts with these limits."""
+        parts = self.scan_parts
         low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
         return gymnasium.spaces.Box(
-            np.concatenate([np.zeros(beams, np.float32), low]),
-            np.concatenate([np.ones(beams, np.float32), high]),
+            np.concatenate([np.zeros(parts, np.float32), low]),
+            np.concatenate([np.ones(parts, np.float32), high]),
             dtype=np.float32,
         )
 
     def free_share(self, ranges: NDArray[np.float32]) -> Observation:
-        """Ranges (..., B) in shares of the greatest: 1 no return, 0 too close or unknown."""
+        """Ranges (..., B) in shares (..., P): 1 no return, 0 too close or unknown.
+
+        A share is one of the lidar's greatest range, or of that of the layout `scan`.
+        """
         return self._look(ranges)[0]
 
     def touches(self, ranges: NDArray[np.float32]) -> Flags:
@@ -179,14 +203,40 @@ class Task(ABC):
     def _look(self, ranges: NDArray[np.float32]) -> tuple[Observation, Flags]:
         ranges = np.ascontiguousarray(ranges, np.float32)
         rows = ranges.reshape(-1, ranges.shape[-1])
-        shares, touched = np.empty_like(rows), np.empty(len(rows), np.bool_)
-        kernels.looks(shares, touched, rows, self.per_metre, self.contact_ranges)
-        return shares.reshape(ranges.shape), touched.reshape(ranges.shape[:-1])
+        parts = rows.shape[-1] if self.scan is None else self.scan.sectors
+        shares, touched = np.empty((len(rows), parts), np.float32), np.empty(len(rows), np.bool_)
+        kernels.looks(shares, touched, rows, self.sensor)
+        lead = ranges.shape[:-1]
+        return shares.reshape(*lead, parts), touched.reshape(lead)
+
+    @property
+    def scan_parts(self) -> int:
+        """P, parts of an observation that are a scan: sectors of `scan`, or beams."""
+        return self.lidar.beams if self.scan is None else self.scan.sectors
+
+    @cached_property
+    def sight(self) -> Sight:
+        """What these parts mean."""
+        if self.scan is not None:
+            layout = self.scan
+            return Sight(layout.angles, np.array(layout.viewpoint), layout.range_max)
+        x, y, heading = self.lidar.mount
+        return Sight(self.lidar.angles + heading, np.array([x, y]), self.lidar.range_max)
+
+    @cached_property
+    def plan(self) -> Plan:
+        """How the lidar's beams fill the sectors of `scan`; of no sectors without one."""
+        return NO_PLAN if self.scan is None else plan_of(self.lidar, self.scan)
+
+    @cached_property
+    def sensor(self) -> tuple[Any, ...]:
+        """What the kernels take: `per_metre`, `contact_ranges`, and the plan's arrays."""
+        return self.per_metre, self.contact_ranges, self.plan.arguments
 
     @cached_property
     def per_metre(self) -> np.float32:
-        """1 / greatest range of the lidar [1/m]."""
-        return np.float32(1.0 / self.lidar.range_max)
+        """1 / the range that a share of 1 stands for [1/m]."""
+        return np.float32(1.0 / self.sight.range_max)
 
     @cached_property
     def contact_ranges(self) -> NDArray[np.float32]:

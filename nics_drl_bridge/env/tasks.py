@@ -15,6 +15,7 @@ from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.canonical import layout_of
 
 TASKS = {
     "navigation": "nics_drl_bridge.env.navigation:Navigation",
@@ -33,7 +34,8 @@ def make_task(
         task: the name of a shipped one (`navigation`), `path/to/file.py:ClassName`, a class, or a
             Task that is already made.
         model: gives the robot and the lidar.
-        options: further arguments of the class.
+        options: further arguments of the class; `scan` may also be a number of sectors, the name
+            of a layout or its fields, see `canonical.layout_of`.
 
     Raises:
         ConfigError: no such task, an argument it does not know, or a Task for another robot.
@@ -41,9 +43,12 @@ def make_task(
     if isinstance(task, Task):
         return _checked(task, model, options)
     found = task if isinstance(task, type) else _class_of(task)
-    _check_options(found, options or {})
+    options = dict(options or {})
+    _check_options(found, options)
+    if "scan" in options:
+        options["scan"] = layout_of(options["scan"], model.lidar)
     try:
-        return found(model.robot, model.lidar, **(options or {}))
+        return found(model.robot, model.lidar, **options)
     except TypeError as error:
         reason = str(error).removeprefix(f"{found.__name__}.__init__() ")
         raise ConfigError(f"task {found.__name__}, task_options {options}: {reason}.") from None

@@ -9,45 +9,58 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.node import Node
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.middleware.health import Health
 from nics_drl_bridge.middleware.view import rehearse
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.robot_topics import RobotTopics
-from nics_drl_bridge.nodes.runner import declare, declare_model, run_node
+from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
+from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
+from nics_drl_bridge.nodes.runner import declare, declare_model_name, run_node
 
 DIAGNOSTICS_PERIOD_S = 1.0
 SILENCE_S = 5.0
 """Diagnostics warn of a topic that has been silent for so long."""
 
 
-class MiddlewareNode(Node):
+class MiddlewareNode(ManagedNode):
     """Listens to a robot's topics; publishes `odometry/filtered` and `/diagnostics`.
 
     Which topics, `RobotTopics` says; what becomes of them, `docs/middleware.md`.
-    `~/reset` forgets everything, so that the next odometry fixes `map` anew.
+    `~/reset` forgets everything, so that the next odometry fixes `map` anew. It listens when it is
+    configured and publishes the estimate when it is active; diagnostics come in every state.
 
     Args:
         context: to live in.
     """
 
     def __init__(self, context: Context) -> None:
-        super().__init__("middleware_node", context=context)
-        model = declare_model(self)
-        rehearse(model)
+        super().__init__("middleware_node", context)
+        declare_model_name(self)
+        declare_sensors(self)
         declare(self, "map_frame", "map", "Frame id of the estimate.")
         declare(self, "base_frame", "base_link", "Frame id of the robot.")
-        self._filtered = self.create_publisher(Odometry, "odometry/filtered", qos.SENSOR_RELIABLE)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._topics = RobotTopics(self, model, on_odometry=self._publish)
         self.create_service(Trigger, "~/reset", self._on_reset)
         # Steady: diagnostics matter most when the robot's time stands still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=steady)
 
+    def configure(self) -> None:
+        """Opens the model and listens."""
+        model = open_model(str(self.get_parameter("model").value))
+        rehearse(model)
+        self._filtered = self.create_lifecycle_publisher(
+            Odometry, "odometry/filtered", qos.SENSOR_RELIABLE
+        )
+        self.undo.callback(self.destroy_lifecycle_publisher, self._filtered)
+        self._topics = RobotTopics(self, model, on_odometry=self._publish)
+        self.undo.callback(self._topics.close)
+
     def _publish(self, stamp_ns: int) -> None:
+        if self.state != ACTIVE:
+            return
         estimator = self._topics.middleware.estimator
         # A pose or a yaw rate may have been newer.
         stamp_ns = max(stamp_ns, estimator.time_ns)
@@ -62,17 +75,22 @@ class MiddlewareNode(Node):
         )
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self.state == UNCONFIGURED:
+            response.success, response.message = False, "it is not configured, so knows nothing"
+            return response
         self._topics.restart()
         response.success, response.message = True, "the next odometry fixes the map frame"
         return response
 
     def _diagnose(self) -> None:
-        health = self._topics.middleware.health(self._topics.now_ns())
         status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: topics")
-        trouble = silence(health, self._topics.expected)
-        status.level = DiagnosticStatus.WARN if trouble else DiagnosticStatus.OK
-        status.message = trouble or "receiving"
-        status.values = [KeyValue(key=key, value=value) for key, value in facts(health).items()]
+        status.level, status.message = DiagnosticStatus.OK, self.state
+        if self.state != UNCONFIGURED:
+            health = self._topics.middleware.health(self._topics.now_ns())
+            trouble = silence(health, self._topics.expected)
+            status.level = DiagnosticStatus.WARN if trouble else DiagnosticStatus.OK
+            status.message = trouble or ("receiving" if self.state == ACTIVE else self.state)
+            status.values = [KeyValue(key=key, value=value) for key, value in facts(health).items()]
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)

@@ -27,13 +27,21 @@ ANYWHERE = (100.0, 100.0, np.pi)
 """How well odometry alone tells where a robot is in the map of a pose sensor [m, rad]."""
 
 
+def declare_sensors(node: Node) -> None:
+    """Declares which sensors a robot has beside scan and odometry."""
+    about = f"Type of `{POSE}`, in the map frame: {NO_POSE}, {', '.join(POSE_TYPES)}."
+    declare(node, "pose_type", NO_POSE, about, read_only=True)
+    declare(node, "use_imu", False, "Whether to use the yaw rate of `imu`.", read_only=True)
+
+
 class RobotTopics:
     """Subscribes to a robot's topics and keeps the middleware up to date.
 
     These are `scan`, `odom` and `cmd_vel`, and if the node's parameters `pose_type` and `use_imu`
-    say so, `pose` and `imu`. Data are used at their own stamps; a command, which has none, at
-    the stamp of the newest datum before it. The first odometry fixes where `map` is, unless there
-    is a pose sensor: then the first pose does.
+    say so, `pose` and `imu`. `declare_sensors` declares these two, before.
+    Data are used at their own stamps; a command, which has none, at the stamp of the newest datum
+    before it. The first odometry fixes where `map` is, unless there is a pose sensor: then the
+    first pose does.
 
     Args:
         node: whose topics they are.
@@ -56,16 +64,17 @@ class RobotTopics:
         self.middleware = Middleware(model)
         self.restart()
         self._on_odometry, self._on_scan = on_odometry, on_scan
-        node.create_subscription(LaserScan, SCAN, self._take_scan, qos.SENSOR)
-        node.create_subscription(Odometry, ODOM, self._take_odometry, qos.SENSOR)
-        node.create_subscription(Twist, CMD_VEL, self._take_command, qos.COMMAND)
+        self._subscriptions = [
+            node.create_subscription(LaserScan, SCAN, self._take_scan, qos.SENSOR),
+            node.create_subscription(Odometry, ODOM, self._take_odometry, qos.SENSOR),
+            node.create_subscription(Twist, CMD_VEL, self._take_command, qos.COMMAND),
+        ]
         self.expected = (SCAN, ODOM, *self._subscribe_optional())
 
     def _subscribe_optional(self) -> list[str]:
         """The topics that the parameters ask for."""
-        node, asked = self._node, []
-        about = f"Type of `{POSE}`, in the map frame: {NO_POSE}, {', '.join(POSE_TYPES)}."
-        pose_type = str(declare(node, "pose_type", NO_POSE, about, read_only=True))
+        node, asked = self._node, {}
+        pose_type = str(node.get_parameter("pose_type").value)
         self._posed = pose_type != NO_POSE
         if self._posed:
             if pose_type not in POSE_TYPES:
@@ -73,13 +82,17 @@ class RobotTopics:
                     f"parameter 'pose_type': there is no {pose_type!r}; "
                     f"{nearest(pose_type, (NO_POSE, *POSE_TYPES))}"
                 )
-            kind = POSE_TYPES[pose_type]
-            node.create_subscription(kind, POSE, self._take_pose, qos.SENSOR)
-            asked.append(POSE)
-        if declare(node, "use_imu", False, "Whether to use the yaw rate of `imu`.", read_only=True):
-            node.create_subscription(Imu, IMU, self._take_imu, qos.SENSOR)
-            asked.append(IMU)
-        return asked
+            asked[POSE] = (POSE_TYPES[pose_type], self._take_pose)
+        if node.get_parameter("use_imu").value:
+            asked[IMU] = (Imu, self._take_imu)
+        for topic, (kind, take) in asked.items():
+            self._subscriptions.append(node.create_subscription(kind, topic, take, qos.SENSOR))
+        return list(asked)
+
+    def close(self) -> None:
+        """Listens no more."""
+        while self._subscriptions:
+            self._node.destroy_subscription(self._subscriptions.pop())
 
     def restart(self) -> None:
         """Forgets everything; the next odometry begins anew."""

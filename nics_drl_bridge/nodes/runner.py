@@ -57,8 +57,9 @@ def last_word(publisher: Publisher, message: Any) -> None:
 def run_node(make: Callable[[Context], Node], args: Sequence[str] | None = None) -> None:
     """Runs a node until SIGINT or SIGTERM, then destroys it in order.
 
-    A node that offers `stop()` is asked to leave its robot standing still while it can still
-    publish. What the user got wrong is one sentence on standard error and exit code 2.
+    A node that offers `start()` is asked to begin. One that offers `stop()` is asked to leave its
+    robot standing still while it can still publish. What the user got wrong is one sentence on
+    standard error and exit code 2.
 
     Args:
         make: makes the node in a context of its own.
@@ -71,6 +72,8 @@ def run_node(make: Callable[[Context], Node], args: Sequence[str] | None = None)
     try:
         context = open_context(sys.argv if args is None else args)
         node = make(context)
+        if hasattr(node, "start"):
+            node.start()
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
         with contextlib.suppress(ExternalShutdownException):
@@ -91,8 +94,13 @@ def run_node(make: Callable[[Context], Node], args: Sequence[str] | None = None)
 
 def declare_model(node: Node) -> SimulatorModel:
     """Declares the parameter `model` and opens what it names."""
+    return open_model(declare_model_name(node))
+
+
+def declare_model_name(node: Node) -> str:
+    """Declares the parameter `model`; what it names is opened later."""
     about = "Folder of a SimulatorModel, or a shipped robot."
-    return open_model(str(declare(node, "model", "ackermann", about, read_only=True)))
+    return str(declare(node, "model", "ackermann", about, read_only=True))
 
 
 def declare(node: Node, name: str, default: Any, description: str, **limits: Any) -> Any:
@@ -103,11 +111,14 @@ def declare(node: Node, name: str, default: Any, description: str, **limits: Any
         name: of the parameter.
         default: gives the type too.
         description: for `ros2 param describe`.
-        limits: `low` and `high` of a floating-point parameter, `read_only`.
+        limits: `low` and `high` of a floating-point parameter; `read_only`, which in a managed node
+            is so from configure to cleanup.
     """
-    descriptor = ParameterDescriptor(
-        description=description, read_only=limits.get("read_only", False)
-    )
+    fixed = limits.get("read_only", False)
+    if fixed and hasattr(node, "fixed"):  # a managed node reads it anew each time it is configured
+        node.fixed.add(name)
+        fixed = False
+    descriptor = ParameterDescriptor(description=description, read_only=fixed)
     if "low" in limits:
         span = FloatingPointRange(from_value=limits["low"], to_value=limits["high"])
         descriptor.floating_point_range = [span]

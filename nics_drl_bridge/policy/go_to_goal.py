@@ -60,15 +60,15 @@ class GoToGoal:
 
     @cached_property
     def _chosen(self) -> tuple[NDArray[np.intp], Array]:
-        """The beams to look at, and their directions (H, 2) in `base_link`."""
-        count = self.task.lidar.beams
+        """The parts of the scan to look at, and their directions (H, 2) in `base_link`."""
+        count = self.task.scan_parts
         index = np.unique(np.linspace(0, count - 1, min(count, self.beams)).astype(np.intp))
-        angles = self.task.lidar.angles[index] + self.task.lidar.mount[2]
+        angles = self.task.sight.angles[index]
         return index, np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The action (C,) for an observation (B + 6,)."""
-        distance, cosine, sine = observation[self.task.lidar.beams :][:3].astype(float)
+        """The action (C,) for an observation (P + 6,)."""
+        distance, cosine, sine = observation[self.task.scan_parts :][:3].astype(float)
         goal = distance * np.array([cosine, sine])
         curvature, points, heading = self._paths
         free = self._free_steps(observation, points)
@@ -79,8 +79,8 @@ class GoToGoal:
         """How many points (P,) of each path the footprint reaches without coming too close."""
         index, directions = self._chosen
         share = observation[index].astype(float)
-        mount = np.array(self.task.lidar.mount[:2])
-        hits = (mount + share[:, None] * self.task.lidar.range_max * directions)[share < 1.0]
+        sight = self.task.sight
+        hits = (sight.origin + share[:, None] * sight.range_max * directions)[share < 1.0]
         if not len(hits):
             return np.full(len(points), points.shape[1])
         squared = (points[:, :, None, 0] - hits[:, 0]) ** 2 + (

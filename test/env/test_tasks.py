@@ -137,3 +137,34 @@ def test_bearing_and_distance_agree_with_plane_geometry():
     assert distance(pose, points) == pytest.approx(expected[:, 0])
     assert bearing(np.zeros((4, 1, 3)), np.ones((5, 2))).shape == (4, 5, 3)
     assert bearing([1.0, 2.0, 0.3], [1.0, 2.0]).tolist() == [0.0, 1.0, 0.0]
+
+
+@pytest.mark.parametrize("name", ["navigation", "cooperative_reaching", "pursuit_evasion"])
+def test_a_task_sees_sectors_where_a_layout_is_given_and_judges_touches_by_beams(name):
+    model = direct_model(sensor=lidar(beams=720))
+    own, sectors = make_task(name, model), make_task(name, model, {"scan": "around"})
+    width = own.observation_space.shape[0] - 720
+    assert sectors.observation_space.shape == (72 + width,)
+    ranges = np.full((5, 720), np.inf, np.float32)
+    ranges[1, 100], ranges[2], ranges[3, 7], ranges[4, :30] = 1.5, np.nan, 0.21, -np.inf
+    shares = sectors.free_share(ranges)
+    assert shares[0].tolist() == [1.0] * 72
+    assert sorted(set(shares[1])) == [0.5, 1.0]
+    assert shares[2].tolist() == [0.0] * 72
+    assert shares[4, :3].tolist() == [0.0] * 3
+    assert sectors.touches(ranges).tolist() == own.touches(ranges).tolist()
+
+
+def test_a_scan_layout_that_the_lidar_cannot_fill_is_refused_when_the_task_is_made():
+    with pytest.raises(ConfigError, match="range_max"):
+        make_task("navigation", direct_model(), {"scan": {"sectors": 36, "range_max": 9.0}})
+
+
+def test_a_policy_of_sectors_sees_the_same_from_lidars_of_other_layout():
+    views = []
+    for beams, angle_min in ((720, -np.pi), (1440, 0.0)):
+        spec = lidar(beams=beams, angle_min=angle_min, angle_max=angle_min + 2.0 * np.pi)
+        task = make_task("navigation", direct_model(sensor=spec), {"scan": "around"})
+        ranges = (1.5 + np.cos(spec.angles)).astype(np.float32)
+        views.append(task.free_share(ranges))
+    assert views[0] == pytest.approx(views[1], abs=0.01)

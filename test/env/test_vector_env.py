@@ -23,8 +23,13 @@ TASKS = (
     {"task": "navigation", "task_options": {"actions": "discrete"}},
     {"task": "cooperative_reaching"},
     {"task": "pursuit_evasion", "task_options": {"actions": "discrete"}},
+    {"task": "navigation", "task_options": {"scan": 24}},
+    {"task": "cooperative_reaching", "task_options": {"scan": "around"}},
 )
-IDS = ("navigation", "navigation-discrete", "cooperative", "pursuit-discrete")
+IDS = (
+    "navigation", "navigation-discrete", "cooperative", "pursuit-discrete", "navigation-sectors",
+    "cooperative-sectors",
+)  # fmt: skip
 LIMIT = 25
 THREADS = (1, 2)
 

@@ -1,0 +1,142 @@
+"""What the managed nodes share: configure, activate, deactivate, cleanup, shutdown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.context import Context
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+
+from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.nodes.runner import declare
+
+UNCONFIGURED, INACTIVE, ACTIVE = "unconfigured", "inactive", "active"
+SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+
+
+class ManagedNode(LifecycleNode):
+    """A node that `ros2 lifecycle` and Nav2's lifecycle manager can lead through its states.
+
+    With the parameter `autostart`, which is the default, it configures and activates itself. A
+    subclass declares its parameters when it is made, so that they can be set while it is
+    unconfigured, and says what the transitions do: `configure` reads the parameters, makes what
+    they ask for, listens, and puts on the stack `undo` how to get rid of each; `activate` begins
+    to act; `deactivate` leaves the robot standing still.
+
+    Args:
+        name: of the node.
+        context: to live in.
+    """
+
+    def __init__(self, name: str, context: Context) -> None:
+        super().__init__(name, context=context)
+        self.fixed: set[str] = set()
+        self.undo = ExitStack()
+        about = "Whether it configures and activates itself, without a lifecycle manager."
+        self._autostart = bool(declare(self, "autostart", True, about, read_only=True))
+        self._state, self._starting = UNCONFIGURED, False
+        self._failure: Exception | None = None
+        self.add_on_set_parameters_callback(self._check_fixed)
+
+    def configure(self) -> None:
+        """Makes what the parameters ask for.
+
+        Raises:
+            BridgeError: a parameter can't be used.
+        """
+
+    def activate(self) -> None:
+        """Begins to act."""
+
+    def deactivate(self) -> None:
+        """Leaves the robot standing still; says nothing after."""
+
+    @property
+    def state(self) -> str:
+        """The primary state that it was last in: `unconfigured`, `inactive` or `active`."""
+        return self._state
+
+    def start(self) -> None:
+        """Configures and activates the node, if `autostart` says so.
+
+        Raises:
+            BridgeError: a parameter can't be used.
+        """
+        if not self._autostart:
+            self.get_logger().info("unconfigured: waits for `ros2 lifecycle set` (autostart false)")
+            return
+        self._starting = True
+        for trigger in (self.trigger_configure, self.trigger_activate):
+            if trigger() != SUCCESS and self._failure is not None:
+                raise self._failure
+        self._starting = False
+
+    def stop(self) -> None:
+        """Leaves the robot standing still, from whatever state."""
+        if self._state == ACTIVE:
+            self.deactivate()
+
+    def _check_fixed(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Refuses what would not be read any more."""
+        late = sorted(self.fixed & {parameter.name for parameter in parameters})
+        if not late or self._state == UNCONFIGURED:
+            return SetParametersResult(successful=True)
+        reason = (
+            f"parameter {late[0]!r} is read when the node is configured; lead it to unconfigured "
+            f"first: `ros2 lifecycle set {self.get_fully_qualified_name()} deactivate`, then "
+            "`cleanup`."
+        )
+        return SetParametersResult(successful=False, reason=reason)
+
+    def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Transition of the state machine; a failure leaves it unconfigured."""
+        done = self._attempt(self.configure, INACTIVE)
+        if done == FAILURE:
+            self.undo.close()
+        return done
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Transition of the state machine."""
+        super().on_activate(state)  # the publishers
+        return self._attempt(self.activate, ACTIVE)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Transition of the state machine."""
+        done = self._attempt(self.deactivate, INACTIVE)
+        super().on_deactivate(state)
+        return done
+
+    def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Transition of the state machine."""
+        return self._attempt(self.undo.close, UNCONFIGURED)
+
+    def on_shutdown(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """Transition of the state machine, from any state; the process goes on."""
+        self.stop()
+        return self._attempt(self.undo.close, UNCONFIGURED)
+
+    def on_error(self, _: LifecycleState) -> TransitionCallbackReturn:
+        """What follows a transition that raised; afterwards it can be configured anew."""
+        self.stop()
+        return self._attempt(self.undo.close, UNCONFIGURED)
+
+    def _attempt(self, do: Callable[[], None], reached: str) -> TransitionCallbackReturn:
+        """Does the work of a transition; rclpy itself would not tell why one failed."""
+        self._failure = None
+        try:
+            do()
+        except Exception as error:
+            self._failure = error
+            expected = isinstance(error, BridgeError)
+            if not self._starting:
+                self.get_logger().error(
+                    str(error) if expected else f"{type(error).__name__}: {error}"
+                )
+            if not expected:
+                raise
+            return FAILURE
+        self._state = reached
+        return SUCCESS
