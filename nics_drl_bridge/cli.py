@@ -15,6 +15,7 @@ from nics_drl_bridge.commands.generate import generate
 from nics_drl_bridge.commands.policy import policy
 from nics_drl_bridge.commands.record import record
 from nics_drl_bridge.commands.replay import replay
+from nics_drl_bridge.commands.train import train
 from nics_drl_bridge.commands.urdf import urdf
 
 app = typer.Typer(
@@ -43,7 +44,7 @@ def _options(
     """Options of every command."""
 
 
-for command in (generate, bake, record, replay, doctor, urdf, demo):
+for command in (generate, bake, record, replay, doctor, urdf, train, demo):
     app.command()(command)
 app.add_typer(bag, name="bag")
 app.add_typer(policy, name="policy")

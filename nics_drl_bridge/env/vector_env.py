@@ -130,6 +130,16 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
         self.memory: Memory = {}
 
+    @property
+    def changing(self) -> dict[str, NDArray[Any]]:
+        """The arrays that change from step to step, by name; see `env.vector_state`."""
+        own = {
+            "ended": self.ended, "over": self._over, "first": self._first,
+            "episode": self._episode, "starts": self._starts, "bodies": self._bodies,
+        }  # fmt: skip
+        data = {f"data.{name}": rows for name, rows in vars(self.simulator.data).items()}
+        return {**own, **data, "goals": self.simulator.goals}
+
     def reset(
         self,
         *,

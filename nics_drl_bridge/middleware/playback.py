@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import RecordingError, nearest
 from nics_drl_bridge.files import sha256, write_bytes, write_text
-from nics_drl_bridge.npz import npz_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.kinematics import topic_roles
 from nics_drl_bridge.kinematics.bag_file import BagFile, Message, opened
@@ -26,6 +25,7 @@ from nics_drl_bridge.lidar.rep117 import from_device
 from nics_drl_bridge.middleware.ekf import ANYWHERE
 from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.npz import npz_bytes
 
 Array = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,9 @@ from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.policy.dynamic_window import DynamicWindow
 from nics_drl_bridge.policy.go_to_goal import GoToGoal
+from nics_drl_bridge.policy.simple_policies import RandomActions, StraightToGoal
 
 
 class Policy(Protocol):
@@ -24,7 +26,12 @@ class Policy(Protocol):
         ...
 
 
-POLICIES: dict[str, Callable[[Navigation], Policy]] = {"go_to_goal": GoToGoal}
+POLICIES: dict[str, Callable[[Navigation], Policy]] = {
+    "dynamic_window": DynamicWindow,
+    "go_to_goal": GoToGoal,
+    "random": RandomActions,
+    "straight": StraightToGoal,
+}
 
 
 SUFFIX = ".onnx"
@@ -52,3 +59,11 @@ def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None
     policy: Policy = import_module("nics_drl_bridge.policy.policy_file").load_policy(name)
     policy.check_fits(model, task)  # type: ignore[attr-defined]
     return policy
+
+
+def act_all(policy: Policy) -> Callable[[NDArray[np.float32]], NDArray[Any]]:
+    """A policy for many robots: actions (N, C) for observations (N, O)."""
+    batched = getattr(policy, "act_all", None)
+    if batched is not None:
+        return lambda observations: np.asarray(batched(observations))
+    return lambda observations: np.stack([policy.act(one) for one in observations])

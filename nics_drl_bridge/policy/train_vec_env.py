@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,38 +20,56 @@ Observation = NDArray[np.float32]
 
 
 class TrainVecEnv(VecEnv):
-    """Feeds Stable-Baselines3 from a `BridgeVectorEnv`.
+    """Feeds Stable-Baselines3 from a `BridgeVectorEnv`, or from several side by side.
 
     The observations are the vector env's own array of the step; what is done for one world at a
     time concerns only those that ended: their `terminal_observation`, `TimeLimit.truncated`,
     `is_success` and `collision` in `infos`.
 
     Args:
-        env: whose `autoreset_mode` is `SameStep` and whose `copy` is True, as the algorithms keep
-            the last observation over a step.
+        envs: of the same spaces, as those of several worlds; their `autoreset_mode` is `SameStep`
+            and their `copy` is True, as the algorithms keep the last observation over a step.
+
+    Attributes:
+        stepping_s: wall time that was spent in the vector envs [s].
 
     Raises:
-        ConfigError: an env that is made otherwise.
+        ConfigError: an env that is made otherwise, or envs that do not fit together.
     """
 
-    def __init__(self, env: BridgeVectorEnv) -> None:
-        if env.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP or not env.copy:
-            raise ConfigError(
-                "Stable-Baselines3 needs BridgeVectorEnv(autoreset_mode='SameStep', copy=True)."
-            )
-        self.env = env
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
-        self._infos: list[dict[str, Any]] = [{} for _ in range(env.num_envs)]
-        self._told: NDArray[np.intp] = np.zeros(0, np.intp)
+    def __init__(self, *envs: BridgeVectorEnv) -> None:
+        for env in envs:
+            if env.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP or not env.copy:
+                raise ConfigError(
+                    "Stable-Baselines3 needs BridgeVectorEnv(autoreset_mode='SameStep', copy=True)."
+                )
+        first = envs[0]
+        for env in envs[1:]:
+            if env.single_observation_space != first.single_observation_space:
+                raise ConfigError(
+                    f"vector envs that are fed together show {first.single_observation_space} and "
+                    f"{env.single_observation_space}; give them one robot, lidar and task."
+                )
+        self.envs = envs
+        edges = np.cumsum([0, *(env.num_envs for env in envs)])
+        self._rows = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
+        count = int(edges[-1])
+        super().__init__(count, first.single_observation_space, first.single_action_space)
+        self._infos: list[dict[str, Any]] = [{} for _ in range(count)]
+        self._told: list[int] = []
         self._actions: NDArray[Any] = np.zeros(0)
+        self.stepping_s = 0.0
 
     def reset(self) -> Observation:
         """Begins an episode in every world, of the seeds given to `seed`."""
-        seeds = None if all(one is None for one in self._seeds) else self._seeds
-        observation, _ = self.env.reset(seed=seeds, options=self._options[0] or None)
+        shown = []
+        for env, rows in zip(self.envs, self._rows, strict=True):
+            given = self._seeds[rows]
+            seeds = None if all(one is None for one in given) else given
+            shown.append(env.reset(seed=seeds, options=self._options[0] or None)[0])
         self._reset_seeds()
         self._reset_options()
-        return observation
+        return _together(shown)
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Takes the actions of the next step."""
@@ -57,33 +77,52 @@ class TrainVecEnv(VecEnv):
 
     def step_wait(self) -> tuple[Observation, NDArray[np.float32], NDArray[np.bool_], list[Any]]:
         """One control period in every world; see Stable-Baselines3."""
-        observation, reward, terminated, truncated, info = self.env.step(self._actions)
-        done = terminated | truncated
+        begin = time.perf_counter()
         for n in self._told:  # fresh ones: an algorithm may still hold those it was given
             self._infos[n] = {}
-        self._told = np.flatnonzero(done)
-        for n in self._told:
-            self._infos[n] = {
+        self._told = []
+        parts = [self._step_env(env, rows) for env, rows in zip(self.envs, self._rows, strict=True)]
+        observation, reward, done = (_together(list(each)) for each in zip(*parts, strict=True))
+        self.stepping_s += time.perf_counter() - begin
+        return observation, reward.astype(np.float32), done, list(self._infos)
+
+    def _step_env(
+        self, env: BridgeVectorEnv, rows: slice
+    ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_]]:
+        """Steps one of the envs and tells of those of its worlds that ended."""
+        observation, reward, terminated, truncated, info = env.step(self._actions[rows])
+        done = terminated | truncated
+        for n in np.flatnonzero(done):
+            self._told.append(rows.start + int(n))
+            self._infos[rows.start + n] = {
                 "terminal_observation": info["final_obs"][n],
                 "TimeLimit.truncated": bool(truncated[n] and not terminated[n]),
                 **_results(info["final_info"], n),
             }
-        return observation, reward.astype(np.float32), done, list(self._infos)
+        return observation, reward, done
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of the vector env, for each of the worlds."""
-        return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
+        """An attribute of the vector env of each of the worlds."""
+        return [getattr(self._env_of(n), attr_name) for n in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Sets an attribute of the vector env, which all worlds share."""
-        setattr(self.env, attr_name, value)
+        """Sets an attribute of the vector envs, which all their worlds share."""
+        for env in self.envs:
+            setattr(env, attr_name, value)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Calls a method of the vector env once; its result for each of the worlds."""
-        result = getattr(self.env, method_name)(*method_args, **method_kwargs)
-        return [result] * len(list(self._get_indices(indices)))
+        """Calls a method of each vector env once; the result for each of its worlds."""
+        results = {
+            id(env): getattr(env, method_name)(*method_args, **method_kwargs) for env in self.envs
+        }
+        return [results[id(self._env_of(n))] for n in self._get_indices(indices)]
+
+    def _env_of(self, n: int) -> BridgeVectorEnv:
+        """The vector env that world n is in."""
+        which = next(k for k, rows in enumerate(self._rows) if n < rows.stop)
+        return self.envs[which]
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None
@@ -93,11 +132,17 @@ class TrainVecEnv(VecEnv):
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         """A picture of every world."""
-        return list(self.env.render() or [None] * self.num_envs)
+        return [picture for env in self.envs for picture in env.render() or [None] * env.num_envs]
 
     def close(self) -> None:
-        """Closes the vector env."""
-        self.env.close()
+        """Closes the vector envs."""
+        for env in self.envs:
+            env.close()
+
+
+def _together(parts: list[NDArray[Any]]) -> NDArray[Any]:
+    """Rows of several envs below each other; those of one as they are."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _results(final: dict[str, Any], n: np.intp) -> dict[str, Any]:

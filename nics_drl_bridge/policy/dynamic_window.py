@@ -1,0 +1,102 @@
+"""A dynamic-window planner: the twist of the next moments that serves best."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.policy import dynamic_window_kernels as kernels
+
+Array = NDArray[np.float64]
+DEFAULT_WHEELBASE = 0.2
+LAGS = ("speed_lag", "steering_lag", "wheel_lag")
+
+
+@dataclass(frozen=True)
+class DynamicWindow:
+    """The dynamic-window approach (Fox, Burgard, Thrun 1997) on scan, goal and twist.
+
+    Tries the twists that the commands allow, within what the robot can reach from its present one
+    in a period; each is held for the look-ahead. One that would touch something before the robot
+    could stop is not admissible; of the others the best in distance, aim, clearance and room is
+    chosen. It plans no way: behind a long wall it stays.
+
+    Attributes:
+        task: whose observations and actions it speaks.
+        margin: free space to keep beside the footprint [m].
+        period: between commands [s].
+        steps: of the look-ahead, each a period and a half long.
+        weights: of gap to the goal [1/m], aim, clearance, and time until a contact.
+    """
+
+    task: Navigation
+    margin: float = 0.05
+    period: float = 0.1
+    steps: int = 10
+    weights: tuple[float, float, float, float] = (1.0, 0.6, 0.3, 1.5)
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The action (C,) for an observation (O,)."""
+        return self.act_all(observation[None])[0]
+
+    def act_all(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Actions (N, C) for observations (N, O)."""
+        parts = self.task.scan_parts
+        seen = observations.astype(np.float64)
+        goals = seen[:, parts : parts + 1] * seen[:, parts + 1 : parts + 3]
+        chosen = np.empty(len(seen), np.int64)
+        kernels.choose_all(
+            chosen, np.ascontiguousarray(seen[:, :parts]), goals,
+            np.ascontiguousarray(seen[:, parts + 3 : parts + 6]),
+            self._twists, self._sight, self._body, np.array(self.weights),
+        )  # fmt: skip
+        return self._actions[chosen]
+
+    @cached_property
+    def _sight(self) -> tuple[Array, Array, float]:
+        sight = self.task.sight
+        directions = np.stack([np.cos(sight.angles), np.sin(sight.angles)], axis=-1)
+        return directions, sight.origin, float(sight.range_max)
+
+    @cached_property
+    def _body(self) -> tuple[Array, float, float, int, float]:
+        """What the kernel takes as `body`."""
+        robot = self.task.robot
+        lag = max((robot.parameters.get(name, 0.0) for name in LAGS), default=0.0)
+        share = 1.0 - math.exp(-self.period / lag) if lag > 0.0 else 1.0
+        reach = share * (self._twists.max(axis=0) - self._twists.min(axis=0)) + 1e-6
+        radius = robot.footprint_radius + self.margin
+        return reach, radius, 1.5 * self.period, self.steps, 2.0 * self.period + lag
+
+    @cached_property
+    def _commands(self) -> Array:
+        """(K, C) a grid of commands between their limits, zero among them."""
+        robot = self.task.robot
+        counts = {1: (15,), 2: (7, 15), 3: (7, 7, 5)}.get(len(robot.command), ())
+        axes = [
+            np.unique(np.append(np.linspace(one.min, one.max, count), np.clip(0, one.min, one.max)))
+            for one, count in itertools.zip_longest(robot.command, counts, fillvalue=3)
+        ]
+        return np.array(list(itertools.product(*axes)))
+
+    @cached_property
+    def _actions(self) -> NDArray[np.float32]:
+        """(K, C) the same, scaled to [-1, 1]."""
+        low, high = self.task.robot.command_low, self.task.robot.command_high
+        return (2.0 * (self._commands - low) / (high - low) - 1.0).astype(np.float32)
+
+    @cached_property
+    def _twists(self) -> Array:
+        """(K, 3) the body twist that each command comes to."""
+        robot = self.task.robot
+        twists = robot.to_cmd_vel(self._commands)
+        if any(one.cmd_vel == "angular.z" and one.unit == "rad" for one in robot.command):
+            wheelbase = robot.parameters.get("wheelbase", DEFAULT_WHEELBASE)
+            twists[:, 2] = twists[:, 0] * np.tan(twists[:, 2]) / wheelbase
+        return twists

@@ -1,0 +1,102 @@
+"""Compiled search of the dynamic-window planner. Shapes: N robots, P parts of a scan, K twists."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def choose_all(out, scans, goals, twists, candidates, sight, body, weights):  # type: ignore[no-untyped-def]
+    """`choose` for N robots, into out (N,): which of the candidates each takes."""
+    hits = np.empty((scans.shape[1], 2))
+    for n in range(out.shape[0]):
+        count = hits_of(hits, scans[n], sight)
+        out[n] = choose(hits[:count], goals[n], twists[n], candidates, body, weights)
+
+
+@njit(cache=True, nogil=True)
+def hits_of(hits, shares, sight):  # type: ignore[no-untyped-def]
+    """Writes where a scan ended into hits (P, 2) [m] in `base_link`; how many there are.
+
+    Args:
+        hits: result.
+        shares: (P,) of the greatest range; 1 is free.
+        sight: directions (P, 2), origin (2,) [m] and range_max [m].
+    """
+    directions, origin, range_max = sight
+    count = 0
+    for p in range(shares.shape[0]):
+        if shares[p] < 1.0:
+            hits[count, 0] = origin[0] + shares[p] * range_max * directions[p, 0]
+            hits[count, 1] = origin[1] + shares[p] * range_max * directions[p, 1]
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def choose(hits, goal, twist, candidates, body, weights):  # type: ignore[no-untyped-def]
+    """The candidate that costs least; of those within the window, if any is.
+
+    Args:
+        hits: (H, 2) where the scan ended [m].
+        goal: (2,) in `base_link` [m].
+        twist: (3,) of the robot now.
+        candidates: (K, 3) twists that it may aim at.
+        body: reach (3,) of a twist in one period, radius with margin [m], period [s], steps of
+            the look ahead, time to come to rest [s].
+        weights: (4,) of gap, aim, clearance and time until a contact.
+    """
+    reach = body[0]
+    best, least = 0, math.inf
+    for k in range(candidates.shape[0]):
+        far = False
+        for i in range(3):
+            far |= abs(candidates[k, i] - twist[i]) > reach[i]
+        cost = cost_of(hits, goal, candidates[k], body, weights)
+        cost += 1e6 if far else 0.0
+        if cost < least:
+            best, least = k, cost
+    return best
+
+
+@njit(cache=True, nogil=True)
+def cost_of(hits, goal, aimed, body, weights):  # type: ignore[no-untyped-def]
+    """What it costs to hold a twist (3,): it may not lead to a contact before it can be stopped."""
+    _, radius, period, steps, rest = body
+    x, y, heading = 0.0, 0.0, 0.0
+    gap, clearance, free = math.hypot(goal[0], goal[1]), math.inf, steps
+    now = nearest_hit(hits, 0.0, 0.0)
+    limit = min(radius, 0.98 * now)  # already nearer than that: then away only
+    for step in range(steps):
+        middle = heading + 0.5 * aimed[2] * period
+        x += (aimed[0] * math.cos(middle) - aimed[1] * math.sin(middle)) * period
+        y += (aimed[0] * math.sin(middle) + aimed[1] * math.cos(middle)) * period
+        heading += aimed[2] * period
+        room = nearest_hit(hits, x, y)
+        if room < limit:
+            free = step
+            break
+        clearance = min(clearance, room - radius)
+        gap = min(gap, math.hypot(goal[0] - x, goal[1] - y))
+        if gap < 0.15:
+            break  # what lies behind the goal does not matter
+    turn = math.atan2(goal[1] - y, goal[0] - x) - heading
+    turn = abs((turn + math.pi) % (2.0 * math.pi) - math.pi) / math.pi
+    cost = weights[0] * gap + weights[1] * turn * min(gap, 1.0)
+    cost += weights[2] * (1.0 - min(max(clearance, 0.0), 0.4) / 0.4)
+    cost += weights[3] * (1.0 - free / steps)
+    moves = abs(aimed[0]) + abs(aimed[1]) > 1e-9
+    return cost + (1e3 if moves and free * period < rest else 0.0)
+
+
+@njit(cache=True, nogil=True)
+def nearest_hit(hits, x, y):  # type: ignore[no-untyped-def]
+    """Distance [m] from a point to the nearest of hits (H, 2)."""
+    least = math.inf
+    for h in range(hits.shape[0]):
+        dx, dy = hits[h, 0] - x, hits[h, 1] - y
+        least = min(least, dx * dx + dy * dy)
+    return math.sqrt(least)

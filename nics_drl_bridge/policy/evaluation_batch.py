@@ -1,0 +1,131 @@
+"""The evaluation protocol: episodes of fixed seeds, hundreds side by side in a vector env."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.policy.evaluation_intervals import Estimate, mean, rate
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Act = Callable[[NDArray[np.float32]], NDArray[Any]]
+"""Actions (N, C) for observations (N, O)."""
+FIRST_SEED = 1_000_000
+"""Of an evaluation: far from the seeds of any training."""
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """How episodes ended. All arrays are (E,).
+
+    Attributes:
+        seeds: of the episodes, as `BridgeEnv.reset` takes them.
+        success: the goal was reached and nothing touched.
+        collision: the task says so, or the robot truly touched something.
+        steps: control periods.
+        length: of the true path [m]; of a team, the mean of its robots.
+        reward: sum over the episode.
+    """
+
+    seeds: NDArray[np.int64]
+    success: Flags
+    collision: Flags
+    steps: NDArray[np.int64]
+    length: Array
+    reward: Array
+
+    @property
+    def time_out(self) -> Flags:
+        """Neither success nor collision."""
+        return ~(self.success | self.collision)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What an evaluation came to, each figure with its 95 % interval.
+
+    Attributes:
+        episodes: E.
+        success, collision, time_out: shares of the episodes.
+        length: mean path of the successful ones [m].
+        time: mean duration of the successful ones [s].
+    """
+
+    episodes: int
+    success: Estimate
+    collision: Estimate
+    time_out: Estimate
+    length: Estimate
+    time: Estimate
+
+
+def summarise(outcomes: Outcomes, control_period: float) -> Summary:
+    """The figures of episodes; `control_period` [s]."""
+    count = len(outcomes.seeds)
+    shares = (outcomes.success, outcomes.collision, outcomes.time_out)
+    return Summary(
+        count,
+        *(rate(int(flags.sum()), count) for flags in shares),
+        mean(outcomes.length[outcomes.success]),
+        mean(outcomes.steps[outcomes.success] * control_period),
+    )
+
+
+def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcomes:
+    """Drives one episode per seed, as many at once as the env has worlds.
+
+    The episodes are those of `BridgeEnv.reset(seed=...)` without estimator, to the bit.
+
+    Args:
+        env: whose `autoreset_mode` is `NextStep`, the default.
+        act: the policy, for many robots at once.
+        seeds: of the episodes.
+    """
+    width, given = env.num_envs, np.asarray(seeds, np.int64)
+    done = []
+    for first in range(0, len(given), width):
+        # The last ones are filled up with seeds that are driven but not counted.
+        chunk = np.resize(given[first : first + width], width)
+        rows = _drive_once(env, act, chunk)
+        done.append(tuple(row[: len(given) - first] for row in rows))
+    return Outcomes(given, *(np.concatenate(each) for each in zip(*done, strict=True)))
+
+
+def _drive_once(env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]) -> tuple[Any, ...]:
+    """One episode in each world: success, collision, steps, length, reward, each (N,)."""
+    count = env.num_envs
+    observation, info = env.reset(seed=list(seeds))
+    where = np.reshape(info["start"], (count, -1, 3))[..., :2]
+    success, collision = np.zeros((2, count), np.bool_)
+    steps, reward = np.zeros(count, np.int64), np.zeros(count)
+    length, running = np.zeros(count), np.ones(count, np.bool_)
+    while running.any():
+        observation, gain, terminated, truncated, info = env.step(act(observation))
+        there = np.reshape(info["true_pose"], (count, -1, 3))[..., :2]
+        moved = np.hypot(*np.moveaxis(there - where, -1, 0)).mean(axis=-1)
+        where = there
+        length += np.where(running, moved, 0.0)
+        reward += np.where(running, gain, 0.0)
+        steps += running
+        ended = running & (terminated | truncated)
+        touched = _any_robot(info, "collision") | _any_robot(info, "true_collision")
+        collision |= ended & touched
+        success |= ended & ~touched & _all_robots(info, "is_success")
+        running &= ~ended
+    return success, collision, steps, length, reward
+
+
+def _any_robot(info: dict[str, Any], name: str) -> Flags:
+    values = np.asarray(info[name], np.bool_) if name in info else np.zeros(1, np.bool_)
+    return values.reshape(len(values), -1).any(axis=1)
+
+
+def _all_robots(info: dict[str, Any], name: str) -> Flags:
+    values = np.asarray(info[name], np.bool_) if name in info else np.zeros(1, np.bool_)
+    return values.reshape(len(values), -1).all(axis=1)

@@ -1,0 +1,150 @@
+"""Checkpoints of a training: all that it needs to go on with the same bits.
+
+A checkpoint is the trainer's own and is never deployed. It holds tensors, numbers and text only
+and is read by PyTorch's `weights_only` reader, which makes no other objects: nothing in it can
+run code.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import zipfile
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.utils import set_random_seed
+
+from nics_drl_bridge.env.vector_state import restore, snapshot
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
+
+FORMAT = "nics_drl_bridge/checkpoint/1"
+COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
+REPLAYED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+
+def save_checkpoint(
+    path: Path, algorithm: BaseAlgorithm, env: TrainVecEnv, about: dict[str, Any]
+) -> None:
+    """Writes a checkpoint, whole or not at all, between two rollouts.
+
+    Args:
+        path: the file.
+        algorithm: that learns on `env`.
+        env: where it stands.
+        about: plain data that tell which training it is of.
+    """
+    content = {
+        "format": FORMAT,
+        "about": json.dumps(about),
+        "parameters": algorithm.get_parameters(),
+        "variables": _variables(algorithm),
+        "counters": {name: getattr(algorithm, name) for name in COUNTERS},
+        "recent": list(algorithm.ep_success_buffer or ()),
+        "last": _tensors({name: getattr(algorithm, name) for name in _LAST}),
+        "replay": _replay(algorithm),
+        "random": _random_state(algorithm),
+        "envs": [_tensors(snapshot(one)) for one in env.envs],
+    }
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    write_bytes(path, buffer.getvalue())
+
+
+_LAST = ("_last_obs", "_last_episode_starts")
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """The content of a checkpoint; `about` is that of `save_checkpoint`.
+
+    Raises:
+        ConfigError: there is none, or it is damaged or of another kind.
+    """
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such checkpoint; leave out --resume to begin anew.")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        if content["format"] != FORMAT:
+            raise KeyError("format")
+        return {**content, "about": json.loads(content["about"])}
+    except (
+        RuntimeError, pickle.UnpicklingError, zipfile.BadZipFile, EOFError, OSError, KeyError,
+        TypeError, ValueError,
+    ):  # fmt: skip
+        raise ConfigError(
+            f"{path}: is no checkpoint of a training, or a damaged one; leave out --resume to "
+            "begin anew."
+        ) from None
+
+
+def resume(content: dict[str, Any], algorithm: BaseAlgorithm, env: TrainVecEnv) -> None:
+    """Puts a checkpoint into an algorithm and an env that are made as those were."""
+    algorithm.set_parameters(content["parameters"], exact_match=True)
+    for name, value in content["variables"].items():
+        getattr(algorithm, name).data.copy_(value)
+    for name, value in content["counters"].items():
+        setattr(algorithm, name, value)
+    size = algorithm._stats_window_size
+    algorithm.ep_success_buffer = deque(content["recent"], maxlen=size)
+    algorithm.ep_info_buffer = deque(maxlen=size)
+    for name, value in content["last"].items():
+        setattr(algorithm, name, value.numpy().copy())
+    for one, state in zip(env.envs, content["envs"], strict=True):
+        restore(one, {name: value.numpy() for name, value in state.items()})
+    if isinstance(algorithm, OffPolicyAlgorithm):
+        _fill_replay(algorithm, content["replay"])
+    _set_random_state(algorithm, content["random"])
+
+
+def _tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
+    return {name: torch.from_numpy(np.ascontiguousarray(rows)) for name, rows in arrays.items()}
+
+
+def _variables(algorithm: BaseAlgorithm) -> dict[str, torch.Tensor]:
+    """What an algorithm learns beside its networks: the temperature of SAC."""
+    names = algorithm._get_torch_save_params()[1]
+    return {name: getattr(algorithm, name).detach().clone() for name in names}
+
+
+def _replay(algorithm: BaseAlgorithm) -> dict[str, Any]:
+    if not isinstance(algorithm, OffPolicyAlgorithm):
+        return {}
+    buffer: Any = algorithm.replay_buffer
+    rows = {name: getattr(buffer, name)[: buffer.size()] for name in REPLAYED}
+    return {"pos": buffer.pos, "full": buffer.full, **_tensors(rows)}
+
+
+def _fill_replay(algorithm: OffPolicyAlgorithm, content: dict[str, Any]) -> None:
+    buffer: Any = algorithm.replay_buffer
+    buffer.pos, buffer.full = content["pos"], content["full"]
+    for name in REPLAYED:
+        getattr(buffer, name)[: buffer.size()] = content[name].numpy()
+
+
+def _random_state(algorithm: BaseAlgorithm) -> dict[str, Any]:
+    """Of all generators that draw: PyTorch's, numpy's global one, that of the action space."""
+    shared = np.random.get_state(legacy=False)  # noqa: NPY002 - Stable-Baselines3 draws from it
+    spaces = algorithm.action_space.np_random.bit_generator.state
+    return {
+        "torch": torch.get_rng_state(),
+        "numpy": json.dumps(shared, default=lambda array: array.tolist()),
+        "actions": json.dumps(spaces),
+    }
+
+
+def _set_random_state(algorithm: BaseAlgorithm, content: dict[str, Any]) -> None:
+    set_random_seed(0)
+    torch.set_rng_state(content["torch"])
+    shared = json.loads(content["numpy"])
+    shared["state"]["key"] = np.array(shared["state"]["key"], np.uint32)
+    np.random.set_state(shared)  # noqa: NPY002 - as above
+    algorithm.action_space.np_random.bit_generator.state = json.loads(content["actions"])

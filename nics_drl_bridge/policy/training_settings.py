@@ -1,0 +1,152 @@
+"""Settings of a training: what is learned, where, by which algorithm, for how long."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, field_validator
+
+from nics_drl_bridge.config import Schema, find_config, load_yaml, share_folder, validate
+
+Share = Annotated[float, Field(gt=0.0, le=1.0)]
+Count = Annotated[int, Field(ge=1)]
+Algorithm = Literal["ppo", "sac"]
+
+
+class PpoSettings(Schema):
+    """Proximal policy optimisation (Schulman and others 2017), as Stable-Baselines3 has it.
+
+    Attributes:
+        learning_rate: at the start; it falls linearly to a fiftieth at the end.
+        rollout: steps in each world between two updates.
+        batch: transitions of one gradient step.
+        epochs: how often an update goes through the rollouts.
+        discount, gae_lambda: of the advantages.
+        clip: of the ratio of the new policy to the old one.
+        entropy: weight of the entropy of the policy.
+        log_std: logarithm of the spread of actions at the start.
+    """
+
+    learning_rate: float = Field(default=1e-3, gt=0.0)
+    rollout: Count = 32
+    batch: Count = 2048
+    epochs: Count = 5
+    discount: Share = 0.98
+    gae_lambda: Share = 0.95
+    clip: float = Field(default=0.2, gt=0.0)
+    entropy: float = Field(default=0.0, ge=0.0)
+    log_std: float = -0.5
+
+
+class SacSettings(Schema):
+    """Soft actor-critic (Haarnoja and others 2018), as Stable-Baselines3 has it.
+
+    Attributes:
+        learning_rate: of actor, critics and entropy; constant.
+        buffer: transitions that are kept, of all worlds together.
+        batch: transitions of one gradient step.
+        updates: gradient steps after each step of the worlds.
+        begin_after: transitions of random actions before the first update.
+        discount: of later rewards.
+        soft_update: share of the critics that their targets take over in each gradient step.
+    """
+
+    learning_rate: float = Field(default=1e-3, gt=0.0)
+    buffer: Count = 300_000
+    batch: Count = 512
+    updates: Count = 8
+    begin_after: Count = 5_000
+    discount: Share = 0.98
+    soft_update: Share = 0.01
+
+
+class TrainingSettings(Schema):
+    """A training, as `config/training/*.yaml` has it.
+
+    Attributes:
+        task: a name, or `path/to/file.py:ClassName`.
+        task_options: further arguments of the task's class.
+        robot: name of a shipped robot, or the folder of a model.
+        worlds: how many copies of which worlds; names of shipped ones or YAML files.
+        randomisation: what each episode draws anew, a shipped one or a YAML file.
+        steps: environment steps of all worlds together.
+        max_episode_steps: after so many an episode ends as a time-out.
+        algorithm: which of the two sections below learns.
+        hidden: widths of the hidden layers of actor and critic, each for itself.
+        threads: of PyTorch; sums of several round otherwise than those of one.
+        checkpoint_every: environment steps between two checkpoints.
+        ppo, sac: of the algorithm.
+    """
+
+    task: str = "navigation"
+    task_options: dict[str, Any] = Field(default_factory=dict)
+    robot: str = "differential"
+    worlds: dict[str, Count] = Field(default_factory=lambda: {"circles": 256}, min_length=1)
+    randomisation: str | None = None
+    steps: Count = 1_000_000
+    max_episode_steps: Count = 300
+    algorithm: Algorithm = "ppo"
+    hidden: tuple[Count, ...] = Field(default=(64, 64), min_length=1)
+    threads: Count = 1
+    checkpoint_every: Count = 200_000
+    ppo: PpoSettings = PpoSettings()
+    sac: SacSettings = SacSettings()
+
+    @field_validator("task_options")
+    @classmethod
+    def _named(cls, options: dict[str, Any]) -> dict[str, Any]:
+        if taken := sorted({"robot", "lidar"} & set(options)):
+            raise ValueError(f"task_options can't hold {taken[0]!r}, which the model gives")
+        return options
+
+    @property
+    def title(self) -> str:
+        """What a folder of its runs may be called."""
+        task = self.task.rpartition(":")[2]
+        return f"{task}_{Path(self.robot).stem}_{self.algorithm}"
+
+    @property
+    def num_envs(self) -> int:
+        """N, worlds of all kinds together."""
+        return sum(self.worlds.values())
+
+
+def load_training(name: str) -> TrainingSettings:
+    """Settings by the name of a shipped file (`navigation_differential`), or by path.
+
+    Raises:
+        ConfigError: no such file, or something in it is wrong.
+    """
+    return load_yaml(find_config(name, "training"), TrainingSettings)
+
+
+def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> TrainingSettings:
+    """Settings as a user chose them.
+
+    Args:
+        task: to learn.
+        name: of shipped settings, or a YAML file; by default those of task and robot, and where
+            none are shipped, the defaults.
+        changes: further keys of `TrainingSettings`; and `world`, names that share the worlds
+            among them.
+
+    Raises:
+        ConfigError: an unknown name or a wrong value.
+    """
+    robot = str(changes.get("robot", "differential"))
+    if name is not None:
+        base = load_training(name)
+    elif f"{task}_{robot}" in _shipped():
+        base = load_training(f"{task}_{robot}")
+    else:
+        base = TrainingSettings(task=task, robot=robot)
+    changed = base.model_dump(mode="json") | changes
+    if worlds := changed.pop("world", None):
+        each = max(1, base.num_envs // len(worlds))
+        changed["worlds"] = dict.fromkeys(worlds, each)
+    return validate(changed, TrainingSettings, "training settings")
+
+
+def _shipped() -> list[str]:
+    return [path.stem for path in (share_folder() / "config" / "training").glob("*.yaml")]

@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from robots import direct_model, field
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.policy import train as training
+from nics_drl_bridge.policy.train import CHECKPOINT, evaluate, train
+from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
+from nics_drl_bridge.policy.training_settings import TrainingSettings
+
+MODEL, WORLD = direct_model(odometry=(0.02, 0.02)), field(count=2)
+
+
+class InterruptedError_(Exception):
+    """As a user's Ctrl-C."""
+
+
+@pytest.fixture(autouse=True)
+def _small_world(monkeypatch):
+    """Trains a robot of few beams in a small field, whatever names the settings hold."""
+    monkeypatch.setattr(training, "open_model", lambda _: MODEL)
+    made = training.BridgeVectorEnv
+    monkeypatch.setattr(
+        training, "BridgeVectorEnv", lambda n, model, _, *rest, **more: made(
+            n, model, WORLD, *rest, **more
+        ),
+    )  # fmt: skip
+
+
+def settings(algorithm="ppo", **changes):
+    data = {
+        "worlds": {"one": 5, "another": 3},
+        "steps": 1600,
+        "max_episode_steps": 40,
+        "algorithm": algorithm,
+        "hidden": [16],
+        "checkpoint_every": 320,
+        "randomisation": "mild",
+        "ppo": {"rollout": 16, "batch": 64, "epochs": 2},
+        "sac": {"batch": 32, "updates": 1, "begin_after": 400, "buffer": 800},
+    }
+    return TrainingSettings.model_validate(data | changes)
+
+
+def weights(algorithm):
+    return {name: value.clone() for name, value in algorithm.policy.state_dict().items()}
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
+def test_an_interrupted_training_comes_to_the_same_weights(algorithm, tmp_path):
+    whole = train(settings(algorithm), 1, tmp_path / "whole")
+
+    def interrupt(progress):
+        if progress.steps > 1000:
+            raise InterruptedError_
+
+    # Told of every rollout, whatever the clock says.
+    with pytest.raises(InterruptedError_), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nics_drl_bridge.policy.train_progress.TOLD_S", 0.0)
+        train(settings(algorithm), 1, tmp_path / "broken", interrupt)
+    kept = read_checkpoint(tmp_path / "broken" / CHECKPOINT)["counters"]["num_timesteps"]
+    assert 0 < kept < 1000
+    torch.manual_seed(99)
+    np.random.seed(99)  # noqa: NPY002 - what another program may have done meanwhile
+    again = train(settings(algorithm), 1, tmp_path / "broken", resumed=True)
+    assert again.steps == whole.steps
+    for name, value in weights(whole.algorithm).items():
+        assert torch.equal(value, weights(again.algorithm)[name]), name
+
+
+def test_training_again_with_the_same_seed_gives_the_same_weights_and_with_another_others(tmp_path):
+    one, same, other = (
+        train(settings(steps=256), seed, tmp_path / str(k)) for k, seed in enumerate((0, 0, 1))
+    )
+    parameter = "action_net.weight"
+    assert torch.equal(weights(one.algorithm)[parameter], weights(same.algorithm)[parameter])
+    assert not torch.equal(weights(one.algorithm)[parameter], weights(other.algorithm)[parameter])
+
+
+def test_a_little_training_reaches_more_goals_than_none(tmp_path):
+    def successes(steps):
+        chosen = settings(
+            worlds={"one": 32}, steps=steps, hidden=[32, 32], randomisation=None,
+            ppo={"rollout": 32, "batch": 256, "learning_rate": 2e-3},
+        )  # fmt: skip
+        algorithm = train(chosen, 0, tmp_path / str(steps)).algorithm
+        return evaluate(algorithm, chosen, "one", 100).success.mean()
+
+    assert successes(40_000) > successes(1024) + 0.2
+
+
+def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path):
+    train(settings(steps=128), 0, tmp_path)
+    with pytest.raises(ConfigError, match=r"was trained with hidden \[16\], not \[8\]"):
+        train(settings(steps=128, hidden=[8]), 0, tmp_path, resumed=True)
+    with pytest.raises(ConfigError, match="is of seed 0, not 4"):
+        train(settings(steps=128), 4, tmp_path, resumed=True)
+    path = tmp_path / CHECKPOINT
+    path.write_bytes(path.read_bytes()[:-500])
+    with pytest.raises(ConfigError, match="is no checkpoint of a training, or a damaged one"):
+        read_checkpoint(path)
+
+
+def test_a_checkpoint_that_would_run_code_is_refused(tmp_path):
+    class Harmful:
+        def __reduce__(self):
+            return (tmp_path.joinpath("harm").touch, ())
+
+    path = tmp_path / CHECKPOINT
+    torch.save({"format": "nics_drl_bridge/checkpoint/1", "about": Harmful()}, path)
+    with pytest.raises(ConfigError, match="is no checkpoint"):
+        read_checkpoint(path)
+    assert not (tmp_path / "harm").exists()
+
+
+def test_sac_is_refused_for_discrete_actions_and_a_batch_that_no_rollout_fills(tmp_path):
+    with pytest.raises(ConfigError, match="'sac' needs continuous actions; use 'ppo'"):
+        train(settings("sac", task_options={"actions": "discrete"}), 0, tmp_path)
+    with pytest.raises(ConfigError, match="ppo.batch 999: is more than the 128 transitions"):
+        train(settings(ppo={"rollout": 16, "batch": 999}), 0, tmp_path)
