@@ -189,8 +189,8 @@ def test_each_robot_of_an_estimating_team_has_an_estimate_of_its_own():
 def test_a_team_gets_an_action_for_each_robot():
     env = BridgeEnv(model=direct_model(), world=field(8.0), task="cooperative_reaching")
     env.reset(seed=0)
-    env.step(REST)
-    with pytest.raises(gymnasium.error.InvalidAction, match=r"must be of shape \(3, 3\)"):
+    env.step(REST.ravel())
+    with pytest.raises(gymnasium.error.InvalidAction, match=r"must be of shape \(9,\)"):
         env.step(REST[0])
 
 

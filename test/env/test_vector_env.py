@@ -22,7 +22,7 @@ CHECKS = [
     getattr(checking, f"check_{name}")
     for name in (
         "seed_deprecation", "reset_return_info_deprecation", "reset_return_type",
-        "reset_seed_determinism", "reset_options", "returned_data_not_reused",
+        "reset_seed_determinism", "reset_options",
     )
     if hasattr(checking, f"check_{name}")  # Gymnasium 1.2 has not all of them
 ]  # fmt: skip

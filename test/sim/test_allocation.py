@@ -15,7 +15,9 @@ STEPS, WARM_UP = 1000, 50
 BOOKKEEPING = 20_000
 """Python's own objects that a step makes and drops, whatever the number of worlds [bytes]."""
 GROWTH = 20_000
-FEW = 8
+FEW = 2
+"""Times that compiled code allocates per step: the handle of the commands that it is given."""
+MANY = 256
 MOVING = {**circles(3), "motion": {"kind": "wander", "speed": [0.2, 0.5]}}
 SCENES = {
     "circles": (lambda: field(6.0, 5), 1),
@@ -50,7 +52,7 @@ def taken(step, steps=STEPS):
 
 
 def compiled(step, steps=100):
-    """How often compiled code allocates in a step: some per array that it is handed."""
+    """How often compiled code allocates in a step."""
     _nrt_python.memsys_enable_stats()
     try:
         step()
@@ -63,7 +65,7 @@ def compiled(step, steps=100):
 
 
 @pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("worlds", [1, 64])
+@pytest.mark.parametrize("worlds", [1, MANY])
 def test_a_simulator_allocates_nothing_per_step_however_many_worlds_it_has(scene, worlds):
     world, robots = SCENES[scene]
     model = noisy_model()
@@ -75,7 +77,8 @@ def test_a_simulator_allocates_nothing_per_step_however_many_worlds_it_has(scene
     assert compiled(lambda: simulator.step(commands)) < FEW
     assert grown < GROWTH
     assert most < BOOKKEEPING
-    assert simulator.data.ranges.nbytes * 64 // worlds > BOOKKEEPING  # an array would be seen
+    if worlds == MANY:
+        assert simulator.data.ranges.nbytes > 2 * BOOKKEEPING  # so that a copy would be seen
 
 
 @pytest.mark.parametrize("task", ["navigation", "cooperative_reaching"])
