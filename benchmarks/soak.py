@@ -1,0 +1,254 @@
+"""The whole stack for a long time: does anything grow, and does the robot ever stop unasked?
+
+Two things run at once. In one DDS domain a robot drives to ever new goals as it would in the field,
+in real time, each part a process: `simulator_node`, `middleware_node`, `policy_node` and
+`command_gate`. In another, a Gymnasium env begins and drives episodes over lock-step topics as fast as it can.
+Memory (resident), threads and file descriptors of each process, and of this one, are taken after
+a warm-up and until the end. A stop is explained if this script asked for it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from measuring.processes import Use, use_of
+from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from nics_drl_bridge.env.registration import NAVIGATION, register_envs
+from nics_drl_bridge.errors import BackendError
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.runner import open_context
+
+ROBOT, WORLD = "differential", "empty"
+GOALS = np.array([[1.5, 0.0], [1.5, 1.5], [0.0, 1.5], [-1.5, 0.0], [0.0, -1.5]])
+NEAR_M, STEPS_PER_EPISODE = 0.35, 20
+SAMPLE_S, PATIENCE_S, GOAL_AGAIN_S = 5.0, 90.0, 1.0
+
+
+class Drive:
+    """Arms the gate, sends goals one after the other, and counts the stops that the gate tells of.
+
+    Attributes:
+        goals: how many were reached.
+        stops: rule -> how often it stopped the robot since it was armed.
+    """
+
+    def __init__(self, domain_id: int) -> None:
+        self._context = open_context(domain_id=domain_id)
+        self._node = Node("soak", context=self._context, start_parameter_services=False)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self.goals, self.stops, self._sent_s = 0, {}, 0.0
+        self.armed, self._asked_s, self._answer = False, 0.0, None
+        self._goal = self._node.create_publisher(PoseStamped, "goal_pose", qos.COMMAND)
+        self._arm = self._node.create_client(Trigger, "command_gate/arm")
+        self._node.create_subscription(Odometry, "ground_truth", self._look, qos.SENSOR)
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._read, 10)
+
+    def _look(self, message: Odometry) -> None:
+        pose = conversions.odometry_from_ros(message)[0]
+        goal, now = GOALS[self.goals % len(GOALS)], time.monotonic()
+        if np.hypot(*(pose[:2] - goal)) < NEAR_M:
+            self.goals += 1
+            self._sent_s = 0.0
+        elif now - self._sent_s > GOAL_AGAIN_S:
+            self._sent_s = now
+            told = PoseStamped()
+            told.header.frame_id = "map"
+            told.pose.position.x, told.pose.position.y = map(float, goal)
+            self._goal.publish(told)
+
+    def _read(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            for value in status.values:
+                if value.key.startswith("stopped, "):
+                    self.stops[value.key.removeprefix("stopped, ")] = int(value.value)
+
+    def arm(self) -> None:
+        """Asks the gate until it grants."""
+        now = time.monotonic()
+        if self._answer is not None and self._answer.done():
+            self.armed = bool(self._answer.result().success)
+            self._answer = None
+        if not self.armed and now - self._asked_s > 1.0 and self._arm.service_is_ready():
+            self._asked_s, self._answer = now, self._arm.call_async(Trigger.Request())
+
+    def spin(self) -> None:
+        """Handles what has come."""
+        for _ in range(20):
+            self._executor.spin_once(timeout_sec=0.0)
+
+    def close(self) -> None:
+        """Leaves the graph."""
+        self._executor.shutdown(timeout_sec=1.0)
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+
+class Episodes:
+    """Short episodes of an env over lock-step topics, one after the other."""
+
+    def __init__(self, domain_id: int) -> None:
+        register_envs()
+        options = {"domain_id": domain_id, "timeout_s": PATIENCE_S}
+        self.env = gymnasium.make(
+            NAVIGATION, backend="dds", model=ROBOT, world="arena", backend_options=options
+        )
+        self.resets, self.steps, self._left = 0, 0, 0
+        self._rng = np.random.default_rng(0)
+
+    def go_on(self) -> None:
+        """A reset or a step."""
+        if self._left == 0:
+            self.env.reset(seed=self.resets)
+            self.resets += 1
+            self._left = STEPS_PER_EPISODE
+            return
+        action = self._rng.uniform(-1.0, 1.0, self.env.action_space.shape).astype(np.float32)
+        _, _, ended, cut, _ = self.env.step(action)
+        self.steps += 1
+        self._left = 0 if ended or cut else self._left - 1
+
+
+@dataclass(frozen=True)
+class Soak:
+    """What is running.
+
+    Attributes:
+        drive: of the robot in real time.
+        episodes: of the env.
+        uses: name -> what a process uses now.
+    """
+
+    drive: Drive
+    episodes: Episodes
+    uses: Callable[[], dict[str, Use]]
+
+
+def begin(stack: ExitStack) -> Soak:
+    """Starts everything; it ends with the stack."""
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+    field, track = free_domain_id(), free_domain_id()
+    gate = {"model": ROBOT, "limits": ROBOT, "black_box": str(folder / "black_box")}
+    parts: dict[str, tuple[str, dict[str, Any], int]] = {
+        "simulator_node": ("simulator_node", {"model": ROBOT, "world": WORLD}, field),
+        "middleware_node": ("middleware_node", {"model": ROBOT}, field),
+        "policy_node": ("policy_node", {"model": ROBOT}, field),
+        "command_gate": ("command_gate", gate, field),
+        "lockstep_simulator_node": (
+            "simulator_node", {"model": ROBOT, "world": "arena", "mode": "lockstep"}, track,
+        ),
+    }  # fmt: skip
+    processes = {
+        name: stack.enter_context(NodeProcess(node, folder / name, given, domain))
+        for name, (node, given, domain) in parts.items()
+    }
+    drive = Drive(field)
+    try:
+        episodes = Episodes(track)
+    except BackendError:
+        for process in processes.values():
+            process.check()  # raises with the log of the one that is to blame
+        raise
+    stack.callback(drive.close)
+    stack.callback(episodes.env.close)
+
+    def uses() -> dict[str, Use]:
+        for process in processes.values():
+            process.check()
+        return {name: use_of(p.pid) for name, p in processes.items()} | {"env": use_of()}
+
+    return Soak(drive, episodes, uses)
+
+
+def run(soak: Soak, seconds: float) -> list[dict[str, Use]]:
+    """Lets everything go on for a time; what was used every few seconds."""
+    samples, end, due = [soak.uses()], time.monotonic() + seconds, time.monotonic()
+    while (now := time.monotonic()) < end:
+        soak.drive.spin()
+        soak.drive.arm()
+        soak.episodes.go_on()
+        if now > due:
+            samples.append(soak.uses())
+            due = now + SAMPLE_S
+    return samples
+
+
+def growth(samples: list[dict[str, Use]], of: Callable[[Use], float]) -> dict[str, float]:
+    """By process: the least of the last tenth minus the least of the first tenth of the samples.
+
+    The least, since a garbage collector lets memory swing.
+    """
+    tenth = max(1, len(samples) // 10)
+    return {
+        name: min(of(one[name]) for one in samples[-tenth:])
+        - min(of(one[name]) for one in samples[:tenth])
+        for name in samples[0]
+    }
+
+
+def measure(minutes: float, warm_up: float) -> dict[str, Any]:
+    """Runs everything and tells what grew."""
+    with ExitStack() as stack:
+        soak = begin(stack)
+        deadline = time.monotonic() + PATIENCE_S
+        while not (soak.drive.armed and soak.drive.goals) and time.monotonic() < deadline:
+            run(soak, 1.0)
+        run(soak, 60.0 * warm_up)
+        before = dict(soak.drive.stops)
+        goals, resets, steps = soak.drive.goals, soak.episodes.resets, soak.episodes.steps
+        samples = run(soak, 60.0 * minutes)
+        stops = {
+            rule: count - before.get(rule, 0)
+            for rule, count in soak.drive.stops.items()
+            if count > before.get(rule, 0)
+        }
+        memory = growth(samples, lambda use: use.rss_mb)
+        return {
+            "rss_growth_mb": round(max(memory.values()), 2),
+            "fds_growth": int(max(growth(samples, lambda use: use.files).values())),
+            "threads_growth": int(max(growth(samples, lambda use: use.threads).values())),
+            "unexplained_stops": sum(stops.values()),
+            "stops": stops,
+            "rss_growth_mb_by_process": {name: round(v, 2) for name, v in memory.items()},
+            "goals_reached": soak.drive.goals - goals,
+            "resets": soak.episodes.resets - resets,
+            "steps": soak.episodes.steps - steps,
+            "minutes": minutes,
+        }
+
+
+def main() -> None:
+    """Prints a table, or one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--warm-up", type=float, default=1.0, help="minutes before it counts")
+    given = parser.parse_args()
+    result = measure(given.minutes, given.warm_up)
+    if given.json:
+        sys.stdout.write(json.dumps(result) + "\n")
+    else:
+        for key, value in result.items():
+            sys.stdout.write(f"{key:<28}{value}\n")
+
+
+if __name__ == "__main__":
+    main()
