@@ -95,7 +95,8 @@ def world_file(folder: Path, robots: int) -> Path:
     """An empty field with room for all."""
     side = SIDE_PER_ROBOT_M * robots**0.5
     file = folder / "field.yaml"
-    file.write_text(dump_yaml({"name": "field", "size": [side, side]}), encoding="utf-8")
+    field = {"name": "field", "size": [side, side], "clearance": 0.2, "goal_distance": [1.0, side]}
+    file.write_text(dump_yaml(field), encoding="utf-8")
     return file
 
 
@@ -136,6 +137,7 @@ def measure(robots: int, seconds: float) -> Run:
             if listener.stdout is None or listener.stdout.readline().strip() != "counting":
                 simulator.check()
                 raise RuntimeError("the listener ended without a result")
+            simulator.check()
             before, began = cpu_seconds(simulator.pid), time.monotonic()
             line = listener.stdout.readline()
             cores = (cpu_seconds(simulator.pid) - before) / (time.monotonic() - began)
