@@ -148,7 +148,7 @@ def stamped(launch, meet):
             frame_prefix="car/",
         )
         robot = Stamped(meet(domain_id))
-        robot.process = process
+        robot.process, robot.stranger = process, meet(domain_id)
         robot.peer.until(lambda: len(robot.stamps("scan")) > 2, "scans")
         yield robot
         process.check()
@@ -193,7 +193,7 @@ def test_a_command_whose_stamp_is_older_than_the_timeout_is_ignored_and_said_to_
 
 
 def test_a_publisher_of_the_other_type_is_named_with_both_types(stamped):
-    stamped.peer.node.create_publisher(Twist, "cmd_vel", 1)
+    stamped.stranger.node.create_publisher(Twist, "cmd_vel", 1)
 
     def said():
         text = stamped.process.log.read_text()
