@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -167,14 +166,17 @@ class MujocoSimulator:
             self._mujoco.mj_step(self._simulation, data, nstep=self._steps)
             touched[self._touching()] = True
             before, turned = turned, [rig.encoders(data) for rig in rigs]
-            state = [r.mean_state(*two, part_s) for r, *two in zip(rigs, before, turned, strict=True)]
-            counted = self._twist(np.array(state))
+            means = [
+                rig.mean_state(*two, part_s) for rig, *two in zip(rigs, before, turned, strict=True)
+            ]
+            counted = self._twist(np.array(means))
             wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
         readings = [rig.read(data) for rig in rigs]
-        return Driven(
-            *(np.array([getattr(r, name) for r in readings]) for name in ("pose", "twist", "state")),
-            wheels, counted, touched,
-        )  # fmt: skip
+        pose, twist, state = (
+            np.array([getattr(reading, name) for reading in readings])
+            for name in ("pose", "twist", "state")
+        )
+        return Driven(pose, twist, state, wheels, counted, touched)
 
     def _place_obstacles(self, time: float) -> None:
         bodies = self._driven.move_obstacles(time)
