@@ -130,8 +130,8 @@ class MujocoSimulator:
             for m in range(robots)
         ]
         self._mocap = [
-            (int(k), int(compiled.body(scenery.obstacle_name(k)).mocapid[0]))
-            for k in np.flatnonzero(moving)
+            (k, int(compiled.body(scenery.obstacle_name(k)).mocapid[0]))
+            for k in np.flatnonzero(moving).tolist()
         ]
         self._bumper_of = scenery.bumpers(compiled, robots)
 
@@ -167,7 +167,8 @@ class MujocoSimulator:
             touched[self._touching()] = True
             before, turned = turned, [rig.encoders(data) for rig in rigs]
             means = [
-                rig.mean_state(*two, part_s) for rig, *two in zip(rigs, before, turned, strict=True)
+                rig.mean_state(first, last, part_s)
+                for rig, first, last in zip(rigs, before, turned, strict=True)
             ]
             counted = self._twist(np.array(means))
             wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
@@ -187,7 +188,7 @@ class MujocoSimulator:
     def _touching(self) -> NDArray[np.int64]:
         """Which robots' bumpers touch something now."""
         found = self._bumper_of[self._data.contact.geom.ravel()]
-        return found[found >= 0]
+        return np.asarray(found[found >= 0])
 
     def _require_sane(self) -> None:
         """Raises BackendError for a robot that lies on its side without having been hit."""
