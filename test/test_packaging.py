@@ -17,7 +17,8 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "nics_drl_bridge"
 EXECUTABLES = {
-    "nics", "simulator_node", "middleware_node", "policy_node", "command_gate", "record_node"
+    "nics", "simulator_node", "mujoco_node", "middleware_node", "policy_node", "command_gate",
+    "record_node",
 }  # fmt: skip
 VERSION = "9.8.7"  # written into the package.xml of the copy, and nowhere else
 

@@ -57,7 +57,8 @@ def rectangles(blocked: NDArray[np.bool_]) -> NDArray[np.int64]:
     Returns:
         (R, 4) first row, first column, and those after the last.
     """
-    done, open_runs = [], {}
+    done: list[tuple[int, int, int, int]] = []
+    open_runs: dict[tuple[int, int], int] = {}
     for row in range(len(blocked) + 1):
         runs = _runs(blocked[row]) if row < len(blocked) else set()
         for run in [run for run in open_runs if run not in runs]:

@@ -1,7 +1,7 @@
 """A scene in MuJoCo: robots with their bumpers, walls, map and obstacles.
 
-A bumper is the footprint of the RobotSpec, at the height of the axles; what it touches are walls
-and obstacles as high as the lidar sees them, and the bumpers of others. Wheels touch the floor only.
+A bumper is the footprint of the RobotSpec, at the height of the axles; it touches walls, obstacles
+and the bumpers of others. Wheels touch the floor only.
 """
 
 from __future__ import annotations

@@ -130,8 +130,8 @@ class MujocoSimulator:
             for m in range(robots)
         ]
         self._mocap = [
-            (int(k), int(compiled.body(scenery.obstacle_name(k)).mocapid[0]))
-            for k in np.flatnonzero(moving)
+            (k, int(compiled.body(scenery.obstacle_name(k)).mocapid[0]))
+            for k in np.flatnonzero(moving).tolist()
         ]
         self._bumper_of = scenery.bumpers(compiled, robots)
 
@@ -166,16 +166,18 @@ class MujocoSimulator:
             self._mujoco.mj_step(self._simulation, data, nstep=self._steps)
             touched[self._touching()] = True
             before, turned = turned, [rig.encoders(data) for rig in rigs]
-            state = [
-                r.mean_state(*two, part_s) for r, *two in zip(rigs, before, turned, strict=True)
+            means = [
+                rig.mean_state(first, last, part_s)
+                for rig, first, last in zip(rigs, before, turned, strict=True)
             ]
-            counted = self._twist(np.array(state))
+            counted = self._twist(np.array(means))
             wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
         readings = [rig.read(data) for rig in rigs]
-        return Driven(
-            *(np.array([getattr(r, name) for r in readings]) for name in ("pose", "twist", "state")),
-            wheels, counted, touched,
-        )  # fmt: skip
+        pose, twist, state = (
+            np.array([getattr(reading, name) for reading in readings])
+            for name in ("pose", "twist", "state")
+        )
+        return Driven(pose, twist, state, wheels, counted, touched)
 
     def _place_obstacles(self, time: float) -> None:
         bodies = self._driven.move_obstacles(time)
@@ -186,7 +188,7 @@ class MujocoSimulator:
     def _touching(self) -> NDArray[np.int64]:
         """Which robots' bumpers touch something now."""
         found = self._bumper_of[self._data.contact.geom.ravel()]
-        return found[found >= 0]
+        return np.asarray(found[found >= 0])
 
     def _require_sane(self) -> None:
         """Raises BackendError for a robot that lies on its side without having been hit."""

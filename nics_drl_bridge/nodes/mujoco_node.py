@@ -13,7 +13,8 @@ from nics_drl_bridge.highfidelity.machine import Physics
 from nics_drl_bridge.highfidelity.simulator import MujocoSimulator
 from nics_drl_bridge.interface import Simulator
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
-from nics_drl_bridge.nodes.device_node import DeviceNode, choice
+from nics_drl_bridge.nodes.device_node import DeviceNode
+from nics_drl_bridge.nodes.device_parameters import choice
 from nics_drl_bridge.nodes.runner import declare, run_node
 from nics_drl_bridge.sim.world import World
 
