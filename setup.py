@@ -117,7 +117,7 @@ setup(
         "gymnasium.envs": [f"NicsBridge = {PACKAGE}.env.registration:register_envs"],
         f"{PACKAGE}.backends": [
             f"sim = {PACKAGE}.env.sim_backend:SimBackend",
-            f"dds = {PACKAGE}.nodes.dds_backend:DdsBackend",
+            f"dds = {PACKAGE}.nodes.backends:dds_backend",
         ],
     },
 )

@@ -238,8 +238,19 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         waiting = self.robots > 1 and bool(self.ended.any())
         if waiting:
             command = np.where(self.ended[:, None], self._still, command)
-        # After an error in the backend, only a reset leads back.
+        # After an error from here on, only a reset leads back.
         before, self._view = self._view, None
+        try:
+            return self._apply(command, before, waiting)
+        except BaseException:
+            # Of the task, too: whoever catches it shall not be left with a moving robot.
+            getattr(self._backend, "halt", lambda: None)()
+            raise
+
+    def _apply(
+        self, command: Array, before: RobotView, waiting: bool
+    ) -> tuple[NDArray[np.float32], dict[str, Array], dict[str, Any]]:
+        """What `advance` does with a command that is allowed."""
         seen, facts = self._backend.step(command)
         view, out = self._lifted(seen), np.empty(self._shape, np.float32)
         outcome = self.task.step_into(out, before, view, self.memory)

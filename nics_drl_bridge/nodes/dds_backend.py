@@ -185,12 +185,12 @@ class DdsBackend:
         """The first half of a step: checks and publishes a command (C,)."""
         self._link.check_open()
         with self._link.zero_after_an_error():
+            self._link.check_alone()
             # Data that are there before the command would be taken for its answer.
             self._check_stamps()
             twist = self._robot.to_cmd_vel(command)
             self._link.send(twist)
-            # The rest while the simulator is at work.
-            self._link.check_alone()
+            # Booked while the simulator is at work.
             self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
             self._now_ns += self._period_ns
 

@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from std_msgs.msg import Int32
+from std_srvs.srv import Trigger
+
+from nics_drl_bridge.nodes.executor import StandingExecutor
+from nics_drl_bridge.nodes.runner import open_context
+
+pytestmark = pytest.mark.ros
+SPINS = 2000
+
+
+@pytest.fixture
+def node(domain_id):
+    context = open_context(domain_id=domain_id)
+    made = Node("standing", context=context, start_parameter_services=False)
+    yield made
+    made.destroy_node()
+    context.try_shutdown()
+
+
+@pytest.fixture
+def executor(node):
+    made = StandingExecutor(node.context)
+    made.add_node(node)
+    yield made
+    made.shutdown(timeout_sec=1.0)
+
+
+def spin_until(executor, done, what):
+    for _ in range(SPINS):
+        if done():
+            return
+        executor.spin_once(timeout_sec=0.02)
+    raise AssertionError(f"never: {what}")
+
+
+def test_ends_that_come_and_go_are_noticed(node, executor):
+    publisher, one, two = node.create_publisher(Int32, "count", 10), [], []
+    first = node.create_subscription(Int32, "count", one.append, 10)
+    spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched")
+    publisher.publish(Int32(data=1))
+    spin_until(executor, lambda: one == [Int32(data=1)], "the first message")
+    node.create_subscription(Int32, "count", two.append, 10)
+    node.destroy_subscription(first)
+    spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched anew")
+    publisher.publish(Int32(data=2))
+    spin_until(executor, lambda: two == [Int32(data=2)], "the message of the second")
+    assert one == [Int32(data=1)]
+
+
+def test_services_clients_timers_and_guard_conditions_are_served_beside(node, executor):
+    def answer(_, response):
+        response.success = True
+        return response
+
+    ticks, triggered = [], []
+    node.create_service(Trigger, "ask", answer)
+    client = node.create_client(Trigger, "ask")
+    node.create_timer(0.01, lambda: ticks.append(1))
+    guard = node.create_guard_condition(lambda: triggered.append(1))
+    spin_until(executor, client.service_is_ready, "the service")
+    future = client.call_async(Trigger.Request())
+    called_back = []
+    future.add_done_callback(called_back.append)
+    guard.trigger()
+    spin_until(executor, lambda: called_back and triggered and len(ticks) > 5, "all served")
+    assert future.result().success
+
+
+def test_an_error_of_a_callback_comes_out_of_the_spin(node, executor):
+    def fail():
+        raise ZeroDivisionError
+
+    node.create_timer(0.001, fail)
+    with pytest.raises(ZeroDivisionError):
+        spin_until(executor, lambda: False, "an error")
+
+
+def test_a_context_that_is_shut_down_ends_the_spin(node, executor):
+    node.context.try_shutdown()
+    with pytest.raises(ExternalShutdownException):
+        executor.spin_once(timeout_sec=5.0)

@@ -1,0 +1,203 @@
+from __future__ import annotations
+
+import signal
+import time
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from geometry_msgs.msg import PoseStamped, TwistStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import LaserScan
+from std_srvs.srv import SetBool
+
+from nics_drl_bridge.env.registration import NAVIGATION
+from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError
+from nics_drl_bridge.interface import Start
+from nics_drl_bridge.nodes import conversions, qos, realtime_backend
+from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
+from nics_drl_bridge.sim.world import load_world
+
+pytestmark = pytest.mark.ros
+
+PATIENCE_S = 60.0
+START = Start(seed=3, pose=np.array([0.5, -0.5, 1.0]))
+FORWARD = np.array([0.5, 0.0])
+
+
+@pytest.fixture(scope="module")
+def simulator(launch, module_domain_id):
+    """The domain of a simulator in real time, and its process."""
+    process = launch("simulator_node", module_domain_id, mode="realtime")
+    yield module_domain_id, process
+    process.check()
+
+
+@pytest.fixture
+def connect(simulator, model):
+    """Makes backends on that simulator, or in the domain that is given."""
+    made = []
+
+    def make(**options):
+        options = {"domain_id": simulator[0], "timeout_s": PATIENCE_S} | options
+        made.append(RealtimeBackend(model, load_world("arena"), **options))
+        return made[-1]
+
+    yield make
+    for backend in made:
+        backend.close()
+
+
+@pytest.fixture
+def vehicle(meet, domain_id, model):
+    """The topics of a robot without services, and `stand(pose, twist)`, which tells where it is."""
+    peer = meet(domain_id)
+    odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
+    scan = peer.node.create_publisher(LaserScan, "scan", qos.SENSOR_RELIABLE)
+    sensor = peer.node.create_publisher(PoseStamped, "pose", qos.SENSOR_RELIABLE)
+    stamps = iter(range(10**9, 10**12, 10**8))
+
+    def stand(pose, twist=(0.0, 0.0, 0.0)):
+        stamp = next(stamps)
+        ranges = np.full(model.lidar.beams, 2.0, np.float32)
+        frames, variance = ("odom", "base_link"), (1e-4,) * 4
+        odom.publish(conversions.odometry_to_ros(pose, twist, stamp, frames, variance))
+        scan.publish(conversions.scan_to_ros(model.lidar, ranges, stamp, "laser"))
+        measured = PoseStamped()
+        measured.header.stamp = conversions.stamp_to_ros(stamp)
+        measured.pose.position.x, measured.pose.position.y = float(pose[0]), float(pose[1])
+        measured.pose.orientation = conversions.heading_to_ros(pose[2])
+        sensor.publish(measured)
+
+    return SimpleNamespace(peer=peer, domain_id=domain_id, stand=stand)
+
+
+def drive_on(backend):
+    for _ in range(1000):
+        backend.step(FORWARD)
+
+
+def test_gymnasium_make_drives_a_simulator_in_real_time(simulator):
+    options = {"domain_id": simulator[0], "mode": "realtime", "stale_after_s": PATIENCE_S}
+    env = gymnasium.make(NAVIGATION, backend="dds", backend_options=options)
+    try:
+        _, info = env.reset(seed=3)
+        before = info["pose"]
+        told = [env.step(np.array([1.0, 0.0], np.float32))[4] for _ in range(5)]
+    finally:
+        env.close()
+    sequences = [info["odom_sequence"] for info in told]
+    assert sequences == sorted(sequences)
+    assert sequences[-1] > sequences[0]
+    assert np.hypot(*(told[-1]["pose"] - before)[:2]) > 0.01
+    for info in told:
+        assert info["stamp_ns"] == max(info["scan_stamp_ns"], info["odom_stamp_ns"])
+        assert 0.0 <= info["scan_silence_s"] <= PATIENCE_S
+
+
+def test_silence_of_a_topic_is_named_with_its_age_and_a_reset_goes_on(connect, simulator, meet):
+    backend = connect(stale_after_s=2.0)
+    backend.reset(START)
+    backend.step(FORWARD)
+    _, process = simulator
+    process._process.send_signal(signal.SIGSTOP)
+    try:
+        with pytest.raises(StaleDataError, match=r"no fresh data within 2.000 s") as caught:
+            drive_on(backend)
+    finally:
+        process._process.send_signal(signal.SIGCONT)
+    assert caught.value.topic in ("scan", "odom")
+    assert caught.value.age_s > 2.0
+    assert backend.reset(START).pose == pytest.approx(START.pose, abs=0.2)
+    backend.step(FORWARD)
+
+    peer = meet(simulator[0])
+    peer.call(SetBool, "simulator_node/pause", SetBool.Request(data=True))
+    with pytest.raises(StaleDataError):
+        drive_on(backend)
+    peer.call(SetBool, "simulator_node/pause", SetBool.Request(data=False))
+    backend.reset(START)
+
+
+def test_missed_deadlines_are_counted_and_not_made_up_for(connect, monkeypatch):
+    backend = connect(stale_after_s=1e6)
+    backend.reset(START)
+    period, clock = backend._period_ns, SimpleNamespace(now=time.monotonic_ns())
+    clock.monotonic_ns = lambda: clock.now
+    clock.sleep = lambda seconds: setattr(clock, "now", clock.now + round(seconds * 1e9))
+    monkeypatch.setattr(realtime_backend, "time", clock)
+    backend._deadline_ns = (began := clock.now) + period
+
+    def step(thinking=0.0):
+        clock.now += round(thinking * period)
+        misses = backend.step(FORWARD)[1]["deadline_misses"]
+        return round((clock.now - began) / period, 3), misses
+
+    assert step() == (1.0, 0)
+    assert step(thinking=0.9) == (2.0, 0)
+    assert step(thinking=2.5) == (5.0, 2)  # due at 3; it comes at 4.5
+    assert step() == (6.0, 2)
+
+
+def test_a_vehicle_is_awaited_at_its_start_and_what_is_missing_is_said(
+    connect, vehicle, monkeypatch
+):
+    monkeypatch.setattr(realtime_backend, "SAY_EVERY_S", 0.05)
+    said = []
+    robot = vehicle.peer.listen(TwistStamped, "cmd_vel")
+
+    def say(sentence):
+        said.append(sentence.removeprefix("waiting for the robot: "))
+        if said[-1].startswith("no "):
+            vehicle.stand(START.pose + np.array([1.0, 0.0, 0.5]))
+        elif "off its start" in said[-1]:
+            vehicle.stand(START.pose, (0.3, 0.0, 0.0))
+        else:
+            vehicle.stand(START.pose)
+
+    backend = connect(
+        domain_id=vehicle.domain_id, say=say, stale_after_s=PATIENCE_S, stamped=True,
+        tolerance=(0.2, 0.2), pose_type="PoseStamped",
+    )  # fmt: skip
+    view = backend.reset(START)
+    assert np.hypot(*(view.pose - START.pose)[:2]) < 0.2
+    assert said[0].startswith("no ")
+    assert "it is 1.00 m and 29 deg off its start (0.50 m, -0.50 m, 57 deg)" in said, said
+    assert "it is still moving" in said
+    backend.step(FORWARD)
+    heard = "a command stamped with its scan"
+    vehicle.peer.until(lambda: robot and robot[-1].twist.linear.x == 0.5, heard)
+    stamp_ns = backend._topics.middleware.cache.newest["scan"].stamp_ns
+    assert conversions.stamp_from_ros(robot[-1].header.stamp) == stamp_ns
+
+
+def test_a_vehicle_that_does_not_come_ends_the_reset_and_the_present_pose_would_do(
+    connect, vehicle, monkeypatch
+):
+    monkeypatch.setattr(realtime_backend, "SAY_EVERY_S", 0.05)
+    vehicle.peer.listen(TwistStamped, "cmd_vel_raw")
+    options = {
+        "domain_id": vehicle.domain_id,
+        "command_topic": "cmd_vel_raw",
+        "stale_after_s": PATIENCE_S,
+        "say": lambda _: vehicle.stand(np.zeros(3)),
+    }
+    waiting = connect(**options, start_timeout_s=0.5)
+    with pytest.raises(BackendError, match=r"not ready: it is 0.71 m and 57 deg off.*'present'"):
+        waiting.reset(START)
+    waiting.close()
+    present = connect(**options, start="present")
+    assert present.reset(START).pose == pytest.approx(np.zeros(3), abs=0.05)
+
+
+def test_a_wrong_option_is_one_sentence(connect, model, domain_id):
+    with pytest.raises(ConfigError, match=r"backend_options.*stale_after_s"):
+        connect(stale_after=1.0)
+    with pytest.raises(ConfigError, match="pose_type"):
+        connect(pose_type="Pose", timeout_s=0.1)
+    with pytest.raises(BackendError, match=r"no publisher of /odom.*mode:=realtime"):
+        connect(domain_id=domain_id, timeout_s=0.3)

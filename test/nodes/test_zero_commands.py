@@ -1,0 +1,139 @@
+"""Whatever ends a process that drives a robot, a zero command is the last that is heard of it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import LaserScan
+
+from nics_drl_bridge.nodes import conversions, qos
+
+pytestmark = pytest.mark.ros
+
+DRIVER = """
+import gc, sys
+import gymnasium
+import numpy as np
+from nics_drl_bridge.env.registration import NAVIGATION, register_envs
+
+what = sys.argv[1]
+register_envs()
+
+def say(sentence):
+    print(sentence, flush=True)
+    if what == "error_in_reset":
+        raise ValueError(what)
+
+wait = what in ("reset", "error_in_reset")
+options = {
+    "mode": "realtime", "vehicle": True, "stale_after_s": 1e6, "timeout_s": 60.0, "say": say,
+    "start": "wait" if wait else "present",
+}
+env = gymnasium.make(NAVIGATION, backend="dds", backend_options=options)
+env.reset(seed=3)
+action = np.array([1.0, 0.0], np.float32)
+task = env.unwrapped.task
+while True:
+    env.step(action)
+    print("stepped", flush=True)
+    if what == "error_in_step":
+        task.step_into = None
+    if what == "garbage":
+        env = task = None
+        gc.collect()
+        print("collected", flush=True)
+        sys.stdin.read()
+    if what == "exit":
+        sys.exit(0)
+"""
+
+
+@pytest.fixture
+def robot(meet, domain_id, model):
+    """Topics of a robot that stands at (5, 5), and what it hears."""
+    peer = meet(domain_id)
+    odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
+    scan = peer.node.create_publisher(LaserScan, "scan", qos.SENSOR_RELIABLE)
+    ranges, stamps = np.full(model.lidar.beams, 2.0, np.float32), iter(range(10**9, 10**12, 10**8))
+
+    def tell():
+        stamp = next(stamps)
+        frames, variance = ("odom", "base_link"), (1e-4,) * 4
+        pose, twist = np.array([5.0, 5.0, 0.0]), np.zeros(3)
+        odom.publish(conversions.odometry_to_ros(pose, twist, stamp, frames, variance))
+        scan.publish(conversions.scan_to_ros(model.lidar, ranges, stamp, "laser"))
+        return False
+
+    return peer, peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND), tell
+
+
+@pytest.fixture
+def drive(domain_id):
+    """Starts a process that drives, `drive(what)`."""
+    started = []
+
+    def start(what):
+        process = subprocess.Popen(
+            [sys.executable, "-u", "-c", DRIVER, what],
+            env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        os.set_blocking(process.stdout.fileno(), False)
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def said(process, text, told=""):
+    """Whether a process has said something."""
+    try:
+        told = process.stdout.read() or ""
+    except (BlockingIOError, TypeError):
+        return False
+    return text in told
+
+
+@pytest.mark.parametrize(
+    ("what", "until", "signals", "code"),
+    [
+        ("step", "stepped", [signal.SIGINT], -signal.SIGINT),
+        ("step", "stepped", [signal.SIGINT] * 5, -signal.SIGINT),
+        ("step", "stepped", [signal.SIGTERM], 128 + signal.SIGTERM),
+        ("reset", "off its start", [signal.SIGINT], -signal.SIGINT),
+        ("reset", "off its start", [signal.SIGINT] * 5, -signal.SIGINT),
+        ("error_in_step", "stepped", [], 1),
+        ("error_in_reset", "waiting", [], 1),
+        ("exit", "stepped", [], 0),
+        ("garbage", "collected", [], None),
+    ],
+)
+def test_the_last_command_of_a_process_is_zero(robot, drive, what, until, signals, code):
+    peer, heard, tell = robot
+    process = drive(what)
+    peer.until(lambda: tell() or said(process, until), f"{what}: {until}", 60.0)
+    for number in signals:
+        process.send_signal(number)
+        peer.until(lambda: True, "a moment")
+    if code is not None:
+        peer.until(lambda: process.poll() is not None, "its end")
+        error = process.communicate()[1]
+        assert process.returncode in {code, abs(code), 130}, error
+        assert "FATAL" not in error
+        assert "terminate called" not in error
+    if until == "stepped":
+        assert any(command.linear.x > 0.0 for command in heard)
+    peer.until(lambda: heard and heard[-1] == Twist(), "a zero command")
