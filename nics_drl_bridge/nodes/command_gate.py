@@ -62,7 +62,7 @@ class CommandGate(QosWatch):
                 "simulations; set it on a vehicle."
             )
         self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.DIAGNOSTICS)
         self._listen()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD_S, lambda: self._decide(Tick()), clock=steady)

@@ -41,7 +41,7 @@ class MiddlewareNode(ManagedNode):
         declare_sensors(self)
         declare(self, "map_frame", "map", "Frame id of the estimate.")
         declare(self, "base_frame", "base_link", "Frame id of the robot.")
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.DIAGNOSTICS)
         self.create_service(Trigger, "~/reset", self._on_reset)
         # Steady: diagnostics matter most when the robot's time stands still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -64,15 +64,15 @@ class MiddlewareNode(ManagedNode):
         estimator = self._topics.middleware.estimator
         # A pose or a yaw rate may have been newer.
         stamp_ns = max(stamp_ns, estimator.time_ns)
-        view, covariance = self._topics.middleware.view(stamp_ns), estimator.covariance
+        view = self._topics.middleware.view(stamp_ns)
         frames = (
             str(self.get_parameter("map_frame").value),
             str(self.get_parameter("base_frame").value),
         )
-        variance = (max(covariance[0, 0], covariance[1, 1]), covariance[2, 2], 1e-4, 1e-4)
-        self._filtered.publish(
-            conversions.odometry_to_ros(view.pose, view.twist, stamp_ns, frames, variance)
-        )
+        message = conversions.odometry_to_ros(view.pose, view.twist, stamp_ns, frames, (0.0,) * 4)
+        message.pose.covariance = conversions.covariance_to_ros(estimator.covariance[:3, :3])
+        message.twist.covariance = conversions.covariance_to_ros(estimator.twist_covariance)
+        self._filtered.publish(message)
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self.state == UNCONFIGURED:
