@@ -147,6 +147,7 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(launch, meet, domain_
     assert status().level == DiagnosticStatus.WARN
     assert status().message == "nothing on scan, odom yet"
     assert status().name == "/car/middleware_node: topics"
+    assert status().hardware_id == "ackermann"
 
     def drive(x, second):
         stamp = int(second * conversions.NANO)
