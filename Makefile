@@ -41,7 +41,7 @@ DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Ma
 
 OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
 
-.PHONY: help setup demo test ros-status lint format types pytest benchmark clean distclean
+.PHONY: help setup demo test test-jazzy ros-status lint format types pytest benchmark clean distclean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 12
@@ -109,12 +109,34 @@ types: setup ## mypy
 pytest: setup
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
+# The node tests on another distribution: its wheels have the names of ours, so they need an
+# environment of their own. What is pinned is the same but for ROS.
+JAZZY := .venv-jazzy
+JAZZY_WHEELS := ros-jazzy-rclpy ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp
+JAZZY_EXTRAS := bags,deploy,mujoco,multi,test
+
+test-jazzy: $(JAZZY)/.ready ## the node tests on the wheels of ROS 2 Jazzy, in .venv-jazzy
+	$(CLEAN_ENV) $(JAZZY)/bin/python -m pytest test/nodes $(PYTEST_ARGS)
+
+$(JAZZY)/.ready: $(DESCRIBED_BY)
+	@if [ "$(ROS)" != wheels ]; then \
+		echo "make test-jazzy: needs Linux on x86-64 and a shell without a sourced ROS 2." >&2; \
+		exit 1; fi
+	@echo "Building $(JAZZY) with Python $(VERSION); the first time takes a minute or more."
+	@test -x $(JAZZY)/bin/python || $(CLEAN_ENV) $(BASE) -m venv $(JAZZY)
+	@grep -v '^ros-' constraints.txt > $(JAZZY)/constraints.txt
+	@export PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_CONSTRAINT=$(JAZZY)/constraints.txt; \
+		$(CLEAN_ENV) $(JAZZY)/bin/python -m pip install -qq setuptools; \
+		$(CLEAN_ENV) $(JAZZY)/bin/python -m pip install -qq --no-build-isolation \
+			--editable '.[$(JAZZY_EXTRAS)]' onnx $(JAZZY_WHEELS)
+	@touch $@
+
 benchmark: setup ## run every benchmark and print its table
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python "$$script"; done
 
 clean: ## remove what building and testing left behind
 	rm -rf build dist install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
-	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +
 
-distclean: clean ## the same, and .venv and runs/
-	rm -rf $(VENV) runs
+distclean: clean ## the same, and .venv, .venv-jazzy and runs/
+	rm -rf $(VENV) $(JAZZY) runs

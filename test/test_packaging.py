@@ -30,6 +30,7 @@ PROBES = {
     f"{PACKAGE}/probe/inner/leaf.py": "",
     "config/probe/inner/leaf.yaml": "answer: 42\n",
     "launch/probe/leaf.launch.py": "",
+    "urdf/probe/leaf.urdf": "",
 }
 
 WHERE_AM_I = f"""
@@ -141,11 +142,13 @@ def test_the_wheel_holds_every_module(checkout: Path, names_in_wheel: set[str]) 
     assert {name for name in names_in_wheel if name.startswith(f"{PACKAGE}/")} == written
 
 
-def test_the_wheel_holds_every_config_and_launch_file(
+def test_the_wheel_holds_every_config_launch_and_urdf_file(
     checkout: Path, names_in_wheel: set[str]
 ) -> None:
-    written = files_below(checkout, "config", "launch")
-    assert {"config/probe/inner/leaf.yaml", "launch/probe/leaf.launch.py"} <= written
+    written = files_below(checkout, "config", "launch", "urdf")
+    assert {
+        "config/probe/inner/leaf.yaml", "launch/probe/leaf.launch.py", "urdf/probe/leaf.urdf"
+    } <= written  # fmt: skip
     share = f"share/{PACKAGE}/"
     shared = {name.removeprefix(share) for name in names_in_wheel if name.startswith(share)}
     assert shared == written | {"package.xml"}
@@ -179,12 +182,12 @@ def test_colcon_puts_the_executables_where_ros2_run_looks(install_space: Path) -
     assert all(os.access(path, os.X_OK) for path in folder.iterdir())
 
 
-def test_colcon_shares_config_launch_files_and_the_ament_marker(
+def test_colcon_shares_config_launch_files_urdf_and_the_ament_marker(
     checkout: Path, install_space: Path
 ) -> None:
     share = install_space / PACKAGE / "share"
-    written = files_below(checkout, "config", "launch")
-    assert files_below(share / PACKAGE, "config", "launch") == written
+    written = files_below(checkout, "config", "launch", "urdf")
+    assert files_below(share / PACKAGE, "config", "launch", "urdf") == written
     assert (share / PACKAGE / "package.xml").is_file()
     assert (share / "ament_index" / "resource_index" / "packages" / PACKAGE).is_file()
 

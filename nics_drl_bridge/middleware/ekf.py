@@ -125,6 +125,13 @@ class Estimator:
         """(3 + S, 3 + S) of pose and state."""
         return np.array(self._filter.P)
 
+    @property
+    def twist_covariance(self) -> Array:
+        """(3, 3) of the body twist that pose and state stand for."""
+        _, derivative = self._expect(Kind.TWIST)
+        spread: Array = derivative @ self._filter.P @ derivative.T
+        return spread + LEAST_TWIST_STD**2 * np.eye(3)
+
     def effective_ns(self, stamp_ns: int) -> int:
         """When a command that was sent at a time takes effect [ns]."""
         return stamp_ns + self._delay_ns

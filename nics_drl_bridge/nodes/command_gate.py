@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 from rclpy.clock import Clock, ClockType
@@ -15,6 +14,7 @@ from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.diagnostics import Diagnostics
 from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.gate_parameters import declare_gate
 from nics_drl_bridge.nodes.qos_watch import QosWatch
@@ -36,7 +36,6 @@ from nics_drl_bridge.safety.inputs import (
 from nics_drl_bridge.safety.state import Decision, begin
 
 PERIOD_S = 0.02
-DIAGNOSTICS_PERIOD_S = 1.0
 
 
 class CommandGate(QosWatch):
@@ -55,18 +54,17 @@ class CommandGate(QosWatch):
         parameters = declare_gate(self)
         self._config, self._lidar = parameters.config, parameters.lidar
         self._state = begin(self._config)
-        self._log = GateLog(self._config, parameters.black_box, self.get_logger())
+        self._log = GateLog(parameters, self.get_logger())
         if not self._config.e_stop_required:
             self.get_logger().warning(
                 "e_stop_required is false: silence of e_stop does not stop the robot. That is for "
                 "simulations; set it on a vehicle."
             )
         self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._listen()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD_S, lambda: self._decide(Tick()), clock=steady)
-        self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=steady)
+        Diagnostics(self, "gate", lambda: self._log.finding(self._state))
 
     def _listen(self) -> None:
         self.create_subscription(LaserScan, "scan", self._on_scan, qos.SENSOR)
@@ -128,12 +126,6 @@ class CommandGate(QosWatch):
             self._out.publish(conversions.twist_to_ros(decision.twist))
         self._log.note(Entry(now, given, before, decision))
         return decision
-
-    def _diagnose(self) -> None:
-        status = self._log.status(self.get_fully_qualified_name(), self._state)
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
 
     def stop(self) -> None:
         """Leaves a zero command behind."""

@@ -128,6 +128,16 @@ def odometry_from_ros(message: Odometry) -> tuple[Array, Array]:
 PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 """Where x, y and heading stand in the 6 x 6 covariance of a message."""
 
+UNUSED_VARIANCE = 1e6
+"""Of z, roll and pitch, which a planar robot does not measure."""
+
+
+def covariance_to_ros(planar: Array) -> Array:
+    """A covariance (3, 3) of x, y and heading, or of their rates, as the (36,) of a message."""
+    whole = np.diag(np.full(6, UNUSED_VARIANCE))
+    whole[PLANAR] = planar
+    return whole.ravel()
+
 
 def pose_from_ros(
     message: PoseStamped | PoseWithCovarianceStamped,
@@ -160,10 +170,5 @@ def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState
     return message
 
 
-UNUSED_VARIANCE = 1e6
-"""Of z, roll and pitch, which a planar robot does not measure."""
-
-
 def _diagonal(linear: float, angular: float) -> Array:
-    diagonal = [linear, linear, UNUSED_VARIANCE, UNUSED_VARIANCE, UNUSED_VARIANCE, angular]
-    return np.diag(diagonal).ravel()
+    return covariance_to_ros(np.diag([linear, linear, angular]))

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from collections import Counter
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
 
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
+from nics_drl_bridge.nodes.diagnostics import Finding
+from nics_drl_bridge.nodes.gate_parameters import GateParameters
 from nics_drl_bridge.safety.black_box import BlackBox, Entry, write
-from nics_drl_bridge.safety.state import Cause, GateConfig, GateState
+from nics_drl_bridge.safety.state import Cause, GateState
 
 FILES_KEPT = 20
 
@@ -20,14 +20,14 @@ class GateLog:
     """One line and one file for each stop, and counters of everything.
 
     Args:
-        config: of the gate.
-        folder: of the files.
+        parameters: of the gate.
         logger: takes the lines.
     """
 
-    def __init__(self, config: GateConfig, folder: Path, logger: RcutilsLogger) -> None:
+    def __init__(self, parameters: GateParameters, logger: RcutilsLogger) -> None:
         self.counters: Counter[str] = Counter()
-        self._box, self._folder, self._logger = BlackBox(config), folder, logger
+        self._box, self._logger = BlackBox(parameters.config), logger
+        self._folder, self._hardware = parameters.black_box, parameters.robot
         self._cause: Cause | None = None
         self._passing = False
         # Beside the gate: a disk may take its time.
@@ -66,18 +66,15 @@ class GateLog:
         if error is not None:
             self._logger.error(f"the black box could not be written: {error}")
 
-    def status(self, name: str, state: GateState) -> DiagnosticStatus:
+    def finding(self, state: GateState) -> Finding:
         """For `/diagnostics`."""
-        status = DiagnosticStatus(name=f"{name}: gate")
-        status.level = DiagnosticStatus.WARN if self._cause else DiagnosticStatus.OK
-        status.message = self._cause.line if self._cause else "commands pass"
-        facts: dict[str, object] = {
+        facts = {
             "armed": state.armed,
             "latched": state.latched is not None,
             **dict(sorted(self.counters.items())),
         }
-        status.values = [KeyValue(key=key, value=str(value)) for key, value in facts.items()]
-        return status
+        message = self._cause.line if self._cause else "commands pass"
+        return Finding(message, self._cause is not None, facts, self._hardware)
 
     def close(self) -> None:
         """Waits for the files that are being written."""

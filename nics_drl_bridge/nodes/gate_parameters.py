@@ -27,11 +27,13 @@ class GateParameters:
 
     Attributes:
         config: of the rules.
+        robot: name of the robot behind it.
         lidar: whose scans it gets.
         black_box: folder of the recordings of stops.
     """
 
     config: GateConfig
+    robot: str
     lidar: LidarSpec
     black_box: Path
 
@@ -78,7 +80,9 @@ def declare_gate(node: Node) -> GateParameters:
         shield=_declare_shield(node, model),
     )
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
-    return GateParameters(config, lidar, Path(get("black_box", "", folder) or home / "black_box"))
+    return GateParameters(
+        config, robot.name, lidar, Path(get("black_box", "", folder) or home / "black_box")
+    )
 
 
 def _declare_shield(node: Node, model: SimulatorModel) -> ShieldConfig | None:

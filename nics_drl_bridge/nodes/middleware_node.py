@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from std_srvs.srv import Trigger
 
@@ -15,11 +13,11 @@ from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.middleware.health import Health
 from nics_drl_bridge.middleware.view import rehearse
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
 from nics_drl_bridge.nodes.runner import declare, declare_model_name, run_node
 
-DIAGNOSTICS_PERIOD_S = 1.0
 SILENCE_S = 5.0
 """Diagnostics warn of a topic that has been silent for so long."""
 
@@ -41,15 +39,13 @@ class MiddlewareNode(ManagedNode):
         declare_sensors(self)
         declare(self, "map_frame", "map", "Frame id of the estimate.")
         declare(self, "base_frame", "base_link", "Frame id of the robot.")
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(Trigger, "~/reset", self._on_reset)
-        # Steady: diagnostics matter most when the robot's time stands still.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=steady)
+        Diagnostics(self, "topics", self._look)
 
     def configure(self) -> None:
         """Opens the model and listens."""
         model = open_model(str(self.get_parameter("model").value))
+        self._hardware = model.robot.name
         rehearse(model)
         self._filtered = self.create_lifecycle_publisher(
             Odometry, "odometry/filtered", qos.SENSOR_RELIABLE
@@ -64,15 +60,15 @@ class MiddlewareNode(ManagedNode):
         estimator = self._topics.middleware.estimator
         # A pose or a yaw rate may have been newer.
         stamp_ns = max(stamp_ns, estimator.time_ns)
-        view, covariance = self._topics.middleware.view(stamp_ns), estimator.covariance
+        view = self._topics.middleware.view(stamp_ns)
         frames = (
             str(self.get_parameter("map_frame").value),
             str(self.get_parameter("base_frame").value),
         )
-        variance = (max(covariance[0, 0], covariance[1, 1]), covariance[2, 2], 1e-4, 1e-4)
-        self._filtered.publish(
-            conversions.odometry_to_ros(view.pose, view.twist, stamp_ns, frames, variance)
-        )
+        message = conversions.odometry_to_ros(view.pose, view.twist, stamp_ns, frames, (0.0,) * 4)
+        message.pose.covariance = conversions.covariance_to_ros(estimator.covariance[:3, :3])
+        message.twist.covariance = conversions.covariance_to_ros(estimator.twist_covariance)
+        self._filtered.publish(message)
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self.state == UNCONFIGURED:
@@ -82,18 +78,13 @@ class MiddlewareNode(ManagedNode):
         response.success, response.message = True, "the next odometry fixes the map frame"
         return response
 
-    def _diagnose(self) -> None:
-        status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: topics")
-        status.level, status.message = DiagnosticStatus.OK, self.state
-        if self.state != UNCONFIGURED:
-            health = self._topics.middleware.health(self._topics.now_ns())
-            trouble = silence(health, self._topics.expected)
-            status.level = DiagnosticStatus.WARN if trouble else DiagnosticStatus.OK
-            status.message = trouble or ("receiving" if self.state == ACTIVE else self.state)
-            status.values = [KeyValue(key=key, value=value) for key, value in facts(health).items()]
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
+    def _look(self) -> Finding:
+        if self.state == UNCONFIGURED:
+            return Finding(self.state, warns=False, facts={})
+        health = self._topics.middleware.health(self._topics.now_ns())
+        trouble = silence(health, self._topics.expected)
+        message = trouble or ("receiving" if self.state == ACTIVE else self.state)
+        return Finding(message, bool(trouble), facts(health), self._hardware)
 
 
 def silence(health: Health, expected: Sequence[str]) -> str:

@@ -20,6 +20,9 @@ WIDENED: dict[Parameter.Type, tuple[Parameter.Type, Callable[[Any], Any]]] = {
 QOS = "qos_overrides."
 """Names that rclpy reads itself, where a publisher or subscription asks for it."""
 
+SHARED = "model"
+"""A file gives it to all nodes at once, also to those that have no model."""
+
 
 def widen(node: Node, name: str, default: Any) -> None:
     """Lets `rate:=2` be given for a floating-point parameter: rclpy itself refuses an integer.
@@ -47,11 +50,17 @@ def given_values(node: Node) -> dict[str, Parameter]:
     return found
 
 
+def unknown(node: Node) -> list[str]:
+    """A sentence for each value whose parameter the node does not have."""
+    known = [name for name in node._parameters if not name.startswith(QOS)]
+    return [
+        f"there is no parameter {name!r}, its value is ignored; {nearest(name, known)}"
+        for name in sorted(given_values(node))
+        if name not in (*known, SHARED) and not name.startswith(QOS)
+    ]
+
+
 def warn_of_unknown(node: Node) -> None:
     """Warns of values for parameters that the node does not have: rclpy ignores them silently."""
-    known = [name for name in node._parameters if not name.startswith(QOS)]
-    for name in sorted(given_values(node)):
-        if name not in known and not name.startswith(QOS):
-            node.get_logger().warning(
-                f"there is no parameter {name!r}, its value is ignored; {nearest(name, known)}"
-            )
+    for sentence in unknown(node):
+        node.get_logger().warning(sentence)

@@ -1,4 +1,10 @@
-"""Quality of service of each kind of topic, with the reason."""
+"""Quality of service of each kind of topic, with the reason.
+
+A publisher that is reliable matches subscribers of both kinds, one that is best effort only those
+that ask for no more: what this package publishes is reliable, what it subscribes to is best effort
+wherever a lost message does no harm. So RViz, `ros2 topic echo`, Nav2 and drivers of every kind
+match it as they are. Nothing is kept for late joiners (volatile): a robot's old data mislead.
+"""
 
 from __future__ import annotations
 
@@ -15,18 +21,19 @@ def _keep_last(depth: int, reliability: ReliabilityPolicy) -> QoSProfile:
 
 
 SENSOR = _keep_last(5, ReliabilityPolicy.BEST_EFFORT)
-"""Scans and odometry: a new one beats a repeated old one. Matches every publisher."""
+"""Subscribing to scans, odometry, poses, IMU. A new datum beats a repeated old one: on a lossy link
+a reliable scan arrives half a second late and looks fresh. It matches every publisher."""
 
 SENSOR_RELIABLE = _keep_last(10, ReliabilityPolicy.RELIABLE)
-"""What the simulator offers, so that subscribers of both kinds match it; and what a lock-step
-client asks for, because there a lost datum would never be sent again."""
+"""Publishing them, so that subscribers of both kinds match; and subscribing in lock-step, because
+there a lost datum would never be sent again."""
 
 EVERY_COMMAND = _keep_last(10, ReliabilityPolicy.RELIABLE)
 """Commands in lock-step: each moves the world, so that a second publisher does not go unnoticed by
-replacing the first one's."""
+replacing the first one's. Also `e_stop`, of which no press may be overwritten."""
 
 COMMAND = _keep_last(1, ReliabilityPolicy.RELIABLE)
-"""Commands: only the newest counts, and it has to arrive."""
+"""Commands and goals: only the newest counts, and it has to arrive."""
 
 TRANSFORMS = _keep_last(100, ReliabilityPolicy.RELIABLE)
 """`/tf`: as tf2's own broadcasters, whose listeners ask for reliable."""
@@ -38,3 +45,7 @@ FIXED_TRANSFORMS = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 """`/tf_static`: told once, and again to everybody who comes later."""
+
+DIAGNOSTICS = _keep_last(10, ReliabilityPolicy.RELIABLE)
+"""`/diagnostics`: rare and small, and each one may tell of something else; as the diagnostic
+aggregator expects it."""

@@ -179,3 +179,13 @@ def test_an_imu_gives_its_yaw_rate_and_variance_unless_it_has_none():
     assert conversions.imu_from_ros(over_the_wire(message)) == (-0.75, 0.25)
     message.angular_velocity_covariance[0] = -1.0
     assert conversions.imu_from_ros(over_the_wire(message)) is None
+
+
+def test_a_planar_covariance_survives_the_way_through_a_message():
+    planar = np.array([[0.04, 0.01, 0.002], [0.01, 0.09, -0.003], [0.002, -0.003, 0.01]])
+    message = PoseWithCovarianceStamped()
+    message.pose.covariance = conversions.covariance_to_ros(planar)
+    assert conversions.pose_from_ros(message)[1] == pytest.approx(planar)
+    whole = np.reshape(message.pose.covariance, (6, 6))
+    assert (np.linalg.eigvalsh(whole) > 0.0).all()
+    assert whole[2, 2] == whole[3, 3] == whole[4, 4] == conversions.UNUSED_VARIANCE

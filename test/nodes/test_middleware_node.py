@@ -101,6 +101,18 @@ def test_the_estimate_names_its_frames_and_its_doubt(driven):
     assert doubts[1][0] > doubts[0][0]
 
 
+def test_the_estimates_twist_is_doubted_more_than_not_at_all_and_less_than_the_odometry(driven):
+    _, said, step, begin, _ = driven
+    begin()
+    for _ in range(10):
+        last, _ = step(0.5)
+    twist, measured = (
+        np.diag(np.reshape(m.twist.covariance, (6, 6)))[[0, 5]] for m in (last, said["odom"][-1])
+    )
+    assert (twist > 0.0).all()
+    assert (twist < measured + 1e-6 + 1e-12).all()  # no twist is trusted to less than 1e-3
+
+
 def test_a_command_of_nan_does_not_reach_the_estimate(driven):
     _, _, step, begin, commands = driven
     begin()
@@ -135,6 +147,7 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(launch, meet, domain_
     assert status().level == DiagnosticStatus.WARN
     assert status().message == "nothing on scan, odom yet"
     assert status().name == "/car/middleware_node: topics"
+    assert status().hardware_id == "ackermann"
 
     def drive(x, second):
         stamp = int(second * conversions.NANO)

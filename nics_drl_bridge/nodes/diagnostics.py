@@ -1,0 +1,58 @@
+"""What a node says about itself on `/diagnostics`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+
+from nics_drl_bridge.nodes import qos
+
+PERIOD_S = 1.0
+
+
+class Finding(NamedTuple):
+    """How a node is.
+
+    Attributes:
+        message: one line.
+        warns: whether it is one that somebody should look at.
+        facts: what else is known, for people.
+        hardware: whose hardware it concerns, such as the robot's name.
+    """
+
+    message: str
+    warns: bool
+    facts: Mapping[str, object]
+    hardware: str = ""
+
+
+class Diagnostics:
+    """Publishes what a node finds about itself once a second, in the format of the aggregator.
+
+    Args:
+        node: that is told about.
+        part: of the node, for the status' name.
+        look: asked each time.
+    """
+
+    def __init__(self, node: Node, part: str, look: Callable[[], Finding]) -> None:
+        self._node, self._look = node, look
+        self._name = f"{node.get_fully_qualified_name()}: {part}"
+        self._topic = node.create_publisher(DiagnosticArray, "/diagnostics", qos.DIAGNOSTICS)
+        # Steady: diagnostics matter most when the robot's time stands still.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(PERIOD_S, self._tell, clock=steady)
+
+    def _tell(self) -> None:
+        found = self._look()
+        status = DiagnosticStatus(name=self._name, message=found.message)
+        status.level = DiagnosticStatus.WARN if found.warns else DiagnosticStatus.OK
+        status.hardware_id = found.hardware
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in found.facts.items()]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._topic.publish(message)

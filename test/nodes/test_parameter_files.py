@@ -1,0 +1,58 @@
+"""Every parameter of `config/nodes` exists in the node it is meant for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+import yaml
+from rclpy.node import Node
+
+from nics_drl_bridge.nodes import overrides
+from nics_drl_bridge.nodes.command_gate import CommandGate
+from nics_drl_bridge.nodes.drive_parameters import declare_drive
+from nics_drl_bridge.nodes.middleware_node import MiddlewareNode
+from nics_drl_bridge.nodes.policy_node import PolicyNode
+from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.simulator_node import SimulatorNode
+
+pytestmark = pytest.mark.ros
+
+FILES = sorted((Path(__file__).resolve().parents[2] / "config" / "nodes").glob("*.yaml"))
+
+
+def record_node(context):
+    node = Node("record_node", context=context)
+    declare_drive(node)
+    return node
+
+
+MAKERS = {
+    "simulator_node": SimulatorNode,
+    "middleware_node": MiddlewareNode,
+    "policy_node": PolicyNode,
+    "command_gate": CommandGate,
+    "record_node": record_node,
+}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)
+def test_a_node_has_every_parameter_that_a_shipped_file_gives_it(
+    name, file, domain_id, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    section = yaml.safe_load(file.read_text(encoding="utf-8")).get(f"/**/{name}", {})
+    context = open_context(["node", "--ros-args", "--params-file", str(file)], domain_id)
+    try:
+        node = MAKERS[name](context)
+        assert overrides.unknown(node) == []
+        for key, value in section.get("ros__parameters", {}).items():
+            assert node.get_parameter(key).value == value, key
+            assert node.describe_parameter(key).description
+        node.destroy_node()
+    finally:
+        context.try_shutdown()
