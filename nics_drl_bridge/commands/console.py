@@ -13,6 +13,7 @@ from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
+WIDEST = 10_000
 
 RobotOption = Annotated[str, typer.Option(help="A shipped robot (ackermann) or a YAML file.")]
 WorldOption = Annotated[
@@ -76,7 +77,8 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         made.add_row(*(Text(cell, overflow="fold") for cell in row))
     console = Console()
     if not console.is_terminal:
-        console = Console(width=console.measure(made).maximum, color_system=None)
+        wide = Console(width=WIDEST, color_system=None)
+        console = Console(width=wide.measure(made).maximum, color_system=None)
     with console.capture() as captured:
         console.print(made)
     return captured.get().rstrip()

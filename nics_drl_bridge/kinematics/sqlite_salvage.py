@@ -12,6 +12,7 @@ from typing import Any
 BATCH = 500
 SMALLEST_ROW = 16
 """No message takes less room than this [bytes]: it bounds how many there can be."""
+SMALLEST_PAGE = 512
 BESIDE = ("-wal", "-journal")
 """Files beside a database that was not closed, which SQLite needs to put it in order."""
 
@@ -28,6 +29,7 @@ def intact_rows(path: Path) -> tuple[dict[int, tuple[str, str]], dict[str, str],
     with TemporaryDirectory() as folder:
         copy = Path(folder) / "bag.db3"
         shutil.copyfile(path, copy)
+        _drop_cut_page(copy)
         for ending in BESIDE:
             with suppress(FileNotFoundError):
                 shutil.copyfile(f"{path}{ending}", f"{copy}{ending}")
@@ -41,6 +43,15 @@ def intact_rows(path: Path) -> tuple[dict[int, tuple[str, str]], dict[str, str],
                 return {}, {}, []
             topics = {key: (name, kind) for key, name, kind in found}
             return topics, _definitions(base), _rows(base, copy.stat().st_size // SMALLEST_ROW)
+
+
+def _drop_cut_page(copy: Path) -> None:
+    """Leaves whole pages only: SQLite fills one that is cut off with zeros, without a word."""
+    with copy.open("r+b") as file:
+        size = int.from_bytes(file.read(18)[16:], "big")
+        size = 65536 if size == 1 else size
+        if size >= SMALLEST_PAGE and size & (size - 1) == 0:
+            file.truncate(copy.stat().st_size // size * size)
 
 
 def _definitions(base: sqlite3.Connection) -> dict[str, str]:

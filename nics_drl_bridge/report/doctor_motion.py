@@ -20,6 +20,10 @@ LEAST_PATH_M, LEAST_TURN_RAD = 0.3, 0.3
 """Below, a drive says nothing about scales."""
 TOLERANCE = 1.4
 """Pose differences and twist agree within this factor."""
+ALIKE = 0.8
+"""Below this correlation the two have nothing to do with each other, and a factor says nothing."""
+LEAST_ALIKE = 0.3
+"""The same for commands, which the robot follows late and within its limits."""
 JUMP = 5.0
 """Farther than so many times what the greatest speed allows is a jump,"""
 JUMP_M = 0.2
@@ -86,6 +90,12 @@ def _compared(field: str, real: Array, told: Array, unit: int) -> Iterator[Word]
     ratio = _slope(real, told)
     if 1.0 / TOLERANCE < ratio < TOLERANCE:
         return
+    size = float(np.sqrt((real @ real) * (told @ told)))
+    if size == 0.0 or abs(real @ told) < ALIKE * size:
+        what = f"the pose does not do what twist.{field} says"
+        fix = "free the robot if it is stuck; else let both come from the same odometry"
+        yield what, fix, False
+        return
     if -TOLERANCE < ratio < -1.0 / TOLERANCE:
         what = f"twist.{field} has the sign opposite to what the pose does"
         yield what, "turn the sign: forward and counter-clockwise are positive (REP-103)", True
@@ -131,6 +141,6 @@ def scale(facts: Facts) -> float | None:
     wish = told[place[known], 2]
     if np.abs(turn[forward]).sum() < LEAST_TURN_RAD or np.abs(wish[forward]).sum() < 1.0:
         return None
-    together = np.corrcoef(wish[forward], turn[forward])[0, 1] if wish[forward].std() else 1.0
-    slope = _slope(wish[forward], turn[forward])
-    return slope if abs(together) > 0.3 or not wish[forward].std() else None
+    wish, turn = wish[forward], turn[forward]
+    alike = abs(wish @ turn) / np.sqrt((wish @ wish) * (turn @ turn))
+    return _slope(wish, turn) if alike > LEAST_ALIKE else None

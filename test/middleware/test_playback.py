@@ -1,0 +1,121 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags", reason="needs the extra 'bags'")
+
+import bags
+
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.files import npz_arrays
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.middleware.playback import estimate, write_estimate
+
+DURATION_S = 6.0
+MODEL = builtin_model("ackermann")
+STEP = 0.05
+
+
+def odometry(t, shift=0.0):
+    inner = bags.new(
+        "geometry_msgs/PoseWithCovariance", bags.pose(*bags.place_at(t)), np.zeros(36)
+    )
+    twist = bags.new(
+        "geometry_msgs/TwistWithCovariance", bags.twist(0.5, 0.0, 0.25), np.zeros(36)
+    )
+    stamp = None if shift is None else t + shift
+    return bags.new("nav_msgs/msg/Odometry", bags.header(stamp, "odom"), "base_link", inner, twist)
+
+
+def drive(**changed):
+    """Half a circle."""
+    topics = {
+        "/odom": [(t + 0.01, odometry(t)) for t in bags.times(STEP, DURATION_S)],
+        "/cmd_vel": [(t, bags.twist(0.5, 0.0, 0.1)) for t in bags.times(0.1, DURATION_S)],
+        "/pose": [
+            (t + 0.08, bags.pose_stamped(t, *bags.place_at(t)))
+            for t in bags.times(0.1, DURATION_S)
+        ],
+        "/imu": [(t + 0.01, bags.imu(t, 0.0, 0.0, 0.25)) for t in bags.times(STEP, DURATION_S)],
+    }
+    return topics | changed
+
+
+@pytest.fixture
+def bag(tmp_path):
+    return bags.write(tmp_path / "bag", drive())
+
+
+def test_the_estimate_follows_the_drive(bag):
+    made = estimate(bag, MODEL, {"pose": "/pose", "imu": "/imu"})
+    truth = np.array([bags.place_at(t) for t in bags.times(STEP, DURATION_S)])
+    assert len(made.pose) == len(truth)
+    assert np.abs(made.pose[-20:, :2] - truth[-20:, :2]).max() < 0.05
+    assert np.abs(made.twist[-20:, 0] - 0.5).max() < 0.05
+
+
+def test_a_drive_gives_the_same_estimate_bit_for_bit_in_every_process(bag):
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from nics_drl_bridge.generator import builtin_model\n"
+        "from nics_drl_bridge.middleware.playback import estimate\n"
+        "made = estimate(Path(sys.argv[1]), builtin_model('ackermann'), {'pose': '/pose'})\n"
+        "print(made.digest)"
+    )
+    told = [
+        subprocess.run(
+            [sys.executable, "-c", code, bag], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        for _ in range(2)
+    ]
+    assert len(told[0]) == 64
+    assert told[0] == told[1] == estimate(bag, MODEL, {"pose": "/pose"}).digest
+    assert told[0] != estimate(bag, MODEL, {}).digest
+
+
+def test_the_storage_makes_no_difference(tmp_path):
+    made = {
+        estimate(bags.write(tmp_path / kind, drive(), kind), MODEL, {}).digest
+        for kind in ("mcap", "sqlite3")
+    }
+    assert len(made) == 1
+
+
+def test_an_estimate_is_written_exactly(bag, tmp_path):
+    made = estimate(bag, MODEL, {})
+    write_estimate(made, tmp_path / "estimate.npz")
+    arrays = npz_arrays((tmp_path / "estimate.npz").read_bytes())
+    assert np.array_equal(arrays["pose"], made.pose)
+    write_estimate(made, tmp_path / "estimate.csv")
+    head, *rows = (tmp_path / "estimate.csv").read_text().splitlines()
+    assert head == "stamp_ns,x,y,heading,vx,vy,wz"
+    values = np.array([[float(cell) for cell in row.split(",")[1:]] for row in rows])
+    assert np.array_equal(values, np.hstack([made.pose, made.twist]))
+
+
+@pytest.mark.parametrize(
+    ("changed", "topics", "said"),
+    [
+        ({"/odom": [(t, odometry(t, None)) for t in bags.times(STEP, 3.0)]}, {}, "not stamped"),
+        (
+            {"/pose": [(t, bags.pose_stamped(t + 70.0, 0.0, 0.0, 0.0)) for t in bags.times()]},
+            {"pose": "/pose"}, "of two clocks",
+        ),
+        ({}, {"pose": "/mocap"}, "has no topic '/mocap'"),
+        ({}, {"odom": "/pose"}, "odom needs messages of nav_msgs/msg/Odometry"),
+    ],
+)  # fmt: skip
+def test_a_bag_that_gives_no_estimate_is_refused(tmp_path, changed, topics, said):
+    bag = bags.write(tmp_path / "bag", drive(**changed))
+    with pytest.raises(RecordingError, match=said):
+        estimate(bag, MODEL, topics)
+
+
+def test_a_bag_without_odometry_lists_its_topics(tmp_path):
+    bag = bags.write(tmp_path / "bag", {"/pose": drive()["/pose"]})
+    with pytest.raises(RecordingError, match="has no odometry.*/pose"):
+        estimate(bag, MODEL, {})

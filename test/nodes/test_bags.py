@@ -1,0 +1,211 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+pytest.importorskip("rosbags", reason="needs the extra 'bags'")
+
+import bags
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import LaserScan
+
+from nics_drl_bridge.kinematics.bag_file import opened
+from nics_drl_bridge.kinematics.bag_info import bag_info
+from nics_drl_bridge.middleware.playback import estimate
+from nics_drl_bridge.nodes import conversions, qos
+from nodes.peer import stamp_ns
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
+
+ENDS_S = 60.0
+
+
+def nics(domain_id, *words):
+    """The command line, as a process in a DDS domain."""
+    environment = os.environ | {
+        "ROS_DOMAIN_ID": str(domain_id), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }  # fmt: skip
+    command = [sys.executable, "-m", "nics_drl_bridge.cli", *map(str, words)]
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def ended(process):
+    """What a command said, and its exit code."""
+    out, err = process.communicate(timeout=ENDS_S)
+    assert "Traceback" not in err
+    return out, err, process.returncode
+
+
+def small_drive(path):
+    """Two seconds of odometry and commands, at times that differ from topic to topic."""
+    topics = {
+        "/odom": [(t + 0.01, odometry(t)) for t in bags.times(0.05, 2.0)],
+        "/cmd_vel": [
+            (t + 0.013, bags.twist(0.5, 0.0, 0.1 * np.sin(t))) for t in bags.times(0.1, 2.0)
+        ],
+    }
+    return bags.write(path, topics)
+
+
+def odometry(t):
+    inner = bags.new(
+        "geometry_msgs/PoseWithCovariance", bags.pose(*bags.place_at(t)), np.zeros(36)
+    )
+    twist = bags.new(
+        "geometry_msgs/TwistWithCovariance", bags.twist(0.5, 0.0, 0.25), np.zeros(36)
+    )
+    return bags.new("nav_msgs/msg/Odometry", bags.header(t, "odom"), "base_link", inner, twist)
+
+
+class Robot:
+    """Says what the test wants to be recorded."""
+
+    def __init__(self, peer):
+        self.peer, self.sent = peer, 0
+        self.odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR)
+        self.command = peer.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
+
+    def until(self, condition, what):
+        """Publishes until something is the case."""
+
+        def met():
+            stamp = self.peer.node.get_clock().now().nanoseconds
+            self.odom.publish(
+                conversions.odometry_to_ros(
+                    np.zeros(3), np.zeros(3), stamp, ("odom", "base_link"), (0.01,) * 4
+                )
+            )
+            self.command.publish(conversions.twist_to_ros([0.1, 0.0, 0.0]))
+            self.sent += 1
+            return condition()
+
+        self.peer.until(met, what, ENDS_S)
+
+
+def test_a_recorder_writes_a_whole_bag_at_ctrl_c(meet, domain_id, tmp_path):
+    robot = Robot(meet(domain_id))
+    recorder = nics(domain_id, "bag", "record", tmp_path / "drive")
+    robot.until(lambda: robot.odom.get_subscription_count() > 0, "a recorder of odom")
+    robot.until(lambda: robot.command.get_subscription_count() > 0, "a recorder of cmd_vel")
+    until = robot.sent + 40
+    robot.until(lambda: robot.sent > until, "40 more messages")
+    recorder.send_signal(signal.SIGINT)
+    out, err, code = ended(recorder)
+    assert code == 0, err
+    assert "bag written to" in out
+    counts = {topic.topic: topic.count for topic in bag_info(tmp_path / "drive").topics}
+    assert min(counts["/odom"], counts["/cmd_vel"]) >= 30
+    with opened(tmp_path / "drive") as bag:
+        assert [offer.reliable for offer in bag.offers("/odom")] == [False]
+        assert [offer.depth for offer in bag.offers("/cmd_vel")] == [1]
+    assert {path.name for path in tmp_path.iterdir()} == {"drive"}
+
+
+def test_of_a_recorder_that_is_killed_the_drive_is_salvaged(meet, domain_id, tmp_path):
+    robot = Robot(meet(domain_id))
+    recorder = nics(domain_id, "bag", "record", tmp_path / "drive", "--topics", "odom")
+    robot.until(lambda: robot.odom.get_subscription_count() > 0, "a recorder of odom")
+    robot.until(
+        lambda: any(file.stat().st_size > 20_000 for file in tmp_path.glob(".drive.*/*/*.mcap")),
+        "a flush",
+    )
+    recorder.kill()
+    recorder.communicate(timeout=ENDS_S)
+    assert not (tmp_path / "drive").exists()
+    (left,) = tmp_path.glob(".drive.*")
+    out, err, code = ended(nics(domain_id, "bag", "salvage", left, tmp_path / "kept"))
+    assert code == 0, err
+    (topic,) = bag_info(tmp_path / "kept").topics
+    assert (topic.topic, topic.count > 10) == ("/odom", True)
+
+
+def test_nothing_heard_is_one_sentence_and_no_bag(domain_id, tmp_path):
+    out, err, code = ended(
+        nics(domain_id, "bag", "record", tmp_path / "drive", "--duration", "1")
+    )
+    assert code == 2
+    assert err.startswith("nics: nothing was heard")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_bag_is_published_with_its_time_on_the_clock(meet, domain_id, tmp_path):
+    from rosgraph_msgs.msg import Clock
+
+    bag = small_drive(tmp_path / "bag")
+    peer = meet(domain_id)
+    odom, clock = peer.listen(Odometry, "odom"), peer.listen(Clock, "/clock")
+    player = nics(domain_id, "bag", "replay", bag, "--rate", "4")
+    peer.until(lambda: len(odom) >= 40, "the whole bag")
+    out, err, code = ended(player)
+    assert (code, out) == (0, "60 messages were published\n"), err
+    assert [stamp_ns(message) for message in odom] == [bags.ns(t) for t in bags.times(0.05, 2.0)]
+    ticks = [conversions.stamp_from_ros(message.clock) for message in clock]
+    assert ticks == sorted(ticks)
+    assert bags.ns(0.0) <= ticks[0]
+    assert ticks[-1] <= bags.ns(2.0)
+
+
+@pytest.mark.parametrize("attempt", range(1))
+def test_a_replay_in_lock_step_gives_the_same_estimate_bit_for_bit(
+    launch, meet, domain_id, model, tmp_path, attempt
+):
+    """Over DDS and in process, twice over."""
+    bag = small_drive(tmp_path / "bag")
+    peer = meet(domain_id)
+    filtered = peer.listen(Odometry, "odometry/filtered")
+    told = []
+    for _ in range(2):
+        node = launch("middleware_node", domain_id, use_sim_time=True)
+        player = nics(domain_id, "bag", "replay", bag, "--lockstep", "middleware_node")
+        peer.until(lambda: len(filtered) >= 40 or player.poll() is not None, "all", 2 * ENDS_S)
+        out, err, code = ended(player)
+        assert code == 0, err
+        peer.until(lambda: len(filtered) >= 40, "all estimates")
+        told.append(
+            [(stamp_ns(m), *conversions.odometry_from_ros(m)[1], m.pose.pose.position.x)
+             for m in filtered]
+        )  # fmt: skip
+        filtered.clear()
+        node.close()
+    assert told[0] == told[1]
+    made = estimate(bag, model, {})
+    assert [row[0] for row in told[0]] == list(made.stamp_ns)
+    assert np.array_equal([row[1:4] for row in told[0]], made.twist)
+    assert np.array_equal([row[4] for row in told[0]], made.pose[:, 0])
+
+
+def test_the_doctor_finds_nothing_at_the_simulator_and_a_second_driver_beside_it(
+    launch, meet, module_domain_id
+):
+    launch("simulator_node", module_domain_id, world="empty")
+    peer = meet(module_domain_id)
+    scans = peer.listen(LaserScan, "scan")
+    peer.until(lambda: scans, "a scan", ENDS_S)
+    out, err, code = ended(nics(module_domain_id, "doctor", "--duration", "3", "--json"))
+    assert json.loads(out)["findings"] == [], err
+    assert code == 0
+    for _ in range(2):
+        peer.speak(Twist, "cmd_vel")
+    out, err, code = ended(nics(module_domain_id, "doctor", "--duration", "2", "--json"))
+    (finding,) = json.loads(out)["findings"]
+    assert code == 1
+    assert (finding["check"], finding["where"]) == ("publishers", "/cmd_vel")
+
+
+def test_the_doctor_says_what_a_silent_robot_lacks(domain_id):
+    out, _, code = ended(nics(domain_id, "doctor", "--json"))
+    assert code == 1
+    findings = json.loads(out)["findings"]
+    assert {(f["check"], f["where"]) for f in findings} == {
+        ("missing topic", topic) for topic in ("/scan", "/odom", "/cmd_vel")
+    }

@@ -1,0 +1,256 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags", reason="needs the extra 'bags'")
+
+import bags
+
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.kinematics.bag_qos import Offer
+from nics_drl_bridge.report.doctor import examine, expected_of_model
+from nics_drl_bridge.report.doctor_facts import Endpoints, Facts, facts_of_bag, names_in
+
+SECONDS = 8.0
+RELIABLE, BEST_EFFORT = Offer(), Offer(reliable=False)
+EXPECTED = expected_of_model(builtin_model("ackermann"))
+LIDAR = EXPECTED.lidar
+CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
+
+
+def scan(t, **changed):
+    header = LIDAR.header
+    values = dict(
+        angle_min=header.angle_min, angle_max=header.angle_max,
+        angle_increment=header.angle_increment, time_increment=0.0, scan_time=header.scan_time,
+        range_min=header.range_min, range_max=header.range_max,
+        ranges=np.where(np.arange(LIDAR.beams) % 3, 0.6 * LIDAR.range_max, np.inf),
+        frame=LIDAR.frame,
+    )  # fmt: skip
+    values |= changed
+    frame, ranges = values.pop("frame"), np.asarray(values.pop("ranges"), np.float32)
+    return bags.new(
+        "sensor_msgs/msg/LaserScan", bags.header(t, frame), *values.values(), ranges,
+        np.zeros(0, np.float32),
+    )  # fmt: skip
+
+
+def odometry(
+    t, frames=("odom", "base_link"), pose=1.0, speed=1.0, turn=1.0, covariance=0.01, jump=0.0
+):
+    x, y, heading = bags.place_at(0.0 if t is None else t)
+    inner = bags.new(
+        "geometry_msgs/PoseWithCovariance",
+        bags.pose(pose * x + jump, pose * y, heading), np.full(36, covariance),
+    )  # fmt: skip
+    twist = bags.new(
+        "geometry_msgs/TwistWithCovariance",
+        bags.twist(0.5 * speed, 0.0, 0.25 * turn), np.full(36, covariance),
+    )  # fmt: skip
+    return bags.new(
+        "nav_msgs/msg/Odometry", bags.header(t, frames[0]), frames[1], inner, twist
+    )
+
+
+def heard(scans=None, odometries=None, commands=None, late=0.002, ticks=None):
+    """Facts of a live robot that drives a circle; rows (time, message) take the place of its own."""
+    facts = Facts("a robot", True, names_in(""))
+    every = {
+        "scan": scans or [(t, scan(t)) for t in bags.times(1.0 / LIDAR.rate, SECONDS)],
+        "odom": odometries or [(t, odometry(t)) for t in bags.times(0.02, SECONDS)],
+        "cmd_vel": commands or [(t, bags.twist(0.5, 0.0, 0.2)) for t in bags.times(0.1, SECONDS)],
+    }
+    if ticks is not None:
+        every["/clock"] = [
+            (t, bags.new(CLOCK_TYPE, bags.header(value).stamp)) for t, value in ticks
+        ]
+    for role, rows in every.items():
+        for t, message in rows:
+            facts.take(role, bags.ns(t + late), message)
+        asks = (RELIABLE,) if role == "cmd_vel" else ()
+        kind = rows[0][1].__msgtype__
+        facts.topics[facts.names[role]] = Endpoints((kind,), (RELIABLE,), asks)
+    facts.end_ns = bags.ns(SECONDS)
+    return facts
+
+
+def only(facts):
+    """The one thing that is found."""
+    findings = examine(facts, EXPECTED)
+    assert len(findings) == 1, findings
+    return findings[0]
+
+
+def test_a_robot_that_fits_has_no_findings():
+    assert examine(heard(), EXPECTED) == []
+
+
+def each_scan(**changed):
+    return [(t, scan(t, **changed)) for t in bags.times(1.0 / LIDAR.rate, SECONDS)]
+
+
+def each_odometry(**changed):
+    return [(t, odometry(t, **changed)) for t in bags.times(0.02, SECONDS)]
+
+
+FREE = np.where(np.arange(LIDAR.beams) % 3, 0.6 * LIDAR.range_max, 0.0)
+HALF = LIDAR.beams // 2
+
+
+@pytest.mark.parametrize(
+    ("changed", "check", "said"),
+    [
+        ({"frame": "/laser"}, "frame", "/laser"),
+        ({"frame": "camera"}, "frame", "frame: camera"),
+        ({"ranges": FREE}, "range convention", "no_return: zero"),
+        ({"ranges": np.where(FREE == 0.0, np.nan, FREE)}, "range convention", "no_return: nan"),
+        (
+            {"ranges": np.where(FREE == 0.0, LIDAR.range_max, FREE)},
+            "range convention", "no_return: range_max",
+        ),
+        ({"ranges": np.where(FREE == 0.0, -1.0, FREE)}, "range convention", "negative"),
+        ({"ranges": np.where(FREE == 0.0, 2.0 * LIDAR.range_max, FREE)}, "range convention",
+         "exceed range_max"),
+        ({"ranges": 1000.0 * FREE}, "unit", "millimetres"),
+        ({"range_max": 1000.0 * LIDAR.range_max}, "unit", "range_max"),
+        ({"range_max": 2.0 * LIDAR.range_max}, "range limits", "range_max"),
+        ({"ranges": np.full(HALF, np.inf),
+          "angle_max": LIDAR.header.angle_min + (HALF - 1) * LIDAR.header.angle_increment},
+         "beam layout", f"{HALF} beams"),
+        ({"angle_min": LIDAR.header.angle_max, "angle_max": LIDAR.header.angle_min,
+          "angle_increment": -LIDAR.header.angle_increment}, "beam layout", "clockwise"),
+        ({"angle_min": LIDAR.header.angle_min + 0.5, "angle_max": LIDAR.header.angle_max + 0.5},
+         "beam layout", "beams go from"),
+        ({"angle_min": -180.0, "angle_max": -180.0 + 1.0 * (LIDAR.beams - 1),
+          "angle_increment": 1.0}, "unit", "degrees"),
+        ({"angle_max": LIDAR.header.angle_max + 0.5}, "beam layout", "angle_max"),
+    ],
+)  # fmt: skip
+def test_a_scan_that_does_not_fit_is_named(changed, check, said):
+    findings = examine(heard(scans=each_scan(**changed)), EXPECTED)
+    assert any(f.check == check and f.where == "/scan" and said in f.what + f.fix for f in findings)
+    assert {f.where for f in findings} == {"/scan"}
+
+
+@pytest.mark.parametrize(
+    ("changed", "check", "said"),
+    [
+        ({"frames": ("map", "base_link")}, "frame", "'map'"),
+        ({"frames": ("odom", "robot")}, "frame", "child_frame_id"),
+        ({"frames": ("/odom", "base_link")}, "frame", "slash"),
+        ({"speed": 1000.0}, "odometry", "mm/s"),
+        ({"speed": -1.0}, "odometry", "twist.linear.x has the sign opposite"),
+        ({"turn": 180.0 / np.pi}, "odometry", "degrees per second"),
+        ({"turn": -1.0}, "odometry", "twist.angular.z has the sign opposite"),
+        ({"pose": 1000.0}, "odometry", "millimetres"),
+        ({"pose": 2.0}, "odometry", "times what the pose does"),
+        ({"covariance": 0.0}, "odometry", "covariance of zeros"),
+    ],
+)  # fmt: skip
+def test_an_odometry_that_does_not_fit_is_named(changed, check, said):
+    finding = only(heard(odometries=each_odometry(**changed)))
+    assert (finding.check, finding.where) == (check, "/odom")
+    assert said in finding.what + finding.fix
+
+
+def test_a_jump_of_odometry_is_named():
+    rows = [(t, odometry(t, jump=3.0 * (t > 4.0))) for t in bags.times(0.02, SECONDS)]
+    assert "jumps 1 times, by up to 3.0" in only(heard(odometries=rows)).what
+
+
+def test_a_robot_that_turns_against_its_commands_is_named():
+    rows = [(t, bags.twist(0.5, 0.0, -0.2)) for t in bags.times(0.1, SECONDS)]
+    finding = only(heard(commands=rows))
+    assert (finding.check, finding.what) == ("command", "the robot turns against its commands")
+
+
+def test_a_lidar_at_another_rate_is_named():
+    rows = [(t, scan(t)) for t in bags.times(2.0 / LIDAR.rate, SECONDS)]
+    finding = only(heard(scans=rows))
+    assert finding.check == "rate"
+    assert f"{LIDAR.rate / 2:.3g} Hz, expected {LIDAR.rate:.3g} Hz" in finding.what
+
+
+@pytest.mark.parametrize(
+    ("late", "side"), [(-3.0, "after their arrival"), (1.0, "before"), (3600.0, "before")]
+)
+def test_stamps_that_are_not_of_the_time_of_arrival_are_named(late, side):
+    findings = examine(heard(late=late), EXPECTED)
+    assert {(f.check, f.where) for f in findings} == {("stamp", "/scan"), ("stamp", "/odom")}
+    assert all(side in f.what for f in findings)
+    assert all(("NTP" in f.fix) == (late != 1.0) for f in findings)
+
+
+def test_messages_without_stamps_are_named():
+    rows = [(t, odometry(None)) for t in bags.times(0.02, SECONDS)]
+    assert "400 of 400 messages are not stamped" in only(heard(odometries=rows)).what
+
+
+@pytest.mark.parametrize(
+    ("ticks", "said"),
+    [
+        ([(t, t) for t in bags.times(0.01, 4.0)], "silent"),
+        ([(t, 100.0) for t in bags.times(0.01, SECONDS)], "stands still"),
+        ([(t, t % 5.0) for t in bags.times(0.01, SECONDS)], "backwards"),
+    ],
+)
+def test_a_clock_that_does_not_go_on_is_named(ticks, said):
+    findings = [f for f in examine(heard(ticks=ticks), EXPECTED) if f.check == "clock"]
+    assert len(findings) == 1
+    assert said in findings[0].what
+
+
+def test_a_simulation_in_its_own_time_fits():
+    apart = 1000.0
+    facts = heard(
+        scans=[(t, scan(t + apart)) for t in bags.times(1.0 / LIDAR.rate, SECONDS)],
+        odometries=[(t, odometry(t + apart)) for t in bags.times(0.02, SECONDS)],
+        ticks=[(t, t + apart) for t in bags.times(0.02, SECONDS)],
+    )
+    assert examine(facts, EXPECTED) == []
+
+
+@pytest.mark.parametrize(
+    ("topic", "ends", "check", "said"),
+    [
+        ("/cmd_vel", {"offers": (RELIABLE, RELIABLE)}, "publishers", "2 publishers"),
+        ("/cmd_vel", {"offers": (BEST_EFFORT,)}, "quality of service", "asks for reliable"),
+        ("/cmd_vel", {"asks": ()}, "missing topic", "nobody listens"),
+        ("/odom", {"asks": (Offer(transient_local=True),)}, "quality of service", "transient"),
+        ("/scan", {"types": ("sensor_msgs/msg/PointCloud2",)}, "type", "PointCloud2"),
+        ("/cmd_vel", {"types": ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped")},
+         "type", "Twist and geometry_msgs/msg/TwistStamped"),
+    ],
+)  # fmt: skip
+def test_ends_of_a_topic_that_do_not_fit_are_named(topic, ends, check, said):
+    facts = heard()
+    facts.topics[topic] = replace(facts.topics[topic], **ends)
+    finding = only(facts)
+    assert (finding.check, finding.where) == (check, topic)
+    assert said in finding.what
+
+
+def test_a_missing_topic_is_named_with_one_of_its_type():
+    facts = heard()
+    facts.topics["/front/scan"] = facts.topics.pop("/scan")
+    del facts.heard["scan"]
+    facts.layouts, facts.ranges = [], []
+    finding = only(facts)
+    assert finding.what == "there is no such topic"
+    assert "/front/scan is of its type: remap it" in finding.fix
+
+
+def test_a_bag_is_judged_like_the_robot(tmp_path):
+    rows = {
+        "/scan": [(t + 0.002, scan(t)) for t in bags.times(1.0 / LIDAR.rate, SECONDS)],
+        "/odom": [(t + 0.002, odometry(t)) for t in bags.times(0.02, SECONDS)],
+        "/cmd_vel": [(t, bags.twist(0.5, 0.0, 0.2)) for t in bags.times(0.1, SECONDS)],
+    }
+    good = bags.write(tmp_path / "good", rows)
+    assert examine(facts_of_bag(good), EXPECTED) == []
+    rows["/odom"] = [(t + 0.002, odometry(t, turn=-1.0)) for t in bags.times(0.02, SECONDS)]
+    bad = bags.write(tmp_path / "bad", rows)
+    assert "sign opposite" in only(facts_of_bag(bad)).what
