@@ -13,6 +13,7 @@ from nics_drl_bridge.commands.generate import generate
 from nics_drl_bridge.commands.policy import policy
 from nics_drl_bridge.commands.record import record
 from nics_drl_bridge.commands.replay import replay
+from nics_drl_bridge.commands.urdf import urdf
 
 app = typer.Typer(
     help="From a recording of a robot to a fast simulator, and back to the robot over ROS 2.",
@@ -40,7 +41,7 @@ def _options(
     """Options of every command."""
 
 
-for command in (generate, bake, record, replay, demo):
+for command in (generate, bake, record, replay, urdf, demo):
     app.command()(command)
 app.add_typer(policy, name="policy")
 
