@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.env.navigation import Navigation
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy.dynamic_window import DynamicWindow
 from nics_drl_bridge.policy.go_to_goal import GoToGoal
@@ -37,6 +37,11 @@ POLICIES: dict[str, Callable[[Navigation], Policy]] = {
 SUFFIX = ".onnx"
 
 
+def shipped_policies() -> list[str]:
+    """Names of the policy files that come with the package."""
+    return sorted(file.stem for file in (share_folder() / "config" / "policies").glob(f"*{SUFFIX}"))
+
+
 def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None) -> Policy:
     """A policy by name.
 
@@ -51,7 +56,7 @@ def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None
     """
     if name in POLICIES:
         return POLICIES[name](task)
-    files = [file.stem for file in (share_folder() / "config" / "policies").glob(f"*{SUFFIX}")]
+    files = shipped_policies()
     if not name.endswith(SUFFIX) and name not in files:
         known = nearest(name, (*POLICIES, *files))
         raise ConfigError(f"unknown policy {name!r}; {known} Or give the path of an .onnx file.")
@@ -67,3 +72,24 @@ def act_all(policy: Policy) -> Callable[[NDArray[np.float32]], NDArray[Any]]:
     if batched is not None:
         return lambda observations: np.asarray(batched(observations))
     return lambda observations: np.stack([policy.act(one) for one in observations])
+
+
+def open_policy(name: str, model: SimulatorModel) -> tuple[Policy, Navigation]:
+    """A policy by name and the navigation task that it is for.
+
+    Args:
+        name: see `make_policy`.
+        model: of the robot.
+
+    Raises:
+        ConfigError, PolicyError: see `make_policy`; or it was trained for another task.
+    """
+    if name in POLICIES or not (name.endswith(SUFFIX) or name in shipped_policies()):
+        task = Navigation(model.robot, model.lidar)
+        return make_policy(name, task, model), task
+    policy = import_module("nics_drl_bridge.policy.policy_file").load_policy(name)
+    found = policy.make_task(model)
+    if not isinstance(found, Navigation):
+        reason = f"is {policy.contract.task.name!r}; this drives policies of 'navigation'."
+        raise PolicyError(name, "task.name", reason)
+    return policy, found

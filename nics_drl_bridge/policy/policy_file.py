@@ -244,9 +244,9 @@ def _check_golden(policy: PolicyFile, source: str) -> None:
         raise PolicyError(source, "graph", f"onnxruntime can't run it ({words}).") from None
     found = {"actions": action.reshape(len(observations), -1), "commands": command}
     for name, rows in found.items():
-        error = np.abs(rows - golden.rows(name))
-        if not error.max() <= GOLDEN_TOLERANCE:
-            reason = f"differ by {error.max():.3g} from what the graph gives here; not used."
+        gap = np.abs(rows - golden.rows(name)).max()
+        if not gap <= GOLDEN_TOLERANCE:
+            reason = f"differ by {gap:.3g} from what the graph gives here; not used."
             raise PolicyError(source, f"golden.{name}", reason)
     robot = policy.contract.robot
     beyond = (command < robot.command_low - GOLDEN_TOLERANCE).any()

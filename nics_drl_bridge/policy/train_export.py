@@ -39,7 +39,7 @@ GOLDEN_SPREAD = 3.0
 """Golden observations lie within this of zero where their limits are wider."""
 
 
-class Deployed(torch.nn.Module):
+class Deployed(torch.nn.Module):  # type: ignore[misc]
     """What the graph of a policy file computes.
 
     Args:
@@ -75,7 +75,7 @@ class Deployed(torch.nn.Module):
         return action, torch.minimum(torch.maximum(command, self.low), self.high)
 
 
-class _Gaussian(torch.nn.Module):
+class _Gaussian(torch.nn.Module):  # type: ignore[misc]
     """The mean of an actor-critic policy such as PPO's, or its logits."""
 
     def __init__(self, policy: Any) -> None:
@@ -88,7 +88,7 @@ class _Gaussian(torch.nn.Module):
         return raw
 
 
-class _Squashed(torch.nn.Module):
+class _Squashed(torch.nn.Module):  # type: ignore[misc]
     """The mode of SAC's actor."""
 
     def __init__(self, actor: Any) -> None:

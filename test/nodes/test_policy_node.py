@@ -34,7 +34,7 @@ def driving(launch, meet, module_domain_id):
     )
     start = {"episode_start": [-2.0, 0.0, 0.0], "episode_start_given": True}
     simulator = launch("simulator_node", module_domain_id, world="empty", rate=RATE, **start)
-    policy = launch("policy_node", module_domain_id, base_frame="car")
+    policy = launch("policy_node", module_domain_id, base_frame="car", rate=0.0)
     goals = peer.speak(PoseStamped, "goal_pose")
     peer.until(lambda: all(said.values()), "all topics")
     yield peer, said, goals, policy

@@ -1,0 +1,112 @@
+"""Does a policy file drive where nothing of training is installed?
+
+Makes a virtual environment with the package, its extra `deploy` and ROS 2, and starts `policy_node`
+there with a policy file. A stand-in for the robot, in the same environment, publishes scans and
+odometry and waits for commands. Where ROS 2 is installed it is used, otherwise its wheels.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+ROBOT = "differential"
+FORBIDDEN = ("torch", "stable_baselines3", "mujoco", "tensorboard")
+STAND_IN = Path(__file__).resolve().parent / "measuring" / "deployed_policy.py"
+INSTALL_S, DRIVE_S = 900, 400
+
+
+def export(folder: Path) -> Path:
+    """A policy file with weights at random, made in the present environment."""
+    import torch
+
+    from nics_drl_bridge.env.tasks import make_task
+    from nics_drl_bridge.generator import open_model
+    from nics_drl_bridge.policy.train_export import export_policy
+
+    torch.manual_seed(0)
+    model = open_model(ROBOT)
+    task = make_task("navigation", model, {"scan": "around"})
+    size = task.observation_space.shape[0]
+    layers = [torch.nn.Linear(size, 64), torch.nn.Tanh(), torch.nn.Linear(64, 2)]
+    path = folder / "policy.onnx"
+    export_policy(torch.nn.Sequential(*layers), task, model, path)
+    return path
+
+
+def environment() -> dict[str, str]:
+    """That of a child: the ROS 2 wheels leave words in it that lead others to wrong libraries."""
+    left = {"LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE", "PYTHONPATH", "VIRTUAL_ENV"}
+    if "ROS_DISTRO" in os.environ:
+        left -= {"LD_LIBRARY_PATH", "PYTHONPATH"}
+    kept = {name: value for name, value in os.environ.items() if name not in left}
+    return kept | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+
+def installed(folder: Path) -> Path:
+    """The Python of a new environment with the package and `deploy`."""
+    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True, env=environment())
+    source = folder / "source"
+    kept = shutil.ignore_patterns(".git", ".venv", "__pycache__", "build", "*.egg-info")
+    shutil.copytree(ROOT, source, ignore=kept)
+    python = folder / "bin" / "python"
+    extras = "deploy" if "ROS_DISTRO" in os.environ else "deploy,ros"
+    command = [str(python), "-m", "pip", "install", "-q", "-c", str(ROOT / "constraints.txt")]
+    command.append(f"{source}[{extras}]")
+    subprocess.run(command, check=True, env=environment(), timeout=INSTALL_S)
+    return python
+
+
+def present(python: Path) -> list[str]:
+    """Which of the forbidden modules an environment has."""
+    code = f"import importlib.util as u; print(*[n for n in {FORBIDDEN!r} if u.find_spec(n)])"
+    done = subprocess.run(
+        [str(python), "-c", code], env=environment(), capture_output=True, text=True, check=True
+    )
+    return done.stdout.split()
+
+
+def measure() -> dict[str, Any]:
+    """Makes the environment, drives in it, and removes it."""
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        policy = export(folder)
+        began = time.monotonic()
+        python = installed(folder / "environment")
+        install_s = time.monotonic() - began
+        found = present(python)
+        done = subprocess.run(
+            [str(python), str(STAND_IN), ROBOT, str(policy)],
+            env=environment(), cwd=folder, capture_output=True, text=True, timeout=DRIVE_S,
+        )  # fmt: skip
+        if done.returncode != 0:
+            raise SystemExit(f"policy_node did not drive:\n{done.stdout}\n{done.stderr}")
+        drove = json.loads(done.stdout.splitlines()[-1])
+    return {"install_s": round(install_s, 1), "training_modules": found, **drove}
+
+
+def main() -> int:
+    """Prints what was found; 0 when the node drove without anything of training."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+    arguments = parser.parse_args()
+    found = measure()
+    if arguments.json:
+        print(json.dumps(found))
+    else:
+        for name, value in found.items():
+            print(f"{name:<20} {value}")
+    return 0 if found["commands"] > 0 and not found["training_modules"] else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,202 @@
+"""policy_node with a policy file, where nothing of training can be imported, and other lidars."""
+
+from __future__ import annotations
+
+import array
+import os
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistStamped
+from nav_msgs.msg import Odometry
+from policy.policy_rig import network
+from sensor_msgs.msg import LaserScan
+
+from nics_drl_bridge.env.tasks import make_task
+from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.policy.policy_file import load_policy
+from nics_drl_bridge.policy.train_export import export_policy
+from nodes.peer import stamp_ns
+
+pytestmark = pytest.mark.ros
+
+GOAL = [1.5, 0.5]
+NOTHING_OF_TRAINING = """
+import sys
+class Block:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("torch", "stable_baselines3", "mujoco", "tensorboard"):
+            raise ImportError(name + " is not to be imported")
+sys.meta_path.insert(0, Block())
+"""
+
+
+def ranges_of(angles):
+    """A smooth surrounding, in sight of every lidar."""
+    return (1.6 + 0.7 * np.cos(angles) + 0.3 * np.sin(2.0 * angles)).astype(np.float32)
+
+
+def scan_of(angles, backwards=False):
+    message = LaserScan(range_min=0.05, range_max=3.0)
+    message.header.frame_id = "laser"
+    ordered = angles[::-1] if backwards else angles
+    message.angle_min, message.angle_max = float(ordered[0]), float(ordered[-1])
+    message.angle_increment = float((ordered[-1] - ordered[0]) / (len(ordered) - 1))
+    message.ranges = array.array("f", ranges_of(ordered).tobytes())
+    return message
+
+
+def around(beams):
+    return -np.pi + 2.0 * np.pi / beams * np.arange(beams)
+
+
+class Robot:
+    """A robot that stands at the origin of the map and looks around."""
+
+    def __init__(self, peer):
+        self.peer = peer
+        self.raw = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
+        self.told = peer.listen(DiagnosticArray, "/diagnostics")
+        self.scans = peer.speak(LaserScan, "scan")
+        self.odometry = peer.speak(Odometry, "odom")
+
+    def says(self, scan):
+        """Publishes a scan and an odometry of now; returns their stamp [ns]."""
+        now = time.time_ns()
+        scan.header.stamp = conversions.stamp_to_ros(now)
+        self.odometry.publish(
+            conversions.odometry_to_ros(
+                np.zeros(3), np.zeros(3), now, ("odom", "base_link"), (1e-3,) * 4
+            )
+        )
+        self.scans.publish(scan)
+        return now
+
+    def hears(self, scan, count=3):
+        """The command for a scan, repeated until the node has answered some."""
+        known, stamps = len(self.raw), set()
+
+        def answered():
+            stamps.add(self.says(scan))
+            return len([raw for raw in self.raw[known:] if stamp_ns(raw) in stamps]) >= count
+
+        self.peer.until(answered, "commands")
+        return conversions.twist_from_ros(self.raw[-1].twist)
+
+
+@pytest.fixture(scope="module")
+def file(model, tmp_path_factory):
+    path = tmp_path_factory.mktemp("policy") / "car.onnx"
+    task = make_task("navigation", model, {"scan": "around"})
+    export_policy(network(78, len(model.robot.command)), task, model, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def driving(launch, meet, module_domain_id, file, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("blocked")
+    (folder / "sitecustomize.py").write_text(NOTHING_OF_TRAINING, encoding="utf-8")
+    paths = [str(folder), os.environ.get("PYTHONPATH", "")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
+        node = launch("policy_node", module_domain_id, policy=str(file), goal=GOAL, deadline=5.0)
+    robot = Robot(meet(module_domain_id))
+    yield robot, node
+    node.check()
+
+
+def wanted(file, model):
+    """What the policy commands in process, in the same place."""
+    policy = load_policy(file)
+    task = policy.make_task(model)
+    view = RobotView(np.zeros(3), np.zeros(3), ranges_of(model.lidar.angles), 0.0, 0.0, 0.0)
+    action = policy.act(task.observation(view, {"goal": np.array(GOAL)}))
+    return task.robot.to_cmd_vel(task.command(action))
+
+
+def test_it_commands_what_the_file_does_in_process(driving, file, model):
+    robot, _ = driving
+    command = robot.hears(scan_of(model.lidar.angles))
+    assert np.abs(command).max() > 0.0
+    assert command == pytest.approx(wanted(file, model), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("angles", "backwards"),
+    [(around(360), False), (around(1440), True), (around(720) + np.pi, False)],
+    ids=["coarser", "finer-clockwise", "from-zero"],
+)
+def test_scans_of_another_lidar_give_the_same_command(driving, file, model, angles, backwards):
+    robot, _ = driving
+    command = robot.hears(scan_of(angles, backwards))
+    assert command == pytest.approx(wanted(file, model), abs=0.02)
+
+
+def test_it_acts_no_faster_than_its_control_period(driving, model):
+    robot, _ = driving
+    robot.hears(scan_of(model.lidar.angles))
+    known, began = len(robot.raw), time.monotonic()
+    robot.hears(scan_of(model.lidar.angles), count=10)
+    periods = (time.monotonic() - began) / model.control_period
+    assert len(robot.raw) - known <= periods + 3
+
+
+def test_its_diagnostics_count_inferences(driving):
+    robot, _ = driving
+    mine = "policy_node: policy"
+
+    def facts():
+        found = [s for m in robot.told for s in m.status if s.name.endswith(mine)]
+        return {value.key: value.value for value in found[-1].values} if found else {}
+
+    robot.peer.until(lambda: int(facts().get("answered", 0)) > 0, "diagnostics")
+    assert facts()["late"] == "0"
+
+
+def test_scans_that_cannot_fill_its_sectors_are_refused_in_one_sentence_once(driving, model):
+    robot, node = driving
+    narrow = scan_of(np.linspace(-1.0, 1.0, 200))
+
+    def refused():
+        robot.says(narrow)
+        return "scan is not used" in node.log.read_text(encoding="utf-8")
+
+    robot.peer.until(refused, "a refusal")
+    known = len(robot.raw)
+    for _ in range(5):
+        robot.says(narrow)
+    robot.hears(scan_of(model.lidar.angles))  # it goes on with one that can
+    log = node.log.read_text(encoding="utf-8")
+    assert log.count("scan is not used") == 1
+    assert "looks from -57.3 to 57.3 deg" in log
+    assert len(robot.raw) > known
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"policy": "none.onnx"}, "none.onnx: field 'file'"),
+        ({"policy": "go_to_gaol"}, "did you mean 'go_to_goal'"),
+        ({"rate": -1.0}, "rate -1.0"),
+    ],
+)
+def test_what_cannot_be_driven_ends_it_with_one_sentence(
+    launch, meet, domain_id, parameters, words
+):
+    node = launch("policy_node", domain_id, **parameters)
+    assert node._process.wait(60) == 2
+    assert words in node.log.read_text(encoding="utf-8")
+    assert "Traceback" not in node.log.read_text(encoding="utf-8")
+
+
+def test_inferences_that_are_late_every_time_command_zero(launch, meet, domain_id, file, model):
+    launch("policy_node", domain_id, policy=str(file), goal=GOAL, deadline=1e-9, late_limit=3)
+    robot = Robot(meet(domain_id))
+    assert robot.hears(scan_of(model.lidar.angles)).tolist() == [0.0, 0.0, 0.0]
+    assert all(conversions.twist_from_ros(raw.twist).tolist() == [0.0] * 3 for raw in robot.raw)
