@@ -12,9 +12,7 @@ from nics_drl_bridge.commands.console import one_sentence, progress_bar
 
 def train(
     more_seeds: Annotated[list[int] | None, typer.Argument(hidden=True)] = None,
-    task: Annotated[
-        str, typer.Option(help="A task, or path/to/file.py:ClassName.")
-    ] = "navigation",
+    task: Annotated[str, typer.Option(help="A task, or path/to/file.py:ClassName.")] = "navigation",
     robot: Annotated[
         str | None,
         typer.Option(help="A shipped robot (differential), or the folder of a model."),
@@ -52,8 +50,7 @@ def train(
             from nics_drl_bridge.policy import train_run
         except ModuleNotFoundError as error:
             raise ConfigError(
-                f"training needs the module {error.name!r}; "
-                "pip install 'nics_drl_bridge[train]'."
+                f"training needs the module {error.name!r}; pip install 'nics_drl_bridge[train]'."
             ) from None
         if resume and out is not None:
             chosen = train_run.settings_of(out)

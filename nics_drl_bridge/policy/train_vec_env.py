@@ -81,9 +81,7 @@ class TrainVecEnv(VecEnv):
         for n in self._told:  # fresh ones: an algorithm may still hold those it was given
             self._infos[n] = {}
         self._told = []
-        parts = [
-            self._step_env(env, rows) for env, rows in zip(self.envs, self._rows, strict=True)
-        ]
+        parts = [self._step_env(env, rows) for env, rows in zip(self.envs, self._rows, strict=True)]
         observation, reward, done = (_together(list(each)) for each in zip(*parts, strict=True))
         self.stepping_s += time.perf_counter() - begin
         return observation, reward.astype(np.float32), done, list(self._infos)

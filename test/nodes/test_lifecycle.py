@@ -109,5 +109,3 @@ def test_a_middleware_publishes_its_estimate_only_while_active_and_its_health_al
     assert stamp_ns(filtered[-1]) == last
     assert lead(managed, "middleware_node", "cleanup")
     managed.until(lambda: message() == "unconfigured", "a diagnosis")
-
-
