@@ -44,7 +44,7 @@ EXTRAS = {
         "tensorboard>=2.16",
         "torch>=2.3,<2.14",
     ],
-    "deploy": ["onnxruntime>=1.18"],
+    "deploy": ["onnx>=1.16", "onnxruntime>=1.18"],
     "test": [
         "build",
         "colcon-bash",
@@ -76,12 +76,12 @@ def text_of(tag: str) -> str:
 
 
 def data_files() -> list[tuple[str, list[str]]]:
-    """What goes to share/: the ament index marker, package.xml, config and launch files."""
+    """What goes to share/: the ament index marker, package.xml, config, launch files, URDF."""
     by_folder = {
         "share/ament_index/resource_index/packages": [f"resource/{PACKAGE}"],
         SHARE: ["package.xml"],
     }
-    for top in ("config", "launch"):
+    for top in ("config", "launch", "urdf"):
         for path in sorted((ROOT / top).rglob("*")):
             file = path.relative_to(ROOT)
             if path.is_file() and "__pycache__" not in file.parts:

@@ -1,54 +1,44 @@
-"""Middleware, policy and gate on a robot's topics; with `simulation:=true`, a simulator too.
+"""Middleware, policy and gate on a robot's topics.
 
-ros2 launch nics_drl_bridge bridge.launch.py simulation:=true
-ros2 topic pub --once /goal_pose geometry_msgs/PoseStamped '{pose: {position: {x: 1.0}}}'
+ros2 launch nics_drl_bridge bridge.launch.py namespace:=car
 """
 
-from pathlib import Path
-
-from ament_index_python.packages import get_package_share_directory
 from launch.actions import DeclareLaunchArgument
-from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
 
 PACKAGE = "nics_drl_bridge"
+DEFAULT = PathJoinSubstitution([FindPackageShare(PACKAGE), "config", "nodes", "bridge.yaml"])
 
 
 def generate_launch_description():
-    share = Path(get_package_share_directory(PACKAGE))
-    arguments = {
-        "namespace": ("", "Namespace of the robot"),
-        "params_file": (str(share / "config" / "nodes" / "bridge.yaml"), "Parameters of all nodes"),
-        "use_sim_time": ("false", "Take the time from /clock"),
-        "log_level": ("info", "Log level of all nodes"),
-        "simulation": ("false", "Start the simulator as well"),
-    }
-    value = {name: LaunchConfiguration(name) for name in arguments}
+    use_sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
+    autostart = ParameterValue(LaunchConfiguration("autostart"), value_type=bool)
 
-    def node(executable, condition=None):
+    def node(name, **more):
         return Node(
             package=PACKAGE,
-            executable=executable,
-            name=executable,
-            namespace=value["namespace"],
-            parameters=[value["params_file"], {"use_sim_time": value["use_sim_time"]}],
-            arguments=["--ros-args", "--log-level", value["log_level"]],
+            executable=name,
+            name=name,
+            namespace=LaunchConfiguration("namespace"),
+            parameters=[LaunchConfiguration("params_file"), {"use_sim_time": use_sim_time, **more}],
+            arguments=["--ros-args", "--log-level", LaunchConfiguration("log_level")],
             output="screen",
-            condition=condition,
         )
 
     return LaunchDescription(
         [
-            *(
-                DeclareLaunchArgument(name, default_value=default, description=text)
-                for name, (default, text) in arguments.items()
-            ),
-            node("simulator_node", IfCondition(value["simulation"])),
-            node("middleware_node"),
+            DeclareLaunchArgument("namespace", default_value="", description="Of the robot"),
+            DeclareLaunchArgument("params_file", default_value=DEFAULT, description="Of all nodes"),
+            DeclareLaunchArgument("use_sim_time", default_value="false", description="Use /clock"),
+            DeclareLaunchArgument("autostart", default_value="true", description="Lead lifecycles"),
+            DeclareLaunchArgument("log_level", default_value="info", description="Of all nodes"),
             node("command_gate"),
-            node("policy_node"),
+            node("middleware_node", autostart=autostart),
+            node("policy_node", autostart=autostart),
         ]
     )

@@ -10,9 +10,11 @@ from nics_drl_bridge import __version__
 from nics_drl_bridge.commands.bake import bake
 from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.generate import generate
+from nics_drl_bridge.commands.policy import policy
 from nics_drl_bridge.commands.record import record
 from nics_drl_bridge.commands.replay import replay
 from nics_drl_bridge.commands.train import train
+from nics_drl_bridge.commands.urdf import urdf
 
 app = typer.Typer(
     help="From a recording of a robot to a fast simulator, and back to the robot over ROS 2.",
@@ -40,8 +42,9 @@ def _options(
     """Options of every command."""
 
 
-for command in (generate, bake, record, replay, train, demo):
+for command in (generate, bake, record, replay, urdf, train, demo):
     app.command()(command)
+app.add_typer(policy, name="policy")
 
 
 def main() -> None:

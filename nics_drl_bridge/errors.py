@@ -39,6 +39,21 @@ class BackendError(BridgeError):
     """A backend (simulator, ROS 2 graph, vehicle) does not answer as it must."""
 
 
+class PolicyError(BridgeError):
+    """A policy file can't be used, or does not fit the robot.
+
+    Attributes:
+        field: what is wrong in it, as `lidar.beams`.
+    """
+
+    def __init__(self, source: str, field: str, reason: str) -> None:
+        self.source, self.field, self.reason = source, field, reason
+        super().__init__(f"{source}: field {field!r}: {reason}")
+
+    def __reduce__(self) -> tuple[type[PolicyError], tuple[str, str, str]]:
+        return type(self), (self.source, self.field, self.reason)  # so that it can be pickled
+
+
 class StaleDataError(BackendError):
     """No fresh data came in time.
 

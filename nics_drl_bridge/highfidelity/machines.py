@@ -12,6 +12,7 @@ from nics_drl_bridge.highfidelity import machine
 from nics_drl_bridge.highfidelity.machine import Machine, Motor, Physics
 from nics_drl_bridge.highfidelity.rollers import roller_wheel
 from nics_drl_bridge.kinematics.spec import RobotSpec, require_textbook
+from nics_drl_bridge.kinematics.urdf import car_wheels
 
 Array = NDArray[np.float64]
 Parameters = dict[str, float]
@@ -53,7 +54,7 @@ def ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
     tendon that averages their speeds, which shares its torque as a differential does.
     """
     wheelbase = p["wheelbase"]
-    track, radius = p.get("track", 0.8 * wheelbase), p.get("wheel_radius", 0.18 * wheelbase)
+    track, radius = car_wheels(p)
     total = physics.mass + 4 * physics.wheel_mass
     engine = machine.motor(
         (total + 2 * physics.wheel_mass) * radius**2, p["speed_lag"], radius, step, physics

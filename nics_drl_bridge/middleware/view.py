@@ -74,6 +74,11 @@ class Middleware:
         self.estimator.reset(time_ns, pose, std)
         self._timeline.reset()
 
+    def expect_beams(self, beams: int) -> None:
+        """Takes scans of so many beams from now on; the newest one is forgotten."""
+        self._beams, self._unknown = beams, np.full(beams, np.nan, np.float32)
+        self.cache.newest.pop(SCAN, None)
+
     def command(
         self, stamp_ns: int | None, command: ArrayLike, arrival_ns: int | None = None
     ) -> bool:

@@ -10,7 +10,6 @@ from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
@@ -18,6 +17,7 @@ from std_srvs.srv import Trigger
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.gate_parameters import declare_gate
+from nics_drl_bridge.nodes.qos_watch import QosWatch
 from nics_drl_bridge.nodes.runner import last_word, run_node
 from nics_drl_bridge.safety.black_box import Entry
 from nics_drl_bridge.safety.gate import decide
@@ -39,7 +39,7 @@ PERIOD_S = 0.02
 DIAGNOSTICS_PERIOD_S = 1.0
 
 
-class CommandGate(Node):
+class CommandGate(QosWatch):
     """Stands between `cmd_vel_raw` and `cmd_vel`, in a process of its own.
 
     It starts disarmed. `~/arm` lets commands pass if nothing speaks against it, `~/e_stop`

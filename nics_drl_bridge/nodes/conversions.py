@@ -14,8 +14,9 @@ from sensor_msgs.msg import Imu, JointState, LaserScan
 
 from nics_drl_bridge.kinematics.joints import POSITION_UNITS
 from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.lidar.canonical import Reader, reader_of
 from nics_drl_bridge.lidar.rep117 import from_device, to_device
-from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader
 
 Array = NDArray[np.float64]
 NANO = 1_000_000_000
@@ -86,6 +87,30 @@ def scan_to_ros(
 def scan_from_ros(spec: LidarSpec, message: LaserScan) -> NDArray[np.float32]:
     """Ranges (B,) of a LaserScan of the device, REP-117."""
     return from_device(message.ranges, spec)
+
+
+def reader_from_ros(message: LaserScan, like: LidarSpec, upside_down: bool = False) -> Reader:
+    """The lidar of a LaserScan and the order of its beams.
+
+    Args:
+        message: whose header describes it.
+        like: what is expected; it is the answer where the header says the same.
+        upside_down: whether the device hangs with its z axis down.
+
+    Raises:
+        ConfigError: the header describes no lidar.
+    """
+    header = ScanHeader(*(float(getattr(message, name)) for name in ScanHeader._fields))
+    found = reader_of(header, len(message.ranges), like, upside_down)
+    limits = np.array([found.lidar.range_min, found.lidar.range_max])
+    same = found.lidar.beams == like.beams and np.allclose(
+        limits, [like.range_min, like.range_max], rtol=1e-4, atol=1e-4
+    )
+    turned = found.lidar.angles - like.angles if same else np.ones(1)
+    whole = 2.0 * np.pi * np.round(turned[0] / (2.0 * np.pi))  # the same beams, by other names
+    if same and np.abs(turned - whole).max() < 0.1 * like.angle_increment:
+        return Reader(like, found.backwards)
+    return found
 
 
 def odometry_to_ros(

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
+from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.context import Context
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 
 from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.nodes.qos_watch import QosWatch
 from nics_drl_bridge.nodes.runner import declare
 
 UNCONFIGURED, INACTIVE, ACTIVE = "unconfigured", "inactive", "active"
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
-class ManagedNode(LifecycleNode):
+class ManagedNode(QosWatch, LifecycleNode):
     """A node that `ros2 lifecycle` and Nav2's lifecycle manager can lead through its states.
 
     With the parameter `autostart`, which is the default, it configures and activates itself. A
@@ -40,6 +43,11 @@ class ManagedNode(LifecycleNode):
         self._state, self._starting = UNCONFIGURED, False
         self._failure: Exception | None = None
         self.add_on_set_parameters_callback(self._check_fixed)
+
+    def create_lifecycle_publisher(self, kind: Any, topic: str, qos: Any) -> Publisher:
+        """A publisher that is silent unless the node is active."""
+        events = self.publisher_events(topic, qos)
+        return super().create_lifecycle_publisher(kind, topic, qos, event_callbacks=events)
 
     def configure(self) -> None:
         """Makes what the parameters ask for.

@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
+
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from numpy.typing import NDArray
+from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 
-from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.view import rehearse
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
 from nics_drl_bridge.nodes.runner import declare, declare_model_name, last_word, run_node
-from nics_drl_bridge.policy.policies import make_policy
+from nics_drl_bridge.policy.pacing import Answer, Deadline, Pace
+from nics_drl_bridge.policy.policies import open_policy
 
-ODOM = "odom"
+POLLS = 0.1
+"""How often it looks whether it is time to act, in shares of the control period."""
+DIAGNOSTICS_PERIOD_S = 1.0
 
 
 class PolicyNode(ManagedNode):
-    """Answers each scan with `cmd_vel_raw`, stamped with that scan, until the goal is reached.
+    """Answers scans with `cmd_vel_raw`, stamped with its scan, until the goal is reached.
 
-    It observes through the same task as the Gymnasium env. The goal, in `map`, is a parameter
+    It observes through the same task as the Gymnasium env, at a fixed rate of the steady clock: it
+    acts at most once in a control period and on each scan. An inference that takes longer than the
+    deadline is dropped; after several in a row it commands zero. The goal, in `map`, is a parameter
     at the start and the topic `goal_pose` afterwards. It listens when it is configured and commands
     when it is active; the last that it says before it is no longer is zero.
 
@@ -36,18 +47,30 @@ class PolicyNode(ManagedNode):
         super().__init__("policy_node", context)
         declare_model_name(self)
         declare_sensors(self)
-        declare(self, "policy", "go_to_goal", "Name of a policy.", read_only=True)
+        about = "A policy file (*.onnx), or the name of a shipped one or of a baseline."
+        declare(self, "policy", "go_to_goal", about, read_only=True)
         declare(self, "base_frame", "base_link", "Frame id of the robot.")
         about = "x, y in map [m]; NaN waits for goal_pose."
         declare(self, "goal", [float("nan")] * 2, about, read_only=True)
+        about = (
+            "Actions per second of the steady clock; NaN: of the control period; 0: one for each "
+            "scan, for a simulator that is not in real time."
+        )
+        declare(self, "rate", float("nan"), about, read_only=True)
+        about = "Longest time of an inference [s]; NaN: half the control period."
+        declare(self, "deadline", float("nan"), about, read_only=True)
+        about = "So many late inferences in a row command zero."
+        declare(self, "late_limit", 3, about, read_only=True)
         self._acted_ns = 0
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
     def configure(self) -> None:
         """Opens model and policy, and listens."""
-        model = open_model(str(self.get_parameter("model").value))
-        self._task = Navigation(model.robot, model.lidar)
-        self._policy = make_policy(str(self.get_parameter("policy").value), self._task)
+        model = self._model = open_model(str(self.get_parameter("model").value))
+        name = str(self.get_parameter("policy").value)
+        self._policy, self._task = open_policy(name, model)
         self._goal: NDArray[np.float64] = self._declared_goal()
+        self._pace, self._deadline = self._declared_pace(model.control_period)
         view = rehearse(model)
         self._task.judge(view, {"goal": np.zeros(2)})
         self._command(view, np.zeros(2))
@@ -55,12 +78,43 @@ class PolicyNode(ManagedNode):
         self.undo.callback(self.destroy_lifecycle_publisher, self._raw)
         goals = self.create_subscription(PoseStamped, "goal_pose", self._on_goal, qos.COMMAND)
         self.undo.callback(self.destroy_subscription, goals)
-        self._topics = RobotTopics(self, model, on_odometry=self._act, on_scan=self._act)
+        self._topics = RobotTopics(
+            self, model, on_odometry=self._act, on_scan=self._act, on_lidar=self._on_lidar
+        )
         self.undo.callback(self._topics.close)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        for period, tick in (
+            (POLLS * model.control_period, self._act),
+            (DIAGNOSTICS_PERIOD_S, self._diagnose),
+        ):
+            self.undo.callback(self.destroy_timer, self.create_timer(period, tick, clock=steady))
 
     def deactivate(self) -> None:
         """Leaves a zero command behind."""
         last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
+
+    def _declared_pace(self, control_period: float) -> tuple[Pace, Deadline]:
+        rate, limit, patience = (
+            self.get_parameter(name).value for name in ("rate", "deadline", "late_limit")
+        )
+        if rate < 0.0 or limit <= 0.0 or patience < 1:
+            raise ConfigError(
+                f"parameters rate {rate}, deadline {limit}, late_limit {patience}: must be at "
+                "least 0, more than 0, and at least 1."
+            )
+        period = control_period if np.isnan(rate) else 1.0 / rate if rate > 0.0 else 0.0
+        return Pace(period), Deadline(0.5 * control_period if np.isnan(limit) else limit, patience)
+
+    def _on_lidar(self, lidar: LidarSpec) -> None:
+        """Looks through another lidar from now on. Raises ConfigError where that can't be done."""
+        name = str(self.get_parameter("policy").value)
+        self._policy, self._task = open_policy(name, replace(self._model, lidar=lidar))
+        begin, end = np.degrees([lidar.angles[0], lidar.angles[-1]])
+        self.get_logger().info(
+            f"scans of {lidar.beams} beams from {begin:.4g} to {end:.4g} deg are resampled"
+            if self._task.scan is not None
+            else f"scans of {lidar.beams} beams from {begin:.4g} to {end:.4g} deg are used"
+        )
 
     def _declared_goal(self) -> NDArray[np.float64]:
         goal = self.get_parameter("goal").value
@@ -72,18 +126,45 @@ class PolicyNode(ManagedNode):
         self._goal = np.array([message.pose.position.x, message.pose.position.y])
         self.get_logger().info(f"new goal ({self._goal[0]:.2f}, {self._goal[1]:.2f}) m")
 
-    def _act(self, _: int) -> None:
-        """Acts once per scan, as soon as an odometry at least as new is there."""
+    def _act(self, _: int = 0) -> None:
+        """Acts when it is time, once per scan, with an odometry at least as new."""
         if self.state != ACTIVE:
             return
         newest = self._topics.middleware.cache.newest
-        if "scan" not in newest or ODOM not in newest:
+        if SCAN not in newest or ODOM not in newest:
             return
-        scan_ns = newest["scan"].stamp_ns
+        scan_ns, begin_s = newest[SCAN].stamp_ns, time.monotonic()
         if newest[ODOM].stamp_ns < scan_ns or scan_ns <= self._acted_ns:
             return
+        if not self._pace.due(begin_s):
+            return
+        self._pace.acted(begin_s)
         self._acted_ns = scan_ns
-        self._raw.publish(self._message(self._twist(), scan_ns))
+        twist = self._twist()
+        answer = self._deadline.judge(time.monotonic() - begin_s)
+        if answer is not Answer.SEND:
+            self.get_logger().warning(
+                f"inference was late ({self._deadline.late} so far), its command is dropped",
+                throttle_duration_sec=5.0,
+            )
+        if answer is not Answer.DROP:
+            sent = twist if answer is Answer.SEND and np.isfinite(twist).all() else np.zeros(3)
+            self._raw.publish(self._message(sent, scan_ns))
+
+    def _diagnose(self) -> None:
+        deadline = self._deadline
+        status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: policy")
+        status.level = DiagnosticStatus.WARN if deadline.late else DiagnosticStatus.OK
+        status.message = f"{self.state}; {deadline.late} late inferences"
+        told = {
+            "answered": str(deadline.answered),
+            "late": str(deadline.late),
+            "longest inference [ms]": f"{1e3 * deadline.longest_s:.2f}",
+        }
+        status.values = [KeyValue(key=key, value=value) for key, value in told.items()]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
 
     def _twist(self) -> NDArray[np.float64]:
         """The command (3,) for the present view; zero without a goal, at it, or at a touch.

@@ -10,9 +10,12 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, LaserScan
 
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import BridgeError, ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.lidar.canonical import Reader
+from nics_drl_bridge.lidar.rep117 import from_device
+from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.view import Middleware
 from nics_drl_bridge.nodes import conversions, qos
@@ -31,6 +34,8 @@ def declare_sensors(node: Node) -> None:
     """Declares which sensors a robot has beside scan and odometry."""
     about = f"Type of `{POSE}`, in the map frame: {NO_POSE}, {', '.join(POSE_TYPES)}."
     declare(node, "pose_type", NO_POSE, about, read_only=True)
+    about = "Whether the lidar hangs with its z axis down, so that its beams come clockwise."
+    declare(node, "lidar_upside_down", False, about, read_only=True)
     declare(node, "use_imu", False, "Whether to use the yaw rate of `imu`.", read_only=True)
 
 
@@ -48,6 +53,9 @@ class RobotTopics:
         model: of the robot.
         on_odometry: called with the stamp [ns] after each odometry that is the newest.
         on_scan: called with the stamp [ns] after each scan that was used.
+        on_lidar: called when scans come whose header is not that of the model's lidar, with what
+            they come from; it raises ConfigError where that can't be used. Without it, and then,
+            such scans are rejected.
 
     Raises:
         ConfigError: no such `pose_type`.
@@ -59,11 +67,15 @@ class RobotTopics:
         model: SimulatorModel,
         on_odometry: Callable[[int], None] | None = None,
         on_scan: Callable[[int], None] | None = None,
+        on_lidar: Callable[[LidarSpec], None] | None = None,
     ) -> None:
         self._node, self._robot, self._lidar = node, model.robot, model.lidar
+        self._model = model
         self.middleware = Middleware(model)
         self.restart()
-        self._on_odometry, self._on_scan = on_odometry, on_scan
+        self._on_odometry, self._on_scan, self._on_lidar = on_odometry, on_scan, on_lidar
+        self._reader: Reader | None = Reader(model.lidar, backwards=False)
+        self._header, self._told = b"", ""
         self._subscriptions = [
             node.create_subscription(LaserScan, SCAN, self._take_scan, qos.SENSOR),
             node.create_subscription(Odometry, ODOM, self._take_odometry, qos.SENSOR),
@@ -119,10 +131,38 @@ class RobotTopics:
 
     def _take_scan(self, message: LaserScan) -> None:
         stamp = conversions.stamp_from_ros(message.header.stamp)
-        ranges = conversions.scan_from_ros(self._lidar, message)
+        reader = self._reader_for(message)
+        if reader is None:
+            self.middleware.cache.reject(f"{SCAN}: another lidar")
+            return
+        ordered = reader.ordered(np.asarray(message.ranges, np.float32))
+        ranges = from_device(np.ascontiguousarray(ordered), reader.lidar)
         used = self.middleware.scan(stamp, self.now_ns(), ranges)
         if used and self._on_scan is not None:
             self._on_scan(stamp)
+
+    def _reader_for(self, message: LaserScan) -> Reader | None:
+        """How to read a scan; None when it can't be used, which is told once for each header."""
+        fields = [message.angle_min, message.angle_increment, message.range_min, message.range_max]
+        header = np.array([*fields, len(message.ranges)], np.float32).tobytes()
+        if header != self._header and self._on_lidar is not None:
+            self._header, self._reader = header, self._follow(message)
+        return self._reader
+
+    def _follow(self, message: LaserScan) -> Reader | None:
+        upside_down = bool(self._node.get_parameter("lidar_upside_down").value)
+        try:
+            reader = conversions.reader_from_ros(message, self._model.lidar, upside_down)
+            if reader.lidar != self._lidar and self._on_lidar is not None:
+                self._on_lidar(reader.lidar)
+                self.middleware.expect_beams(reader.lidar.beams)
+                self._lidar = reader.lidar
+        except BridgeError as error:
+            if str(error) != self._told:
+                self._node.get_logger().error(f"{SCAN} is not used: {error}")
+            self._told = str(error)
+            return None
+        return reader
 
     def _take_odometry(self, message: Odometry) -> None:
         stamp = conversions.stamp_from_ros(message.header.stamp)

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
@@ -20,10 +20,15 @@ from rclpy.publisher import Publisher
 
 from nics_drl_bridge.errors import BackendError, BridgeError
 from nics_drl_bridge.generator import SimulatorModel, open_model
+from nics_drl_bridge.nodes.overrides import warn_of_unknown, widen
 
 SPIN_S = 0.1
 DELIVERY_S = 0.5
 EXIT_BAD_INPUT = 2
+RANGES = {
+    int: (IntegerRange, "integer_range"),
+    float: (FloatingPointRange, "floating_point_range"),
+}
 
 
 def open_context(args: Sequence[str] | None = None, domain_id: int | None = None) -> Context:
@@ -65,15 +70,25 @@ def run_node(make: Callable[[Context], Node], args: Sequence[str] | None = None)
         make: makes the node in a context of its own.
         args: the command line, `sys.argv` by default.
     """
-    stopping = threading.Event()
+    stopping, starting = threading.Event(), threading.Event()
+    starting.set()
+
+    def end(*_: Any) -> None:
+        stopping.set()
+        if starting.is_set():  # it may be compiling, which can take longer than a launch waits
+            starting.clear()
+            raise SystemExit(0)
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stopping.set())
+        signal.signal(number, end)
     context, node = None, None
     try:
         context = open_context(sys.argv if args is None else args)
         node = make(context)
         if hasattr(node, "start"):
             node.start()
+        warn_of_unknown(node)
+        starting.clear()
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
         with contextlib.suppress(ExternalShutdownException):
@@ -81,9 +96,10 @@ def run_node(make: Callable[[Context], Node], args: Sequence[str] | None = None)
                 executor.spin_once(timeout_sec=SPIN_S)
         executor.shutdown(timeout_sec=1.0)
     except (BridgeError, ParameterException) as error:
-        sys.stderr.write(f"{error}\n")
+        sys.stderr.write(f"{' '.join(str(error).split())}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
     finally:
+        starting.clear()
         if node is not None:
             if node.context.ok() and hasattr(node, "stop"):
                 node.stop()
@@ -111,7 +127,7 @@ def declare(node: Node, name: str, default: Any, description: str, **limits: Any
         name: of the parameter.
         default: gives the type too.
         description: for `ros2 param describe`.
-        limits: `low` and `high` of a floating-point parameter; `read_only`, which in a managed node
+        limits: `low` and `high` of a number; `read_only`, which in a managed node
             is so from configure to cleanup.
     """
     fixed = limits.get("read_only", False)
@@ -120,6 +136,8 @@ def declare(node: Node, name: str, default: Any, description: str, **limits: Any
         fixed = False
     descriptor = ParameterDescriptor(description=description, read_only=fixed)
     if "low" in limits:
-        span = FloatingPointRange(from_value=limits["low"], to_value=limits["high"])
-        descriptor.floating_point_range = [span]
+        kind, field = RANGES[type(default)]
+        span = kind(from_value=limits["low"], to_value=limits["high"])
+        setattr(descriptor, field, [span])
+    widen(node, name, default)
     return node.declare_parameter(name, default, descriptor).value

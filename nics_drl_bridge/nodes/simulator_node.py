@@ -14,7 +14,6 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock as SteadyClock
 from rclpy.clock import ClockType
 from rclpy.context import Context
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, LaserScan
@@ -24,6 +23,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BridgeError, ConfigError, nearest
 from nics_drl_bridge.lidar.scanner import RENDERERS
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.qos_watch import QosWatch
 from nics_drl_bridge.nodes.runner import declare, declare_model, run_node
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
@@ -34,7 +34,7 @@ COVARIANCE_GROWTH_S = 1.0
 """An odometry pose is given the variance of this many seconds of drift at least."""
 
 
-class SimulatorNode(Node):
+class SimulatorNode(QosWatch):
     """Takes `cmd_vel`, publishes `scan`, `odom`, `joint_states`, `ground_truth` and `/clock`.
 
     Stamps are simulated time, as on `/clock`: it begins at the system's time and never runs

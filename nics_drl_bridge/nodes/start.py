@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from importlib import import_module
 
@@ -11,6 +12,8 @@ EXIT_BAD_INPUT = 2
 
 
 def _start(node: str) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):  # to import takes seconds
+        signal.signal(number, lambda *_: sys.exit(0))
     try:
         module = import_module(f"nics_drl_bridge.nodes.{node}")
     except ModuleNotFoundError as error:

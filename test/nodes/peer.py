@@ -63,12 +63,14 @@ class Peer:
         )
         return publisher
 
-    def call(self, kind: Any, service: str, request: Any = None) -> Any:
+    def call(
+        self, kind: Any, service: str, request: Any = None, deadline_s: float = DEADLINE_S
+    ) -> Any:
         """The answer of a service."""
         client = self.node.create_client(kind, service)
         self.until(client.service_is_ready, f"the service {service}")
         future = client.call_async(kind.Request() if request is None else request)
-        self.until(future.done, f"an answer of {service}")
+        self.until(future.done, f"an answer of {service}", deadline_s)
         self.node.destroy_client(client)
         return future.result()
 

@@ -33,7 +33,8 @@ def managed(launch, meet, module_domain_id):
 def lead(peer, node, transition):
     request = ChangeState.Request()
     request.transition.label = transition
-    return peer.call(ChangeState, f"{node}/change_state", request).success
+    # To configure may mean to compile.
+    return peer.call(ChangeState, f"{node}/change_state", request, 200.0).success
 
 
 def state(peer, node):

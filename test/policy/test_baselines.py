@@ -9,7 +9,7 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.policy.evaluation_batch import drive_worlds
-from nics_drl_bridge.policy.policies import POLICIES, act_all, make_policy
+from nics_drl_bridge.policy.policies import POLICIES, make_policy
 
 ROBOTS = ("ackermann", "differential", "mecanum")
 
@@ -39,7 +39,7 @@ def test_any_observation_gives_an_action_of_the_space_alone_as_among_many(robot,
     for _ in range(20):
         ranges = rng.choice([np.inf, -np.inf, np.nan, 0.3, 1.0], 90).astype(np.float32)
         seen.append(observe(task, rng.uniform(-3, 3), rng.uniform(0, 5), ranges))
-    actions = act_all(among)(np.array(seen))
+    actions = among.act(np.array(seen))
     for observation, action in zip(seen, actions, strict=True):
         mine = alone.act(observation)
         assert task.action_space.contains(mine)
@@ -84,7 +84,7 @@ def test_random_actions_are_those_of_the_seed():
 def test_the_planner_reaches_most_goals_where_straight_ones_collide(robot):
     env = BridgeVectorEnv(30, robot, "arena", max_episode_steps=200)
     share = {
-        name: drive_worlds(env, act_all(make_policy(name, env.task)), range(30)).success.mean()
+        name: drive_worlds(env, make_policy(name, env.task).act, range(30)).success.mean()
         for name in ("dynamic_window", "straight", "random")
     }
     assert share["dynamic_window"] >= 0.8

@@ -1,0 +1,290 @@
+"""The contract of a policy file: what it was trained on, and what it must run on."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from nics_drl_bridge.config import Schema, validate
+from nics_drl_bridge.env.task import Task
+from nics_drl_bridge.env.tasks import TASKS
+from nics_drl_bridge.errors import ConfigError, PolicyError
+from nics_drl_bridge.files import sha256
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.lidar.canonical import ScanLayout
+from nics_drl_bridge.lidar.spec import LidarSpec
+
+FORMAT = "nics_drl_bridge/policy/1"
+GOLDEN = 16
+CHECKSUM = 8
+"""Hexadecimal digits of a field's checksum; it finds mistakes, it is no signature."""
+Rows = NDArray[np.float32]
+
+
+class TaskEntry(Schema):
+    """The task of a policy.
+
+    Attributes:
+        name: as in `env.tasks.TASKS`, or the name of a class of one's own.
+        options: all of its options but `scan`.
+        sha256: over name, options and observation.
+    """
+
+    name: str = Field(min_length=1)
+    options: dict[str, Any]
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+
+
+class ObservationEntry(Schema):
+    """What the network takes.
+
+    Attributes:
+        size: O, parts.
+        scan_parts: P, the first ones, which are a scan.
+        rest_low, rest_high: (O - P) limits of the others.
+    """
+
+    size: int = Field(ge=1, le=200_000)
+    scan_parts: int = Field(ge=0)
+    rest_low: tuple[float, ...]
+    rest_high: tuple[float, ...]
+
+
+class GoldenEntry(Schema):
+    """Sixteen pairs that must reproduce; float32, little endian, in base 64.
+
+    Attributes:
+        observations: (16, O).
+        actions: (16, C) continuous, or (16, 1) discrete.
+        commands: (16, C), SI.
+    """
+
+    observations: str
+    actions: str
+    commands: str
+
+    def rows(self, name: str) -> Rows:
+        """One of them as (16, ...). Raises ValueError when it is damaged."""
+        data = base64.b64decode(getattr(self, name), validate=True)
+        return np.frombuffer(data, "<f4").reshape(GOLDEN, -1)
+
+
+class Contract(Schema):
+    """All that a policy file says about itself.
+
+    Attributes:
+        format: of the file.
+        robot: whose commands it gives.
+        lidar: that it was trained with.
+        scan: the sectors that it sees; None: the beams of exactly this lidar.
+        task: what it was trained to do.
+        observation: what the network takes.
+        actions: `continuous` or `discrete`.
+        control_period: time between commands [s].
+        model_fingerprint: of the SimulatorModel that it was trained in.
+        provenance: command, seed, versions: how it came about.
+        graph_sha256: over the graph, weights included.
+        golden: pairs that must reproduce.
+        checksums: of each entry above, by its path.
+    """
+
+    format: Literal["nics_drl_bridge/policy/1"]
+    robot: RobotSpec
+    lidar: LidarSpec
+    scan: ScanLayout | None
+    task: TaskEntry
+    observation: ObservationEntry
+    actions: Literal["continuous", "discrete"]
+    control_period: float = Field(gt=0.0, le=10.0)
+    model_fingerprint: str = Field(pattern="^[0-9a-f]{16}$")
+    provenance: dict[str, Any]
+    graph_sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    golden: GoldenEntry
+    checksums: dict[str, str]
+
+    @field_validator("provenance")
+    @classmethod
+    def _plain(cls, provenance: dict[str, Any]) -> dict[str, Any]:
+        if any(not isinstance(v, str | int | float | bool | None) for v in provenance.values()):
+            raise ValueError("must hold words and numbers only")
+        return provenance
+
+
+def contract_of(
+    task: Task,
+    model: SimulatorModel,
+    golden: Mapping[str, Rows],
+    graph_sha256: str,
+    provenance: Mapping[str, Any],
+) -> str:
+    """The contract of a policy for a task of a robot, as JSON.
+
+    Args:
+        task: gives observation, action, scan and options.
+        model: that it was trained in.
+        golden: the arrays of `GoldenEntry` by name.
+        graph_sha256: see `Contract`.
+        provenance: words and numbers.
+
+    Raises:
+        ConfigError: an entry is not of its kind.
+    """
+    data = {
+        "format": FORMAT,
+        "robot": task.robot.model_dump(mode="json"),
+        "lidar": task.lidar.model_dump(mode="json"),
+        "scan": None if task.scan is None else task.scan.model_dump(mode="json"),
+        "task": {**task_entry(task), "sha256": task_hash(task)},
+        "observation": observation_entry(task),
+        "actions": task.actions,
+        "control_period": model.control_period,
+        "model_fingerprint": model.fingerprint,
+        "provenance": dict(provenance),
+        "graph_sha256": graph_sha256,
+        "golden": {
+            name: base64.b64encode(np.ascontiguousarray(rows, "<f4").tobytes()).decode()
+            for name, rows in golden.items()
+        },
+    }
+    data["checksums"] = checksums(data)
+    validate(data, Contract, "policy")
+    return json.dumps(data, allow_nan=False)
+
+
+def task_entry(task: Task) -> dict[str, Any]:
+    """Name and options of a task."""
+    kind = type(task)
+    path = f"{kind.__module__}:{kind.__name__}"
+    name = next((name for name, place in TASKS.items() if place == path), kind.__name__)
+    options = {
+        field.name: getattr(task, field.name)
+        for field in dataclasses.fields(task)
+        if field.init and field.name not in ("robot", "lidar", "scan")
+    }
+    return {"name": name, "options": options}
+
+
+def observation_entry(task: Task) -> dict[str, Any]:
+    """What a task observes."""
+    space, parts = task.observation_space, task.scan_parts
+    return {
+        "size": int(space.shape[0]),
+        "scan_parts": parts,
+        "rest_low": [float(value) for value in space.low[parts:]],
+        "rest_high": [float(value) for value in space.high[parts:]],
+    }
+
+
+def task_hash(task: Task) -> str:
+    """Tells two tasks apart: SHA-256 over name, options and observation."""
+    return hash_of(task_entry(task), observation_entry(task))
+
+
+def hash_of(entry: Mapping[str, Any], observation: Mapping[str, Any]) -> str:
+    """`task_hash` from the entries of a contract."""
+    known = {"name": entry["name"], "options": entry["options"], "observation": dict(observation)}
+    return sha256(json.dumps(known, sort_keys=True).encode())
+
+
+def leaves(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Every entry of nested mappings and lists, with its path, as `robot.command.0.max`."""
+    if isinstance(data, dict | list) and data:
+        items = data.items() if isinstance(data, dict) else enumerate(data)
+        for key, value in items:
+            yield from leaves(value, f"{path}.{key}" if path else str(key))
+    else:
+        yield path, data
+
+
+def checksums(data: Mapping[str, Any]) -> dict[str, str]:
+    """A checksum of each entry but `checksums`, by its path."""
+    known = {name: value for name, value in data.items() if name != "checksums"}
+    return {path: sha256(json.dumps(v).encode())[:CHECKSUM] for path, v in leaves(known)}
+
+
+def read_contract(text: str, source: str) -> Contract:
+    """Reads and checks the contract of a policy file.
+
+    Raises:
+        PolicyError: an entry is missing, unknown, of a wrong kind, changed after the export, or
+            does not agree with another; the field is named.
+    """
+    try:
+        data = json.loads(text, object_pairs_hook=_once, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        reason = f"is not JSON as `export_policy` writes it ({str(error)[:80]})"
+        raise PolicyError(source, "metadata", f"{reason}; export the policy anew.") from None
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        given = data.get("format") if isinstance(data, dict) else None
+        raise PolicyError(
+            source, "format", f"is {given!r}, not {FORMAT!r}; export the policy with this version."
+        )
+    try:
+        contract = validate(data, Contract, source)
+    except ConfigError as error:
+        reason = str(error).removeprefix(f"{source}: ")
+        raise PolicyError(source, _key_in(reason), reason) from None
+    _check_unchanged(data, source)
+    _check_agreement(contract, source)
+    return contract
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    if len(dict(pairs)) != len(pairs):
+        raise ValueError("a key stands twice")
+    return dict(pairs)
+
+
+def _no_constant(word: str) -> Any:
+    raise ValueError(f"{word} is no number")
+
+
+def _key_in(sentence: str) -> str:
+    quoted = sentence.split("'")
+    return quoted[1] if len(quoted) > 2 and "key" in quoted[0] else "metadata"
+
+
+def _check_unchanged(data: dict[str, Any], source: str) -> None:
+    now, then = checksums(data), data["checksums"]
+    for path in (*now, *then):
+        if now.get(path) != then.get(path):
+            raise PolicyError(
+                source, path, "was changed after the export; take the file as it was exported."
+            )
+
+
+def _check_agreement(contract: Contract, source: str) -> None:
+    observation, scan = contract.observation, contract.scan
+    parts = contract.lidar.beams if scan is None else scan.sectors
+    name = "lidar.beams" if scan is None else "scan.sectors"
+    rest = len(observation.rest_low)
+    if observation.scan_parts != parts:
+        reason = f"is {parts}, but observations hold {observation.scan_parts} parts of a scan."
+        raise PolicyError(source, name, reason)
+    if observation.size != parts + rest or len(observation.rest_high) != rest:
+        reason = f"is {observation.size}, not the {parts} of the scan and {rest} others."
+        raise PolicyError(source, "observation.size", reason)
+    entry, seen = contract.task, observation.model_dump(mode="json")
+    if entry.sha256 != hash_of({"name": entry.name, "options": entry.options}, seen):
+        raise PolicyError(source, "task.sha256", "does not belong to the task and observation.")
+    width = {"actions": 1 if contract.actions == "discrete" else None}
+    sizes = {
+        "observations": observation.size, "commands": len(contract.robot.command),
+        "actions": width["actions"] or len(contract.robot.command),
+    }  # fmt: skip
+    for name, size in sizes.items():
+        try:
+            rows = contract.golden.rows(name)
+        except ValueError:
+            raise PolicyError(source, f"golden.{name}", "is damaged.") from None
+        if rows.shape != (GOLDEN, size) or not np.isfinite(rows).all():
+            reason = f"must be {GOLDEN} rows of {size} finite numbers, not {rows.shape}."
+            raise PolicyError(source, f"golden.{name}", reason)

@@ -1,0 +1,261 @@
+"""Policy files: one `.onnx` with network, normaliser, commands and contract.
+
+Loading needs onnxruntime and onnx, and nothing of training. Everything is checked before the
+first inference; nothing is ever unpickled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.config import share_folder
+from nics_drl_bridge.env.task import Task
+from nics_drl_bridge.env.tasks import TASKS, make_task
+from nics_drl_bridge.errors import ConfigError, PolicyError
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.lidar.canonical import plan_of
+from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.policy import onnx_graph
+from nics_drl_bridge.policy.contract import (
+    Contract,
+    leaves,
+    observation_entry,
+    read_contract,
+    task_entry,
+)
+
+SUFFIX = ".onnx"
+GOLDEN_TOLERANCE = 1e-5
+PERIOD_TOLERANCE = 1e-9
+Rows = NDArray[np.float32]
+
+
+class PolicyFile:
+    """A policy that was loaded and checked.
+
+    Attributes:
+        path: of the file.
+        contract: what it says about itself.
+    """
+
+    def __init__(self, path: Path, contract: Contract, session: Any) -> None:
+        self.path, self.contract, self._session = path, contract, session
+
+    def act(self, observation: Rows) -> NDArray[Any]:
+        """The action (C,) in [-1, 1], or () discrete, for an observation (O,); or of n at once."""
+        return self._run(observation)[0]
+
+    def command(self, observation: Rows) -> Rows:
+        """The command (C,) in SI, in the order of the robot, for (O,); or (n, C) for (n, O)."""
+        return self._run(observation)[1]
+
+    def _run(self, observation: Rows) -> list[NDArray[Any]]:
+        given = np.asarray(observation, np.float32)
+        size = self.contract.observation.size
+        if given.ndim not in (1, 2) or given.shape[-1] != size:
+            reason = f"is {size}, but was given observations {given.shape}; use its own task."
+            raise PolicyError(str(self.path), "observation.size", reason)
+        rows = given.reshape(-1, size)
+        names = [onnx_graph.ACTION, onnx_graph.COMMAND]
+        out = self._session.run(names, {onnx_graph.INPUT: rows})
+        return [part[0] if given.ndim == 1 else part for part in out]
+
+    @cached_property
+    def task_options(self) -> dict[str, Any]:
+        """What makes the policy's task: its options, and its scan."""
+        scan = self.contract.scan
+        return {**self.contract.task.options, **({} if scan is None else {"scan": scan})}
+
+    def make_task(self, model: SimulatorModel, kind: str | type[Task] | None = None) -> Task:
+        """The task of the policy, for a robot that it fits.
+
+        Args:
+            model: the robot.
+            kind: where the task is no shipped one, its class or `path/to/file.py:ClassName`.
+
+        Raises:
+            PolicyError: it does not fit; the field is named.
+        """
+        name = self.contract.task.name
+        if kind is None and name not in TASKS:
+            reason = f"{name!r} is no shipped task; give path/to/file.py:{name}."
+            raise PolicyError(str(self.path), "task.name", reason)
+        self.check_fits(model)
+        task = make_task(kind or name, model, self.task_options)
+        self.check_fits(model, task)
+        return task
+
+    def check_fits(self, model: SimulatorModel | None, task: Task | None = None) -> None:
+        """Raises PolicyError, with the field, unless the policy fits a robot and a task.
+
+        Another SimulatorModel of the same robot fits, and so does any lidar that fills the
+        policy's sectors; a policy without sectors needs the beams that it was trained with.
+        """
+        if model is not None:
+            self._check_robot(model.robot, model.lidar)
+            period = self.contract.control_period
+            if abs(period - model.control_period) > PERIOD_TOLERANCE:
+                self._refuse("control_period", period, model.control_period)
+        if task is not None:
+            self._check_robot(task.robot, task.lidar)
+            self._check_task(task)
+
+    def _check_robot(self, robot: RobotSpec, lidar: LidarSpec) -> None:
+        ours = self.contract.model_dump(mode="json", include={"robot": ROBOT, "lidar": LIDAR})
+        theirs = {
+            "robot": robot.model_dump(mode="json", include=ROBOT),
+            "lidar": lidar.model_dump(mode="json", include=LIDAR),
+        }
+        if self.contract.scan is not None:
+            del ours["lidar"], theirs["lidar"]
+            try:
+                plan_of(lidar, self.contract.scan)
+            except ConfigError as error:
+                raise PolicyError(str(self.path), "scan", str(error)) from None
+        self._compare(ours, theirs)
+
+    def _check_task(self, task: Task) -> None:
+        contract, scan = self.contract, task.scan
+        sees = None if scan is None else scan.model_dump(mode="json")
+        wants = None if contract.scan is None else contract.scan.model_dump(mode="json")
+        self._compare(
+            {
+                "task": {"name": contract.task.name},
+                "actions": contract.actions,
+                "scan": wants,
+                "observation": contract.observation.model_dump(mode="json"),
+            },
+            {
+                "task": {"name": task_entry(task)["name"]},
+                "actions": task.actions,
+                "scan": sees,
+                "observation": observation_entry(task),
+            },
+        )
+
+    def _compare(self, ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> None:
+        mine, other = dict(leaves(dict(ours))), dict(leaves(dict(theirs)))
+        for path in (*mine, *other):
+            if mine.get(path) != other.get(path):
+                self._refuse(path, mine.get(path), other.get(path))
+
+    def _refuse(self, field: str, ours: Any, theirs: Any) -> None:
+        reason = f"is {ours!r}, but the robot's is {theirs!r}; use a policy that was trained so."
+        raise PolicyError(str(self.path), field, reason)
+
+
+ROBOT = {"command", "footprint", "footprint_radius"}
+LIDAR = {"beams", "angle_min", "angle_max", "range_max", "mount"}
+
+
+def find_policy(name: str) -> Path:
+    """The file of a policy by its path, or by the name of a shipped one."""
+    path = Path(name)
+    return path if name.endswith(SUFFIX) or path.is_file() else shipped() / f"{name}{SUFFIX}"
+
+
+def shipped() -> Path:
+    """The folder of the policies that come with the package."""
+    return share_folder() / "config" / "policies"
+
+
+def load_policy(path: str | Path) -> PolicyFile:
+    """Loads a policy file, after it has passed every check.
+
+    Args:
+        path: of the file, or the name of a shipped one.
+
+    Raises:
+        PolicyError: anything is wrong with it; the field is named.
+    """
+    file = find_policy(str(path))
+    return policy_of(_read(file), file)
+
+
+def _read(path: Path) -> bytes:
+    source = str(path)
+    try:
+        size = path.stat().st_size
+        if not path.is_file():
+            raise PolicyError(source, "file", "is no file; give the path of an .onnx file.")
+        if size > onnx_graph.SIZE_LIMIT:
+            limit = onnx_graph.SIZE_LIMIT // 2**20
+            reason = f"is {size / 2**20:.0f} MB, a policy is at most {limit} MB; not opened."
+            raise PolicyError(source, "file", reason)
+        return path.read_bytes()
+    except OSError as error:
+        raise PolicyError(source, "file", f"can't be read ({error.strerror}).") from None
+
+
+def policy_of(data: bytes, path: Path) -> PolicyFile:
+    """The policy that a file's content holds; see `load_policy`."""
+    source = str(path)
+    model = onnx_graph.parse(data, source)
+    contract = read_contract(onnx_graph.metadata(model, source), source)
+    commands = len(contract.robot.command)
+    discrete = contract.actions == "discrete"
+    widths = {"observation": contract.observation.size, "command": commands}
+    onnx_graph.check_ends(model, {**widths, "action": None if discrete else commands}, source)
+    if onnx_graph.graph_hash(model) != contract.graph_sha256:
+        reason = "does not belong to the graph, which was changed after the export."
+        raise PolicyError(source, "graph_sha256", reason)
+    policy = PolicyFile(path, contract, open_session(data, source))
+    _check_golden(policy, source)
+    return policy
+
+
+def open_session(data: bytes, source: str) -> Any:
+    """An onnxruntime session on one thread.
+
+    Raises:
+        PolicyError: onnxruntime is missing, or can't run the graph.
+    """
+    try:
+        import onnxruntime
+    except ImportError:
+        raise ConfigError(
+            "a policy file needs the module 'onnxruntime'; pip install 'nics_drl_bridge[deploy]'."
+        ) from None
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.log_severity_level = 4
+    try:
+        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    except (RuntimeError, ValueError) as error:
+        words = " ".join(str(error).split())[:120]
+        raise PolicyError(source, "graph", f"onnxruntime can't run it ({words}).") from None
+
+
+def _check_golden(policy: PolicyFile, source: str) -> None:
+    golden = policy.contract.golden
+    observations = golden.rows("observations")
+    try:
+        action, command = policy._run(observations)
+    except (RuntimeError, ValueError) as error:
+        words = " ".join(str(error).split())[:120]
+        raise PolicyError(source, "graph", f"onnxruntime can't run it ({words}).") from None
+    found = {"actions": action.reshape(len(observations), -1), "commands": command}
+    for name, rows in found.items():
+        gap = np.abs(rows - golden.rows(name)).max()
+        if not gap <= GOLDEN_TOLERANCE:
+            reason = f"differ by {gap:.3g} from what the graph gives here; not used."
+            raise PolicyError(source, f"golden.{name}", reason)
+    robot = policy.contract.robot
+    beyond = (command < robot.command_low - GOLDEN_TOLERANCE).any()
+    if beyond or (command > robot.command_high + GOLDEN_TOLERANCE).any():
+        raise PolicyError(source, "robot.command", "the graph gives commands beyond its limits.")
+
+
+def summary(policy: PolicyFile) -> dict[str, Any]:
+    """The contract in plain data, without arrays and checksums."""
+    data = policy.contract.model_dump(mode="json")
+    del data["golden"], data["checksums"]
+    return {"file": str(policy.path), "bytes": policy.path.stat().st_size, **data}

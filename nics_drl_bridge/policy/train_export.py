@@ -1,0 +1,208 @@
+"""From a trained network to a policy file: normaliser, network and commands in one graph.
+
+Stable-Baselines3's own recipe for ONNX leaves out clipping, unscaling and the normaliser.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from nics_drl_bridge.env.actions import discrete_commands
+from nics_drl_bridge.env.task import Task
+from nics_drl_bridge.errors import ConfigError, PolicyError
+from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.policy import onnx_graph
+from nics_drl_bridge.policy.contract import GOLDEN, contract_of
+from nics_drl_bridge.policy.policy_file import (
+    GOLDEN_TOLERANCE,
+    SUFFIX,
+    PolicyFile,
+    open_session,
+    policy_of,
+)
+
+Rows = NDArray[np.float32]
+Normaliser = tuple[ArrayLike, ArrayLike, float]
+OPSET = 17
+GOLDEN_SEED = 0
+GOLDEN_SPREAD = 3.0
+"""Golden observations lie within this of zero where their limits are wider."""
+
+
+class Deployed(torch.nn.Module):  # type: ignore[misc]
+    """What the graph of a policy file computes.
+
+    Args:
+        actor: from observations (n, O) to raw actions (n, C), or logits (n, A) of discrete ones.
+        task: gives the commands and their limits.
+        normaliser: mean (O,), standard deviation (O,), limit; None where the actor has its own.
+    """
+
+    def __init__(self, actor: torch.nn.Module, task: Task, normaliser: Normaliser | None) -> None:
+        super().__init__()
+        self.actor, self.discrete = actor, task.actions == "discrete"
+        self.limit = None if normaliser is None else float(normaliser[2])
+        if normaliser is not None:
+            self.register_buffer("mean", _vector(normaliser[0]))
+            self.register_buffer("std", _vector(normaliser[1]))
+        if self.discrete:
+            self.register_buffer("commands", _vector(discrete_commands(task.robot)))
+        else:
+            self.register_buffer("low", _vector(task.robot.command_low))
+            self.register_buffer("high", _vector(task.robot.command_high))
+
+    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Actions (n, C) in [-1, 1] or (n,), and commands (n, C) in SI, of observations (n, O)."""
+        seen = observation
+        if self.limit is not None:
+            seen = torch.clamp((seen - self.mean) / self.std, -self.limit, self.limit)
+        raw = self.actor(seen)
+        if self.discrete:
+            action = torch.argmax(raw, dim=1)
+            return action, self.commands[action]
+        action = torch.clamp(raw, -1.0, 1.0)
+        command = self.low + (action + 1.0) / 2.0 * (self.high - self.low)
+        return action, torch.minimum(torch.maximum(command, self.low), self.high)
+
+
+class _Gaussian(torch.nn.Module):  # type: ignore[misc]
+    """The mean of an actor-critic policy such as PPO's, or its logits."""
+
+    def __init__(self, policy: Any) -> None:
+        super().__init__()
+        self.features, self.action_net = policy.pi_features_extractor, policy.action_net
+        self.latent = policy.mlp_extractor.policy_net
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        raw: torch.Tensor = self.action_net(self.latent(self.features(observation)))
+        return raw
+
+
+class _Squashed(torch.nn.Module):  # type: ignore[misc]
+    """The mode of SAC's actor."""
+
+    def __init__(self, actor: Any) -> None:
+        super().__init__()
+        self.features, self.latent, self.mu = actor.features_extractor, actor.latent_pi, actor.mu
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return torch.tanh(self.mu(self.latent(self.features(observation))))
+
+
+def actor_of(model: Any) -> torch.nn.Module:
+    """The part of a trained model that acts, without exploration.
+
+    Args:
+        model: an algorithm or policy of Stable-Baselines3 (PPO, A2C, SAC), or any module from
+            observations (n, O) to raw actions (n, C) or logits (n, A).
+
+    Raises:
+        ConfigError: none of these.
+    """
+    policy = getattr(model, "policy", model)
+    if hasattr(policy, "action_net") and hasattr(policy, "mlp_extractor"):
+        return _Gaussian(policy)
+    if hasattr(policy, "actor") and hasattr(policy.actor, "latent_pi"):
+        return _Squashed(policy.actor)
+    if isinstance(policy, torch.nn.Module):
+        return policy
+    raise ConfigError(
+        f"a {type(model).__name__} can't be exported; give a PPO, A2C or SAC, or a torch module."
+    )
+
+
+def export_policy(
+    model: Any,
+    task: Task,
+    simulator_model: SimulatorModel,
+    path: str | Path,
+    normaliser: Normaliser | None = None,
+    provenance: Mapping[str, Any] | None = None,
+) -> PolicyFile:
+    """Writes a trained model as a policy file, and loads it as a robot would.
+
+    Args:
+        model: see `actor_of`.
+        task: that it was trained on.
+        simulator_model: that it was trained in.
+        path: of the file, `*.onnx`.
+        normaliser: mean (O,), standard deviation (O,) and limit of the normalised observations.
+        provenance: command, seed and so on: words and numbers.
+
+    Raises:
+        ConfigError: the model can't be exported.
+        PolicyError: the file does not give what the model gives.
+    """
+    file = Path(path)
+    if file.suffix != SUFFIX:
+        raise ConfigError(f"{file}: a policy file ends with {SUFFIX!r}; change the name.")
+    deployed = Deployed(actor_of(model), task, normaliser).eval().cpu()
+    graph = _graph(deployed, task)
+    observations = golden_observations(task)
+    session = open_session(graph.SerializeToString(), str(file))
+    names = [onnx_graph.ACTION, onnx_graph.COMMAND]
+    action, command = session.run(names, {onnx_graph.INPUT: observations})
+    _compare(deployed, observations, action, command, str(file))
+    golden = {
+        "observations": observations,
+        "actions": np.asarray(action, np.float32).reshape(GOLDEN, -1),
+        "commands": command,
+    }
+    text = contract_of(
+        task, simulator_model, golden, onnx_graph.graph_hash(graph), provenance or {}
+    )
+    onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
+    data = graph.SerializeToString(deterministic=True)
+    policy = policy_of(data, file)
+    write_bytes(file, data)
+    return policy
+
+
+def golden_observations(task: Task) -> Rows:
+    """(16, O) observations within their limits, always the same."""
+    space = task.observation_space
+    low = np.maximum(space.low, -GOLDEN_SPREAD)
+    high = np.minimum(space.high, GOLDEN_SPREAD)
+    rng = np.random.default_rng(GOLDEN_SEED)
+    return rng.uniform(low, high, (GOLDEN, len(low))).astype(np.float32)
+
+
+def _graph(deployed: Deployed, task: Task) -> Any:
+    """The ModelProto of a module."""
+    example = torch.zeros(1, task.observation_space.shape[0])
+    names, buffer = [onnx_graph.ACTION, onnx_graph.COMMAND], io.BytesIO()
+    with warnings.catch_warnings():
+        # This exporter is being replaced; the new one takes several times longer.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            deployed, (example,), buffer,
+            input_names=[onnx_graph.INPUT], output_names=names, opset_version=OPSET,
+            dynamic_axes={name: {0: "n"} for name in (onnx_graph.INPUT, *names)},
+            dynamo=False,
+        )  # fmt: skip
+    return onnx.load_model_from_string(buffer.getvalue())
+
+
+def _compare(deployed: Deployed, seen: Rows, action: Rows, command: Rows, source: str) -> None:
+    """Raises PolicyError unless the graph gives what the module gives."""
+    with torch.no_grad():
+        wanted = [part.numpy() for part in deployed(torch.as_tensor(seen))]
+    for name, ours, theirs in zip(("actions", "commands"), (action, command), wanted, strict=True):
+        error = float(np.abs(ours - theirs).max())
+        if not error <= GOLDEN_TOLERANCE:
+            reason = f"onnxruntime and torch differ by {error:.3g}; the model can't be exported."
+            raise PolicyError(source, f"golden.{name}", reason)
+
+
+def _vector(values: ArrayLike) -> torch.Tensor:
+    return torch.as_tensor(np.asarray(values, np.float32))

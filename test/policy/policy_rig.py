@@ -1,0 +1,63 @@
+"""A small policy and its file, and ways to spoil it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+from robots import direct_model, lidar
+
+from nics_drl_bridge.env.tasks import make_task
+from nics_drl_bridge.policy import contract, onnx_graph
+from nics_drl_bridge.policy.train_export import export_policy
+
+SECTORS = 24
+
+
+def model_of(**changes):
+    return direct_model(sensor=lidar(**changes))
+
+
+def network(inputs: int, outputs: int) -> torch.nn.Module:
+    torch.manual_seed(0)
+    layers = torch.nn.Linear(inputs, 16), torch.nn.Tanh(), torch.nn.Linear(16, outputs)
+    return torch.nn.Sequential(*layers)
+
+
+def export(path: Path, model=None, normaliser=None, **options):
+    model = model or model_of()
+    task = make_task("navigation", model, {"scan": SECTORS} | options)
+    size = task.observation_space.shape[0]
+    outputs = 9 if task.actions == "discrete" else 3
+    made = {"command": "a test", "seed": 3}
+    return export_policy(network(size, outputs), task, model, path, normaliser, made), task
+
+
+def bytes_of(proto) -> bytes:
+    return proto.SerializeToString(deterministic=True)
+
+
+def contract_in(proto) -> dict:
+    return json.loads(onnx_graph.metadata(proto, "file"))
+
+
+def signed(proto, data: dict | None = None):
+    """The file with a contract whose checksums are right again."""
+    data = contract_in(proto) if data is None else data
+    data["graph_sha256"] = onnx_graph.graph_hash(proto)
+    data["checksums"] = contract.checksums(data)
+    return with_contract(proto, json.dumps(data))
+
+
+def with_contract(proto, text: str):
+    onnx.helper.set_model_props(proto, {onnx_graph.KEY: text})
+    return proto
+
+
+def weight(proto):
+    """The first weight, as an array that can be put back."""
+    tensor = proto.graph.initializer[0]
+    return tensor, np.array(onnx.numpy_helper.to_array(tensor))

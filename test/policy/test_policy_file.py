@@ -1,0 +1,422 @@
+from __future__ import annotations
+
+import base64
+import io
+import json
+import pickle
+import subprocess
+import sys
+import zipfile
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from robots import DIRECT, lidar
+
+from nics_drl_bridge.env.tasks import make_task
+from nics_drl_bridge.errors import ConfigError, PolicyError
+from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.policy import onnx_graph
+from nics_drl_bridge.policy.contract import GoldenEntry
+from nics_drl_bridge.policy.policies import make_policy
+from nics_drl_bridge.policy.policy_file import load_policy
+from policy.policy_rig import (
+    SECTORS,
+    bytes_of,
+    contract_in,
+    export,
+    model_of,
+    signed,
+    weight,
+    with_contract,
+)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("policies") / "go.onnx"
+    export(path)
+    return path
+
+
+def test_a_policy_acts_as_its_network_alone_and_in_batches(file):
+    policy = load_policy(file)
+    rows = np.random.default_rng(0).uniform(0.0, 1.0, (5, SECTORS + 6)).astype(np.float32)
+    actions = policy.act(rows)
+    assert actions.shape == (5, 3)
+    assert np.abs(actions).max() <= 1.0
+    assert policy.act(rows[0]) == pytest.approx(actions[0], abs=1e-6)
+    assert policy.command(rows) == pytest.approx(2.0 * actions, abs=1e-6)
+
+
+def test_its_command_is_what_the_task_makes_of_its_action(file):
+    model = model_of()
+    policy = load_policy(file)
+    task = policy.make_task(model)
+    ranges = np.full(72, 1.0, np.float32)
+    view = RobotView(np.zeros(3), np.zeros(3), ranges, 0.0, 0.0, 0.0)
+    seen = task.observation(view, {"goal": np.array([1.0, 0.5])})
+    assert policy.command(seen) == pytest.approx(task.command(policy.act(seen)), abs=1e-5)
+
+
+def test_make_policy_opens_a_file_and_checks_it_against_the_task(file):
+    model = model_of()
+    task = make_task("navigation", model, {"scan": SECTORS})
+    policy = make_policy(str(file), task, model)
+    assert policy.act(np.zeros(SECTORS + 6, np.float32)).shape == (3,)
+    with pytest.raises(PolicyError, match=r"field 'scan\.?"):
+        make_policy(str(file), make_task("navigation", model, {"scan": 36}), model)
+    with pytest.raises(ConfigError, match="did you mean 'go_to_goal'"):
+        make_policy("go_to_gaol", task, model)
+
+
+def test_an_observation_of_another_size_is_refused(file):
+    with pytest.raises(PolicyError, match=r"observation\.size"):
+        load_policy(file).act(np.zeros(7, np.float32))
+
+
+# What is refused. Each takes the parsed file and gives the bytes of a spoilt one.
+
+
+def changed(path, value, resigned):
+    """An entry of the contract set to another value; the checksums follow or not."""
+
+    def spoil(proto):
+        data = contract_in(proto)
+        at = data
+        for key in path[:-1]:
+            at = at[key]
+        at[path[-1]] = value
+        return bytes_of(signed(proto, data) if resigned else with_contract(proto, json.dumps(data)))
+
+    return spoil
+
+
+def without(key):
+    def spoil(proto):
+        data = contract_in(proto)
+        del data[key]
+        return bytes_of(with_contract(proto, json.dumps(data)))
+
+    return spoil
+
+
+def weights(value, resigned=True):
+    def spoil(proto):
+        tensor, array = weight(proto)
+        array.flat[0] = value
+        tensor.CopyFrom(onnx.numpy_helper.from_array(array, tensor.name))
+        return bytes_of(signed(proto) if resigned else proto)
+
+    return spoil
+
+
+def elsewhere(location):
+    def spoil(proto):
+        tensor, _ = weight(proto)
+        tensor.ClearField("raw_data")
+        tensor.data_location = onnx.TensorProto.EXTERNAL
+        entry = tensor.external_data.add()
+        entry.key, entry.value = "location", location
+        return bytes_of(signed(proto))
+
+    return spoil
+
+
+def node(op_type, domain="", **attributes):
+    def spoil(proto):
+        ends = ["observation"], ["unused"]
+        proto.graph.node.append(onnx.helper.make_node(op_type, *ends, domain=domain, **attributes))
+        if domain:
+            proto.opset_import.append(onnx.helper.make_opsetid(domain, 1))
+        return bytes_of(signed(proto))
+
+    return spoil
+
+
+def golden(name, position):
+    def spoil(proto):
+        data = contract_in(proto)
+        rows = GoldenEntry(**data["golden"]).rows(name).copy()
+        rows[position] += 2e-5
+        data["golden"][name] = base64.b64encode(rows.tobytes()).decode()
+        return bytes_of(signed(proto, data))
+
+    return spoil
+
+
+def end(kind, name):
+    def spoil(proto):
+        getattr(proto.graph, kind)[0].name = name
+        return bytes_of(signed(proto))
+
+    return spoil
+
+
+def narrower(proto):
+    proto.graph.input[0].type.tensor_type.shape.dim[1].dim_value = 7
+    return bytes_of(signed(proto))
+
+
+def doubles(proto):
+    proto.graph.input[0].type.tensor_type.elem_type = onnx.TensorProto.DOUBLE
+    return bytes_of(signed(proto))
+
+
+def loud(proto):
+    """Commands beyond the limits of the robot, by a contract of a weaker robot."""
+    data = contract_in(proto)
+    data["robot"]["command"][0]["max"] = 0.01
+    return bytes_of(signed(proto, data))
+
+
+def function(proto):
+    proto.functions.append(
+        onnx.helper.make_function(
+            "own", "F", ["x"], ["y"], [onnx.helper.make_node("Tanh", ["x"], ["y"])],
+            [onnx.helper.make_opsetid("", 17)],
+        )
+    )  # fmt: skip
+    return bytes_of(signed(proto))
+
+
+def branch(proto):
+    inner = onnx.helper.make_graph([], "inner", [], [])
+    return node("Identity", body=inner)(proto)
+
+
+def zipped(proto):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("data", "{}")
+        archive.writestr("policy.pth", bytes_of(proto))
+    return buffer.getvalue()
+
+
+def torch_file(_):
+    buffer = io.BytesIO()
+    torch.save({"weights": torch.zeros(3)}, buffer)
+    return buffer.getvalue()
+
+
+def two_contracts(proto):
+    entry = proto.metadata_props.add()
+    entry.key, entry.value = onnx_graph.KEY, "{}"
+    return bytes_of(proto)
+
+
+def bare(proto):
+    del proto.metadata_props[:]
+    return bytes_of(proto)
+
+
+REFUSED = {
+    "beams": (changed(["lidar", "beams"], 360, False), "lidar.beams"),
+    "range": (changed(["scan", "range_max"], 5.0, False), "scan.range_max"),
+    "lidar range": (changed(["lidar", "range_max"], 12.0, False), "lidar.range_max"),
+    "sectors": (changed(["scan", "sectors"], 36, True), "scan.sectors"),
+    "rate": (changed(["control_period"], 0.05, False), "control_period"),
+    "no rate": (changed(["control_period"], 0.0, True), "control_period"),
+    "task": (changed(["task", "name"], "pursuit_evasion", False), "task.name"),
+    "task signed": (changed(["task", "name"], "pursuit_evasion", True), "task.sha256"),
+    "task option": (changed(["task", "options", "goal_radius"], 3.0, True), "task.sha256"),
+    "task hash": (changed(["task", "sha256"], "0" * 64, True), "task.sha256"),
+    "model hash": (changed(["model_fingerprint"], "0" * 16, False), "model_fingerprint"),
+    "graph hash": (changed(["graph_sha256"], "0" * 64, False), "graph_sha256"),
+    "command limit": (changed(["robot", "command", 0, "max"], 9.0, False), "robot.command.0.max"),
+    "seed": (changed(["provenance", "seed"], 4, False), "provenance.seed"),
+    "other format": (changed(["format"], "nics_drl_bridge/policy/9", True), "format"),
+    "unknown entry": (changed(["extra"], 1, True), "extra"),
+    "size": (changed(["observation", "size"], 31, True), "observation.size"),
+    "missing": (without("robot"), "robot"),
+    "no checksums": (without("checksums"), "checksums"),
+    "no JSON": (lambda proto: bytes_of(with_contract(proto, "{")), "metadata"),
+    "NaN in JSON": (lambda p: bytes_of(with_contract(p, '{"format": NaN}')), "metadata"),
+    "a key twice": (lambda p: bytes_of(with_contract(p, '{"a": 1, "a": 2}')), "metadata"),
+    "no contract": (bare, "metadata"),
+    "two contracts": (two_contracts, "metadata"),
+    "NaN weights": (weights(np.nan), "weights."),
+    "inf weights": (weights(np.inf, resigned=False), "weights."),
+    "other weights": (weights(0.5, resigned=False), "graph_sha256"),
+    "other weights signed": (weights(5.0), "golden."),
+    "external data": (elsewhere("weights.bin"), "weights."),
+    "absolute path": (elsewhere("/etc/passwd"), "weights."),
+    "path outside": (elsewhere("../../weights.bin"), "weights."),
+    "own operator": (node("Evil", "com.example"), "opset_import"),
+    "loop": (node("Loop"), "graph.node"),
+    "random": (node("RandomNormalLike"), "graph.node"),
+    "graph in a node": (branch, "graph.node"),
+    "function": (function, "graph"),
+    "input name": (end("input", "obs"), "graph"),
+    "output name": (end("output", "mean"), "graph"),
+    "input width": (narrower, "graph"),
+    "input type": (doubles, "graph"),
+    "golden command": (golden("commands", (3, 1)), "golden.commands"),
+    "golden action": (golden("actions", (0, 0)), "golden.actions"),
+    "golden cut": (changed(["golden", "actions"], "AAAA", True), "golden.actions"),
+    "limits of a weaker robot": (loud, "robot.command"),
+    "cut at half": (lambda proto: bytes_of(proto)[: len(bytes_of(proto)) // 2], "file"),
+    "cut at the end": (lambda proto: bytes_of(proto)[:-3], ""),
+    "empty": (lambda _: b"", "file"),
+    "text": (lambda _: b"format: policy\n" * 20, "file"),
+    "pickle": (lambda _: pickle.dumps({"weights": [1.0]}), "file"),
+    "zip of Stable-Baselines3": (zipped, "file"),
+    "torch": (torch_file, "file"),
+    "numpy": (lambda _: b"\x93NUMPY\x01\x00" + bytes(64), "file"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_spoilt_file_is_refused_and_the_field_named(file, tmp_path, name):
+    spoil, field = REFUSED[name]
+    path = tmp_path / "spoilt.onnx"
+    path.write_bytes(spoil(onnx.load(file)))
+    with pytest.raises(PolicyError) as refused:
+        load_policy(path)
+    assert refused.value.field.startswith(field)
+    assert str(refused.value).startswith(f"{path}: field ")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("share", np.linspace(0.01, 0.99, 23).tolist())
+def test_a_file_cut_anywhere_is_refused(file, tmp_path, share):
+    whole = file.read_bytes()
+    path = tmp_path / "cut.onnx"
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(PolicyError):
+        load_policy(path)
+
+
+def test_a_flipped_bit_anywhere_is_refused_or_changes_nothing(file, tmp_path):
+    whole, rng = file.read_bytes(), np.random.default_rng(4)
+    rows = np.zeros((1, SECTORS + 6), np.float32)
+    wanted = load_policy(file).command(rows)
+    path = tmp_path / "flipped.onnx"
+    for _ in range(150):
+        data = bytearray(whole)
+        data[rng.integers(len(data))] ^= 1 << rng.integers(8)
+        path.write_bytes(bytes(data))
+        try:
+            found = load_policy(path).command(rows)
+        except PolicyError:
+            continue
+        assert np.array_equal(found, wanted)
+
+
+def test_a_pickle_in_disguise_is_never_opened(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return open, (str(tmp_path / "sprung"), "w")
+
+    path = tmp_path / "trap.onnx"
+    path.write_bytes(pickle.dumps(Trap()))
+    with pytest.raises(PolicyError, match="a pickle, which is never opened"):
+        load_policy(path)
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_a_file_that_is_not_there_or_too_large_is_refused(tmp_path):
+    with pytest.raises(PolicyError, match="No such file"):
+        load_policy(tmp_path / "none.onnx")
+    with pytest.raises(PolicyError, match="field 'file'"):
+        load_policy(tmp_path)
+    path = tmp_path / "large.onnx"
+    with path.open("wb") as large:
+        large.truncate(onnx_graph.SIZE_LIMIT + 1)
+    with pytest.raises(PolicyError, match="at most 64 MB"):
+        load_policy(path)
+
+
+# What it runs on.
+
+
+@pytest.mark.parametrize("changes", [{"beams": 720}, {"range_max": 12.0}, {"rate": 5.0}])
+def test_any_lidar_that_fills_its_sectors_fits(file, changes):
+    model = model_of(**changes)
+    load_policy(file).make_task(model)
+
+
+def misfit_model(**changes):
+    model = model_of()
+    for name, value in changes.items():
+        object.__setattr__(model, name, value)
+    return model
+
+
+def robot(**changes):
+    return DIRECT.model_copy(update=changes)
+
+
+FASTER = (DIRECT.command[0].model_copy(update={"max": 3.0}), *DIRECT.command[1:])
+
+
+@pytest.mark.parametrize(
+    ("model", "field"),
+    [
+        (model_of(angle_min=-1.0, angle_max=1.0), "scan"),
+        (model_of(range_max=2.0), "scan"),
+        (misfit_model(control_period=0.05), "control_period"),
+        (misfit_model(robot=robot(command=FASTER)), "robot.command.0.max"),
+        (misfit_model(robot=robot(command=DIRECT.command[:2])), "robot.command.2.name"),
+        (misfit_model(robot=robot(footprint_radius=0.5)), "robot.footprint_radius"),
+    ],
+)
+def test_a_robot_that_does_not_fit_is_refused_and_the_field_named(file, model, field):
+    with pytest.raises(PolicyError) as refused:
+        load_policy(file).check_fits(model)
+    assert refused.value.field == field
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "field"),
+    [
+        ("navigation", {"scan": 36}, "scan.sectors"),
+        ("navigation", {}, "scan"),
+        ("navigation", {"scan": SECTORS, "actions": "discrete"}, "actions"),
+        ("cooperative_reaching", {"scan": SECTORS}, "task.name"),
+    ],
+)
+def test_a_task_that_does_not_fit_is_refused_and_the_field_named(file, name, options, field):
+    model = model_of()
+    with pytest.raises(PolicyError) as refused:
+        load_policy(file).check_fits(model, make_task(name, model, options))
+    assert refused.value.field.startswith(field)
+
+
+def test_a_policy_of_beams_needs_the_very_lidar(tmp_path):
+    policy, _ = export(tmp_path / "beams.onnx", scan=None)
+    policy.make_task(model_of())
+    with pytest.raises(PolicyError, match=r"field 'lidar\.beams'"):
+        policy.check_fits(model_of(beams=144))
+
+
+BLOCKED = """
+import sys
+class Block:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("torch", "stable_baselines3", "mujoco", "tensorboard"):
+            raise ImportError(name + " is not to be imported")
+sys.meta_path.insert(0, Block())
+"""
+
+
+def test_it_loads_where_nothing_of_training_is_installed(file):
+    code = (
+        "from nics_drl_bridge.policy.policy_file import load_policy\n"
+        f"print(load_policy({str(file)!r}).contract.robot.name)"
+    )
+    done = subprocess.run([sys.executable, "-c", BLOCKED + code], capture_output=True, text=True)
+    assert done.stdout.strip() == "direct", done.stderr
+
+
+def test_a_scan_of_another_lidar_gives_the_same_command(file):
+    policy, commands = load_policy(file), []
+    for spec in (lidar(beams=1440), lidar(beams=720, angle_min=0.0, angle_max=2.0 * np.pi)):
+        task = policy.make_task(
+            model_of(**spec.model_dump(include={"beams", "angle_min", "angle_max"}))
+        )
+        ranges = (1.5 + np.cos(spec.angles)).astype(np.float32)
+        view = RobotView(np.zeros(3), np.zeros(3), ranges, 0.0, 0.0, 0.0)
+        commands.append(policy.command(task.observation(view, {"goal": np.ones(2)})))
+    assert commands[0] == pytest.approx(commands[1], abs=0.01)

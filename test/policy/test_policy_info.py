@@ -1,0 +1,35 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+from policy.policy_rig import SECTORS, export
+
+
+def info(*words: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "nics_drl_bridge.cli", "policy", "info", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=100)
+
+
+def test_nics_policy_info_tells_what_a_file_is_for_people_and_programs(tmp_path):
+    path = tmp_path / "go.onnx"
+    policy, _ = export(path)
+    text = info(path)
+    assert text.returncode == 0, text.stderr
+    assert f"{SECTORS} sectors from -180 to 180 deg, 3 m" in text.stdout
+    assert "all checks passed" in text.stdout
+    (line,) = info(path, "--json").stdout.splitlines()
+    facts = json.loads(line)
+    assert facts["scan"]["sectors"] == SECTORS
+    assert facts["graph_sha256"] == policy.contract.graph_sha256
+    assert facts["provenance"] == {"command": "a test", "seed": 3}
+
+
+def test_nics_policy_info_refuses_in_one_sentence(tmp_path):
+    path = tmp_path / "go.onnx"
+    path.write_bytes(b"\x80\x04K\x01.")
+    done = info(path)
+    assert done.returncode == 2
+    (sentence,) = done.stderr.splitlines()
+    assert sentence.startswith(f"nics: {path}: field 'file': is a pickle")

@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from robots import field
+from stable_baselines3 import PPO, SAC
+
+from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.tasks import make_task
+from nics_drl_bridge.errors import ConfigError, PolicyError
+from nics_drl_bridge.policy.policy_file import load_policy
+from nics_drl_bridge.policy.train_export import Deployed, export_policy
+from policy.policy_rig import SECTORS, export, model_of, network
+
+
+@pytest.fixture(params=["continuous", "discrete"])
+def env(request):
+    options = {"scan": SECTORS, "actions": request.param}
+    return BridgeEnv(model=model_of(), world=field(), task_options=options)
+
+
+def observations(env, count=50):
+    space = env.task.observation_space
+    rng = np.random.default_rng(5)
+    return rng.uniform(np.maximum(space.low, -4), np.minimum(space.high, 4), (count, *space.shape))
+
+
+def test_the_file_of_a_ppo_acts_as_it_predicts(env, tmp_path):
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
+    with torch.no_grad():  # actions that have to be cut at the limits
+        model.policy.action_net.weight.mul_(500.0)
+    policy = export_policy(model, env.task, env.model, tmp_path / "ppo.onnx")
+    rows = observations(env).astype(np.float32)
+    wanted, _ = model.predict(rows, deterministic=True)
+    assert policy.act(rows) == pytest.approx(wanted, abs=1e-5)
+    assert policy.command(rows) == pytest.approx(env.task.command(wanted), abs=1e-5)
+    assert len(np.unique(np.round(policy.act(rows), 2))) > 2
+
+
+def test_the_file_of_a_sac_acts_as_it_predicts(tmp_path):
+    env = BridgeEnv(model=model_of(), world=field(), task_options={"scan": SECTORS})
+    model = SAC("MlpPolicy", env, seed=0, buffer_size=10, device="cpu")
+    policy = export_policy(model, env.task, env.model, tmp_path / "sac.onnx")
+    rows = observations(env).astype(np.float32)
+    assert policy.act(rows) == pytest.approx(model.predict(rows, deterministic=True)[0], abs=1e-5)
+
+
+def test_the_normaliser_is_inside_the_graph(tmp_path):
+    rng = np.random.default_rng(6)
+    mean, std = rng.normal(size=SECTORS + 6), rng.uniform(0.5, 2.0, SECTORS + 6)
+    policy, _ = export(tmp_path / "one.onnx", normaliser=(mean, std, 1.5))
+    seen = rng.normal(size=(7, SECTORS + 6)).astype(np.float32)
+    cut = np.clip((seen - mean) / std, -1.5, 1.5).astype(np.float32)
+    with torch.no_grad():
+        raw = network(SECTORS + 6, 3)(torch.as_tensor(cut)).numpy()
+    assert policy.act(seen) == pytest.approx(np.clip(raw, -1.0, 1.0), abs=1e-5)
+
+
+def test_a_policy_says_how_it_came_about(tmp_path):
+    _, task = export(tmp_path / "one.onnx")
+    contract = load_policy(tmp_path / "one.onnx").contract
+    assert contract.provenance == {"command": "a test", "seed": 3}
+    assert contract.model_fingerprint == model_of().fingerprint
+    assert contract.task.options["goal_radius"] == task.goal_radius
+    assert contract.robot == task.robot
+
+
+def test_what_is_no_policy_cannot_be_exported(tmp_path):
+    model = model_of()
+    task = make_task("navigation", model)
+    with pytest.raises(ConfigError, match="can't be exported"):
+        export_policy("PPO", task, model, tmp_path / "one.onnx")
+    with pytest.raises(ConfigError, match=r"ends with .\.onnx"):
+        export_policy(network(78, 3), task, model, tmp_path / "one.zip")
+
+
+def test_a_network_with_nan_weights_is_not_written(tmp_path):
+    model = model_of()
+    task = make_task("navigation", model, {"scan": SECTORS})
+    broken = network(SECTORS + 6, 3)
+    with torch.no_grad():
+        broken[0].weight[0, 0] = np.nan
+    with pytest.raises(PolicyError, match=r"golden|weights"):
+        export_policy(broken, task, model, tmp_path / "one.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_the_graph_computes_lies_within_the_limits_of_the_robot():
+    model = model_of()
+    task = make_task("navigation", model, {"scan": SECTORS})
+    deployed = Deployed(network(SECTORS + 6, 3), task, None)
+    _, command = deployed(1e6 * torch.randn(100, SECTORS + 6))
+    low, high = (torch.as_tensor(limit) for limit in (DIRECT_LOW, DIRECT_HIGH))
+    assert (command >= low).all()
+    assert (command <= high).all()
+
+
+DIRECT_LOW, DIRECT_HIGH = model_of().robot.command_low, model_of().robot.command_high
