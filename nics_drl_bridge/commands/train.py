@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -78,5 +80,6 @@ def _run(
             typer.echo(f"  {world}: {train_run.line_of(summary)}")
 
     with progress_bar() as tell:
-        train_run.run(settings, seeds, folder, episodes, resume, told, done)
-    typer.echo(f"checkpoints and logs: {folder}; look at them with tensorboard --logdir {folder}")
+        command = shlex.join(["nics", *sys.argv[1:]])
+        train_run.run(settings, seeds, folder, episodes, resume, command, told, done)
+    typer.echo(f"policy files, checkpoints and logs: {folder}; tensorboard --logdir {folder}")

@@ -42,13 +42,9 @@ class DynamicWindow:
     weights: tuple[float, float, float, float] = (1.0, 0.6, 0.3, 1.5)
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The action (C,) for an observation (O,)."""
-        return self.act_all(observation[None])[0]
-
-    def act_all(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Actions (N, C) for observations (N, O)."""
+        """The action (C,) for an observation (O,); or (N, C) for (N, O)."""
         parts = self.task.scan_parts
-        seen = observations.astype(np.float64)
+        seen = np.atleast_2d(observation).astype(np.float64)
         goals = seen[:, parts : parts + 1] * seen[:, parts + 1 : parts + 3]
         chosen = np.empty(len(seen), np.int64)
         kernels.choose_all(
@@ -56,7 +52,7 @@ class DynamicWindow:
             np.ascontiguousarray(seen[:, parts + 3 : parts + 6]),
             self._twists, self._sight, self._body, np.array(self.weights),
         )  # fmt: skip
-        return self._actions[chosen]
+        return self._actions[chosen[0] if observation.ndim == 1 else chosen]
 
     @cached_property
     def _sight(self) -> tuple[Array, Array, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ class Policy(Protocol):
     """From an observation to an action; the same in every world."""
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The action (C,) in [-1, 1] for an observation (O,)."""
+        """The action (C,) in [-1, 1] for an observation (O,); or (N, C) for (N, O)."""
         ...
 
 

@@ -26,21 +26,17 @@ class StraightToGoal:
     task: Navigation
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The action (C,) for an observation (O,)."""
-        return self.act_all(observation[None])[0]
-
-    def act_all(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Actions (N, C) for observations (N, O)."""
-        robot, parts = self.task.robot, self.task.scan_parts
-        cosine, sine = observations[:, parts + 1].astype(float), observations[:, parts + 2]
+        """The action (C,) for an observation (O,); or (N, C) for (N, O)."""
+        robot, first = self.task.robot, self.task.scan_parts + 1
+        cosine, sine = np.moveaxis(observation[..., first : first + 2].astype(float), -1, 0)
         turn = np.clip(np.arctan2(sine, cosine) / FULL_TURN_RAD, -1.0, 1.0)
         steers = any(one.cmd_vel == "angular.z" and one.unit == "rad" for one in robot.command)
         ahead = np.maximum(cosine, CREEP if steers else 0.0)
         shares = {"linear.x": ahead, "angular.z": turn}
-        wanted = np.zeros((len(observations), len(robot.command)))
+        wanted = np.zeros((*cosine.shape, len(robot.command)))
         for i, one in enumerate(robot.command):
             if one.cmd_vel in shares:
-                wanted[:, i] = shares[one.cmd_vel] * one.max
+                wanted[..., i] = shares[one.cmd_vel] * one.max
         low, high = robot.command_low, robot.command_high
         return np.clip(2.0 * (wanted - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
 
@@ -59,12 +55,8 @@ class RandomActions:
     _rng: list[np.random.Generator] = field(default_factory=list, repr=False)
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """An action (C,)."""
-        return self.act_all(observation[None])[0]
-
-    def act_all(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Actions (N, C)."""
+        """An action (C,); or (N, C) for (N, O)."""
         if not self._rng:
             self._rng.append(np.random.default_rng(self.seed))
-        shape = (len(observations), len(self.task.robot.command))
+        shape = (*observation.shape[:-1], len(self.task.robot.command))
         return self._rng[0].uniform(-1.0, 1.0, shape).astype(np.float32)

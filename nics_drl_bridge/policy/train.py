@@ -128,8 +128,8 @@ def _again(
     for key in new:
         if old.get(key) != new[key]:
             raise ConfigError(
-                f"{path}: was trained with {key} {old.get(key)!r}, not {new[key]!r}; resume it with "
-                "the same settings, or train anew in another folder."
+                f"{path}: was trained with {key} {old.get(key)!r}, not {new[key]!r}; resume it "
+                "with the same settings, or train anew in another folder."
             )
     if content["about"]["seed"] != about["seed"]:
         raise ConfigError(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium
 import numpy as np
 import torch
@@ -51,10 +53,8 @@ def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
     return rows.mean(axis=0), np.maximum(rows.std(axis=0), LEAST_STD)
 
 
-def _random_actions(
-    env: VecEnv, rng: np.random.Generator
-) -> NDArray[np.float32] | NDArray[np.int64]:
+def _random_actions(env: VecEnv, rng: np.random.Generator) -> NDArray[Any]:
     space = env.action_space
     if isinstance(space, gymnasium.spaces.Discrete):
-        return rng.integers(space.n, size=env.num_envs)
+        return np.asarray(rng.integers(space.n, size=env.num_envs))
     return rng.uniform(-1.0, 1.0, (env.num_envs, *space.shape)).astype(np.float32)

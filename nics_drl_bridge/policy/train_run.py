@@ -9,16 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nics_drl_bridge.config import dump_yaml, load_yaml
+from nics_drl_bridge.env.tasks import make_task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import write_text
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.policy.evaluation_batch import Summary, summarise
 from nics_drl_bridge.policy.evaluation_intervals import Estimate
 from nics_drl_bridge.policy.train import CHECKPOINT, Trained, evaluate, train
+from nics_drl_bridge.policy.train_export import export_policy
 from nics_drl_bridge.policy.train_progress import Progress
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
-SETTINGS, EVALUATION = "settings.yaml", "evaluation.json"
+SETTINGS, EVALUATION, POLICY = "settings.yaml", "evaluation.json", "policy.onnx"
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,7 @@ def run(
     out: Path,
     episodes: int,
     resumed: bool = False,
+    command: str = "",
     tell: Callable[[Progress], None] = lambda _: None,
     done: Callable[[SeedResult], None] = lambda _: None,
 ) -> list[SeedResult]:
@@ -53,6 +56,7 @@ def run(
         out: folder of the run; each seed gets one below it.
         episodes: of an evaluation in each world.
         resumed: whether to go on from the checkpoints that there are.
+        command: what the user called, for the policy files.
         tell: is told of the progress.
         done: is told of each seed that is through.
 
@@ -70,8 +74,18 @@ def run(
         summaries = results[-1].summaries
         plain = {world: dataclasses.asdict(summary) for world, summary in summaries.items()}
         write_text(folder / EVALUATION, json.dumps(plain, indent=2) + "\n")
+        _export(settings, results[-1], command, folder / POLICY)
         done(results[-1])
     return results
+
+
+def _export(settings: TrainingSettings, result: SeedResult, command: str, path: Path) -> None:
+    """Writes the policy file, which tells how the policy came about and how well it drives."""
+    model = open_model(settings.robot)
+    task = make_task(settings.task, model, settings.task_options)
+    rates = {f"success in {world}": one.success.value for world, one in result.summaries.items()}
+    provenance = {"command": command, "seed": result.seed, "steps": result.trained.steps, **rates}
+    export_policy(result.trained.algorithm, task, model, path, provenance=provenance)
 
 
 def _check(seeds: Sequence[int], out: Path, resumed: bool) -> None:

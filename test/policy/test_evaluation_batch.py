@@ -9,7 +9,7 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.policy.evaluation import drive
 from nics_drl_bridge.policy.evaluation_batch import Outcomes, drive_worlds, summarise
-from nics_drl_bridge.policy.policies import act_all, make_policy
+from nics_drl_bridge.policy.policies import make_policy
 
 LIMIT = 40
 MODEL, WORLD = direct_model(odometry=(0.02, 0.02)), field(count=6)
@@ -20,7 +20,7 @@ def test_many_at_once_end_as_one_after_the_other(worlds):
     env = BridgeVectorEnv(worlds, MODEL, WORLD, max_episode_steps=LIMIT)
     policy = make_policy("straight", env.task)
     seeds = [7, 3, 11, 5, 100, 42, 43]
-    found = drive_worlds(env, act_all(policy), seeds)
+    found = drive_worlds(env, policy.act, seeds)
     alone = TimeLimit(BridgeEnv(model=MODEL, world=WORLD), LIMIT)
     episodes = [drive(alone, policy, seed) for seed in seeds]
     assert found.seeds.tolist() == seeds

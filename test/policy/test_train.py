@@ -14,7 +14,7 @@ from nics_drl_bridge.policy.training_settings import TrainingSettings
 MODEL, WORLD = direct_model(odometry=(0.02, 0.02)), field(count=2)
 
 
-class InterruptedError_(Exception):
+class BrokenOffError(Exception):
     """As a user's Ctrl-C."""
 
 
@@ -50,16 +50,16 @@ def weights(algorithm):
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac"])
-def test_an_interrupted_training_comes_to_the_same_weights(algorithm, tmp_path):
+def test_an_interrupted_training_comes_to_the_same_weights(algorithm, tmp_path, monkeypatch):
     whole = train(settings(algorithm), 1, tmp_path / "whole")
 
     def interrupt(progress):
         if progress.steps > 1000:
-            raise InterruptedError_
+            raise BrokenOffError
 
     # Told of every rollout, whatever the clock says.
-    with pytest.raises(InterruptedError_), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nics_drl_bridge.policy.train_progress.TOLD_S", 0.0)
+    monkeypatch.setattr("nics_drl_bridge.policy.train_progress.TOLD_S", 0.0)
+    with pytest.raises(BrokenOffError):
         train(settings(algorithm), 1, tmp_path / "broken", interrupt)
     kept = read_checkpoint(tmp_path / "broken" / CHECKPOINT)["counters"]["num_timesteps"]
     assert 0 < kept < 1000
@@ -119,5 +119,5 @@ def test_a_checkpoint_that_would_run_code_is_refused(tmp_path):
 def test_sac_is_refused_for_discrete_actions_and_a_batch_that_no_rollout_fills(tmp_path):
     with pytest.raises(ConfigError, match="'sac' needs continuous actions; use 'ppo'"):
         train(settings("sac", task_options={"actions": "discrete"}), 0, tmp_path)
-    with pytest.raises(ConfigError, match="ppo.batch 999: is more than the 128 transitions"):
+    with pytest.raises(ConfigError, match=r"ppo\.batch 999: is more than the 128 transitions"):
         train(settings(ppo={"rollout": 16, "batch": 999}), 0, tmp_path)

@@ -1,0 +1,140 @@
+"""How long does it take to learn to navigate, from nothing?
+
+Trains a shipped robot among ten random obstacles with the shipped settings, then drives unseen
+episodes there. Wall time counts from the first random weight to the last evaluated episode; the
+kernels are compiled before. Of several seeds, `--json` gives the one with the least success, and
+the longest time and greatest share of all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.generator import open_model
+from nics_drl_bridge.policy.evaluation_batch import FIRST_SEED, Summary, drive_worlds, summarise
+from nics_drl_bridge.policy.train import train
+from nics_drl_bridge.policy.train_algorithms import act_of
+from nics_drl_bridge.policy.train_run import line_of
+from nics_drl_bridge.policy.training_settings import TrainingSettings, load_training
+
+WORLD = "circles"
+BARS = {"differential": (0.95, 180.0), "ackermann": (0.90, 600.0), "mecanum": (0.95, 300.0)}
+"""Least success and longest time [s]."""
+SHARE_BAR = 0.15
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training and its evaluation.
+
+    Attributes:
+        summary: of the evaluation.
+        steps: environment steps of the training.
+        wall_s, cpu_s: of both together [s].
+        env_s: of the wall time, what went to the simulator [s].
+    """
+
+    summary: Summary
+    steps: int
+    wall_s: float
+    cpu_s: float
+    env_s: float
+
+    def figures(self) -> dict[str, Any]:
+        """What `--json` prints."""
+        success = self.summary.success
+        return {
+            "success_rate": success.value,
+            "success_95ci": [success.low, success.high],
+            "collision_rate": self.summary.collision.value,
+            "wall_s": self.wall_s,
+            "env_steps": self.steps,
+            "env_share_of_wall": self.env_s / self.wall_s,
+        }
+
+
+def measure(settings: TrainingSettings, seed: int, episodes: int) -> Run:
+    """Trains with one seed and drives unseen episodes."""
+    model = open_model(settings.robot)
+    begin, cpu = time.perf_counter(), time.process_time()
+    with tempfile.TemporaryDirectory() as folder:
+        trained = train(settings, seed, Path(folder))
+    env = BridgeVectorEnv(
+        episodes, model, WORLD, settings.task, settings.task_options, settings.max_episode_steps
+    )
+    act, acting = act_of(trained.algorithm), [0.0]
+
+    def timed(observations: NDArray[np.float32]) -> NDArray[Any]:
+        start = time.perf_counter()
+        actions = act(observations)
+        acting[0] += time.perf_counter() - start
+        return actions
+
+    start = time.perf_counter()
+    outcomes = drive_worlds(env, timed, range(FIRST_SEED, FIRST_SEED + episodes))
+    end = time.perf_counter()
+    return Run(
+        summarise(outcomes, model.control_period),
+        trained.steps,
+        end - begin,
+        time.process_time() - cpu,
+        trained.stepping_s + (end - start - acting[0]),
+    )
+
+
+def warmed_up(settings: TrainingSettings, episodes: int) -> None:
+    """Compiles all kernels, and fills caches, with a training of one rollout."""
+    short = settings.ppo.rollout * settings.num_envs
+    measure(settings.model_copy(update={"steps": short}), 0, min(episodes, 20))
+
+
+def worst(runs: list[Run]) -> dict[str, Any]:
+    """The figures of the run with the least success, with the longest time and share of all."""
+    figures = [run.figures() for run in runs]
+    least = min(figures, key=lambda one: one["success_rate"])
+    greatest = ("wall_s", "env_steps", "env_share_of_wall")
+    return {**least, **{name: max(one[name] for one in figures) for name in greatest}}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--robot", choices=sorted(BARS), default="differential")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seeds", type=int, nargs="+", help="several seeds instead of one")
+    parser.add_argument("--episodes", type=int, default=500)
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    settings = load_training(f"navigation_{arguments.robot}")
+    warmed_up(settings, arguments.episodes)
+    runs = []
+    for seed in arguments.seeds or [arguments.seed]:
+        runs.append(measure(settings, seed, arguments.episodes))
+        if not arguments.json:
+            run = runs[-1]
+            print(f"{arguments.robot}, seed {seed}: {line_of(run.summary)}")
+            print(
+                f"  {run.steps:,} steps, {run.wall_s:.1f} s ({run.cpu_s:.1f} s of CPU), of which "
+                f"{100 * run.env_s / run.wall_s:.1f} % simulator; {os.cpu_count()} cores"
+            )
+    figures = worst(runs)
+    if arguments.json:
+        print(json.dumps(figures))
+    success, limit = BARS[arguments.robot]
+    passed = figures["success_rate"] >= success and figures["wall_s"] <= limit
+    return 0 if passed and figures["env_share_of_wall"] < SHARE_BAR else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

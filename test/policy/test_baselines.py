@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import lidar
+
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.policy.evaluation_batch import drive_worlds
+from nics_drl_bridge.policy.policies import POLICIES, make_policy
+
+ROBOTS = ("ackermann", "differential", "mecanum")
+
+
+def task_of(robot, **changes):
+    return Navigation(load_robot(robot), lidar(beams=90, **changes))
+
+
+def observe(task, bearing, distance=2.0, ranges=None):
+    free = np.full(task.lidar.beams, np.inf, np.float32) if ranges is None else ranges
+    view = RobotView(np.zeros(3), np.zeros(3), free, 0.0, 0.0, 0.0)
+    goal = np.array([distance * np.cos(bearing), distance * np.sin(bearing)])
+    return task.observation(view, {"goal": goal})
+
+
+def twist_of(task, action):
+    return task.robot.to_cmd_vel(task.command(action))
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("name", sorted(POLICIES))
+def test_any_observation_gives_an_action_of_the_space_alone_as_among_many(robot, name):
+    task = task_of(robot, mount=(0.05, 0.0, 0.1))
+    alone, among = make_policy(name, task), make_policy(name, task)
+    rng = np.random.default_rng(0)
+    seen = []
+    for _ in range(20):
+        ranges = rng.choice([np.inf, -np.inf, np.nan, 0.3, 1.0], 90).astype(np.float32)
+        seen.append(observe(task, rng.uniform(-3, 3), rng.uniform(0, 5), ranges))
+    actions = among.act(np.array(seen))
+    for observation, action in zip(seen, actions, strict=True):
+        mine = alone.act(observation)
+        assert task.action_space.contains(mine)
+        assert np.array_equal(mine, action)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("name", ["dynamic_window", "straight"])
+def test_it_turns_or_moves_to_the_side_of_the_goal_and_drives_to_one_ahead(robot, name):
+    task = task_of(robot)
+    policy = make_policy(name, task)
+    for side in (1.0, -1.0):
+        _, left, turn = twist_of(task, policy.act(observe(task, side)))
+        assert side * (left + turn) > 0.05
+    forward, left, turn = twist_of(task, policy.act(observe(task, 0.0)))
+    assert forward > 0.3
+    if robot != "mecanum" or name == "straight":  # one on rollers is fastest askew
+        assert (left, turn) == pytest.approx((0.0, 0.0), abs=1e-6)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_planner_does_not_drive_on_towards_a_wall_that_the_straight_one_drives_into(robot):
+    task = task_of(robot)
+    ahead = np.abs(task.lidar.angles) < 1.2
+    ranges = np.full(90, np.inf, np.float32)
+    ranges[ahead] = 0.3 / np.cos(task.lidar.angles[ahead])
+    observation = observe(task, 0.0, ranges=ranges)
+    assert twist_of(task, make_policy("dynamic_window", task).act(observation))[0] < 0.2
+    assert twist_of(task, make_policy("straight", task).act(observation))[0] > 0.5
+
+
+def test_random_actions_are_those_of_the_seed():
+    task = task_of("differential")
+    seen = observe(task, 0.0)
+    one, other = (make_policy("random", task) for _ in range(2))
+    first = one.act(seen)
+    assert np.array_equal(first, other.act(seen))
+    assert not np.array_equal(first, one.act(seen))
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_planner_reaches_most_goals_where_straight_ones_collide(robot):
+    env = BridgeVectorEnv(30, robot, "arena", max_episode_steps=200)
+    share = {
+        name: drive_worlds(env, make_policy(name, env.task).act, range(30)).success.mean()
+        for name in ("dynamic_window", "straight", "random")
+    }
+    assert share["dynamic_window"] >= 0.8
+    assert share["dynamic_window"] > share["straight"] > share["random"]

@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from nics_drl_bridge.cli import app
+from nics_drl_bridge.policy.policy_file import load_policy
+
+SETTINGS = """
+worlds: {arena: 8}
+task_options: {scan: around}
+steps: 256
+max_episode_steps: 20
+hidden: [8]
+ppo: {rollout: 16, batch: 64, epochs: 1}
+"""
+
+
+def nics(*arguments):
+    return CliRunner().invoke(app, ["train", *map(str, arguments)])
+
+
+@pytest.fixture
+def settings(tmp_path):
+    path = tmp_path / "settings.yaml"
+    path.write_text(SETTINGS)
+    return path
+
+
+def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed(
+    tmp_path, settings
+):
+    out = tmp_path / "run"
+    done = nics("--settings", settings, "--seeds", 3, 4, "--episodes", 10, "--out", out)
+    assert done.exit_code == 0, done.output
+    assert done.output.count("of 10 episodes") == 2
+    for seed in (3, 4):
+        folder = out / f"seed_{seed}"
+        assert load_policy(folder / "policy.onnx").contract.provenance["seed"] == seed
+        figures = json.loads((folder / "evaluation.json").read_text())["arena"]
+        assert figures["success"]["low"] <= figures["success"]["value"]
+        assert any(folder.glob("events.out.tfevents.*"))
+    again = nics("--resume", "--seeds", 4, "--episodes", 10, "--out", out)
+    assert again.exit_code == 0, again.output
+    assert again.output.startswith("seed 4: 256 steps")
+    refused = nics("--settings", settings, "--seeds", 3, "--out", out)
+    assert refused.exit_code == 2
+    assert "holds checkpoints of these seeds; add --resume" in refused.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--robot", "diferential"], "did you mean 'differential'"),
+        (["--world", "arenna"], "unknown world 'arenna'; did you mean 'arena'"),
+        (["--algorithm", "dqn"], "key 'algorithm'"),
+        (["--resume"], "--resume needs --out"),
+        (["--resume", "--steps", "5", "--out", "x"], "--steps: a resumed run has its own settings"),
+        (["--resume", "--out", "nowhere"], "nowhere: holds no settings.yaml"),
+        (["--seeds", "1", "1", "--out", "run"], "give one or more, none twice"),
+    ],
+)
+def test_what_can_not_be_trained_gives_one_sentence(
+    tmp_path, monkeypatch, settings, arguments, sentence
+):
+    monkeypatch.chdir(tmp_path)
+    done = nics(*arguments)
+    assert done.exit_code == 2
+    assert sentence in " ".join(done.output.split())
+    assert "Traceback" not in done.output

@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+import pytest
+
+from nics_drl_bridge.config import share_folder
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.policy.training_settings import chosen_settings, load_training
+
+SHIPPED = sorted(path.stem for path in (share_folder() / "config" / "training").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_settings_name_worlds_and_a_task_that_there_are(name):
+    settings = load_training(name)
+    for world in settings.worlds:
+        env = BridgeVectorEnv(1, settings.robot, world, settings.task, settings.task_options)
+        assert env.single_observation_space.shape == (78,)
+    assert settings.ppo.rollout * settings.num_envs >= settings.ppo.batch
+
+
+def test_settings_are_those_of_task_and_robot_and_a_user_changes_them():
+    settings = chosen_settings("navigation", None, {"robot": "mecanum", "steps": 99})
+    assert (settings.robot, settings.steps) == ("mecanum", 99)
+    assert settings.hidden == load_training("navigation_mecanum").hidden
+    assert settings.title == "navigation_mecanum_ppo"
+
+
+def test_worlds_that_are_named_share_the_copies_among_them():
+    settings = chosen_settings("navigation", None, {"world": ["arena", "crowd"]})
+    assert settings.worlds == {"arena": 256, "crowd": 256}
+
+
+def test_a_robot_or_task_without_settings_gets_the_defaults():
+    settings = chosen_settings("my_task.py:Reach", None, {"robot": "runs/model"})
+    assert settings.task_options == {}
+    assert settings.title == "Reach_model_ppo"
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("ppo: {rolout: 3}", r"unknown key 'ppo.rolout'; did you mean 'rollout'"),
+        ("algorithm: dqn", r"key 'algorithm': input should be 'ppo' or 'sac', not 'dqn'"),
+        ("worlds: {}", r"key 'worlds'"),
+        ("worlds: {arena: 0}", r"key 'worlds.arena': .* greater than or equal to 1, not 0"),
+        ("steps: 0.5", r"key 'steps'"),
+        ("task_options: {robot: x}", r"task_options can't hold 'robot', which the model gives"),
+    ],
+)
+def test_wrong_settings_are_refused_with_the_key(tmp_path, text, sentence):
+    file = tmp_path / "wrong.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=sentence):
+        load_training(str(file))
+    with pytest.raises(ConfigError, match="unknown training 'navigation_mecanun'; did you mean"):
+        load_training("navigation_mecanun")
