@@ -66,14 +66,6 @@ def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None
     return policy
 
 
-def act_all(policy: Policy) -> Callable[[NDArray[np.float32]], NDArray[Any]]:
-    """A policy for many robots: actions (N, C) for observations (N, O)."""
-    batched = getattr(policy, "act_all", None)
-    if batched is not None:
-        return lambda observations: np.asarray(batched(observations))
-    return lambda observations: np.stack([policy.act(one) for one in observations])
-
-
 def open_policy(name: str, model: SimulatorModel) -> tuple[Policy, Navigation]:
     """A policy by name and the navigation task that it is for.
 
