@@ -2,7 +2,8 @@
 
 A simulator node runs in lock-step as a process of its own. Both envs are reset to the same
 seeds and get the same random actions. A late observation is one that holds a scan or an
-odometry older than the step that it answers.
+odometry older than the step that it answers. By default each robot drives alone, and then a team
+of four cars drives with each in its own namespace.
 """
 
 from __future__ import annotations
@@ -13,26 +14,33 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
 
-from nics_drl_bridge.env.registration import NAVIGATION, register_envs
+from nics_drl_bridge.env.registration import COOPERATIVE_REACHING, NAVIGATION, register_envs
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
+ROBOTS = ("ackermann", "differential", "mecanum")
+FLEET = 4
 
-def measure(robot: str, world: str, steps: int, seed: int) -> dict[str, float]:
+
+def measure(robot: str, world: str, steps: int, seed: int, robots: int = 1) -> dict[str, float]:
     """Drives both envs for `steps` steps and compares every observation."""
     register_envs()
     domain_id = free_domain_id()
-    parameters = {"model": robot, "world": world, "mode": "lockstep"}
+    parameters = {"model": robot, "world": world, "mode": "lockstep", "robots": robots}
+    task: dict[str, Any] = {"id": NAVIGATION}
+    if robots > 1:
+        task = {"id": COOPERATIVE_REACHING, "task_options": {"robots": robots}}
     with (
         tempfile.TemporaryDirectory() as folder,
         NodeProcess("simulator_node", Path(folder), parameters, domain_id),
     ):
-        here = gymnasium.make(NAVIGATION, backend="sim", model=robot, world=world, estimator=True)
+        here = gymnasium.make(**task, backend="sim", model=robot, world=world, estimator=True)
         there = gymnasium.make(
-            NAVIGATION,
+            **task,
             backend="dds",
             model=robot,
             world=world,
@@ -75,21 +83,48 @@ def compare(here: gymnasium.Env, there: gymnasium.Env, steps: int, seed: int) ->
     }
 
 
+def measure_all(world: str, steps: int, seed: int) -> dict[str, Any]:
+    """Each robot alone, then the fleet; with the worst of all on top."""
+    runs = {robot: measure(robot, world, steps, seed) for robot in ROBOTS}
+    runs[f"{FLEET} robots in namespaces"] = measure(ROBOTS[0], world, steps, seed, FLEET)
+    name = "max_abs_observation_difference"
+    return {
+        "steps": sum(int(run["steps"]) for run in runs.values()),
+        name: max(run[name] for run in runs.values()),
+        "late_observations": sum(int(run["late_observations"]) for run in runs.values()),
+        "runs": runs,
+    }
+
+
+def show(result: dict[str, Any], indent: str = "") -> None:
+    """Prints a table."""
+    for key, value in result.items():
+        if isinstance(value, dict):
+            sys.stdout.write(f"{indent}{key}\n")
+            show(value, indent + "  ")
+        else:
+            sys.stdout.write(f"{indent}{key:<34}{value}\n")
+
+
 def main() -> None:
     """Prints a table, or one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--steps", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--robot", default="ackermann")
+    parser.add_argument("--robot", help="one kind of robot alone, as ackermann")
+    parser.add_argument("--robots", type=int, help="so many of them, in namespaces")
     parser.add_argument("--world", default="arena")
     given = parser.parse_args()
-    result = measure(given.robot, given.world, given.steps, given.seed)
+    if given.robot is None and given.robots is None:
+        result = measure_all(given.world, given.steps, given.seed)
+    else:
+        robot = given.robot or ROBOTS[0]
+        result = measure(robot, given.world, given.steps, given.seed, given.robots or 1)
     if given.json:
         sys.stdout.write(json.dumps(result) + "\n")
     else:
-        for key, value in result.items():
-            sys.stdout.write(f"{key:<34}{value}\n")
+        show(result)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -33,13 +34,25 @@ class RobotView:
     odom_age_s: float
 
 
+def stacked(views: Sequence[RobotView]) -> RobotView:
+    """Views of M robots as one with a leading (M,); the ages are the greatest."""
+    return RobotView(
+        np.stack([view.pose for view in views]),
+        np.stack([view.twist for view in views]),
+        np.stack([view.ranges for view in views]),
+        max(view.stamp_s for view in views),
+        max(view.scan_age_s for view in views),
+        max(view.odom_age_s for view in views),
+    )
+
+
 @dataclass(frozen=True)
 class Start:
     """How an episode begins.
 
     Attributes:
         seed: names the episode; a simulator draws its scene and its noise from it.
-        pose: (3,) where the robot stands: x [m], y [m], heading [rad] in `map`.
+        pose: (3,) where the robot stands: x [m], y [m], heading [rad] in `map`; (M, 3) of a team.
     """
 
     seed: int

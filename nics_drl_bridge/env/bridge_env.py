@@ -150,18 +150,13 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self, backend: str, estimator: bool | None, randomisation: str | Randomisation | None
     ) -> dict[str, Any]:
         """What a backend by name is told beside the user's own options."""
-        if self.robots > 1 and (backend != "sim" or estimator):
-            raise ConfigError(
-                f"task {type(self.task).__name__!r} has {self.robots} robots; only backend='sim' "
-                "without estimator drives several."
-            )
         if backend != "sim":
             if estimator is False or randomisation is not None:
                 raise ConfigError(
                     f"backend {backend!r} always estimates and is never randomised; leave out "
                     "`estimator` and `randomisation`."
                 )
-            return {}
+            return {} if self.robots == 1 else {"robots": self.robots}
         chosen = {"estimator": bool(estimator), "robots": self.robots}
         return chosen if randomisation is None else {**chosen, "randomisation": randomisation}
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import RobotView, Start
+from nics_drl_bridge.interface import RobotView, Start, stacked
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.middleware.view import Middleware
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -21,8 +21,8 @@ NANO = 1_000_000_000
 class SimBackend:
     """One world of the fast simulator, in this process.
 
-    With `estimator`, scan and odometry of its one robot pass through the middleware as those of
-    the nodes do, so that this backend and the one over DDS give the same numbers for the same seed
+    With `estimator`, scan and odometry of each robot pass through its middleware as those of the
+    nodes do, so that this backend and the one over DDS give the same numbers for the same seed
     and commands. Without, the pose is what the wheels' odometry says: the same bits as a world of
     the vector env, and several times faster.
 
@@ -30,7 +30,7 @@ class SimBackend:
         model: the robot.
         world: the field.
         renderer: `baked` or `exact` lidar.
-        estimator: whether the middleware stands between simulator and env.
+        estimator: whether a middleware for each robot stands between simulator and env.
         robots: M; views and commands have a leading (M,) when there are several.
         simulation: further arguments of the FastSimulator.
     """
@@ -46,7 +46,7 @@ class SimBackend:
     ) -> None:
         self._robot = model.robot
         self.simulator = FastSimulator(model, world, robots=robots, renderer=renderer, **simulation)
-        self._middleware = Middleware(model) if estimator else None
+        self._middlewares = [Middleware(model) for _ in range(robots if estimator else 0)]
         self._period_ns = round(model.control_period * NANO)
         self._row: Any = (0, 0) if robots == 1 else 0
         self._now_ns = 0
@@ -56,18 +56,20 @@ class SimBackend:
         robots = self.simulator.data.pose.shape[1]
         self.simulator.reset([start.seed], starts=start.pose.reshape(1, robots, 3))
         self._now_ns = 0
-        if self._middleware is not None:
-            self._middleware.reset(self._now_ns, start.pose)
+        for middleware, pose in zip(self._middlewares, start.pose.reshape(-1, 3), strict=False):
+            middleware.reset(self._now_ns, pose)
         return self._measure()
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Moves the robots by one control period; see `interface.Backend`."""
-        if self._middleware is not None:
+        data = self.simulator.data
+        if self._middlewares:
             # By way of cmd_vel, as over ROS 2, so that both round alike.
             command = self._robot.from_cmd_vel(self._robot.to_cmd_vel(command))
-            self._middleware.command(self._now_ns, command)
-        data = self.simulator.data
-        self.simulator.step(command.reshape(1, data.pose.shape[1], -1))
+        commands = command.reshape(data.pose.shape[1], -1)
+        for middleware, one in zip(self._middlewares, commands, strict=False):
+            middleware.command(self._now_ns, one)
+        self.simulator.step(commands[None])
         self._now_ns += self._period_ns
         view = self._measure()
         collided = data.collided[self._row]
@@ -81,11 +83,16 @@ class SimBackend:
     def _measure(self) -> RobotView:
         data, now, row = self.simulator.data, self._now_ns, self._row
         odom, twist, ranges = data.odom[row].copy(), data.twist[row].copy(), data.ranges[row].copy()
-        if self._middleware is None:
+        if not self._middlewares:
             return RobotView(odom, twist, ranges, now * 1e-9, 0.0, 0.0)
-        self._middleware.odometry(now, now, odom, twist)
-        self._middleware.scan(now, now, ranges)
-        return self._middleware.view(now)
+        views = [self._estimated(robot) for robot in range(len(self._middlewares))]
+        return views[0] if len(views) == 1 else stacked(views)
+
+    def _estimated(self, robot: int) -> RobotView:
+        data, now, middleware = self.simulator.data, self._now_ns, self._middlewares[robot]
+        middleware.odometry(now, now, data.odom[0, robot].copy(), data.twist[0, robot].copy())
+        middleware.scan(now, now, data.ranges[0, robot].copy())
+        return middleware.view(now)
 
     def close(self) -> None:
         """Nothing has to be freed."""

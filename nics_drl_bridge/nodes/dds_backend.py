@@ -99,7 +99,7 @@ class DdsBackend:
         self._robot, self._lidar = model.robot, model.lidar
         self._middleware = Middleware(model)
         self._period_ns = round(model.control_period * conversions.NANO)
-        self._timeout_s, self._topics = timeout_s, (ODOM, SCAN, *((TRUTH,) if truth else ()))
+        self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *((TRUTH,) if truth else ()))
         self._now_ns, self._mail = 0, _Mailbox()
         self._link = Link(namespace, domain_id)
         types = {SCAN: LaserScan, ODOM: Odometry, TRUTH: Odometry}
@@ -123,21 +123,26 @@ class DdsBackend:
             ModelError: it runs another model or world.
             StaleDataError: its data do not arrive.
         """
-        self._link.check_open()
         with self._link.zero_after_an_error():
-            self._episodes.choose(start, self._timeout_s)
-            deadline = time.monotonic() + self._timeout_s
-            while True:
-                patience_s = min(RESET_PATIENCE_S, max(0.0, deadline - time.monotonic()))
-                self._now_ns = self._episodes.begin(self._timeout_s)
-                self._middleware.reset(self._now_ns, start.pose)
-                try:
-                    return self._measure(patience_s)[0]
-                except StaleDataError as error:
-                    # The simulator may not have discovered our subscription yet, and what it
-                    # sends before that is lost: begin the same episode again.
-                    if time.monotonic() >= deadline:
-                        raise StaleDataError(error.topic, error.age_s, self._timeout_s) from None
+            self.choose(start)
+            return insist(
+                lambda patience_s: self.first(self.begin(), start.pose, patience_s), self.timeout_s
+            )
+
+    def choose(self, start: Start) -> None:
+        """The first part of a reset: says which episode `begin` begins."""
+        self._link.check_open()
+        self._episodes.choose(start, self.timeout_s)
+
+    def begin(self) -> int:
+        """The second part: begins it; the stamp of its first data [ns]."""
+        return self._episodes.begin(self.timeout_s)
+
+    def first(self, stamp_ns: int, pose: Array, patience_s: float) -> RobotView:
+        """The last part: waits for the data of a stamp, of a robot that stands at a pose (3,)."""
+        self._now_ns = stamp_ns
+        self._middleware.reset(stamp_ns, pose)
+        return self._measure(patience_s)[0]
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Publishes a command and waits for the data after it; see `interface.Backend`.
@@ -164,7 +169,7 @@ class DdsBackend:
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
         """The second half: waits for the data after the command, and for `info` about them."""
         with self._link.zero_after_an_error():
-            return self._measure(self._timeout_s)
+            return self._measure(self.timeout_s)
 
     def _check_stamps(self, stamps: dict[str, int]) -> None:
         """Raises BackendError when data are not stamped with the present step."""
@@ -200,6 +205,28 @@ class DdsBackend:
     def close(self) -> None:
         """Publishes a zero command and ends the node."""
         self._link.close()
+
+
+def insist(begin: Callable[[float], RobotView], timeout_s: float) -> RobotView:
+    """Begins an episode, and again while its data do not arrive, until a time is over.
+
+    The simulator may not have discovered a subscription yet, and what it sends before that is
+    lost.
+
+    Args:
+        begin: begins it and waits so long [s]; raises StaleDataError.
+        timeout_s: when to give up.
+
+    Raises:
+        StaleDataError: its data do not arrive.
+    """
+    deadline = time.monotonic() + timeout_s
+    while True:
+        try:
+            return begin(min(RESET_PATIENCE_S, max(0.0, deadline - time.monotonic())))
+        except StaleDataError as error:
+            if time.monotonic() >= deadline:
+                raise StaleDataError(error.topic, error.age_s, timeout_s) from None
 
 
 def _putter(mail: _Mailbox, topic: str) -> Callable[[Any], None]:

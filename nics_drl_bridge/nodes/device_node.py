@@ -69,13 +69,14 @@ class DeviceNode(Node):
         model = device_parameters.timed_model(self, model, self._time)
         simulator = make(self, model, world, len(self._names))
         self._world = DeviceWorld(simulator, model, len(self._names))
-        self._now_ns = time.time_ns() // self._time.step_ns * self._time.step_ns
+        self._now_ns = 0
         self._command_ns = np.zeros(len(self._names), np.int64)
         self._heard = np.zeros(len(self._names), np.bool_)
         self._paused = False
         self._world.advance()  # compiled before anybody waits for it
         self._open_topics(model)
         self._start_time()
+        self._now_ns = time.time_ns() // self._time.step_ns * self._time.step_ns
         self._begin()
 
     def _open_topics(self, model: SimulatorModel) -> None:

@@ -166,7 +166,7 @@ def namespaces(node: Node) -> tuple[str, ...]:
     """
     value: Any = node.get_parameter("robots").value
     if isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= GREATEST_FLEET:
-        return ("",) if value == 1 else tuple(f"robot{k + 1}" for k in range(value))
+        return ("",) if value == 1 else default_namespaces(value)
     names = tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else ()
     valid = all(isinstance(name, str) and NAMESPACE.fullmatch(name) for name in names)
     if not names or not valid or len(set(names)) < len(names) or len(names) > GREATEST_FLEET:
@@ -175,6 +175,11 @@ def namespaces(node: Node) -> tuple[str, ...]:
             "of different namespaces, as in [robot1, robot2]."
         )
     return names
+
+
+def default_namespaces(robots: int) -> tuple[str, ...]:
+    """Of so many robots: robot1, robot2, ..."""
+    return tuple(f"robot{k + 1}" for k in range(robots))
 
 
 def frames(node: Node, namespace: str) -> Frames:

@@ -45,7 +45,7 @@ class Episodes:
         request = SetParametersAtomically.Request()
         request.parameters = [
             Parameter("episode_seed", value=int(start.seed)).to_parameter_msg(),
-            Parameter("episode_start", value=[float(v) for v in start.pose]).to_parameter_msg(),
+            Parameter("episode_start", value=start.pose.ravel().tolist()).to_parameter_msg(),
             Parameter("episode_start_given", value=True).to_parameter_msg(),
         ]
         result = self._link.call(self._parameters, request, timeout_s).result

@@ -19,6 +19,8 @@ from rclpy.node import Node
 from rclpy.waitable import NumberOfEntities
 
 NANO = 1_000_000_000
+MOST_AT_ONCE = 32
+"""A timer without a period is always ready, and who spins wants to look after other things too."""
 
 
 class StandingExecutor(SingleThreadedExecutor):
@@ -62,7 +64,7 @@ class StandingExecutor(SingleThreadedExecutor):
     def _handle_others(self) -> None:
         """Lets rclpy handle all that is ready now."""
         with contextlib.suppress(TimeoutException):
-            while True:
+            for _ in range(MOST_AT_ONCE):
                 task, _, _ = self.wait_for_ready_callbacks(timeout_sec=0.0)
                 task()
                 task.result()  # raises what the callback did

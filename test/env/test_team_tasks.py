@@ -10,7 +10,6 @@ from nics_drl_bridge.env.cooperative_reaching import CooperativeReaching
 from nics_drl_bridge.env.pursuit_evasion import PursuitEvasion
 from nics_drl_bridge.env.task import Episodes, bearing, distance
 from nics_drl_bridge.env.teams import distances, others, seen
-from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import RobotView
 
 B = 72
@@ -167,10 +166,15 @@ def test_the_teams_reward_is_the_sum_over_its_robots(task):
             break
 
 
-def test_a_team_is_not_driven_over_topics_nor_estimated():
-    for arguments in ({"backend": "dds"}, {"estimator": True}):
-        with pytest.raises(ConfigError, match="has 3 robots; only backend='sim'"):
-            BridgeEnv(model=direct_model(), task="cooperative_reaching", **arguments)
+def test_each_robot_of_an_estimating_team_has_an_estimate_of_its_own():
+    env = BridgeEnv(
+        model=direct_model(), world=field(8.0), task="cooperative_reaching", estimator=True
+    )
+    env.reset(seed=0)
+    for _ in range(5):
+        info = env.step(np.array([[0.5, 0.0, 0.0], [0.0, 0.5, 0.2], [-0.5, 0.0, 0.0]]))[4]
+    assert info["pose"].shape == (3, 3)
+    assert info["pose"] == pytest.approx(info["true_pose"], abs=0.05)
 
 
 def test_a_team_gets_an_action_for_each_robot():

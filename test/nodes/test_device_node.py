@@ -1,0 +1,202 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from domains import claimed_domain
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import LaserScan
+from std_srvs.srv import Trigger
+
+from nics_drl_bridge.nodes import conversions
+from nodes.peer import stamp_ns
+
+pytestmark = pytest.mark.ros
+
+NANO = conversions.NANO
+NAMES = ("left", "right")
+
+
+class Fleet:
+    """Two robots in lock-step, and all that they say."""
+
+    def __init__(self, peer):
+        self.peer = peer
+        self.scans = {name: peer.listen(LaserScan, f"{name}/scan") for name in NAMES}
+        self.odoms = {name: peer.listen(Odometry, f"{name}/odom") for name in NAMES}
+        self.commands = {name: peer.speak(Twist, f"{name}/cmd_vel") for name in NAMES}
+
+    def reset(self, start):
+        given = {"episode_start": start, "episode_start_given": True}
+        assert self.peer.set_parameters("simulator_node", **given).successful
+        for _ in range(20):
+            answer = self.peer.call(Trigger, "simulator_node/reset")
+            if not answer.success:
+                return answer
+            stamp = json.loads(answer.message)["stamp_ns"]
+            try:
+                self.peer.until(lambda stamp=stamp: self.stamps() == {stamp}, "first data", 1.5)
+            except AssertionError:
+                continue
+            return answer
+        raise AssertionError("no data after a reset")
+
+    def stamps(self):
+        said = (*self.scans.values(), *self.odoms.values())
+        return {stamp_ns(each[-1]) if each else -1 for each in said}
+
+    def command(self, name, speed):
+        self.commands[name].publish(conversions.twist_to_ros([speed, 0.0, 0.0]))
+
+    def x(self, name):
+        return conversions.odometry_from_ros(self.odoms[name][-1])[0][0]
+
+
+FACING = [0.0, 0.0, 0.0, 1.0, 0.0, np.pi]
+
+
+@pytest.fixture(scope="module")
+def fleet(launch, meet, module_domain_id):
+    peer = meet(module_domain_id)
+    process = launch(
+        "simulator_node", module_domain_id, mode="lockstep", world="empty", robots=list(NAMES)
+    )
+    robots = Fleet(peer)
+    assert robots.reset(FACING).success
+    yield robots
+    process.check()
+
+
+def test_a_fleet_moves_when_each_of_its_robots_has_a_command(fleet):
+    fleet.reset(FACING)
+    (now,) = fleet.stamps()
+    fleet.command("left", 0.5)
+    for _ in range(3):  # each call makes the node spin
+        assert fleet.peer.set_parameters("simulator_node", episode_seed=0).successful
+    assert fleet.stamps() == {now}
+    fleet.command("right", 0.0)
+    fleet.peer.until(lambda: fleet.stamps() == {now + NANO // 10}, "a step of the fleet")
+    assert fleet.x("left") > 0.0
+
+
+def test_robots_of_a_fleet_see_each_other(fleet, model):
+    fleet.reset(FACING)
+    seen = [fleet.scans[name][-1].ranges[model.lidar.beams // 2] for name in NAMES]
+    assert seen == pytest.approx([1.0 - model.robot.footprint_radius] * 2, abs=0.05)
+
+
+def test_the_frames_of_a_fleet_begin_with_the_namespace_of_each_robot(fleet):
+    for name in NAMES:
+        scan, odom = fleet.scans[name][-1], fleet.odoms[name][-1]
+        assert scan.header.frame_id == f"{name}/laser"
+        assert (odom.header.frame_id, odom.child_frame_id) == (f"{name}/odom", f"{name}/base_link")
+
+
+def test_a_fleet_that_gets_starts_for_other_robots_says_how_many_it_needs(fleet):
+    answer = fleet.reset([0.0, 0.0, 0.0])
+    assert not answer.success
+    assert "2 robots need 6" in answer.message
+    assert fleet.reset(FACING).success
+
+
+class Stamped:
+    """A robot of stamped commands, whose scan is told 50 ms after it was measured."""
+
+    def __init__(self, peer):
+        self.peer = peer
+        self.order = []
+        for kind, topic in ((LaserScan, "scan"), (Odometry, "odom")):
+            peer.node.create_subscription(
+                kind, topic, lambda m, topic=topic: self.order.append((topic, stamp_ns(m))), 10
+            )
+        peer.node.create_subscription(
+            Clock,
+            "/clock",
+            lambda m: self.order.append(("clock", conversions.stamp_from_ros(m.clock))),
+            50,
+        )
+        self.odom = peer.listen(Odometry, "odom")
+        self.commands = peer.speak(TwistStamped, "cmd_vel")
+
+    def stamps(self, topic):
+        return [stamp for name, stamp in list(self.order) if name == topic]
+
+    def drive(self, age_ns):
+        message = TwistStamped(twist=conversions.twist_to_ros([0.5, 0.0, 0.0]))
+        if age_ns is not None:
+            message.header.stamp = conversions.stamp_to_ros(stamp_ns(self.odom[-1]) - age_ns)
+        self.commands.publish(message)
+        return self.peer.another(self.odom, "odometry").twist.twist.linear.x
+
+
+@pytest.fixture(scope="module")
+def stamped(launch, meet):
+    with claimed_domain() as domain_id:
+        process = launch(
+            "simulator_node",
+            domain_id,
+            world="empty",
+            enable_stamped_cmd_vel=True,
+            odom_rate=50.0,
+            scan_latency=0.05,
+            frame_prefix="car/",
+        )
+        robot = Stamped(meet(domain_id))
+        robot.process, robot.stranger = process, meet(domain_id)
+        robot.peer.until(lambda: len(robot.stamps("scan")) > 2, "scans")
+        yield robot
+        process.check()
+
+
+def test_scan_and_odometry_have_rates_of_their_own(stamped):
+    known = len(stamped.stamps("scan"))
+    stamped.peer.until(lambda: len(stamped.stamps("scan")) > known + 5, "scans")
+    assert set(np.diff(stamped.stamps("scan"))) == {NANO // 10}
+    assert set(np.diff(stamped.stamps("odom"))) == {NANO // 50}
+
+
+def test_a_scan_is_told_as_late_as_the_latency_says_but_stamped_when_it_was_measured(stamped):
+    known = len(stamped.stamps("scan"))
+    stamped.peer.until(lambda: len(stamped.stamps("scan")) > known + 5, "scans")
+    clock, late = 0, []
+    for topic, stamp in list(stamped.order):
+        if topic == "clock":
+            clock = stamp
+        elif topic == "scan" and clock:
+            late.append((clock - stamp) / NANO)
+    assert np.median(late) >= 0.02  # the clock ticks every 20 ms
+    assert stamped.odom[-1].header.frame_id == "car/odom"
+
+
+@pytest.mark.parametrize("age_ns", [0, None], ids=["fresh", "without a stamp"])
+def test_a_stamped_command_drives_the_robot(stamped, age_ns):
+    speed = 0.0
+    for _ in range(200):
+        speed = stamped.drive(age_ns)
+        if speed > 0.3:
+            return
+    raise AssertionError(f"it goes at {speed} m/s")
+
+
+def test_a_command_whose_stamp_is_older_than_the_timeout_is_ignored_and_said_to_be(stamped):
+    for _ in range(300):
+        if abs(stamped.drive(2 * NANO)) < 0.05:
+            break
+    assert max(abs(stamped.drive(2 * NANO)) for _ in range(20)) < 0.1
+    assert "older than command_timeout" in stamped.process.log.read_text()
+
+
+def test_a_publisher_of_the_other_type_is_named_with_both_types(stamped):
+    stamped.stranger.node.create_publisher(Twist, "cmd_vel", 1)
+
+    def said():
+        text = stamped.process.log.read_text()
+        return "publishes geometry_msgs/msg/Twist, but geometry_msgs/msg/TwistStamped" in text
+
+    stamped.peer.until(said, "a warning")
