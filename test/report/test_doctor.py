@@ -50,9 +50,7 @@ def odometry(
         "geometry_msgs/TwistWithCovariance",
         bags.twist(0.5 * speed, 0.0, 0.25 * turn), np.full(36, covariance),
     )  # fmt: skip
-    return bags.new(
-        "nav_msgs/msg/Odometry", bags.header(t, frames[0]), frames[1], inner, twist
-    )
+    return bags.new("nav_msgs/msg/Odometry", bags.header(t, frames[0]), frames[1], inner, twist)
 
 
 def heard(scans=None, odometries=None, commands=None, late=0.002, ticks=None):
