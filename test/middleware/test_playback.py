@@ -112,5 +112,5 @@ def test_a_bag_that_gives_no_estimate_is_refused(tmp_path, changed, topics, said
 
 def test_a_bag_without_odometry_lists_its_topics(tmp_path):
     bag = bags.write(tmp_path / "bag", {"/pose": drive()["/pose"]})
-    with pytest.raises(RecordingError, match="has no odometry.*/pose"):
+    with pytest.raises(RecordingError, match=r"has no odometry.*/pose"):
         estimate(bag, MODEL, {})
