@@ -27,7 +27,9 @@ from nics_drl_bridge.nodes.runner import DELIVERY_S, open_context
 
 CLOCK = "/clock"
 CLOCK_PERIOD_NS = 10_000_000
-"""Of `/clock` between messages [ns]; each message is preceded by its own time as well."""
+"""Of `/clock` between messages [ns of the wall]; a message is preceded by its own time as well."""
+QUEUE = 100
+"""Of a topic whose publishers' quality of service the bag does not tell."""
 NAP_S = 0.05
 PATIENCE_S = 20.0
 DISCOVERY_S = 1.0
@@ -123,7 +125,7 @@ class _Player:
         now = first
         for due, _, topic, data in messages:
             while self._order.lockstep is None and now < due and not self._stopping.is_set():
-                now = min(due, now + CLOCK_PERIOD_NS)
+                now = min(due, now + round(CLOCK_PERIOD_NS * self._order.rate))
                 at = began + round((now - first) / self._order.rate)
                 self._stopping.wait(max(at - time.monotonic_ns(), 0) * 1e-9)
                 self._tick(now)
@@ -225,7 +227,7 @@ def _quality(offers: tuple[Offer, ...]) -> QoSProfile:
     kept = any(offer.transient_local for offer in offers)
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=max((offer.depth for offer in offers), default=10),
+        depth=max((offer.depth for offer in offers), default=QUEUE),
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
     )

@@ -137,8 +137,8 @@ def test_a_bag_is_published_with_its_time_on_the_clock(meet, domain_id, tmp_path
 
     bag = small_drive(tmp_path / "bag")
     peer = meet(domain_id)
-    odom, clock = peer.listen(Odometry, "odom"), peer.listen(Clock, "/clock")
-    player = nics(domain_id, "bag", "replay", bag, "--rate", "4")
+    odom, clock = peer.listen(Odometry, "odom", 100), peer.listen(Clock, "/clock", 1000)
+    player = nics(domain_id, "bag", "replay", bag, "--rate", "0.5")
     peer.until(lambda: len(odom) >= 40, "the whole bag", ENDS_S)
     out, err, code = ended(player)
     assert (code, out) == (0, "60 messages were published\n"), err
@@ -155,7 +155,7 @@ def test_a_replay_in_lock_step_gives_the_same_estimate_bit_for_bit(
     """Over DDS and in process, twice over."""
     bag = small_drive(tmp_path / "bag")
     peer = meet(domain_id)
-    filtered = peer.listen(Odometry, "odometry/filtered")
+    filtered = peer.listen(Odometry, "odometry/filtered", 100)
     told = []
     for _ in range(2):
         node = launch("middleware_node", domain_id, use_sim_time=True)
