@@ -22,15 +22,9 @@ CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
 
 def scan(t, **changed):
-    header = LIDAR.header
-    values = {
-        "angle_min": header.angle_min, "angle_max": header.angle_max,
-        "angle_increment": header.angle_increment, "time_increment": 0.0, "scan_time": header.scan_time,
-        "range_min": header.range_min, "range_max": header.range_max,
-        "ranges": np.where(np.arange(LIDAR.beams) % 3, 0.6 * LIDAR.range_max, np.inf),
-        "frame": LIDAR.frame,
-    }  # fmt: skip
-    values |= changed
+    header = LIDAR.header._asdict() | {"time_increment": 0.0}
+    ranges = np.where(np.arange(LIDAR.beams) % 3, 0.6 * LIDAR.range_max, np.inf)
+    values = header | {"ranges": ranges, "frame": LIDAR.frame} | changed
     frame, ranges = values.pop("frame"), np.asarray(values.pop("ranges"), np.float32)
     return bags.new(
         "sensor_msgs/msg/LaserScan", bags.header(t, frame), *values.values(), ranges,
