@@ -31,7 +31,7 @@ CLOCK_PERIOD_NS = 10_000_000
 QUEUE = 100
 """Of a topic whose publishers' quality of service the bag does not tell."""
 NAP_S = 0.05
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 DISCOVERY_S = 1.0
 """Time for subscribers to find the topics before the first message [s]."""
 NANO = 1_000_000_000
