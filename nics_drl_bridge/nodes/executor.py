@@ -49,8 +49,12 @@ class StandingExecutor(SingleThreadedExecutor):
         Raises:
             ExternalShutdownException: the context is shut down.
         """
-        ends = self._gathered()
-        ends.wait(-1 if timeout_sec is None else int(timeout_sec * NANO))
+        try:
+            ends = self._gathered()
+            ends.wait(-1 if timeout_sec is None else int(timeout_sec * NANO))
+        except RuntimeError:  # of the library, whose context another thread may have shut down
+            if self.context.ok():
+                raise
         if not self.context.ok():
             raise ExternalShutdownException
         for subscription in ends.subscriptions_ready():
