@@ -22,15 +22,15 @@ ROOT = Path(__file__).resolve().parents[1]
 ROBOT = "differential"
 FORBIDDEN = ("torch", "stable_baselines3", "mujoco", "tensorboard")
 STAND_IN = Path(__file__).resolve().parent / "measuring" / "deployed_policy.py"
-INSTALL_S, DRIVE_S = 900, 400
+INSTALL_S, DRIVE_S = 900, 900
 
 
-def export(folder: Path) -> Path:
-    """A policy file with weights at random, made in the present environment."""
+def export(folder: Path) -> tuple[Path, Path]:
+    """A model's folder and a policy file with weights at random, made right here."""
     import torch
 
     from nics_drl_bridge.env.tasks import make_task
-    from nics_drl_bridge.generator import open_model
+    from nics_drl_bridge.generator import open_model, save_model
     from nics_drl_bridge.policy.train_export import export_policy
 
     torch.manual_seed(0)
@@ -38,9 +38,9 @@ def export(folder: Path) -> Path:
     task = make_task("navigation", model, {"scan": "around"})
     size = task.observation_space.shape[0]
     layers = [torch.nn.Linear(size, 64), torch.nn.Tanh(), torch.nn.Linear(64, 2)]
-    path = folder / "policy.onnx"
-    export_policy(torch.nn.Sequential(*layers), task, model, path)
-    return path
+    save_model(model, folder / "model")
+    export_policy(torch.nn.Sequential(*layers), task, model, folder / "policy.onnx")
+    return folder / "model", folder / "policy.onnx"
 
 
 def environment() -> dict[str, str]:
@@ -79,13 +79,13 @@ def measure() -> dict[str, Any]:
     """Makes the environment, drives in it, and removes it."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        policy = export(folder)
+        model, policy = export(folder)
         began = time.monotonic()
         python = installed(folder / "environment")
         install_s = time.monotonic() - began
         found = present(python)
         done = subprocess.run(
-            [str(python), str(STAND_IN), ROBOT, str(policy)],
+            [str(python), str(STAND_IN), str(model), str(policy)],
             env=environment(), cwd=folder, capture_output=True, text=True, timeout=DRIVE_S,
         )  # fmt: skip
         if done.returncode != 0:

@@ -17,13 +17,14 @@ import numpy as np
 import rclpy
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
-WANTED, DEADLINE_S = 20, 300.0
+WANTED, DEADLINE_S = 20, 600.0
 
 
 def drive(name: str, policy: str, folder: Path) -> int:
@@ -32,7 +33,7 @@ def drive(name: str, policy: str, folder: Path) -> int:
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=domain_id)
     node = rclpy.create_node("stand_in", context=context)
-    executor = rclpy.executors.SingleThreadedExecutor(context=context)
+    executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
     heard: list[TwistStamped] = []
     node.create_subscription(TwistStamped, "cmd_vel_raw", heard.append, qos.COMMAND)

@@ -19,6 +19,7 @@ from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.env.tasks import make_task
 from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.middleware.view import rehearse
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.train_export import export_policy
@@ -94,6 +95,7 @@ class Robot:
 def file(model, tmp_path_factory):
     path = tmp_path_factory.mktemp("policy") / "car.onnx"
     task = make_task("navigation", model, {"scan": "around"})
+    task.judge(rehearse(model), {"goal": np.zeros(2)})  # so that the node finds it compiled
     export_policy(network(78, len(model.robot.command)), task, model, path)
     return path
 
