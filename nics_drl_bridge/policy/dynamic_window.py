@@ -74,10 +74,10 @@ class DynamicWindow:
     def _commands(self) -> Array:
         """(K, C) a grid of commands between their limits, zero among them."""
         robot = self.task.robot
-        counts = {1: (15,), 2: (7, 15), 3: (7, 7, 5)}.get(len(robot.command), ())
+        counts = {1: (15,), 2: (7, 15), 3: (7, 7, 5)}.get(len(robot.command))
         axes = [
             np.unique(np.append(np.linspace(one.min, one.max, count), np.clip(0, one.min, one.max)))
-            for one, count in itertools.zip_longest(robot.command, counts, fillvalue=3)
+            for one, count in zip(robot.command, counts or [3] * len(robot.command), strict=True)
         ]
         return np.array(list(itertools.product(*axes)))
 

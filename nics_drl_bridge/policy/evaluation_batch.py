@@ -68,13 +68,13 @@ class Summary:
 def summarise(outcomes: Outcomes, control_period: float) -> Summary:
     """The figures of episodes; `control_period` [s]."""
     count = len(outcomes.seeds)
-    shares = (outcomes.success, outcomes.collision, outcomes.time_out)
-    return Summary(
-        count,
-        *(rate(int(flags.sum()), count) for flags in shares),
-        mean(outcomes.length[outcomes.success]),
-        mean(outcomes.steps[outcomes.success] * control_period),
+    success, collision, time_out = (
+        rate(int(flags.sum()), count)
+        for flags in (outcomes.success, outcomes.collision, outcomes.time_out)
     )
+    length = mean(outcomes.length[outcomes.success])
+    time = mean(outcomes.steps[outcomes.success] * control_period)
+    return Summary(count, success, collision, time_out, length, time)
 
 
 def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcomes:
@@ -123,9 +123,9 @@ def _drive_once(env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]) -> tup
 
 def _any_robot(info: dict[str, Any], name: str) -> Flags:
     values = np.asarray(info[name], np.bool_) if name in info else np.zeros(1, np.bool_)
-    return values.reshape(len(values), -1).any(axis=1)
+    return np.asarray(values.reshape(len(values), -1).any(axis=1))
 
 
 def _all_robots(info: dict[str, Any], name: str) -> Flags:
     values = np.asarray(info[name], np.bool_) if name in info else np.zeros(1, np.bool_)
-    return values.reshape(len(values), -1).all(axis=1)
+    return np.asarray(values.reshape(len(values), -1).all(axis=1))
