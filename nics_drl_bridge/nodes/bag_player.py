@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rcl_interfaces.srv import GetParameters
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -22,13 +23,15 @@ from nics_drl_bridge.kinematics.bag_file import BagFile, opened
 from nics_drl_bridge.kinematics.bag_qos import Offer
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.message_types import message_type
-from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.runner import DELIVERY_S, open_context
 
 CLOCK = "/clock"
 CLOCK_PERIOD_NS = 10_000_000
-"""Of `/clock` between messages [ns]; each message is preceded by its own time as well."""
+"""Of `/clock` between messages [ns of the wall]; a message is preceded by its own time as well."""
+QUEUE = 100
+"""Of a topic whose publishers' quality of service the bag does not tell."""
 NAP_S = 0.05
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 DISCOVERY_S = 1.0
 """Time for subscribers to find the topics before the first message [s]."""
 NANO = 1_000_000_000
@@ -90,11 +93,11 @@ class _Player:
 
     def ready(self) -> None:
         """Waits for the node to keep in step with, or a while for whoever listens."""
-        if self._barrier is None:
-            self._stopping.wait(DISCOVERY_S)
-            return
         until = time.monotonic() + PATIENCE_S
-        while not self._barrier.service_is_ready():
+        self._stopping.wait(DISCOVERY_S)
+        while not self._matched() and time.monotonic() < until and not self._stopping.is_set():
+            self._stopping.wait(NAP_S)
+        while self._barrier is not None and not self._barrier.service_is_ready():
             if self._stopping.is_set():
                 return
             if time.monotonic() > until:
@@ -103,7 +106,18 @@ class _Player:
                     "or correct its name, namespace or ROS_DOMAIN_ID."
                 )
             self._stopping.wait(NAP_S)
-        self._stopping.wait(DISCOVERY_S)
+
+    def _matched(self) -> bool:
+        """Whether all subscribers that are known of have found the topics."""
+        return all(
+            each.get_subscription_count() >= self._node.count_subscribers(each.topic_name)
+            for each in self._publishers.values()
+        )
+
+    def finish(self) -> None:
+        """Waits until what was sent has arrived: it is lost when the publisher goes before."""
+        for each in self._publishers.values():
+            each.wait_for_all_acked(Duration(seconds=DELIVERY_S))
 
     def play(self, messages: list[Timed]) -> int:
         """Publishes all messages; returns how many, fewer when it is stopped."""
@@ -111,7 +125,7 @@ class _Player:
         now = first
         for due, _, topic, data in messages:
             while self._order.lockstep is None and now < due and not self._stopping.is_set():
-                now = min(due, now + CLOCK_PERIOD_NS)
+                now = min(due, now + round(CLOCK_PERIOD_NS * self._order.rate))
                 at = began + round((now - first) / self._order.rate)
                 self._stopping.wait(max(at - time.monotonic_ns(), 0) * 1e-9)
                 self._tick(now)
@@ -179,6 +193,7 @@ def play_bag(order: PlayOrder, say: Callable[[str], None]) -> int:
         sent = player.play(timed)
         while order.loop and not stopping.is_set():
             sent += player.play(timed)
+        player.finish()
         return sent
     finally:
         node.destroy_node()
@@ -212,7 +227,7 @@ def _quality(offers: tuple[Offer, ...]) -> QoSProfile:
     kept = any(offer.transient_local for offer in offers)
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=max((offer.depth for offer in offers), default=10),
+        depth=max((offer.depth for offer in offers), default=QUEUE),
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
     )

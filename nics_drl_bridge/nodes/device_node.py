@@ -24,6 +24,7 @@ from nics_drl_bridge.interface import Simulator
 from nics_drl_bridge.nodes import conversions, device_parameters, qos
 from nics_drl_bridge.nodes.command_inlet import CommandInlet
 from nics_drl_bridge.nodes.device_parameters import declare_device
+from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
 from nics_drl_bridge.nodes.outbox import Outbox
 from nics_drl_bridge.nodes.pace import Pace, RealTime
 from nics_drl_bridge.nodes.qos_watch import QosWatch
@@ -75,6 +76,7 @@ class DeviceNode(QosWatch):
         self._heard = np.zeros(len(self._names), np.bool_)
         self._paused = False
         self._world.advance()  # compiled before anybody waits for it
+        self._lags, self._hardware = 0, model.robot.name
         self._open_topics(model)
         self._start_time()
         self._now_ns = time.time_ns() // self._time.step_ns * self._time.step_ns
@@ -101,6 +103,7 @@ class DeviceNode(QosWatch):
         ]
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
+        Diagnostics(self, "simulator", self._look)
 
     def _start_time(self) -> None:
         # Steady: not the node's clock, which with use_sim_time would wait for this very node.
@@ -124,6 +127,19 @@ class DeviceNode(QosWatch):
         for inlet in self._inlets:
             inlet.watch()
 
+    def _look(self) -> Finding:
+        """What `/diagnostics` tells."""
+        facts = {
+            "mode": self._time.mode,
+            "rate": self._time.rate,
+            "robots": len(self._names),
+            "simulated time [s]": f"{self._now_ns / conversions.NANO:.3f}",
+            "times it fell behind real time": self._lags,
+            **self._identity,
+        }
+        message = "paused" if self._paused else "running"
+        return Finding(message, False, facts, self._hardware)
+
     def _timeout_ns(self) -> int:
         return int(float(self.get_parameter("command_timeout").value or 0.0) * conversions.NANO)
 
@@ -142,6 +158,7 @@ class DeviceNode(QosWatch):
             return
         steady_ns = time.monotonic_ns()
         if self._real_time.lost(steady_ns, self._now_ns):
+            self._lags += 1
             self.get_logger().warning(
                 "this machine does not keep up with real time; ask for a smaller rate, scan_rate "
                 "or odom_rate, or fewer robots",

@@ -58,8 +58,7 @@ def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None
         return POLICIES[name](task)
     files = shipped_policies()
     if not name.endswith(SUFFIX) and name not in files:
-        known = nearest(name, (*POLICIES, *files))
-        raise ConfigError(f"unknown policy {name!r}; {known} Or give the path of an .onnx file.")
+        raise ConfigError(f"unknown policy {name!r}; {nearest(name, (*POLICIES, *files))}")
     # Imported here: the others need neither onnx nor onnxruntime.
     policy: Policy = import_module("nics_drl_bridge.policy.policy_file").load_policy(name)
     policy.check_fits(model, task)  # type: ignore[attr-defined]

@@ -225,3 +225,11 @@ def test_odd_headers_of_a_full_circle_are_understood(beams, changes):
 def test_a_header_that_describes_no_lidar_is_refused(beams, changes):
     with pytest.raises(ConfigError, match="LaserScan"):
         reader_of(header(lidar(beams=720), **changes), beams, lidar())
+
+
+def test_a_lidar_with_a_blind_side_fills_the_sectors_that_it_sees():
+    spec = load_lidar("sick_tim571")
+    plan = plan_of(spec, LAYOUTS["front"])
+    assert plan.count.min() >= 1
+    with pytest.raises(ConfigError, match="looks from -135 to 135 deg"):
+        plan_of(spec, LAYOUTS["around"])

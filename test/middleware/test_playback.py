@@ -21,12 +21,8 @@ STEP = 0.05
 
 
 def odometry(t, shift=0.0):
-    inner = bags.new(
-        "geometry_msgs/PoseWithCovariance", bags.pose(*bags.place_at(t)), np.zeros(36)
-    )
-    twist = bags.new(
-        "geometry_msgs/TwistWithCovariance", bags.twist(0.5, 0.0, 0.25), np.zeros(36)
-    )
+    inner = bags.new("geometry_msgs/PoseWithCovariance", bags.pose(*bags.place_at(t)), np.zeros(36))
+    twist = bags.new("geometry_msgs/TwistWithCovariance", bags.twist(0.5, 0.0, 0.25), np.zeros(36))
     stamp = None if shift is None else t + shift
     return bags.new("nav_msgs/msg/Odometry", bags.header(stamp, "odom"), "base_link", inner, twist)
 
@@ -37,8 +33,7 @@ def drive(**changed):
         "/odom": [(t + 0.01, odometry(t)) for t in bags.times(STEP, DURATION_S)],
         "/cmd_vel": [(t, bags.twist(0.5, 0.0, 0.1)) for t in bags.times(0.1, DURATION_S)],
         "/pose": [
-            (t + 0.08, bags.pose_stamped(t, *bags.place_at(t)))
-            for t in bags.times(0.1, DURATION_S)
+            (t + 0.08, bags.pose_stamped(t, *bags.place_at(t))) for t in bags.times(0.1, DURATION_S)
         ],
         "/imu": [(t + 0.01, bags.imu(t, 0.0, 0.0, 0.25)) for t in bags.times(STEP, DURATION_S)],
     }
@@ -117,5 +112,5 @@ def test_a_bag_that_gives_no_estimate_is_refused(tmp_path, changed, topics, said
 
 def test_a_bag_without_odometry_lists_its_topics(tmp_path):
     bag = bags.write(tmp_path / "bag", {"/pose": drive()["/pose"]})
-    with pytest.raises(RecordingError, match="has no odometry.*/pose"):
+    with pytest.raises(RecordingError, match=r"has no odometry.*/pose"):
         estimate(bag, MODEL, {})

@@ -169,3 +169,12 @@ def test_a_rehearsal_ends_with_a_robot_that_stands_still_in_the_open():
     assert np.allclose(view.twist, 0.0, atol=1e-9)
     assert np.isposinf(view.ranges).all()
     assert view.scan_age_s == view.odom_age_s == 0.0
+
+
+def test_after_a_change_of_lidar_only_scans_of_its_beams_are_taken(middleware):
+    assert middleware.scan(SECOND, SECOND, RANGES)
+    middleware.expect_beams(7)
+    assert np.isnan(middleware.view(SECOND).ranges).tolist() == [True] * 7
+    assert not middleware.scan(SECOND + PERIOD, SECOND + PERIOD, RANGES)
+    assert middleware.scan(SECOND + PERIOD, SECOND + PERIOD, np.ones(7, np.float32))
+    assert middleware.view(SECOND + PERIOD).ranges.tolist() == [1.0] * 7

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+from importlib import import_module
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.nodes import conversions
+from nics_drl_bridge.nodes import conversions, qos
 from nodes.peer import stamp_ns
 
 pytestmark = pytest.mark.ros
@@ -200,3 +202,22 @@ def test_a_publisher_of_the_other_type_is_named_with_both_types(stamped):
         return "publishes geometry_msgs/msg/Twist, but geometry_msgs/msg/TwistStamped" in text
 
     stamped.peer.until(said, "a warning")
+
+
+HAS_TF = find_spec("tf2_msgs") is not None
+
+
+@pytest.mark.skipif(not HAS_TF, reason="needs tf2_msgs, for which there is no wheel")
+def test_its_transforms_are_those_of_rep_105_and_the_mount_is_told_to_late_comers(stamped):
+    kind = import_module("tf2_msgs.msg").TFMessage
+    moving = stamped.peer.listen(kind, "/tf", qos.TRANSFORMS)
+    fixed = stamped.peer.listen(kind, "/tf_static", qos.FIXED_TRANSFORMS)
+    stamped.peer.until(lambda: moving and fixed, "transforms")
+    (odom,), (mount,) = moving[-1].transforms, fixed[-1].transforms
+    assert (odom.header.frame_id, odom.child_frame_id) == ("car/odom", "car/base_link")
+    assert (mount.header.frame_id, mount.child_frame_id) == ("car/base_link", "car/laser")
+
+
+@pytest.mark.skipif(HAS_TF, reason="tf2_msgs is installed")
+def test_one_line_says_that_tf2_msgs_is_missing(stamped):
+    assert stamped.process.log.read_text().count("tf2_msgs is not installed") == 1

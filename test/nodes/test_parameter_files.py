@@ -15,6 +15,7 @@ from nics_drl_bridge.nodes import overrides
 from nics_drl_bridge.nodes.command_gate import CommandGate
 from nics_drl_bridge.nodes.drive_parameters import declare_drive
 from nics_drl_bridge.nodes.middleware_node import MiddlewareNode
+from nics_drl_bridge.nodes.mujoco_node import mujoco_node
 from nics_drl_bridge.nodes.policy_node import PolicyNode
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.nodes.simulator_node import SimulatorNode
@@ -32,6 +33,7 @@ def record_node(context):
 
 MAKERS = {
     "simulator_node": SimulatorNode,
+    "mujoco_node": mujoco_node,
     "middleware_node": MiddlewareNode,
     "policy_node": PolicyNode,
     "command_gate": CommandGate,

@@ -22,15 +22,9 @@ CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
 
 def scan(t, **changed):
-    header = LIDAR.header
-    values = dict(
-        angle_min=header.angle_min, angle_max=header.angle_max,
-        angle_increment=header.angle_increment, time_increment=0.0, scan_time=header.scan_time,
-        range_min=header.range_min, range_max=header.range_max,
-        ranges=np.where(np.arange(LIDAR.beams) % 3, 0.6 * LIDAR.range_max, np.inf),
-        frame=LIDAR.frame,
-    )  # fmt: skip
-    values |= changed
+    header = LIDAR.header._asdict() | {"time_increment": 0.0}
+    ranges = np.where(np.arange(LIDAR.beams) % 3, 0.6 * LIDAR.range_max, np.inf)
+    values = header | {"ranges": ranges, "frame": LIDAR.frame} | changed
     frame, ranges = values.pop("frame"), np.asarray(values.pop("ranges"), np.float32)
     return bags.new(
         "sensor_msgs/msg/LaserScan", bags.header(t, frame), *values.values(), ranges,
@@ -50,13 +44,11 @@ def odometry(
         "geometry_msgs/TwistWithCovariance",
         bags.twist(0.5 * speed, 0.0, 0.25 * turn), np.full(36, covariance),
     )  # fmt: skip
-    return bags.new(
-        "nav_msgs/msg/Odometry", bags.header(t, frames[0]), frames[1], inner, twist
-    )
+    return bags.new("nav_msgs/msg/Odometry", bags.header(t, frames[0]), frames[1], inner, twist)
 
 
 def heard(scans=None, odometries=None, commands=None, late=0.002, ticks=None):
-    """Facts of a live robot that drives a circle; rows (time, message) take the place of its own."""
+    """Facts of a robot on a circle; rows (time, message) take the place of its own."""
     facts = Facts("a robot", True, names_in(""))
     every = {
         "scan": scans or [(t, scan(t)) for t in bags.times(1.0 / LIDAR.rate, SECONDS)],

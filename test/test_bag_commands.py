@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("rosbags", reason="needs the extra 'bags'")
+
+import bags
+import numpy as np
+
+from nics_drl_bridge.kinematics import textbook
+from nics_drl_bridge.kinematics.bag_writer import write_bag
+from nics_drl_bridge.kinematics.spec import load_robot
+
+TIMEOUT_S = 120
+
+
+def nics(*words):
+    command = [sys.executable, "-m", "nics_drl_bridge.cli", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S)
+
+
+@pytest.fixture
+def damaged(tmp_path):
+    """A bag whose last tenth is missing."""
+    bag = bags.write(tmp_path / "bag", bags.drive())
+    (file,) = bag.glob("*.mcap")
+    file.write_bytes(file.read_bytes()[: int(0.7 * file.stat().st_size)])
+    return bag
+
+
+def test_info_prints_a_table_or_json(tmp_path):
+    bag = bags.write(tmp_path / "bag", bags.drive())
+    told = nics("bag", "info", bag)
+    assert told.returncode == 0, told.stderr
+    assert "geometry_msgs/msg/PoseStamped" in told.stdout
+    facts = json.loads(nics("bag", "info", bag, "--json").stdout)
+    assert facts["messages"] == 1800
+    assert [topic["topic"] for topic in facts["topics"]] == ["/cmd_vel", "/pose"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("bag", "info"), ("bag", "replay", "--estimate"), ("doctor",), ("generate", "--out", "model")],
+)
+def test_a_damaged_bag_is_one_sentence_for_every_command(damaged, words):
+    told = nics(*words, damaged)
+    assert told.returncode == 2
+    (sentence,) = told.stderr.splitlines()
+    assert sentence.startswith(f"nics: {damaged}: ")
+    assert "nics bag salvage" in sentence
+
+
+def test_what_is_intact_is_saved_and_the_loss_is_told(damaged, tmp_path):
+    told = nics("bag", "salvage", damaged, tmp_path / "saved")
+    assert told.returncode == 0, told.stderr
+    assert "of 1800 are lost" in told.stdout
+    assert nics("bag", "info", tmp_path / "saved").returncode == 0
+    looked = nics("bag", "info", damaged, "--salvage")
+    assert looked.returncode == 0
+    assert "of 1800 are lost" in looked.stderr
+
+
+def test_generate_takes_what_is_intact_when_told_to(damaged, tmp_path):
+    car, bag = load_robot("ackermann"), tmp_path / "drive"
+    write_bag(textbook.record(car, np.random.default_rng(0), duration=60.0), bag, car)
+    (file,) = bag.glob("*.mcap")
+    file.write_bytes(file.read_bytes()[: int(0.8 * file.stat().st_size)])
+    told = nics("generate", bag, "--salvage", "--out", tmp_path / "model")
+    assert told.returncode == 0, told.stderr
+    assert "are lost" in told.stderr
+    assert (tmp_path / "model" / "model.yaml").is_file()
