@@ -18,10 +18,15 @@ from nics_drl_bridge.highfidelity.library import load_mujoco
 from nics_drl_bridge.policy.evaluation import Episode, drive_all
 from nics_drl_bridge.policy.policies import SUFFIX, open_policy, shipped_policies
 
-FAST, DDS, MUJOCO = "fast", "dds", "mujoco_dds"
+FAST, DDS, MUJOCO, VEHICLE = "fast", "dds", "mujoco_dds", "vehicle"
 NODES = {DDS: "simulator_node", MUJOCO: "mujoco_node"}
 PLACES = (FAST, *NODES)
-LABELS = {FAST: "in process", DDS: "over DDS", MUJOCO: "MuJoCo over DDS"}
+LABELS = {
+    FAST: "in process",
+    DDS: "over DDS",
+    MUJOCO: "MuJoCo over DDS",
+    VEHICLE: "on the vehicle",
+}
 DEFAULT_ROBOT = "ackermann"
 START_S = 90.0
 """How long a node may take to come up; its kernels may have to be compiled."""

@@ -184,9 +184,7 @@ def _goals(moments: list[_Moment], goal: ArrayLike | None, ahead_s: float) -> Ar
     return np.stack([np.interp(times + ahead_s, times, place) for place in places.T], axis=-1)
 
 
-def _answered(
-    moments: list[_Moment], goals: Array, name: str, model: SimulatorModel
-) -> Shadow:
+def _answered(moments: list[_Moment], goals: Array, name: str, model: SimulatorModel) -> Shadow:
     policy, task = open_policy(name, model)
     robot, rows = model.robot, list[tuple[Any, ...]]()
     skipped = {"no command was driven": 0, "at the goal": 0, "touching something": 0}
