@@ -11,6 +11,7 @@ from nics_drl_bridge.commands.bag import bag
 from nics_drl_bridge.commands.bake import bake
 from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.doctor import doctor
+from nics_drl_bridge.commands.evaluate import evaluate
 from nics_drl_bridge.commands.generate import generate
 from nics_drl_bridge.commands.policy import policy
 from nics_drl_bridge.commands.record import record
@@ -44,7 +45,7 @@ def _options(
     """Options of every command."""
 
 
-for command in (generate, bake, record, replay, doctor, urdf, train, demo):
+for command in (generate, bake, record, replay, doctor, urdf, train, evaluate, demo):
     app.command()(command)
 app.add_typer(bag, name="bag")
 app.add_typer(policy, name="policy")

@@ -9,13 +9,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 
 from nics_drl_bridge.calibration.identify import Identified
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
-from nics_drl_bridge.env.registration import NAVIGATION, register_envs
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError
 from nics_drl_bridge.files import write_text
 from nics_drl_bridge.generator import SimulatorModel, generate, save_model
@@ -24,14 +22,14 @@ from nics_drl_bridge.kinematics.readers import read_recording
 from nics_drl_bridge.kinematics.recording import save_recording
 from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
 from nics_drl_bridge.lidar.spec import load_lidar
-from nics_drl_bridge.policy.evaluation import Episode, deviation, drive_all, successes
-from nics_drl_bridge.policy.policies import make_policy
+from nics_drl_bridge.policy.evaluation import Episode, deviation, successes
 from nics_drl_bridge.report.calibration_pictures import CAPTIONS, calibration_pictures
 from nics_drl_bridge.report.fit_pictures import accuracy
 from nics_drl_bridge.report.page import Block, Code, Picture, Table, page
 from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import load_world
+from nics_drl_bridge.trial import DDS, FAST, LABELS, Trial, drive_in
 
 RECORDING_SEED = 1
 POLICY = "go_to_goal"
@@ -39,7 +37,7 @@ LIVE_RATE = 2.0
 LIVE_TIMEOUT_S = 40.0
 FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05
 """The gate's limits in the demo: from zero to the greatest command, and to its greatest change."""
-IN_PROCESS, OVER_DDS = "in process", "over DDS"
+IN_PROCESS, OVER_DDS = LABELS[FAST], LABELS[DDS]
 Say = Callable[[str], None]
 
 
@@ -94,10 +92,10 @@ def run(plan: Plan, say: Say) -> Outcome:
     if find_spec("rclpy") is None:
         raise ConfigError(f"the demo {MISSING_ROS.format(module='rclpy')}")
     model, identified = _generate(plan, say)
-    seeds = range(plan.episodes)
     say(f"driving {plan.episodes} episodes in process")
-    here = _drive("sim", plan, model, seeds, say, {})
-    there = _drive_lockstep(plan, model, seeds, say)
+    here = _drive(FAST, plan, say)
+    say(f"driving the same {plan.episodes} episodes over DDS in lock-step")
+    there = _drive(DDS, plan, say)
     live = _drive_live(plan, model, say)
     report = plan.out / "report.html"
     write_text(report, _report(plan, model, identified, here, there, live))
@@ -122,61 +120,15 @@ def _record(robot: RobotSpec, path: Path, say: Say) -> Path:
     return path
 
 
-def _drive(
-    backend: str,
-    plan: Plan,
-    model: SimulatorModel,
-    seeds: Sequence[int],
-    say: Say,
-    options: dict[str, Any],
-) -> list[Episode]:
-    register_envs()
-    env = gymnasium.make(
-        NAVIGATION,
-        backend=backend,
-        model=model,
-        world=plan.world,
-        estimator=True,
-        backend_options=options,
+def _drive(place: str, plan: Plan, say: Say) -> list[Episode]:
+    """The plan's episodes in one of `trial.PLACES`, told of one by one."""
+    seeds, logs = range(plan.episodes), plan.out / "logs" / "lockstep"
+    return drive_in(
+        place,
+        Trial(POLICY, str(plan.out / "model"), plan.world, seeds, logs),
+        lambda e: say(f"  seed {e.seed}: {e.result}, {e.steps} steps, {e.length:.2f} m"),
+        say,
     )
-    try:
-        policy = make_policy(POLICY, Navigation(model.robot, model.lidar))
-        return drive_all(
-            env,
-            policy,
-            seeds,
-            lambda e: say(f"  seed {e.seed}: {e.result}, {e.steps} steps, {e.length:.2f} m"),
-        )
-    finally:
-        env.close()
-
-
-def _drive_lockstep(
-    plan: Plan, model: SimulatorModel, seeds: Sequence[int], say: Say
-) -> list[Episode]:
-    """Simulator and middleware, each a process, stepped over DDS."""
-    from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
-
-    domain_id, logs = free_domain_id(), plan.out / "logs" / "lockstep"
-    folder = str(plan.out / "model")
-    nodes: dict[str, dict[str, Any]] = {
-        "simulator_node": {"model": folder, "world": plan.world, "mode": "lockstep"},
-        "middleware_node": {"model": folder},
-    }
-    with ExitStack() as stack:
-        processes = []
-        for node, parameters in nodes.items():
-            process = stack.enter_context(NodeProcess(node, logs, parameters, domain_id))
-            processes.append(process)
-            say(f"started {node} as process {process.pid} in ROS domain {domain_id}")
-        say(f"driving the same {plan.episodes} episodes over DDS in lock-step")
-        options = {"truth": True, "domain_id": domain_id}
-        try:
-            return _drive("dds", plan, model, seeds, say, options)
-        except BackendError:
-            for process in processes:  # a node that has ended says why better
-                process.check()
-            raise
 
 
 @dataclass(frozen=True)

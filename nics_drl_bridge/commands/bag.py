@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from nics_drl_bridge.commands.console import needs_ros, one_sentence, table
+from nics_drl_bridge.commands.console import needs_ros, one_sentence, roles_of, table
 
 if TYPE_CHECKING:
     from nics_drl_bridge.kinematics.bag_info import BagInfo, BagTopic
@@ -152,18 +152,10 @@ def _storage(name: str) -> Literal["mcap", "sqlite3"]:
 
 
 def _estimate(path: Path, model: str, topics: list[str], out: Path | None) -> None:
-    from nics_drl_bridge.errors import ConfigError, nearest
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.middleware import playback
 
-    roles = {}
-    for option in topics:
-        role, _, name = option.partition("=")
-        if role not in playback.TYPES or not name:
-            known = nearest(role, playback.TYPES)
-            raise ConfigError(f"--topic {option!r}: must be ROLE=TOPIC; {known}")
-        roles[role] = name if name.startswith("/") else f"/{name}"
-    made = playback.estimate(path, open_model(model), roles)
+    made = playback.estimate(path, open_model(model), roles_of(topics))
     if out is not None:
         playback.write_estimate(made, out)
     for reason, count in sorted(made.rejected.items()):

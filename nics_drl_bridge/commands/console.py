@@ -32,6 +32,20 @@ TopicOption = Annotated[
 ]
 
 
+def roles_of(options: Sequence[str]) -> dict[str, str]:
+    """Role -> topic, of options ROLE=TOPIC for a bag that is played. Raises ConfigError."""
+    from nics_drl_bridge.errors import nearest
+    from nics_drl_bridge.middleware.playback import TYPES
+
+    roles = {}
+    for option in options:
+        role, _, name = option.partition("=")
+        if role not in TYPES or not name:
+            raise ConfigError(f"--topic {option!r}: must be ROLE=TOPIC; {nearest(role, TYPES)}")
+        roles[role] = name if name.startswith("/") else f"/{name}"
+    return roles
+
+
 @contextmanager
 def one_sentence() -> Iterator[None]:
     """What the user got wrong becomes one sentence and exit code 2, never a traceback."""

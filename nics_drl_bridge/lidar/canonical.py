@@ -278,3 +278,19 @@ def reader_of(header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool
         "range_min": header.range_min, "range_max": header.range_max,
     }  # fmt: skip
     return Reader(validate(fields, LidarSpec, "LaserScan"), backwards)
+
+
+def reader_beside(
+    header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool = False
+) -> Reader:
+    """`reader_of`, but exactly the expected lidar where the header says the same."""
+    found = reader_of(header, beams, like, upside_down)
+    limits = np.array([found.lidar.range_min, found.lidar.range_max])
+    same = found.lidar.beams == like.beams and np.allclose(
+        limits, [like.range_min, like.range_max], rtol=1e-4, atol=1e-4
+    )
+    turned = found.lidar.angles - like.angles if same else np.ones(1)
+    whole = 2.0 * np.pi * np.round(turned[0] / (2.0 * np.pi))  # the same beams, by other names
+    if same and np.abs(turned - whole).max() < 0.1 * like.angle_increment:
+        return Reader(like, found.backwards)
+    return found

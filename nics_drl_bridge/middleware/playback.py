@@ -21,7 +21,9 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.kinematics import topic_roles
 from nics_drl_bridge.kinematics.bag_file import BagFile, Message, opened
 from nics_drl_bridge.kinematics.bag_messages import command_row, pose_row, stamp, twist_row
+from nics_drl_bridge.lidar.canonical import Reader, reader_beside
 from nics_drl_bridge.lidar.rep117 import from_device
+from nics_drl_bridge.lidar.spec import ScanHeader
 from nics_drl_bridge.middleware.ekf import ANYWHERE
 from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.view import Middleware
@@ -84,11 +86,44 @@ def estimate(path: Path, model: SimulatorModel, topics: Mapping[str, str]) -> Es
         RecordingError: the bag is damaged, a topic is missing or of a wrong type, or its data
             are stamped by several clocks.
     """
+    messages = played(path, topics)
+    playback, rows = Playback(model, POSE in messages), []
+    for role, message in in_order(messages):
+        if playback.take(role, message) and role == ODOM:
+            rows.append(_row(playback.middleware, stamp(message.content)))
+    if not rows:
+        raise RecordingError(
+            "no odometry of the bag could be used; look at it with `nics bag info`."
+        )
+    stamps, poses, twists, covariances = zip(*rows, strict=True)
+    return Estimate(
+        np.array(stamps, dtype=np.int64), np.array(poses), np.array(twists),
+        np.array(covariances), dict(playback.middleware.cache.rejected),
+    )  # fmt: skip
+
+
+def _row(middleware: Middleware, stamp_ns: int) -> tuple[int, Array, Array, Array]:
+    estimator = middleware.estimator
+    stamp_ns = max(stamp_ns, estimator.time_ns)
+    view = middleware.view(stamp_ns)
+    return stamp_ns, view.pose, view.twist, estimator.covariance[:3, :3]
+
+
+def played(path: Path, topics: Mapping[str, str]) -> dict[str, list[Message]]:
+    """The messages of each role that is played.
+
+    Args:
+        path: of the bag.
+        topics: role -> topic, see `chosen`.
+
+    Raises:
+        RecordingError: see `estimate`.
+    """
     with opened(path) as bag:
         roles = chosen(bag, topics)
         messages = {role: bag.messages(topic) for role, topic in roles.items()}
     _check_clocks(str(path), roles, messages)
-    return _Playback(model, POSE in roles).run(messages)
+    return messages
 
 
 def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
@@ -154,76 +189,89 @@ def _check_clocks(
             )
 
 
-class _Playback:
-    """Feeds the middleware as the nodes do."""
+class Playback:
+    """Feeds the middleware as the nodes do.
 
-    def __init__(self, model: SimulatorModel, posed: bool) -> None:
-        self._model, self._middleware, self._posed = model, Middleware(model), posed
+    Args:
+        model: of the robot.
+        posed: whether a pose sensor says where the robot begins.
+        any_lidar: whether scans of another lidar than the model's are taken too, as `policy_node`
+            does; of the first one's from then on.
+
+    Attributes:
+        middleware: that is fed.
+        lidar: whose scans it holds.
+    """
+
+    def __init__(self, model: SimulatorModel, posed: bool, any_lidar: bool = False) -> None:
+        self._model, self._posed, self._any_lidar = model, posed, any_lidar
+        self.middleware, self.lidar = Middleware(model), model.lidar
+        self._reader: Reader | None = None
         self._started = False
-        self._rows: list[tuple[int, Array, Array, Array]] = []
 
-    def run(self, messages: Mapping[str, list[Message]]) -> Estimate:
+    def take(self, role: str, message: Message) -> bool:
+        """Takes a message; whether it is used, and the newest of its topic."""
         takes = {
             SCAN: self._scan, ODOM: self._odometry, CMD_VEL: self._command,
             POSE: self._pose, IMU: self._imu,
         }  # fmt: skip
-        for role, message in _in_order(messages):
-            takes[role](message.receive_ns, message.content)
-        if not self._rows:
-            raise RecordingError(
-                "no odometry of the bag could be used; look at it with `nics bag info`."
-            )
-        stamps, poses, twists, covariances = zip(*self._rows, strict=True)
-        return Estimate(
-            np.array(stamps, dtype=np.int64), np.array(poses), np.array(twists),
-            np.array(covariances), dict(self._middleware.cache.rejected),
-        )  # fmt: skip
+        if not takes[role](message.receive_ns, message.content):
+            return False
+        newest = self.middleware.cache.newest.get(role)
+        return newest is not None and newest.stamp_ns == stamp(message.content)
 
-    def _scan(self, arrival_ns: int, message: Any) -> None:
-        ranges = from_device(message.ranges, self._model.lidar)
-        self._middleware.scan(stamp(message), arrival_ns, ranges)
+    def _scan(self, arrival_ns: int, message: Any) -> bool:
+        values = np.asarray(message.ranges, np.float32)
+        if self._any_lidar:
+            values = self._followed(message).ordered(values)
+            if len(values) != self.lidar.beams:
+                self.middleware.cache.reject(f"{SCAN}: another lidar")
+                return False
+        ranges = from_device(np.ascontiguousarray(values), self.lidar)
+        return self.middleware.scan(stamp(message), arrival_ns, ranges)
 
-    def _odometry(self, arrival_ns: int, message: Any) -> None:
+    def _followed(self, message: Any) -> Reader:
+        """How to read scans; of the first one's lidar from then on."""
+        if self._reader is None:
+            header = ScanHeader(*(float(getattr(message, name)) for name in ScanHeader._fields))
+            self._reader = reader_beside(header, len(message.ranges), self._model.lidar)
+            self.lidar = self._reader.lidar
+            self.middleware.expect_beams(self.lidar.beams)
+        return self._reader
+
+    def _odometry(self, arrival_ns: int, message: Any) -> bool:
         stamp_ns, pose = stamp(message), np.array(pose_row(message))
         if not self._started and np.isfinite(pose).all():
             if self._posed:
-                self._middleware.reset(stamp_ns, pose, ANYWHERE)
+                self.middleware.reset(stamp_ns, pose, ANYWHERE)
             else:
-                self._middleware.reset(stamp_ns, pose)
+                self.middleware.reset(stamp_ns, pose)
             self._started = True
-        twist = np.array(twist_row(message))
-        used = self._middleware.odometry(stamp_ns, arrival_ns, pose, twist)
-        if used and self._middleware.cache.newest[ODOM].stamp_ns == stamp_ns:
-            self._note(stamp_ns)
+        return self.middleware.odometry(stamp_ns, arrival_ns, pose, np.array(twist_row(message)))
 
-    def _note(self, stamp_ns: int) -> None:
-        estimator = self._middleware.estimator
-        stamp_ns = max(stamp_ns, estimator.time_ns)
-        view = self._middleware.view(stamp_ns)
-        self._rows.append((stamp_ns, view.pose, view.twist, estimator.covariance[:3, :3]))
-
-    def _command(self, _: int, message: Any) -> None:
+    def _command(self, _: int, message: Any) -> bool:
         command = self._model.robot.from_cmd_vel(np.array(command_row(message)))
         stamp_ns = stamp(message) if hasattr(message, "header") else 0
-        self._middleware.command(stamp_ns or None, command)
+        self.middleware.command(stamp_ns or None, command)
+        return True
 
-    def _pose(self, arrival_ns: int, message: Any) -> None:
+    def _pose(self, arrival_ns: int, message: Any) -> bool:
         covariance = None
         if hasattr(message.pose, "covariance"):
             six = np.reshape(message.pose.covariance, (6, 6))
             covariance = six[np.ix_([0, 1, 5], [0, 1, 5])]
-        self._middleware.pose(stamp(message), arrival_ns, pose_row(message), covariance)
+        return self.middleware.pose(stamp(message), arrival_ns, pose_row(message), covariance)
 
-    def _imu(self, arrival_ns: int, message: Any) -> None:
+    def _imu(self, arrival_ns: int, message: Any) -> bool:
         covariance = message.angular_velocity_covariance
         if covariance[0] == -1.0:
-            self._middleware.cache.reject(f"{IMU}: no angular velocity")
-            return
+            self.middleware.cache.reject(f"{IMU}: no angular velocity")
+            return False
         rate, variance = float(message.angular_velocity.z), float(covariance[8])
-        self._middleware.imu(stamp(message), arrival_ns, rate, variance)
+        return self.middleware.imu(stamp(message), arrival_ns, rate, variance)
 
 
-def _in_order(messages: Mapping[str, list[Message]]) -> Iterator[tuple[str, Message]]:
+def in_order(messages: Mapping[str, list[Message]]) -> Iterator[tuple[str, Message]]:
     """All messages with their roles, in the order of receipt."""
     every = [
         (message.receive_ns, place, k, role, message)

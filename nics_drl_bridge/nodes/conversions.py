@@ -14,7 +14,7 @@ from sensor_msgs.msg import Imu, JointState, LaserScan
 
 from nics_drl_bridge.kinematics.joints import POSITION_UNITS
 from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.lidar.canonical import Reader, reader_of
+from nics_drl_bridge.lidar.canonical import Reader, reader_beside
 from nics_drl_bridge.lidar.rep117 import from_device, to_device
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader
 
@@ -101,16 +101,7 @@ def reader_from_ros(message: LaserScan, like: LidarSpec, upside_down: bool = Fal
         ConfigError: the header describes no lidar.
     """
     header = ScanHeader(*(float(getattr(message, name)) for name in ScanHeader._fields))
-    found = reader_of(header, len(message.ranges), like, upside_down)
-    limits = np.array([found.lidar.range_min, found.lidar.range_max])
-    same = found.lidar.beams == like.beams and np.allclose(
-        limits, [like.range_min, like.range_max], rtol=1e-4, atol=1e-4
-    )
-    turned = found.lidar.angles - like.angles if same else np.ones(1)
-    whole = 2.0 * np.pi * np.round(turned[0] / (2.0 * np.pi))  # the same beams, by other names
-    if same and np.abs(turned - whole).max() < 0.1 * like.angle_increment:
-        return Reader(like, found.backwards)
-    return found
+    return reader_beside(header, len(message.ranges), like, upside_down)
 
 
 def odometry_to_ros(

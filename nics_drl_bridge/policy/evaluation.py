@@ -48,9 +48,24 @@ class Episode:
         return float(np.linalg.norm(np.diff(self.path[:, :2], axis=0), axis=1).sum())
 
 
-def drive(env: gymnasium.Env[Any, Any], policy: Policy, seed: int) -> Episode:
-    """Drives one episode to its end."""
-    observation, info = env.reset(seed=seed)
+def drive(
+    env: gymnasium.Env[Any, Any],
+    policy: Policy,
+    seed: int,
+    options: dict[str, Any] | None = None,
+    on_start: Callable[[], None] = lambda: None,
+) -> Episode:
+    """Drives one episode to its end.
+
+    Args:
+        env: to drive in.
+        policy: that drives.
+        seed: of the episode.
+        options: of `env.reset`.
+        on_start: is called when the robot stands at its start.
+    """
+    observation, info = env.reset(seed=seed, options=options)
+    on_start()
     goal, bodies = info["goal"], info["bodies"]
     paths, estimates, total = [info["start"]], [info["pose"]], 0.0
     while True:

@@ -11,7 +11,7 @@ pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 import bags
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.files import npz_arrays
+from nics_drl_bridge.npz import npz_arrays
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.middleware.playback import estimate, write_estimate
 

@@ -1,0 +1,187 @@
+"""Evaluates policies in several worlds: Fig. 7 of the paper, with a table."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import write_bytes, write_text
+from nics_drl_bridge.generator import SimulatorModel, open_model
+from nics_drl_bridge.policy.comparison import Tally, record_of, tallies
+from nics_drl_bridge.policy.evaluation import Episode
+from nics_drl_bridge.policy.evaluation_intervals import Estimate
+from nics_drl_bridge.report.pictures import trajectories
+from nics_drl_bridge.sim.world import load_world
+from nics_drl_bridge.trial import LABELS, PLACES, Trial, check_place, drive_in, robot_of
+
+FIRST_SEED = 1_000_000
+"""Far from the seeds of any training."""
+PANELS = 6
+HEADS = (
+    "policy", "world", "success", "95 %", "collision", "time-out", "path [m]", "time [s]",
+    "as in the first", "deviation [m]", "greatest [m]",
+)  # fmt: skip
+Say = Callable[[str], None]
+Tell = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Order:
+    """What to evaluate.
+
+    Attributes:
+        policies: files, or names of shipped ones or of baselines.
+        out: folder for everything that is written.
+        model: folder of a model or a shipped robot; None takes the policies' own robot.
+        world: YAML file or name of the world.
+        episodes: how many.
+        seed: of the first one.
+        places: of `trial.PLACES`, the first is what the others are compared with.
+    """
+
+    policies: Sequence[str]
+    out: Path
+    model: str | None = None
+    world: str = "circles"
+    episodes: int = 20
+    seed: int = FIRST_SEED
+    places: Sequence[str] = PLACES
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """What one policy came to: its episodes and figures in each place."""
+
+    policy: str
+    runs: Mapping[str, Sequence[Episode]]
+    tallies: Mapping[str, Tally]
+
+
+def evaluate(order: Order, say: Say, tell: Tell) -> list[Evaluated]:
+    """Drives every policy through the same episodes in every place, and writes what came out.
+
+    Args:
+        order: what.
+        say: takes a line of progress.
+        tell: takes what is being driven, how many episodes are done, and of how many.
+
+    Returns:
+        One for each policy; `evaluation.json` and a picture for each policy are in `order.out`.
+
+    Raises:
+        BridgeError: a bad name or file, or a node that does not come up.
+    """
+    name = model_name(order)
+    model, world = open_model(name), load_world(order.world)
+    for place in order.places:
+        check_place(place)
+    evaluated = []
+    for policy in order.policies:
+        runs = {place: _drive(order, policy, name, place, say, tell) for place in order.places}
+        made = Evaluated(policy, runs, tallies(runs, model.control_period))
+        evaluated.append(made)
+        picture = trajectories(
+            {LABELS[place]: some[:PANELS] for place, some in runs.items()},
+            world, model.robot.footprint_radius,
+        )  # fmt: skip
+        write_bytes(picture_of(order.out, policy), picture)
+    told = json.dumps(told_of(order, name, model, evaluated))
+    write_text(order.out / "evaluation.json", told + "\n")
+    return evaluated
+
+
+def model_name(order: Order) -> str:
+    """The model that the episodes are driven with."""
+    if order.model is not None:
+        return order.model
+    robots = {policy: robot_of(policy) for policy in order.policies}
+    if len(set(robots.values())) > 1:
+        of_each = ", ".join(f"{policy!r} is of {robot!r}" for policy, robot in robots.items())
+        raise ConfigError(f"{of_each}: evaluate them one by one, or say which with --model.")
+    return next(iter(robots.values()))
+
+
+def _drive(
+    order: Order, policy: str, model: str, place: str, say: Say, tell: Tell
+) -> list[Episode]:
+    seeds = range(order.seed, order.seed + order.episodes)
+    trial = Trial(policy, model, order.world, seeds, order.out / "logs")
+    done = []
+
+    def told(episode: Episode) -> None:
+        done.append(episode)
+        tell(f"{Path(policy).stem} {LABELS[place]}", len(done), order.episodes)
+
+    say(f"driving {order.episodes} episodes of {policy} {LABELS[place]}")
+    return drive_in(place, trial, told, say)
+
+
+def picture_of(out: Path, policy: str) -> Path:
+    """Where the picture of a policy lies."""
+    return out / f"trajectories_{Path(policy).stem}.png"
+
+
+def told_of(
+    order: Order, name: str, model: SimulatorModel, evaluated: Sequence[Evaluated]
+) -> dict[str, Any]:
+    """Everything as plain data."""
+    return {
+        "model": name,
+        "model_fingerprint": model.fingerprint,
+        "robot": model.robot.name,
+        "world": order.world,
+        "seed": order.seed,
+        "policies": {
+            one.policy: {
+                place: {
+                    **one.tallies[place].figures(),
+                    "each": [record_of(episode) for episode in one.runs[place]],
+                }
+                for place in one.runs
+            }
+            for one in evaluated
+        },
+    }
+
+
+def rows_of(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
+    """The table below `HEADS`, for people."""
+    return [
+        (one.policy, LABELS[place], *_cells(tally))
+        for one in evaluated
+        for place, tally in one.tallies.items()
+    ]
+
+
+def _cells(tally: Tally) -> tuple[str, ...]:
+    success = tally.success
+    return (
+        percent(success.value),
+        f"{100 * success.low:.0f} to {100 * success.high:.0f} %",
+        percent(tally.collision.value),
+        percent(tally.time_out.value),
+        _figure(tally.length),
+        _figure(tally.time),
+        percent(tally.same),
+        f"{tally.deviation.value:.2g}",
+        f"{tally.greatest_deviation:.2g}",
+    )
+
+
+def percent(share: float) -> str:
+    """A share for people."""
+    return f"{100 * share:.4g} %"
+
+
+def _figure(estimate: Estimate) -> str:
+    return "-" if estimate.value != estimate.value else f"{estimate.value:.2f}"
+
+
+def line_of(one: Evaluated) -> str:
+    """A policy in one line."""
+    each = ", ".join(f"{LABELS[p]} {percent(t.success.value)}" for p, t in one.tallies.items())
+    return f"{one.policy}: success {each}"

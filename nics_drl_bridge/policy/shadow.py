@@ -1,0 +1,215 @@
+"""Shadow mode: what a policy would have commanded in a recorded drive, beside what was driven."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nics_drl_bridge.errors import ConfigError, RecordingError
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.kinematics.bag_file import Message
+from nics_drl_bridge.kinematics.bag_messages import command_row
+from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, POSE, SCAN
+from nics_drl_bridge.middleware.playback import Playback, in_order, played
+from nics_drl_bridge.policy.pacing import Pace
+from nics_drl_bridge.policy.policies import open_policy
+
+Array = NDArray[np.float64]
+NANO = 1e-9
+JITTER = 0.25
+"""So many periods may a scan be early."""
+HELD_S = 1.0
+"""A command that is older is no longer what the robot does."""
+DEAD_BAND = 0.05
+"""Smaller commands, in shares of their greatest, have no sign."""
+PERCENTILES = (50, 90, 99)
+
+
+@dataclass(frozen=True)
+class Shadow:
+    """A policy beside a drive, at T times at which it would have acted.
+
+    Attributes:
+        names, units: (C) of the commands.
+        time: (T,) since the first [s].
+        pose: (T, 3) estimated, in `map`.
+        goal: (T, 2) that the policy was given [m].
+        policy: (T, C) its commands.
+        driven: (T, C) the recorded ones.
+        scale: (C,) the greatest that each command can be.
+        skipped: reason -> at how many times nothing was compared.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    time: Array
+    pose: Array
+    goal: Array
+    policy: Array
+    driven: Array
+    scale: Array
+    skipped: Mapping[str, int]
+
+    def differences(self) -> dict[str, dict[str, float]]:
+        """How far the policy is from the drive, for each command.
+
+        Mean (policy less drive), mean, percentiles and greatest of its size, in the command's unit;
+        and of the times at which both tell a direction, the share at which they differ.
+        """
+        told = {}
+        for c, name in enumerate(self.names):
+            gap = self.policy[:, c] - self.driven[:, c]
+            size, band = np.abs(gap), DEAD_BAND * self.scale[c]
+            told[name] = {
+                "mean": float(gap.mean()),
+                "mean_size": float(size.mean()),
+                **{f"p{q}": float(np.percentile(size, q)) for q in PERCENTILES},
+                "greatest": float(size.max()),
+                "opposite": _opposite(self.policy[:, c], self.driven[:, c], band),
+            }
+        return told
+
+
+def _opposite(one: Array, other: Array, band: float) -> float:
+    """Share of the times at which both are beyond a band, and on different sides."""
+    told = (np.abs(one) > band) & (np.abs(other) > band)
+    return float((one[told] * other[told] < 0.0).mean()) if told.any() else 0.0
+
+
+@dataclass
+class _Moment:
+    """A time at which the policy would act."""
+
+    receive_ns: int
+    stamp_ns: int
+    view: RobotView
+    driven: Array | None = None
+
+
+def shadow(
+    path: Path,
+    model: SimulatorModel,
+    policy: str,
+    topics: Mapping[str, str],
+    goal: ArrayLike | None = None,
+    ahead_s: float = 4.0,
+) -> Shadow:
+    """Gives a policy what a robot saw, in process and always alike.
+
+    The policy acts when `policy_node` would: once per scan, with an odometry at least as new, at
+    most once in a control period of the stamps. A command is compared with the first one that was
+    recorded after that, or else with the one that still held.
+
+    Args:
+        path: of the bag.
+        model: of the robot.
+        policy: a file, or the name of a shipped one or of a baseline.
+        topics: role -> topic, see `playback.chosen`.
+        goal: (2,) in `map` [m], where the first odometry is what it says. None takes in its place
+            where the robot was `ahead_s` later: the driver's intention, in hindsight.
+        ahead_s: see there [s].
+
+    Raises:
+        RecordingError: the bag can't be used, or lacks scans or commands.
+        BridgeError: the policy can't be used, or does not fit.
+    """
+    if goal is None and not ahead_s > 0.0:
+        raise ConfigError(f"--ahead {ahead_s:g}: must be more than 0 s.")
+    messages = played(path, topics)
+    for role in (SCAN, CMD_VEL):
+        if role not in messages:
+            raise RecordingError(
+                f"{path}: has no {role}, which a policy is compared by; say which topic it is, as "
+                f"in --topic {role}=/car/{role}."
+            )
+    playback = Playback(model, POSE in messages, any_lidar=True)
+    moments = _moments(playback, messages, model)
+    if not moments:
+        raise RecordingError(f"{path}: no scan with an odometry could be used; see nics bag info.")
+    goals = _goals(moments, goal, ahead_s)
+    return _answered(moments, goals, policy, replace(model, lidar=playback.lidar))
+
+
+def _moments(
+    playback: Playback, messages: Mapping[str, list[Message]], model: SimulatorModel
+) -> list[_Moment]:
+    pace, moments = Pace(model.control_period), list[_Moment]()
+    held: tuple[int, Array] | None = None
+    acted_ns = 0
+    for role, message in in_order(messages):
+        playback.take(role, message)
+        if role == CMD_VEL:
+            row = model.robot.from_cmd_vel(np.array(command_row(message.content)))
+            held = message.receive_ns, row
+            if moments and moments[-1].driven is None:
+                moments[-1].driven = row
+        if role not in (SCAN, ODOM):
+            continue
+        newest = playback.middleware.cache.newest
+        if SCAN not in newest or ODOM not in newest:
+            continue
+        scan_ns = newest[SCAN].stamp_ns
+        if newest[ODOM].stamp_ns < scan_ns or scan_ns <= acted_ns:
+            continue
+        if not pace.due(scan_ns * NANO + JITTER * model.control_period):
+            continue
+        pace.acted(scan_ns * NANO)
+        acted_ns = scan_ns
+        _hold(moments, held)
+        view = playback.middleware.view(playback.middleware.newest_ns or scan_ns)
+        moments.append(_Moment(message.receive_ns, scan_ns, view))
+    _hold(moments, held)
+    return moments
+
+
+def _hold(moments: list[_Moment], held: tuple[int, Array] | None) -> None:
+    """The newest moment's command is the one that held, if none came after it."""
+    if moments and moments[-1].driven is None and held is not None:
+        age_s = (moments[-1].receive_ns - held[0]) * NANO
+        moments[-1].driven = held[1] if age_s <= HELD_S else None
+
+
+def _goals(moments: list[_Moment], goal: ArrayLike | None, ahead_s: float) -> Array:
+    """(T, 2) the goal of each moment."""
+    if goal is not None:
+        return np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
+    times = np.array([moment.stamp_ns for moment in moments]) * NANO
+    places = np.array([moment.view.pose[:2] for moment in moments])
+    return np.stack([np.interp(times + ahead_s, times, place) for place in places.T], axis=-1)
+
+
+def _answered(moments: list[_Moment], goals: Array, name: str, model: SimulatorModel) -> Shadow:
+    policy, task = open_policy(name, model)
+    robot, rows = model.robot, list[tuple[Any, ...]]()
+    skipped = {"no command was driven": 0, "at the goal": 0, "touching something": 0}
+    for moment, goal in zip(moments, goals, strict=True):
+        memory = {"goal": goal}
+        verdict = task.judge(moment.view, memory)
+        if moment.driven is None:
+            skipped["no command was driven"] += 1
+        elif verdict.touched:
+            skipped["touching something"] += 1
+        elif verdict.reached:
+            skipped["at the goal"] += 1
+        else:
+            command = task.command(policy.act(task.observation(moment.view, memory)))
+            wanted = robot.from_cmd_vel(robot.to_cmd_vel(command))
+            rows.append((moment.stamp_ns, moment.view.pose, goal, wanted, moment.driven))
+    if not rows:
+        reasons = ", ".join(f"{count} times {why}" for why, count in skipped.items() if count)
+        raise RecordingError(f"nothing to compare the policy by: {reasons}; choose another goal.")
+    stamps, poses, aims, wanted, driven = (np.array(column) for column in zip(*rows, strict=True))
+    return Shadow(
+        tuple(one.name for one in robot.command),
+        tuple(one.unit for one in robot.command),
+        (stamps - stamps[0]) * NANO,
+        poses, aims, wanted, driven,
+        np.maximum(np.abs(robot.command_low), np.abs(robot.command_high)),
+        skipped,
+    )  # fmt: skip
