@@ -160,3 +160,23 @@ def sync_folder(folder: Path) -> None:
 def sha256(data: bytes) -> str:
     """The SHA-256 of some bytes, in hexadecimal."""
     return hashlib.sha256(data).hexdigest()
+
+
+_SEAL = b"sha256 "
+
+
+def sealed(data: bytes) -> bytes:
+    """Some bytes with their checksum behind them, for `unsealed`."""
+    return data + _SEAL + sha256(data).encode()
+
+
+def unsealed(data: bytes) -> bytes:
+    """What was given to `sealed`.
+
+    Raises:
+        ValueError: a bit of it has changed, or there is no checksum.
+    """
+    inner = data[: -len(_SEAL) - 64]
+    if data != sealed(inner):
+        raise ValueError("its checksum is missing or does not fit the rest")
+    return inner

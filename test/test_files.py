@@ -11,7 +11,9 @@ from nics_drl_bridge import files
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import (
     check_folder,
+    sealed,
     sha256,
+    unsealed,
     whole_folder,
     write_bytes,
     write_text,
@@ -259,3 +261,17 @@ def test_a_disk_that_takes_no_more_leaves_the_old_file_and_no_other(tmp_path):
     run = subprocess.run([sys.executable, "-c", FULL, str(path)], capture_output=True, text=True)
     assert run.stdout == "File too large\n", run.stderr
     assert tree(tmp_path) == {"file": b"old"}
+
+
+def test_any_flipped_bit_of_what_was_sealed_is_noticed():
+    whole = sealed(b"content")
+    assert unsealed(whole) == b"content"
+    assert unsealed(sealed(b"")) == b""
+    for place in range(8 * len(whole)):
+        flipped = bytearray(whole)
+        flipped[place // 8] ^= 1 << place % 8
+        with pytest.raises(ValueError, match="checksum"):
+            unsealed(bytes(flipped))
+    for cut in range(len(whole)):
+        with pytest.raises(ValueError, match="checksum"):
+            unsealed(whole[:cut])

@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from measuring.gates import Gate, gate_config
+from nics_drl_bridge.env.tasks import make_task
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import builtin_model, load_model, save_model
@@ -24,11 +26,24 @@ from nics_drl_bridge.kinematics.recording import load_npz, save_recording
 from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
+from nics_drl_bridge.policy.policy_file import load_policy
+from nics_drl_bridge.policy.train import CHECKPOINT, train
+from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
+from nics_drl_bridge.policy.train_export import export_policy
+from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.safety import black_box
 from nics_drl_bridge.safety.inputs import Tick
 
 LONGEST_S = 0.05
 """A writer is killed within this time after it began."""
+SHORT_TRAINING = {
+    "robot": "differential",
+    "worlds": {"empty": 4},
+    "steps": 64,
+    "hidden": [8],
+    "ppo": {"rollout": 16, "batch": 64, "epochs": 1},
+}
+"""For a checkpoint: settings of `nics train`."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +63,9 @@ class Artefact:
 
 def artefacts() -> list[Artefact]:
     """All that the package writes and reads back."""
-    return [_recording(), _model(), _table(), _black_box()]
+    made = [_recording(), _model(), _table(), _black_box()]
+    with tempfile.TemporaryDirectory() as folder:
+        return [*made, _policy(Path(folder)), _checkpoint(Path(folder))]
 
 
 def _recording() -> Artefact:
@@ -96,6 +113,34 @@ def _black_box() -> Artefact:
         black_box.write(config, boxes[n], path)
 
     return Artefact("stop.jsonl", write, version)
+
+
+def _policy(folder: Path) -> Artefact:
+    model = builtin_model("differential")
+    task = make_task("navigation", model, {"scan": 36})
+    contents = []
+    for n in (0, 1):
+        actor = torch.nn.Linear(task.observation_space.shape[0], len(model.robot.command))
+        file = folder / f"{n}.onnx"
+        export_policy(actor, task, model, file, provenance={"seed": n})
+        contents.append(file.read_bytes())
+
+    def version(path: Path) -> int:
+        return int(load_policy(path).contract.provenance["seed"])
+
+    return Artefact("policy.onnx", lambda path, n: write_bytes(path, contents[n]), version)
+
+
+def _checkpoint(folder: Path) -> Artefact:
+    contents = []
+    for seed in (0, 1):
+        train(TrainingSettings.model_validate(SHORT_TRAINING), seed, folder)
+        contents.append((folder / CHECKPOINT).read_bytes())
+
+    def version(path: Path) -> int:
+        return int(read_checkpoint(path)["about"]["seed"])
+
+    return Artefact(CHECKPOINT, lambda path, n: write_bytes(path, contents[n]), version)
 
 
 def _entries(config: Any, lidar: Any, ticks: int) -> tuple[black_box.Entry, ...]:

@@ -135,7 +135,7 @@ class CommandGate(QosWatch):
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of the executable."""
-    run_node(CommandGate, args)
+    run_node(CommandGate, args, "command_gate")
 
 
 if __name__ == "__main__":

@@ -112,7 +112,7 @@ def facts(health: Health) -> dict[str, str]:
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of the executable."""
-    run_node(MiddlewareNode, args)
+    run_node(MiddlewareNode, args, "middleware_node")
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ def mujoco_node(context: Context) -> DeviceNode:
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of the executable."""
-    run_node(mujoco_node, args)
+    run_node(mujoco_node, args, "mujoco_node")
 
 
 if __name__ == "__main__":

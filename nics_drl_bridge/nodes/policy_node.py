@@ -196,7 +196,7 @@ class PolicyNode(ManagedNode):
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of the executable."""
-    run_node(PolicyNode, args)
+    run_node(PolicyNode, args, "policy_node")
 
 
 if __name__ == "__main__":

@@ -245,7 +245,7 @@ def record(given: Mapping[str, Any] | None = None, args: Sequence[str] | None = 
         nodes.append(RecordNode(context, given))
         return nodes[-1]
 
-    run_node(make, args)
+    run_node(make, args, "record_node")
     return nodes[-1].outcome or Outcome(False, None, None, "interrupted: nothing was saved")
 
 

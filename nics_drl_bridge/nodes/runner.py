@@ -22,6 +22,7 @@ from nics_drl_bridge.errors import BackendError, BridgeError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.overrides import warn_of_unknown, widen
+from nics_drl_bridge.nodes.sole import sole
 
 SPIN_S = 0.1
 DELIVERY_S = 0.5
@@ -60,7 +61,9 @@ def last_word(publisher: Publisher, message: Any) -> None:
     publisher.wait_for_all_acked(Duration(seconds=DELIVERY_S))
 
 
-def run_node(make: Callable[[Context], Node], args: Sequence[str] | None = None) -> None:
+def run_node(
+    make: Callable[[Context], Node], args: Sequence[str] | None = None, sole_name: str = ""
+) -> None:
     """Runs a node until SIGINT or SIGTERM, then destroys it in order.
 
     A node that offers `start()` is asked to begin. One that offers `stop()` is asked to leave its
@@ -70,6 +73,7 @@ def run_node(make: Callable[[Context], Node], args: Sequence[str] | None = None)
     Args:
         make: makes the node in a context of its own.
         args: the command line, `sys.argv` by default.
+        sole_name: of the node, where no second one may run in the same namespace.
     """
     stopping, starting = threading.Event(), threading.Event()
     starting.set()
@@ -82,9 +86,11 @@ def run_node(make: Callable[[Context], Node], args: Sequence[str] | None = None)
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
-    context, node = None, None
+    context, node, alone = None, None, contextlib.ExitStack()
     try:
         context = open_context(sys.argv if args is None else args)
+        if sole_name:
+            alone.enter_context(sole(context, sole_name))
         node = make(context)
         if hasattr(node, "start"):
             node.start()
@@ -107,6 +113,7 @@ def run_node(make: Callable[[Context], Node], args: Sequence[str] | None = None)
             node.destroy_node()
         if context is not None:
             context.try_shutdown()
+        alone.close()
 
 
 def declare_model(node: Node) -> SimulatorModel:

@@ -31,7 +31,7 @@ def simulator_node(context: Context) -> DeviceNode:
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of the executable."""
-    run_node(simulator_node, args)
+    run_node(simulator_node, args, "simulator_node")
 
 
 if __name__ == "__main__":

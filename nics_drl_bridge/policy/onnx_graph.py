@@ -16,6 +16,8 @@ from nics_drl_bridge.files import sha256
 
 KEY = "nics_drl_bridge"
 """Of the metadata that holds the contract."""
+SEAL = "sha256"
+"""Of the metadata at the file's end: the checksum of all that stands before it."""
 SIZE_LIMIT = 64 * 2**20
 INPUT, ACTION, COMMAND = "observation", "action", "command"
 OPERATORS = frozenset({
@@ -57,6 +59,25 @@ def parse(data: bytes, source: str) -> Any:
     metadata(model, source)
     check_graph(model, source)
     return model
+
+
+def sealed(data: bytes) -> bytes:
+    """A model's bytes with their checksum as one more entry of the metadata.
+
+    Parts of a protobuf message may follow one another, so other programs read it as any other.
+    """
+    end = onnx.ModelProto()
+    entry = end.metadata_props.add()
+    entry.key, entry.value = SEAL, sha256(data)
+    return data + bytes(end.SerializeToString(deterministic=True))
+
+
+def check_seal(data: bytes, source: str) -> None:
+    """Raises PolicyError unless every bit of a file is as it was written."""
+    size = len(sealed(b""))
+    if data != sealed(data[:-size]):
+        reason = "does not fit the file, which was changed or damaged; copy or export it again."
+        raise PolicyError(source, SEAL, reason)
 
 
 def check_graph(model: Any, source: str) -> None:

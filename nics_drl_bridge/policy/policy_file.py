@@ -208,6 +208,7 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
         raise PolicyError(source, "graph_sha256", reason)
     policy = PolicyFile(path, contract, open_session(data, source))
     _check_golden(policy, source)
+    onnx_graph.check_seal(data, source)  # at last: what can be named was named before
     return policy
 
 

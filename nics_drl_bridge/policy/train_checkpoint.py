@@ -24,10 +24,10 @@ from stable_baselines3.common.utils import set_random_seed
 
 from nics_drl_bridge.env.vector_state import restore, snapshot
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.files import sealed, unsealed, write_bytes
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 
-FORMAT = "nics_drl_bridge/checkpoint/1"
+FORMAT = "nics_drl_bridge/checkpoint/2"
 COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
 REPLAYED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
@@ -57,7 +57,7 @@ def save_checkpoint(
     }
     buffer = io.BytesIO()
     torch.save(content, buffer)
-    write_bytes(path, buffer.getvalue())
+    write_bytes(path, sealed(buffer.getvalue()))
 
 
 _LAST = ("_last_obs", "_last_episode_starts")
@@ -72,7 +72,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise ConfigError(f"{path}: no such checkpoint; leave out --resume to begin anew.")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        data = io.BytesIO(unsealed(path.read_bytes()))
+        content = torch.load(data, map_location="cpu", weights_only=True)
         if content["format"] != FORMAT:
             raise KeyError("format")
         return {**content, "about": json.loads(content["about"])}

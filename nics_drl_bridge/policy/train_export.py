@@ -162,7 +162,7 @@ def export_policy(
         task, simulator_model, golden, onnx_graph.graph_hash(graph), provenance or {}
     )
     onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
-    data = graph.SerializeToString(deterministic=True)
+    data = onnx_graph.sealed(graph.SerializeToString(deterministic=True))
     policy = policy_of(data, file)
     write_bytes(file, data)
     return policy

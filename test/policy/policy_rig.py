@@ -37,7 +37,10 @@ def export(path: Path, model=None, normaliser=None, **options):
 
 
 def bytes_of(proto) -> bytes:
-    return proto.SerializeToString(deterministic=True)
+    """The content of a file with a checksum that is right again."""
+    for entry in [one for one in proto.metadata_props if one.key == onnx_graph.SEAL]:
+        proto.metadata_props.remove(entry)
+    return onnx_graph.sealed(proto.SerializeToString(deterministic=True))
 
 
 def contract_in(proto) -> dict:

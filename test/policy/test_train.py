@@ -1,14 +1,17 @@
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import pytest
 import torch
 from robots import direct_model, field
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import sealed
 from nics_drl_bridge.policy import train as training
 from nics_drl_bridge.policy.train import CHECKPOINT, evaluate, train
-from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
+from nics_drl_bridge.policy.train_checkpoint import FORMAT, read_checkpoint
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
 MODEL, WORLD = direct_model(odometry=(0.02, 0.02)), field(count=2)
@@ -99,9 +102,13 @@ def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="is of seed 0, not 4"):
         train(settings(steps=128), 4, tmp_path, resumed=True)
     path = tmp_path / CHECKPOINT
-    path.write_bytes(path.read_bytes()[:-500])
-    with pytest.raises(ConfigError, match="is no checkpoint of a training, or a damaged one"):
-        read_checkpoint(path)
+    whole = path.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    for damaged in (whole[:-500], bytes(flipped), whole[:-71]):
+        path.write_bytes(damaged)
+        with pytest.raises(ConfigError, match="is no checkpoint of a training, or a damaged one"):
+            read_checkpoint(path)
 
 
 def test_a_checkpoint_that_would_run_code_is_refused(tmp_path):
@@ -110,7 +117,9 @@ def test_a_checkpoint_that_would_run_code_is_refused(tmp_path):
             return (tmp_path.joinpath("harm").touch, ())
 
     path = tmp_path / CHECKPOINT
-    torch.save({"format": "nics_drl_bridge/checkpoint/1", "about": Harmful()}, path)
+    content = io.BytesIO()
+    torch.save({"format": FORMAT, "about": Harmful()}, content)
+    path.write_bytes(sealed(content.getvalue()))
     with pytest.raises(ConfigError, match="is no checkpoint"):
         read_checkpoint(path)
     assert not (tmp_path / "harm").exists()

@@ -1,0 +1,110 @@
+"""Two stacks in one domain: apart by their namespaces, or the second does not start."""
+
+from __future__ import annotations
+
+import signal
+import threading
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from sensor_msgs.msg import LaserScan
+
+from nics_drl_bridge.errors import BackendError
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.sole import sole
+from nodes.peer import DEADLINE_S
+
+pytestmark = pytest.mark.ros
+
+PACE_S = 0.05
+
+
+def ended(process):
+    """Exit code and output of a node that ends by itself."""
+    code = process._process.wait(DEADLINE_S)
+    return code, process.log.read_text()
+
+
+@pytest.mark.timeout(180)
+@pytest.mark.parametrize("node", ["command_gate", "middleware_node"])
+def test_a_second_node_in_the_same_namespace_refuses_to_start(launch, meet, domain_id, node):
+    first, peer = launch(node, domain_id, "one"), meet(domain_id)
+    peer.until(lambda: (node, "/one") in peer.node.get_node_names_and_namespaces(), node)
+    code, told = ended(launch(node, domain_id, "one"))
+    assert code == 2
+    assert told.startswith(f"a node '/one/{node}' runs already in ROS domain {domain_id}; end it")
+    assert told.count("\n") == 1
+    first.check()
+    other = launch(node, domain_id, "two")
+    peer.until(lambda: (node, "/two") in peer.node.get_node_names_and_namespaces(), "the other")
+    other.check()
+
+
+@pytest.mark.timeout(180)
+def test_a_node_that_was_just_killed_does_not_keep_the_next_from_starting(launch, meet, domain_id):
+    first, peer = launch("command_gate", domain_id), meet(domain_id)
+
+    def gates():
+        return peer.node.get_node_names().count("command_gate")
+
+    peer.until(lambda: gates() == 1, "the gate")
+    first._process.send_signal(signal.SIGKILL)
+    first._process.wait()
+    again = launch("command_gate", domain_id)
+    peer.until(lambda: gates() == 2, "the next gate beside the dead one, which is still listed")
+    again.check()
+
+
+def test_a_node_of_another_package_with_the_same_name_is_asked_and_found(domain_id, meet):
+    peer, context = meet(domain_id), open_context(domain_id=domain_id)
+    name = peer.node.get_name()
+    alive = Node(name, context=peer.context)  # with the services of parameters
+    peer._executor.add_node(alive)
+    done = threading.Event()
+    spinning = threading.Thread(
+        target=lambda: peer.until(done.is_set, "the end"), daemon=True, name="alive"
+    )
+    spinning.start()
+    try:
+        with pytest.raises(BackendError, match="runs already"), sole(context, name):
+            pass
+    finally:
+        done.set()
+        spinning.join()
+        alive.destroy_node()
+        context.try_shutdown()
+
+
+@pytest.mark.timeout(180)
+def test_robots_in_one_domain_do_not_hear_each_other(launch, meet, domain_id, model):
+    """One is told to drive: the other neither moves, nor does its gate learn of it."""
+    for space in ("one", "two"):
+        launch("simulator_node", domain_id, space, world="empty")
+    one, two = meet(domain_id, "one"), meet(domain_id, "two")
+    scans = {peer: peer.listen(LaserScan, "scan", qos.SENSOR) for peer in (one, two)}
+    for peer in (one, two):
+        peer.another(scans[peer], "scan")
+    for space, peer in (("one", one), ("two", two)):
+        (info,) = peer.node.get_publishers_info_by_topic(f"/{space}/scan")
+        assert (info.node_namespace, info.node_name) == (f"/{space}", "simulator_node")
+        (heard,) = peer.node.get_subscriptions_info_by_topic(f"/{space}/cmd_vel")
+        assert heard.node_namespace == f"/{space}"
+        assert not peer.node.get_subscriptions_info_by_topic("/cmd_vel")
+        assert not peer.node.get_publishers_info_by_topic("/scan")
+    commands = one.speak(Twist, "cmd_vel")
+    odometry = {peer: peer.listen(Odometry, "odom", qos.SENSOR) for peer in (one, two)}
+    one.node.create_timer(
+        PACE_S, lambda: commands.publish(conversions.twist_to_ros([0.5, 0.0, 0.0]))
+    )
+    one.until(
+        lambda: odometry[one] and odometry[one][-1].pose.pose.position.x > 0.3, "the one drives"
+    )
+    two.another(odometry[two], "odometry")
+    assert all(abs(told.twist.twist.linear.x) < 0.1 for told in odometry[two])
+    assert abs(odometry[two][-1].pose.pose.position.x) < 0.1
