@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from nics_drl_bridge.commands.console import needs_ros, one_sentence, table
 
+if TYPE_CHECKING:
+    from nics_drl_bridge.report.doctor_expected import Expected
+
 EXIT_FINDINGS = 1
+DEFAULT = "ackermann"
 
 
 def doctor(
@@ -19,21 +23,27 @@ def doctor(
         Path | None, typer.Argument(help="A bag to look at; the live robot when left out.")
     ] = None,
     model: Annotated[
-        str, typer.Option(help="What the robot must fit: folder of a model, or a shipped robot.")
-    ] = "ackermann",
+        str | None,
+        typer.Option(
+            help="What the robot must fit: folder of a model, or a shipped robot; ackermann if "
+            "neither it nor a policy is given."
+        ),
+    ] = None,
+    policy: Annotated[
+        str | None, typer.Option(help="What it must fit instead: a policy file.")
+    ] = None,
     namespace: Annotated[str, typer.Option(help="Namespace of the robot's topics.")] = "",
     duration: Annotated[
         float, typer.Option(min=1.0, help="How long to listen to a live robot [s].")
     ] = 5.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Looks at a robot or a bag beside a model, and tells what does not fit; it sends nothing."""
+    """Tells what of a robot or a bag does not fit a model or a policy; it sends nothing."""
     with one_sentence():
-        from nics_drl_bridge.generator import open_model
-        from nics_drl_bridge.report.doctor import examine, expected_of_model
+        from nics_drl_bridge.report.doctor import examine
         from nics_drl_bridge.report.doctor_facts import facts_of_bag
 
-        expected = expected_of_model(open_model(model))
+        expected = _expected(model, policy)
         if bag is not None:
             facts = facts_of_bag(bag, namespace)
         else:
@@ -49,6 +59,19 @@ def doctor(
             rows = [(f.severity, f.check, f.where, f.what, f.fix) for f in findings]
             typer.echo(table(heads, rows))
         else:
-            typer.echo(f"{facts.source}: all fits {model}.")
+            typer.echo(f"{facts.source}: all fits {policy or model or DEFAULT}.")
         if findings:
             raise typer.Exit(EXIT_FINDINGS)
+
+
+def _expected(model: str | None, policy: str | None) -> Expected:
+    from nics_drl_bridge.errors import ConfigError
+    from nics_drl_bridge.generator import open_model
+    from nics_drl_bridge.policy.policy_file import load_policy
+    from nics_drl_bridge.report.doctor_expected import expected_of_model, expected_of_policy
+
+    if policy is None:
+        return expected_of_model(open_model(model or DEFAULT))
+    if model is not None:
+        raise ConfigError("--model and --policy: give one of them, what the robot must fit.")
+    return expected_of_policy(load_policy(policy).contract)

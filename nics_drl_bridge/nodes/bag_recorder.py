@@ -10,7 +10,6 @@ from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -19,6 +18,7 @@ from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.kinematics.bag_qos import Offer
 from nics_drl_bridge.kinematics.bag_sink import BagSink, Storage, bag_sink
 from nics_drl_bridge.nodes.message_types import message_texts, message_type
+from nics_drl_bridge.nodes.qos_watch import QosWatch
 from nics_drl_bridge.nodes.runner import run_node
 
 ROBOT = (
@@ -87,7 +87,7 @@ class Recorded:
     skipped: list[str] = field(default_factory=list)
 
 
-class BagRecorder(Node):
+class BagRecorder(QosWatch):
     """Writes the messages of all wanted topics into a bag, serialized as they came.
 
     A topic is asked for with the best quality of service that all its publishers offer, so that

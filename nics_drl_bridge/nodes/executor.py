@@ -1,10 +1,11 @@
-"""An executor whose wait set stands: a message costs a third of what it does in rclpy's own."""
+"""An executor whose wait set stands, instead of being made anew for each message."""
 
 from __future__ import annotations
 
 import contextlib
+import inspect
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -15,10 +16,15 @@ from rclpy.executors import (
     TimeoutException,
 )
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.waitable import NumberOfEntities
 
 NANO = 1_000_000_000
+PARTS_MISSING = (AttributeError, TypeError)
+"""What Python raises where rclpy is another one than is known here."""
+Received = tuple[Callable[..., Any], tuple[Any, ...]]
+"""A callback and its arguments."""
 MOST_AT_ONCE = 32
 """A timer without a period is always ready, and who spins wants to look after other things too."""
 
@@ -31,8 +37,11 @@ class StandingExecutor(SingleThreadedExecutor):
     condition. Here that is done when an end comes or goes. Whatever is no subscription (timers,
     services, clients, events, tasks) is left to rclpy's own executor.
 
-    Callbacks of subscriptions are plain functions of the message; they are called in the thread
-    that spins, one after the other.
+    Callbacks of subscriptions are plain functions of the message, or of it and what is known about
+    it; they are called in the thread that spins, one after the other.
+
+    That needs parts of rclpy that no interface promises. With an rclpy that lacks one of them it
+    says so once in the log, and is rclpy's own executor from then on.
 
     Args:
         context: of the nodes.
@@ -41,7 +50,7 @@ class StandingExecutor(SingleThreadedExecutor):
     def __init__(self, context: Context) -> None:
         super().__init__(context=context)
         self._ends: _Ends | None = None
-        self._changed = True
+        self._changed, self.stands = True, True
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Waits for something and handles it; see rclpy.
@@ -49,6 +58,22 @@ class StandingExecutor(SingleThreadedExecutor):
         Raises:
             ExternalShutdownException: the context is shut down.
         """
+        if self.stands:
+            try:
+                received, others = self._wait(timeout_sec)
+            except PARTS_MISSING as error:
+                self._fall_back(error)
+        if not self.stands:
+            super().spin_once(timeout_sec)
+            return
+        for callback, arguments in received:
+            callback(*arguments)
+        if others:
+            self._changed = True  # whoever adds an end to a node triggers a guard condition
+            self._handle_others()
+
+    def _wait(self, timeout_sec: float | None) -> tuple[list[Received], bool]:
+        """Waits; what subscriptions received, and whether anything else is ready."""
         try:
             ends = self._gathered()
             ends.wait(-1 if timeout_sec is None else int(timeout_sec * NANO))
@@ -57,13 +82,13 @@ class StandingExecutor(SingleThreadedExecutor):
                 raise
         if not self.context.ok():
             raise ExternalShutdownException
-        for subscription in ends.subscriptions_ready():
-            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-            if taken is not None:
-                subscription.callback(taken[0])
-        if ends.others_ready():
-            self._changed = True  # whoever adds an end to a node triggers a guard condition
-            self._handle_others()
+        return ends.taken(), ends.others_ready()
+
+    def _fall_back(self, error: Exception) -> None:
+        """Goes on as rclpy's own executor."""
+        self.stands = False
+        self._release()
+        get_logger("executor").warning(f"this rclpy needs its own, slower executor ({error})")
 
     def _handle_others(self) -> None:
         """Lets rclpy handle all that is ready now."""
@@ -101,6 +126,7 @@ class _Ends:
     def __init__(self, nodes: Sequence[Node], guards: Sequence[Any], context: Context) -> None:
         self.all = _all_ends(nodes)
         subscriptions, others, timers, clients, services, self._waitables = self.all
+        self._subscriptions = [(one, _arguments(one.callback)) for one in subscriptions]
         kinds = subscriptions, (*guards, *others), timers, clients, services
         self._open = ExitStack()
         for held in (*(end.handle for end in itertools.chain(*kinds)), *self._waitables):
@@ -131,10 +157,15 @@ class _Ends:
             waitable.add_to_wait_set(self._wait_set)
         self._wait_set.wait(timeout_ns)
 
-    def subscriptions_ready(self) -> list[Any]:
-        """Subscriptions that have a message."""
-        is_ready = self._wait_set.is_ready
-        return [s for i, s in enumerate(self.all[0]) if is_ready("subscription", i)]
+    def taken(self) -> list[Received]:
+        """What the subscriptions received that have a message."""
+        is_ready, received = self._wait_set.is_ready, []
+        for i, (subscription, arguments) in enumerate(self._subscriptions):
+            if is_ready("subscription", i):
+                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+                if taken is not None:
+                    received.append((subscription.callback, taken[:arguments]))
+        return received
 
     def others_ready(self) -> bool:
         """Whether anything else is ready."""
@@ -150,6 +181,15 @@ class _Ends:
     def close(self) -> None:
         """Lets go of the handles."""
         self._open.close()
+
+
+def _arguments(callback: Callable[..., Any]) -> int:
+    """How many a subscription's callback takes: the message, or with it what is known about it."""
+    try:
+        inspect.signature(callback).bind(None)
+    except TypeError:
+        return 2
+    return 1
 
 
 def _all_ends(nodes: Sequence[Node]) -> tuple[tuple[Any, ...], ...]:

@@ -21,6 +21,7 @@ from rclpy.publisher import Publisher
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.executor import StandingExecutor
+from nics_drl_bridge.nodes.qos_watch import QosWatch
 from nics_drl_bridge.nodes.runner import last_word, open_context
 
 SPIN_S = 0.2
@@ -53,7 +54,7 @@ class Link:
         _end_orderly_on_sigterm()
         self._context = open_context(domain_id=domain_id)
         overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
-        self.node = Node(
+        self.node = QosWatch(
             "bridge_env", namespace=namespace, context=self._context,
             start_parameter_services=False, parameter_overrides=overrides,
         )  # fmt: skip

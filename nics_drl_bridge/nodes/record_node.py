@@ -14,7 +14,6 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Imu, JointState
 
@@ -26,6 +25,7 @@ from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.drive_log import DriveLog
 from nics_drl_bridge.nodes.drive_parameters import declare_drive
+from nics_drl_bridge.nodes.qos_watch import QosWatch
 from nics_drl_bridge.nodes.runner import EXIT_BAD_INPUT, last_word, run_node
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ class Outcome:
     line: str
 
 
-class RecordNode(Node):
+class RecordNode(QosWatch):
     """Sends `cmd_vel` at 20 Hz, hears `odom`, `joint_states`, `imu`, `pose`, writes a recording.
 
     The circle lies around the place where the robot stands at the start; each segment of the

@@ -6,15 +6,12 @@ Each check is a function of the facts; it yields a finding for each thing that i
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.report.doctor_expected import Expected, Finding, seen
 from nics_drl_bridge.report.doctor_facts import (
     CLOCK,
     CMD_VEL,
@@ -25,6 +22,7 @@ from nics_drl_bridge.report.doctor_facts import (
     Facts,
 )
 from nics_drl_bridge.report.doctor_motion import motion, scale
+from nics_drl_bridge.report.doctor_scan import layout, ranges
 
 NANO = 1e-9
 RATE_TOLERANCE = 0.2
@@ -32,54 +30,12 @@ FUTURE_S, LATE_S, OFFSET_S = 0.005, 0.35, 5.0
 """Stamps more than this after their arrival are from the future; before it, too old for the gate of
 commands; and so much before it that the clocks must differ."""
 STALE_CLOCK_S = 1.0
-ANGLE_TOLERANCE = 0.5
-"""Of a beam's direction, in increments."""
-ODD_SHARE = 0.01
-"""A lidar that puts a value on the wire in more than this share of its beams means it."""
 BODY_FRAMES = ("base_link", "base_footprint")
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something that does not fit.
-
-    Attributes:
-        severity: an `error` makes a policy misbehave; a `warning` may.
-        check: what was looked at.
-        where: the topic.
-        what: what does not fit, with numbers.
-        fix: what to do.
-    """
-
-    severity: Literal["error", "warning"]
-    check: str
-    where: str
-    what: str
-    fix: str
-
-
-@dataclass(frozen=True)
-class Expected:
-    """What is expected of a robot, by whatever it was made for.
-
-    Attributes:
-        robot: units and limits of state and command.
-        lidar: beams, limits, rate, frame and range convention.
-        period_s: between commands [s].
-    """
-
-    robot: RobotSpec
-    lidar: LidarSpec
-    period_s: float
-
-
-def expected_of_model(model: SimulatorModel) -> Expected:
-    """What a SimulatorModel expects."""
-    return Expected(model.robot, model.lidar, model.control_period)
 
 
 def examine(facts: Facts, expected: Expected) -> list[Finding]:
     """All findings, errors first."""
+    expected = seen(facts, expected)
     checks = (
         presence, quality, speakers, frames, rates, latency, clock, layout, ranges, motion_of,
     )  # fmt: skip
@@ -250,84 +206,6 @@ def clock(facts: Facts, _: Expected) -> Iterator[Finding]:
         yield Finding("error", "clock", CLOCK, f"runs backwards {(ticks < 0).sum()} times", fix)
     elif len(ticks) and not ticks.any():
         yield Finding("error", "clock", CLOCK, "stands still", fix)
-
-
-def layout(facts: Facts, expected: Expected) -> Iterator[Finding]:
-    """Number and directions of the beams, and limits of their ranges."""
-    name, want = facts.names[SCAN], expected.lidar.header
-    if len(facts.layouts) > 1:
-        counts = sorted({one.beams for one in facts.layouts})
-        what = f"its header changes; numbers of beams are {', '.join(map(str, counts))}"
-        fix = "use the driver's mode of fixed angles (as `angle_compensate`), or resample"
-        yield Finding("error", "beam layout", name, what, fix)
-    for have in facts.layouts[:1]:
-        fix = "set the driver, or make a lidar file of what it sends and generate the model anew"
-        if have.beams != expected.lidar.beams:
-            what = f"has {have.beams} beams, expected {expected.lidar.beams}"
-            yield Finding("error", "beam layout", name, what, fix)
-        last = have.angle_min + (have.beams - 1) * have.angle_increment
-        step = abs(want.angle_increment)
-        if abs(last - have.angle_max) > ANGLE_TOLERANCE * max(abs(have.angle_increment), 1e-9):
-            what = f"angle_max is {have.angle_max:.5f}, but its beams end at {last:.5f} rad"
-            yield Finding("warning", "beam layout", name, what, "correct the driver's header")
-        if max(abs(have.angle_min), abs(have.angle_max)) > 7.0:
-            what = f"angles go from {have.angle_min:.4g} to {have.angle_max:.4g}: degrees"
-            yield Finding("error", "unit", name, what, "let the driver send radians")
-        elif have.angle_increment < 0.0:
-            what = "its beams go clockwise (angle_increment is negative)"
-            fix = "turn the order in the driver (`inverted`): beams go counter-clockwise (REP-103)"
-            yield Finding("error", "beam layout", name, what, fix)
-        elif (
-            abs(have.angle_min - want.angle_min) > ANGLE_TOLERANCE * step
-            or abs(last - want.angle_max) > ANGLE_TOLERANCE * step
-        ):
-            what = (
-                f"beams go from {have.angle_min:.4f} to {last:.4f} rad, expected "
-                f"{want.angle_min:.4f} to {want.angle_max:.4f}"
-            )
-            yield Finding("error", "beam layout", name, what, fix)
-        for key in ("range_min", "range_max"):
-            ours, theirs = getattr(want, key), getattr(have, key)
-            if abs(ours - theirs) > 0.01 * max(abs(ours), 1e-3) + 1e-6:
-                big = theirs > 100.0 * max(ours, 0.1)
-                what = f"{key} is {theirs:.4g}, expected {ours:.4g} m"
-                kind = "unit" if big else "range limits"
-                yield Finding("error" if big else "warning", kind, name, what, fix)
-
-
-def ranges(facts: Facts, expected: Expected) -> Iterator[Finding]:
-    """What the lidar puts on the wire where nothing came back, and its unit."""
-    if not facts.ranges:
-        return
-    spec, name = expected.lidar, facts.names[SCAN]
-    values = np.concatenate(facts.ranges).astype(np.float64)
-    finite = values[np.isfinite(values) & (values > 0.0)]
-    beyond = finite > 1.001 * spec.range_max
-    if len(finite) and np.median(finite) > 20.0 * spec.range_max:
-        what = f"half of the ranges exceed {np.median(finite):.0f}: millimetres"
-        yield Finding("error", "unit", name, what, "let the driver send metres")
-        return
-    if len(finite) and beyond.mean() > ODD_SHARE:
-        what = f"{100 * beyond.mean():.0f} % of the ranges exceed range_max {spec.range_max:g} m"
-        fix = "set the driver's limit, or range_max of the lidar, and generate the model anew"
-        yield Finding("warning", "range convention", name, what, fix)
-    at_max = np.abs(values - spec.range_max) < 1e-4 * spec.range_max
-    for word, hit in (
-        ("zero", values == 0.0),
-        ("nan", np.isnan(values)),
-        ("range_max", at_max),
-        ("inf", values == np.inf),
-    ):
-        if hit.mean() > ODD_SHARE and word != spec.no_return:
-            what = (
-                f"{100 * hit.mean():.0f} % of the ranges are {word}, but no return is expected "
-                f"as {spec.no_return}"
-            )
-            fix = f"set `no_return: {word}` in the lidar and generate the model anew"
-            yield Finding("error", "range convention", name, what, fix)
-    if (values < 0.0).any() and np.isfinite(values[values < 0.0]).any():
-        fix = "correct the driver: too close is -inf (REP-117), nothing else is negative"
-        yield Finding("error", "range convention", name, "holds negative ranges", fix)
 
 
 def motion_of(facts: Facts, expected: Expected) -> Iterator[Finding]:

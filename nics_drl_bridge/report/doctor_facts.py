@@ -24,6 +24,7 @@ CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 MOST_SCANS = 200
 """Ranges are kept of so many scans; of the others only the time."""
 NANO = 1_000_000_000
+MOST_RAD = 7.0
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,16 @@ class Layout:
     angle_increment: float
     range_min: float
     range_max: float
+
+    @property
+    def last(self) -> float:
+        """Angle of the last beam, by the increment."""
+        return self.angle_min + (self.beams - 1) * self.angle_increment
+
+    @property
+    def in_degrees(self) -> bool:
+        """Whether the angles are too great for radians."""
+        return max(abs(self.angle_min), abs(self.angle_max)) > MOST_RAD
 
 
 @dataclass

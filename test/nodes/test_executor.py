@@ -9,6 +9,7 @@ from rclpy.node import Node
 from std_msgs.msg import Int32
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.nodes import executor as executor_module
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.runner import open_context
 
@@ -87,3 +88,40 @@ def test_a_context_that_is_shut_down_ends_the_spin(node, executor):
     node.context.try_shutdown()
     with pytest.raises(ExternalShutdownException):
         executor.spin_once(timeout_sec=5.0)
+
+
+def test_a_callback_that_asks_for_it_is_told_about_the_message(node, executor):
+    publisher, told = node.create_publisher(Int32, "count", 10), []
+    node.create_subscription(Int32, "count", lambda data, info: told.append((data, info)), 10,
+                             raw=True)  # fmt: skip
+    spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched")
+    publisher.publish(Int32(data=1))
+    spin_until(executor, lambda: told, "the message")
+    data, info = told[0]
+    assert isinstance(data, bytes)
+    assert info["received_timestamp"] > 0
+
+
+@pytest.mark.parametrize("part", ["take_message", "wait set", "ends"])
+def test_with_an_rclpy_that_lacks_a_part_it_is_rclpys_own(node, executor, part, monkeypatch, capfd):
+    class Lacking:
+        def __getattr__(self, name):
+            raise AttributeError(f"no {name}")
+
+    publisher, heard, ticks = node.create_publisher(Int32, "count", 10), [], []
+    node.create_subscription(Int32, "count", heard.append, 10)
+    node.create_timer(0.01, lambda: ticks.append(1))
+    spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched")
+    if part == "take_message":
+        monkeypatch.setattr(executor_module._Ends, "taken", lambda _: Lacking().take_message)
+    elif part == "wait set":
+        monkeypatch.setattr(executor_module, "rclpy_implementation", Lacking())
+        node.create_timer(0.01, lambda: None)  # another end, so that a new wait set is made
+    else:
+        monkeypatch.setattr(executor_module, "_all_ends", lambda nodes: Lacking().guards)
+        node.create_timer(0.01, lambda: None)
+    publisher.publish(Int32(data=1))
+    spin_until(executor, lambda: heard and len(ticks) > 3, "served by rclpy's")
+    spin_until(executor, lambda: not executor.stands, "the part is missed")
+    assert heard == [Int32(data=1)]
+    assert capfd.readouterr().err.count("slower executor") == 1

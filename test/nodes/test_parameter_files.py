@@ -18,7 +18,7 @@ from nics_drl_bridge.nodes.middleware_node import MiddlewareNode
 from nics_drl_bridge.nodes.mujoco_node import mujoco_node
 from nics_drl_bridge.nodes.policy_node import PolicyNode
 from nics_drl_bridge.nodes.runner import open_context
-from nics_drl_bridge.nodes.simulator_node import SimulatorNode
+from nics_drl_bridge.nodes.simulator_node import simulator_node
 
 pytestmark = pytest.mark.ros
 
@@ -32,7 +32,7 @@ def record_node(context):
 
 
 MAKERS = {
-    "simulator_node": SimulatorNode,
+    "simulator_node": simulator_node,
     "mujoco_node": mujoco_node,
     "middleware_node": MiddlewareNode,
     "policy_node": PolicyNode,

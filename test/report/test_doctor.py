@@ -11,7 +11,9 @@ import bags
 
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.kinematics.bag_qos import Offer
-from nics_drl_bridge.report.doctor import examine, expected_of_model
+from nics_drl_bridge.lidar.canonical import ScanLayout
+from nics_drl_bridge.report.doctor import examine
+from nics_drl_bridge.report.doctor_expected import Expected, expected_of_model
 from nics_drl_bridge.report.doctor_facts import Endpoints, Facts, facts_of_bag, names_in
 
 SECONDS = 8.0
@@ -67,6 +69,10 @@ def heard(scans=None, odometries=None, commands=None, late=0.002, ticks=None):
         facts.topics[facts.names[role]] = Endpoints((kind,), (RELIABLE,), asks)
     facts.end_ns = bags.ns(SECONDS)
     return facts
+
+
+SECTORED = Expected(EXPECTED.robot, LIDAR, EXPECTED.period_s, ScanLayout(sectors=36, range_max=3.0))
+"""What a policy expects that sees sectors, all around."""
 
 
 def only(facts):
@@ -146,6 +152,36 @@ def test_an_odometry_that_does_not_fit_is_named(changed, check, said):
     finding = only(heard(odometries=each_odometry(**changed)))
     assert (finding.check, finding.where) == (check, "/odom")
     assert said in finding.what + finding.fix
+
+
+def other_lidar(beams, begin, end, range_max):
+    step = (end - begin) / (beams - 1)
+    ranges = np.where(np.arange(beams) % 3, 1.5, np.inf)
+    return each_scan(
+        ranges=ranges, angle_min=begin, angle_max=end, angle_increment=step, range_max=range_max
+    )
+
+
+def test_any_lidar_fits_a_policy_whose_sectors_it_fills():
+    assert examine(heard(), SECTORED) == []
+    for begin, end in ((-3.13, 3.13), (3.13, -3.13)):
+        facts = heard(scans=other_lidar(360, begin, end, 8.0))
+        assert examine(facts, SECTORED) == []
+        assert {finding.check for finding in examine(facts, EXPECTED)} >= {"beam layout"}
+
+
+@pytest.mark.parametrize(
+    ("scans", "said"),
+    [
+        (other_lidar(360, -1.5, 1.5, 8.0), "use a wider lidar"),
+        (other_lidar(360, -3.13, 3.13, 2.0), "needs 3 m"),
+        (other_lidar(20, -3.0, 3.0, 8.0), "deg apart"),
+    ],
+)
+def test_a_lidar_that_does_not_fill_the_sectors_of_a_policy_is_named_once(scans, said):
+    (finding,) = examine(heard(scans=scans), SECTORED)
+    assert (finding.check, finding.where) == ("beam layout", "/scan")
+    assert said in finding.what
 
 
 def test_a_jump_of_odometry_is_named():
