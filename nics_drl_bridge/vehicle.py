@@ -18,7 +18,8 @@ from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy.comparison import tallies
 from nics_drl_bridge.policy.evaluation import Episode, drive
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.report.doctor import Finding, examine, expected_of_model
+from nics_drl_bridge.report.doctor import examine
+from nics_drl_bridge.report.doctor_expected import Finding, expected_of_model
 from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world import load_world
