@@ -24,7 +24,7 @@ LATE = {"/odom": 0.005, "/scan": 0.01, "/cmd_vel": 0.02}
 
 def scan(t, ranges, lidar=MODEL.lidar):
     fields = [float(value) for value in lidar.header]
-    ranges = np.asarray(ranges, np.float32)
+    ranges = np.array(ranges, np.float32)
     return bags.new(
         "sensor_msgs/msg/LaserScan", bags.header(t, "laser"), *fields, ranges,
         np.zeros(0, np.float32),
