@@ -65,9 +65,14 @@ def tally(episodes: Sequence[Episode], first: Sequence[Episode], control_period:
     arrived = [episode for episode in episodes if episode.result == "success"]
     gaps = [deviation(one, other) for one, other in zip(episodes, first, strict=True)]
     same = sum(one.result == other.result for one, other in zip(episodes, first, strict=True))
+    success, collision, time_out = (
+        rate(sum(episode.result == name for episode in episodes), count) for name in RESULTS
+    )
     return Tally(
         count,
-        *(rate(sum(episode.result == name for episode in episodes), count) for name in RESULTS),
+        success,
+        collision,
+        time_out,
         mean([episode.length for episode in arrived]),
         mean([episode.steps * control_period for episode in arrived]),
         same / count,
