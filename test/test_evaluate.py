@@ -14,7 +14,7 @@ from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.policy.policies import shipped_policies
 
 PNG = b"\x89PNG"
-DEADLINE_S = 300.0
+DEADLINE_S = 280.0
 missing = [name for name in ("rclpy", "mujoco") if find_spec(name) is None]
 needs_nodes = pytest.mark.skipif(bool(missing), reason=f"needs {' and '.join(missing)}")
 
