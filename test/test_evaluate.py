@@ -103,6 +103,7 @@ def test_bad_input_ends_it_with_one_sentence(tmp_path, words, said):
 def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monkeypatch):
     from nics_drl_bridge import vehicle
     from nics_drl_bridge.nodes.processes import NodeProcess
+    from nics_drl_bridge.nodes.witness import Witness
 
     limits = {
         one.name: {"min": one.min, "max": one.max, "rate": 20.0, "jerk": 400.0}
@@ -127,6 +128,8 @@ def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monke
             NodeProcess("middleware_node", logs, model, domain_id),
             NodeProcess("command_gate", logs, gate, domain_id),
         ):
+            with Witness(domain_id) as witness:  # it may be compiling
+                assert witness.sees(DEADLINE_S)
             made = vehicle.drive_vehicle(order, said.append, said.append)
     assert "  command_gate is armed" in said
     assert any("it will drive to" in line for line in said)
