@@ -26,7 +26,7 @@ from nics_drl_bridge.sim.world import load_world
 from nics_drl_bridge.trial import FAST, LABELS, VEHICLE, robot_of
 
 GATE, RAW = "command_gate", "cmd_vel_raw"
-LISTEN_S, ARM_S = 5.0, 20.0
+LISTEN_S, ARM_S = 5.0, 60.0
 Say = Callable[[str], None]
 
 
@@ -45,6 +45,7 @@ class VehicleOrder:
         namespace: of its topics.
         pose_type: type of `pose`, a pose sensor in `map`, or `none`.
         arm: whether to arm the gate before each episode; else somebody does.
+        stale_after_s: an episode ends with an error when data are older [s].
     """
 
     policy: str
@@ -58,6 +59,7 @@ class VehicleOrder:
     namespace: str = ""
     pose_type: str = "none"
     arm: bool = False
+    stale_after_s: float = 0.5
 
 
 def drive_vehicle(order: VehicleOrder, say: Say, ask: Say) -> Evaluated:
@@ -125,6 +127,7 @@ def _drive(order: VehicleOrder, model: SimulatorModel, say: Say, ask: Say) -> li
     options = {
         "mode": "realtime", "vehicle": True, "command_topic": RAW, "start": order.start,
         "namespace": order.namespace, "pose_type": order.pose_type, "say": say,
+        "stale_after_s": order.stale_after_s,
     }  # fmt: skip
     env = _env(order, model, "dds", backend_options=options)
     policy, _ = open_policy(order.policy, model)

@@ -35,7 +35,9 @@ def evaluate(
         list[str] | None,
         typer.Option("--in", help="fast, dds or mujoco_dds; several times; all by default."),
     ] = None,
-    episodes: Annotated[int, typer.Option(min=1, help="How many.")] = 20,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="How many; 20, or 1 on a vehicle.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the first episode.")] = 1_000_000,
     out: Annotated[Path, typer.Option(help="Folder for everything that is written.")] = Path(
         "runs/evaluate"
@@ -84,7 +86,7 @@ def evaluate(
             from nics_drl_bridge.vehicle import VehicleOrder
 
             order = VehicleOrder(
-                policies[0], out, model, world, episodes, seed, start, place, namespace,
+                policies[0], out, model, world, episodes or 1, seed, start, place, namespace,
                 pose_type, arm,
             )  # fmt: skip
             _hardware(order, policies, yes)
@@ -92,7 +94,7 @@ def evaluate(
             from nics_drl_bridge.evaluate import Order
 
             chosen = {"places": tuple(dict.fromkeys(places))} if places else {}
-            _evaluate(Order(policies, out, model, world, episodes, seed, **chosen))
+            _evaluate(Order(policies, out, model, world, episodes or 20, seed, **chosen))
 
 
 def _check(
