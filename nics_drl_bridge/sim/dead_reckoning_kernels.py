@@ -1,4 +1,4 @@
-"""The kernel of `dead_reckoning`: covariances (M, 3, 3) of poses by odometry after one more step."""
+"""The kernel of `dead_reckoning`: covariances (M, 3, 3) of odometry after one more step."""
 
 from __future__ import annotations
 
