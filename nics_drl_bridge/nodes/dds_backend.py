@@ -36,15 +36,15 @@ class _Mailbox:
     good part of a step.
 
     Args:
-        topics: that the caller waits for.
+        topics: of which there are messages.
     """
 
     def __init__(self, topics: tuple[str, ...]) -> None:
-        self._topics = topics
         self._messages: dict[str, Any] = {}
         self._stamps = dict.fromkeys(topics, -1)
         self._arrivals: dict[str, int] = {}
         self._lock, self._complete = threading.Lock(), threading.Event()
+        self._awaited: tuple[str, ...] = ()
         self._awaited_ns = -1
 
     def put(self, topic: str, message: Any) -> None:
@@ -57,7 +57,7 @@ class _Mailbox:
 
     def _late(self) -> str | None:
         """The first topic whose newest message is older than what is waited for."""
-        for topic in self._topics:
+        for topic in self._awaited:
             if self._stamps[topic] < self._awaited_ns:
                 return topic
         return None
@@ -71,14 +71,16 @@ class _Mailbox:
         arrival_ns = self._arrivals.get(topic)
         return math.inf if arrival_ns is None else (time.monotonic_ns() - arrival_ns) * 1e-9
 
-    def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, tuple[Any, int]]:
+    def wait(
+        self, topics: tuple[str, ...], stamp_ns: int, timeout_s: float
+    ) -> list[tuple[Any, int]]:
         """Message and arrival [ns] of each topic, once each is at least as new as a stamp.
 
         Raises:
             StaleDataError: one does not come.
         """
         with self._lock:
-            self._awaited_ns = stamp_ns
+            self._awaited, self._awaited_ns = topics, stamp_ns
             self._complete.clear()
             late = self._late()
         if late is not None and not self._complete.wait(timeout_s):
@@ -87,7 +89,7 @@ class _Mailbox:
             if late is not None:
                 raise StaleDataError(late, self.age_s(late), timeout_s)
         with self._lock:
-            return {t: (message, self._arrivals[t]) for t, message in self._messages.items()}
+            return [(self._messages[topic], self._arrivals[topic]) for topic in topics]
 
 
 class DdsBackend:
@@ -200,30 +202,34 @@ class DdsBackend:
             return self._measure(self.timeout_s)
 
     def _check_stamps(self) -> None:
-        """Raises BackendError when the newest data are not stamped with the present step."""
         for topic in self._topics:
-            off_s = (self._mail.stamp_ns(topic) - self._now_ns) / conversions.NANO
-            if off_s:
-                raise BackendError(
-                    f"topic {topic!r}: stamped {off_s:+.3f} s off the step; start the simulator "
-                    "with mode:=lockstep, and move it from here alone."
-                )
+            self._check_stamp(topic)
+
+    def _check_stamp(self, topic: str) -> None:
+        """Raises BackendError when the newest datum is not stamped with the present step."""
+        off_ns = self._mail.stamp_ns(topic) - self._now_ns
+        if off_ns:
+            raise BackendError(
+                f"topic {topic!r}: stamped {off_ns / conversions.NANO:+.3f} s off the step; start "
+                "the simulator with mode:=lockstep, and move it from here alone."
+            )
 
     def _measure(self, timeout_s: float) -> tuple[RobotView, dict[str, Any]]:
         """The view at the present stamp. Raises BackendError when the data are of another one."""
         now = self._now_ns
-        messages = self._mail.wait(now, timeout_s)
-        self._check_stamps()
-        message, arrival = messages[ODOM]
+        # Odometry comes first, and is worked in while the scan is still on its way.
+        ((message, arrival),) = self._mail.wait((ODOM,), now, timeout_s)
+        self._check_stamp(ODOM)
         self._middleware.odometry(now, arrival, *conversions.odometry_from_ros(message))
-        message, arrival = messages[SCAN]
+        (message, arrival), *others = self._mail.wait(self._topics[1:], now, timeout_s)
+        self._check_stamps()
         self._middleware.scan(now, arrival, conversions.scan_from_ros(self._lidar, message))
         facts: dict[str, Any] = {
             "stamp_ns": now,
             **data_facts(self._middleware, time.monotonic_ns()),
         }
         if TRUTH in self._topics:
-            facts["true_pose"] = conversions.odometry_from_ros(messages[TRUTH][0])[0]
+            facts["true_pose"] = conversions.odometry_from_ros(others[0][0])[0]
         return self._middleware.view(now), facts
 
     def halt(self) -> None:

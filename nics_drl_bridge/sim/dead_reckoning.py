@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nics_drl_bridge.sim import dead_reckoning_kernels as kernels
+
 Array = NDArray[np.float64]
 LEAST_VARIANCE = 1e-9
 """Of odometry without noise: a covariance of zeros would mean that it is unknown."""
@@ -33,7 +35,7 @@ def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Arr
         after: (M, 3) and after.
         added: (3, 3) of one period, see `step_covariance`.
     """
-    way = np.asarray(after, np.float64)[:, :2] - np.asarray(before, np.float64)[:, :2]
-    derivative = np.tile(np.eye(3), (len(way), 1, 1))
-    derivative[:, 0, 2], derivative[:, 1, 2] = -way[:, 1], way[:, 0]
-    return np.asarray(derivative @ covariance @ derivative.transpose(0, 2, 1) + added)
+    after_that = np.array(covariance, np.float64)
+    poses = (np.ascontiguousarray(pose, np.float64) for pose in (before, after))
+    kernels.propagate(after_that, *poses, added)
+    return after_that

@@ -27,7 +27,8 @@ class Sensed:
         state: (S,) true state.
         ranges: (B,) scan.
         pose: (3,) true pose in `map`.
-        true_twist: (3,) mean of the step before.
+        before: (3,) the same a step before.
+        period: of a step [s].
     """
 
     odom: Array
@@ -36,7 +37,13 @@ class Sensed:
     state: Array
     ranges: NDArray[np.float32]
     pose: Array
-    true_twist: Array
+    before: Array
+    period: float
+
+    @property
+    def true_twist(self) -> Array:
+        """(3,) mean of the step before."""
+        return geometry.log(geometry.between(self.before, self.pose)) / self.period
 
 
 class DeviceWorld:
@@ -56,7 +63,7 @@ class DeviceWorld:
         self._added = step_covariance(model.noise.odometry, self._period)
         self.commands: Array = np.zeros((robots, len(model.robot.command)))
         self._covariance = np.tile(self._added, (robots, 1, 1))
-        self._true_twist = np.zeros((robots, 3))
+        self._before = simulator.data.pose[0].copy()
 
     @property
     def robots(self) -> int:
@@ -78,16 +85,15 @@ class DeviceWorld:
         self._simulator.reset([seed], starts=placed)
         self.commands[:] = 0.0
         self._covariance[:] = self._added
-        self._true_twist[:] = 0.0
+        self._before[:] = self._simulator.data.pose[0]
 
     def advance(self) -> None:
         """Moves all robots by one step."""
         data = self._simulator.data
-        pose, odom = data.pose[0].copy(), data.odom[0].copy()
+        self._before[:] = data.pose[0]
+        odom = data.odom[0].copy()
         self._simulator.step(self.commands[None])
         data = self._simulator.data
-        moved = geometry.log(geometry.between(pose, data.pose[0]))
-        self._true_twist = moved / self._period
         self._covariance = propagate(self._covariance, odom, data.odom[0], self._added)
 
     def sensed(self, robot: int) -> Sensed:
@@ -100,5 +106,6 @@ class DeviceWorld:
             data.state[0, robot],
             data.ranges[0, robot],
             data.pose[0, robot],
-            self._true_twist[robot],
+            self._before[robot],
+            self._period,
         )
