@@ -66,8 +66,9 @@ def test_the_shares_hold_both_policies():
 
 @pytest.mark.ros
 class TestWhatTheNodesDo:
+    @staticmethod
     @pytest.fixture(scope="class")
-    def graph(self, launch, meet, module_domain_id, tmp_path_factory):
+    def graph(launch, meet, module_domain_id, tmp_path_factory):
         """Asks the graph of a running stack what a node does."""
         pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
         started = [launch(node, module_domain_id) for node in NODES]
