@@ -154,9 +154,8 @@ def _taken_for_numbers(given: Any, found: Any, place: str = "") -> Iterator[tupl
         pairs = [(key, value, found[key]) for key, value in given.items() if key in found]
     elif isinstance(found, (tuple, list)) and isinstance(given, (tuple, list)):
         pairs = [(k, *both) for k, both in enumerate(zip(given, found, strict=False))]
-    elif isinstance(given, (str, bool)) and isinstance(found, (int, float)):
-        if not isinstance(found, bool):
-            yield place.removeprefix("."), given
+    elif isinstance(given, (str, bool)) and type(found) in (int, float):
+        yield place.removeprefix("."), given
     for key, value, made in pairs:
         yield from _taken_for_numbers(value, made, f"{place}.{key}")
 

@@ -85,7 +85,7 @@ def test_any_value_in_the_place_of_a_number_is_a_number_or_refused(copy, key, va
     except ConfigError as error:
         told = str(error)
         assert path.name in told
-        assert any(word in told for word in (key, "range", "angle"))  # noqa: PT017
+        assert any(word in told for word in (key, "range", "angle"))
     else:
         assert found == float(value.strip("'"))
 
