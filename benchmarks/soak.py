@@ -1,10 +1,10 @@
 """The whole stack for a long time: does anything grow, and does the robot ever stop unasked?
 
-Two things run at once. In one DDS domain a robot drives to ever new goals as it would in the field,
-in real time, each part a process: `simulator_node`, `middleware_node`, `policy_node` and
-`command_gate`. In another, a Gymnasium env begins and drives episodes over lock-step topics as fast
-as it can. Memory (resident), threads and file descriptors of each process, and of this one, are
-taken after a warm-up and until the end. A stop is explained if this script asked for it.
+Two things run at once. In one DDS domain a robot drives to ever new goals as it would in the
+field, in real time, each part a process: `simulator_node`, `middleware_node`, `policy_node` and
+`command_gate`. In another, a Gymnasium env begins and drives episodes over lock-step topics as
+fast as it can. Memory (resident), threads and file descriptors of each process, and of this one,
+are taken after a warm-up and until the end. A stop is explained if this script asked for it.
 """
 
 from __future__ import annotations

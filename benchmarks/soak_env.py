@@ -1,12 +1,14 @@
 """Millions of steps in a row: does memory grow, does a NaN appear, does a world get stuck?
 
 Worlds of every kind (still and moving obstacles, maps, teams, domain randomisation) take turns;
-each is stepped by random actions, with autoreset.
+each is stepped by random actions, with autoreset. With `--resets`, one Gymnasium env is reset so
+often instead, and file descriptors and threads are counted too.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import math
 import sys
@@ -16,9 +18,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
+from measuring.processes import use_of
 from numpy.typing import NDArray
 
+from nics_drl_bridge.env.registration import NAVIGATION, register_envs
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 
 PAGE = 4096
@@ -136,6 +141,30 @@ def run(steps: int, seed: int, names: Sequence[str]) -> dict[str, Any]:
     }
 
 
+def run_resets(resets: int, seed: int) -> dict[str, Any]:
+    """Resets of one Gymnasium env, each with a step; a tenth of them to warm up."""
+    register_envs()
+    env = gymnasium.make(NAVIGATION, model="differential", world="arena")
+    rng, begin, nans = np.random.default_rng(seed), time.perf_counter(), 0
+    uses = []
+    for number in range(resets):
+        seen, _ = env.reset(seed=seed + number)
+        after, reward, *_ = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))
+        nans += not_finite(seen, after, np.array(reward))
+        if number in (resets // 10, resets - 1):
+            gc.collect()
+            uses.append(use_of())
+    env.close()
+    return {
+        "resets": resets,
+        "seconds": time.perf_counter() - begin,
+        "rss_growth_mb": uses[-1].rss_mb - uses[0].rss_mb,
+        "fds_growth": uses[-1].files - uses[0].files,
+        "threads_growth": uses[-1].threads - uses[0].threads,
+        "nans": nans,
+    }
+
+
 def table_of(result: dict[str, Any]) -> str:
     """One line per case, and the sum."""
     text = f"{'case':<18}{'steps':>12}{'episodes':>10}{'longest':>9}{'still':>7}{'NaN':>5}\n"
@@ -155,7 +184,13 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=20_000_000, help="env steps in all")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
+    parser.add_argument("--resets", type=int, default=0, help="resets of a single env instead")
     given = parser.parse_args()
+    if given.resets:
+        told = run_resets(given.resets, given.seed)
+        lines = "".join(f"{key:<16}{value}\n" for key, value in told.items())
+        sys.stdout.write(json.dumps(told) + "\n" if given.json else lines)
+        return
     result = run(given.steps, given.seed, given.cases)
     sys.stdout.write(json.dumps(result) + "\n" if given.json else table_of(result))
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import reprlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,6 +19,8 @@ from nics_drl_bridge.errors import ConfigError, nearest
 
 PACKAGE = "nics_drl_bridge"
 MAX_DEPTH = 32
+MAX_BYTES = 8 * 2**20
+"""Of a YAML file; it is read at about 0.5 MB a second."""
 
 
 class Schema(BaseModel):
@@ -134,9 +137,27 @@ def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> Schema
         ConfigError: the first thing that is wrong, with file, key, value and fix.
     """
     try:
-        return schema.model_validate(data)
+        found = schema.model_validate(data)
     except ValidationError as error:
         raise ConfigError(f"{source}: {_sentence(error, schema)}") from None
+    for place, given in _taken_for_numbers(data, found):
+        raise ConfigError(f"{source}: key {place!r}: should be a number, not {given!r}.")
+    return found
+
+
+def _taken_for_numbers(given: Any, found: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+    """Texts and truth values that pydantic made a number of: `true` is no length."""
+    pairs: list[tuple[Any, Any, Any]] = []
+    if isinstance(found, BaseModel) and isinstance(given, dict):
+        pairs = [(k, v, getattr(found, k)) for k, v in given.items() if hasattr(found, str(k))]
+    elif isinstance(found, dict) and isinstance(given, dict):
+        pairs = [(key, value, found[key]) for key, value in given.items() if key in found]
+    elif isinstance(found, (tuple, list)) and isinstance(given, (tuple, list)):
+        pairs = [(k, *both) for k, both in enumerate(zip(given, found, strict=False))]
+    elif isinstance(given, (str, bool)) and type(found) in (int, float):
+        yield place.removeprefix("."), given
+    for key, value, made in pairs:
+        yield from _taken_for_numbers(value, made, f"{place}.{key}")
 
 
 _SHORT = reprlib.Repr()
@@ -202,6 +223,8 @@ def _inner_models(annotation: Any) -> list[type[BaseModel]]:
 def read_text(path: Path) -> str:
     """Reads a UTF-8 file, with one sentence when that fails."""
     try:
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise ConfigError(f"{path}: is a device or a pipe, not a file; copy it to one.")
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; check the path.") from None
@@ -215,6 +238,9 @@ def read_text(path: Path) -> str:
 
 def load_yaml(path: Path, schema: type[SchemaT]) -> SchemaT:
     """Reads and checks a YAML file. Raises ConfigError with file, key and fix."""
+    if path.is_file() and path.stat().st_size > MAX_BYTES:
+        limit = MAX_BYTES // 2**20
+        raise ConfigError(f"{path}: is larger than {limit} MB; give a configuration instead.")
     return validate(parse_yaml(read_text(path), str(path)), schema, str(path))
 
 

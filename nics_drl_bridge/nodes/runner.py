@@ -105,6 +105,10 @@ def run_node(
     except (BridgeError, ParameterException) as error:
         sys.stderr.write(f"{' '.join(str(error).split())}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        sys.stderr.write(f"{place}{error.strerror or error}; choose another place.\n")
+        raise SystemExit(EXIT_BAD_INPUT) from None
     finally:
         starting.clear()
         if node is not None:

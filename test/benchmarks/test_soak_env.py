@@ -22,3 +22,11 @@ def test_a_soak_finds_no_nan_and_no_world_that_is_stuck():
     for case in found["cases"].values():
         assert case["episodes"] > 0
         assert case["longest"] > 1
+
+
+@pytest.mark.timeout(300)
+def test_resets_of_a_single_env_leave_no_files_and_threads_behind():
+    command = [sys.executable, str(BENCHMARKS / "soak_env.py"), "--resets", "300", "--json"]
+    found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    assert (found["resets"], found["nans"]) == (300, 0)
+    assert found["fds_growth"] == found["threads_growth"] == 0

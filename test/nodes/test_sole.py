@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 
@@ -31,7 +32,12 @@ def ended(process):
     return code, process.log.read_text()
 
 
-@pytest.mark.timeout(180)
+def way(odometry):
+    """How far a robot has come [m]."""
+    places = [(told.pose.pose.position.x, told.pose.pose.position.y) for told in odometry]
+    return math.dist(places[0], places[-1]) if places else 0.0
+
+
 @pytest.mark.parametrize("node", ["command_gate", "middleware_node"])
 def test_a_second_node_in_the_same_namespace_refuses_to_start(launch, meet, domain_id, node):
     first, peer = launch(node, domain_id, "one"), meet(domain_id)
@@ -46,7 +52,6 @@ def test_a_second_node_in_the_same_namespace_refuses_to_start(launch, meet, doma
     other.check()
 
 
-@pytest.mark.timeout(180)
 def test_a_node_that_was_just_killed_does_not_keep_the_next_from_starting(launch, meet, domain_id):
     first, peer = launch("command_gate", domain_id), meet(domain_id)
 
@@ -81,9 +86,8 @@ def test_a_node_of_another_package_with_the_same_name_is_asked_and_found(domain_
         context.try_shutdown()
 
 
-@pytest.mark.timeout(180)
 def test_robots_in_one_domain_do_not_hear_each_other(launch, meet, domain_id, model):
-    """One is told to drive: the other neither moves, nor does its gate learn of it."""
+    """One is told to drive: the other does not move."""
     for space in ("one", "two"):
         launch("simulator_node", domain_id, space, world="empty")
     one, two = meet(domain_id, "one"), meet(domain_id, "two")
@@ -102,9 +106,7 @@ def test_robots_in_one_domain_do_not_hear_each_other(launch, meet, domain_id, mo
     one.node.create_timer(
         PACE_S, lambda: commands.publish(conversions.twist_to_ros([0.5, 0.0, 0.0]))
     )
-    one.until(
-        lambda: odometry[one] and odometry[one][-1].pose.pose.position.x > 0.3, "the one drives"
-    )
-    two.another(odometry[two], "odometry")
+    one.until(lambda: way(odometry[one]) > 0.3, "the one drives")
+    two.until(lambda: len(odometry[two]) > 5, "odometry of the other")
     assert all(abs(told.twist.twist.linear.x) < 0.1 for told in odometry[two])
-    assert abs(odometry[two][-1].pose.pose.position.x) < 0.1
+    assert way(odometry[two]) < 0.1

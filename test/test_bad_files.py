@@ -1,0 +1,110 @@
+"""Whatever is wrong with a file: one sentence that names it, never a traceback."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from bad_files import FILES, TEXTS, VALUES
+
+from nics_drl_bridge.config import MAX_BYTES, share_folder
+from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.kinematics.topic_roles import topic_roles
+from nics_drl_bridge.lidar.maps import load_map
+from nics_drl_bridge.lidar.spec import load_lidar
+from nics_drl_bridge.policy.policy_file import load_policy
+from nics_drl_bridge.policy.training_settings import load_training
+from nics_drl_bridge.safety.black_box import replay
+from nics_drl_bridge.safety.limits import load_limits
+from nics_drl_bridge.sim.randomisation import load_randomisation
+from nics_drl_bridge.sim.world import load_world
+
+CONFIGS = {
+    "robots/ackermann.yaml": load_robot,
+    "lidars/rplidar_a1.yaml": load_lidar,
+    "worlds/doorway.yaml": load_world,
+    "limits/differential.yaml": lambda name: load_limits(name, load_robot("differential")),
+    "randomisation/strong.yaml": load_randomisation,
+    "training/navigation_differential.yaml": load_training,
+    "maps/room.yaml": load_map,
+}
+OTHERS = {
+    "policy.onnx": load_policy,
+    "stop.jsonl": replay,
+    "topics.yaml": topic_roles,
+}
+
+
+def refused(load, path):
+    with pytest.raises(BridgeError) as told:
+        load(path)
+    sentence = str(told.value)
+    assert path.name in sentence
+    assert "\n" not in sentence
+    assert len(sentence) < 400
+
+
+@pytest.fixture
+def copy(tmp_path):
+    def make(name):
+        shutil.copy(share_folder() / "config" / "maps" / "room.pgm", tmp_path)
+        return Path(shutil.copy(share_folder() / "config" / name, tmp_path))
+
+    return make
+
+
+@pytest.mark.parametrize("what", [*FILES, *(text for text in TEXTS if "long" not in text)])
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_damaged_configuration_is_refused_by_name(copy, name, what):
+    path = copy(name)
+    (FILES | TEXTS)[what](path)
+    refused(lambda path: CONFIGS[name](str(path)), path)
+
+
+@pytest.mark.parametrize("what", FILES)
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_damaged_file_is_refused_by_name(tmp_path, name, what):
+    path = tmp_path / name
+    path.write_text("{}\n")
+    FILES[what](path)
+    refused(OTHERS[name], path)
+
+
+@pytest.mark.parametrize("value", VALUES)
+@pytest.mark.parametrize("key", ["beams", "range_max", "angle_min"])
+def test_any_value_in_the_place_of_a_number_is_a_number_or_refused(copy, key, value):
+    path = copy("lidars/rplidar_a1.yaml")
+    lines = path.read_text().splitlines()
+    changed = [f"{key}: {value}" if line.startswith(f"{key}:") else line for line in lines]
+    assert changed != lines
+    path.write_text("\n".join(changed))
+    try:
+        found = getattr(load_lidar(str(path)), key)
+    except ConfigError as error:
+        told = str(error)
+        assert path.name in told
+        assert any(word in told for word in (key, "range", "angle"))
+    else:
+        assert found == float(value.strip("'"))
+
+
+def test_a_huge_configuration_or_an_endless_device_is_refused_without_reading_it(tmp_path):
+    path = tmp_path / "huge.yaml"
+    with path.open("wb") as huge:
+        huge.truncate(MAX_BYTES + 1)
+    with pytest.raises(ConfigError, match=r"huge\.yaml: is larger than 8 MB"):
+        load_robot(str(path))
+    endless = tmp_path / "endless.yaml"
+    endless.symlink_to("/dev/zero")
+    with pytest.raises(ConfigError, match="is a device or a pipe, not a file"):
+        load_robot(str(endless))
+
+
+@pytest.mark.parametrize("begin", [b"\xef\xbb\xbf", b""])
+def test_a_byte_order_mark_and_the_line_ends_of_windows_change_nothing(copy, begin):
+    path = copy("lidars/rplidar_a1.yaml")
+    wanted = load_lidar(str(path))
+    path.write_bytes(begin + path.read_bytes().replace(b"\n", b"\r\n"))
+    assert load_lidar(str(path)) == wanted
