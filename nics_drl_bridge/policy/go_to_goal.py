@@ -67,7 +67,9 @@ class GoToGoal:
         return index, np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The action (C,) for an observation (P + 6,)."""
+        """The action (C,) for an observation (O,); or (N, C) for (N, O)."""
+        if observation.ndim == 2:
+            return np.stack([self.act(one) for one in observation])
         distance, cosine, sine = observation[self.task.scan_parts :][:3].astype(float)
         goal = distance * np.array([cosine, sine])
         curvature, points, heading = self._paths
