@@ -81,5 +81,6 @@ def _run(
 
     with progress_bar() as tell:
         command = shlex.join(["nics", *sys.argv[1:]])
-        train_run.run(settings, seeds, folder, episodes, resume, command, told, done)
+        order = train_run.TrainOrder(settings, seeds, folder, episodes, resume, command)
+        train_run.run(order, told, done)
     typer.echo(f"policy files, checkpoints and logs: {folder}; tensorboard --logdir {folder}")

@@ -38,44 +38,56 @@ class SeedResult:
     summaries: dict[str, Summary]
 
 
-def run(
-    settings: TrainingSettings,
-    seeds: Sequence[int],
-    out: Path,
-    episodes: int,
-    resumed: bool = False,
-    command: str = "",
-    tell: Callable[[Progress], None] = lambda _: None,
-    done: Callable[[SeedResult], None] = lambda _: None,
-) -> list[SeedResult]:
-    """Trains seed after seed and evaluates each in the worlds that it learned in.
+@dataclass(frozen=True)
+class TrainOrder:
+    """What a run is to do.
 
-    Args:
+    Attributes:
         settings: what to learn; a resumed run gives its own, see `settings_of`.
         seeds: of the trainings.
         out: folder of the run; each seed gets one below it.
         episodes: of an evaluation in each world.
         resumed: whether to go on from the checkpoints that there are.
         command: what the user called, for the policy files.
+    """
+
+    settings: TrainingSettings
+    seeds: Sequence[int]
+    out: Path
+    episodes: int
+    resumed: bool = False
+    command: str = ""
+
+
+def run(
+    order: TrainOrder,
+    tell: Callable[[Progress], None] = lambda _: None,
+    done: Callable[[SeedResult], None] = lambda _: None,
+) -> list[SeedResult]:
+    """Trains seed after seed and evaluates each in the worlds that it learned in.
+
+    Args:
+        order: what to do.
         tell: is told of the progress.
         done: is told of each seed that is through.
 
     Raises:
         ConfigError: the folder holds a run already, or none to resume.
     """
-    _check(seeds, out, resumed)
-    write_text(out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
+    _check(order.seeds, order.out, order.resumed)
+    settings = order.settings
+    write_text(order.out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
     results = []
-    for seed in seeds:
-        folder = out / f"seed_{seed}"
+    for seed in order.seeds:
+        folder = order.out / f"seed_{seed}"
         begun = (folder / CHECKPOINT).is_file()
-        trained = train(settings, seed, folder, tell, resumed and begun)
-        results.append(SeedResult(seed, trained, _evaluated(settings, trained, episodes)))
-        summaries = results[-1].summaries
-        plain = {world: dataclasses.asdict(summary) for world, summary in summaries.items()}
+        trained = train(settings, seed, folder, tell, order.resumed and begun)
+        result = SeedResult(seed, trained, _evaluated(settings, trained, order.episodes))
+        plain = {world: dataclasses.asdict(one) for world, one in result.summaries.items()}
         write_text(folder / EVALUATION, json.dumps(plain, indent=2) + "\n")
-        _export(settings, results[-1], command, folder / POLICY)
-        done(results[-1])
+        _export(settings, result, order.command, folder / POLICY)
+        done(result)
+        results.append(result)
     return results
 
 
