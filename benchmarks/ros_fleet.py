@@ -26,7 +26,7 @@ SCAN_HZ, ODOM_HZ, SHARE = 10.0, 50.0, 0.99
 SIZES = (20, 24, 28, 32, 40, 48, 56, 64)
 SIDE_PER_ROBOT_M = 3.0
 PATIENCE_S = 90.0
-LISTENER = '''
+LISTENER = """
 import json, sys, time
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
@@ -65,7 +65,7 @@ while time.monotonic() < began + seconds:
     executor.spin_once(timeout_sec=0.1)
 spent = time.monotonic() - began
 print(json.dumps({topic: (count - known[topic]) / spent for topic, count in counts.items()}))
-'''
+"""
 
 
 @dataclass(frozen=True)

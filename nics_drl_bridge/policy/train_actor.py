@@ -18,7 +18,7 @@ ACTION_GAIN = 0.01
 """Of the last layer of an actor at the start: all its actions are near zero."""
 
 
-class Actor(torch.nn.Module):  # type: ignore[misc]
+class Actor(torch.nn.Module):
     """From observations (n, O) to raw actions (n, C), or to logits (n, A) of discrete ones.
 
     Args:
@@ -31,13 +31,14 @@ class Actor(torch.nn.Module):  # type: ignore[misc]
     def __init__(
         self,
         observations: gymnasium.spaces.Box,
-        actions: gymnasium.Space[NDArray[np.float32]] | gymnasium.spaces.Discrete,
+        actions: gymnasium.spaces.Box | gymnasium.spaces.Discrete,
         hidden: Sequence[int],
         normaliser: tuple[Array, Array],
     ) -> None:
         super().__init__()
-        self.discrete = isinstance(actions, gymnasium.spaces.Discrete)
-        count = int(actions.n) if self.discrete else int(np.prod(actions.shape))
+        discrete = isinstance(actions, gymnasium.spaces.Discrete)
+        count = int(actions.n if discrete else np.prod(actions.shape))
+        self.discrete = discrete
         self.normaliser = Normaliser(observations, *normaliser)
         self.layers = layers_of([self.normaliser.features_dim, *hidden, count], ACTION_GAIN)
 

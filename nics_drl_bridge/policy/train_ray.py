@@ -133,7 +133,8 @@ class Learning:
     @property
     def module(self) -> ActorCritic:
         """The network that learns."""
-        return self.learner.module[DEFAULT_MODULE_ID].unwrapped()
+        network: ActorCritic = self.learner.module[DEFAULT_MODULE_ID].unwrapped()
+        return network
 
     def run(self, tell: Tell, about: dict[str, Any]) -> None:
         """Learns until all steps are done, and keeps checkpoints."""

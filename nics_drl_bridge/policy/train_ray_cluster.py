@@ -29,7 +29,7 @@ def connected(address: str | None, runners: int | None, worlds: int) -> Iterator
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # RLlib's own warnings are many
-    logging.getLogger("ray").setLevel(logging.ERROR)
+    logging.getLogger("ray.rllib").setLevel(logging.ERROR)
     local = {"include_dashboard": False} if address is None else {}
     try:
         ray.init(address or LOCAL, log_to_driver=False, logging_level="ERROR", **local)

@@ -14,7 +14,7 @@ from nics_drl_bridge.policy.train_actor import Actor, layers_of
 Batch = dict[str, Any]
 
 
-class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):  # type: ignore[misc]
+class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
     """RLlib's form of `Actor` and a critic of the same widths.
 
     `model_config` holds `hidden`, `normaliser` and `log_std`, see `Actor` and `PpoSettings`.

@@ -76,7 +76,7 @@ class Rollout:
         ).to_numpy()
 
 
-class WorldsRunner(SingleAgentEnvRunner):  # type: ignore[misc]
+class WorldsRunner(SingleAgentEnvRunner):
     """Drives its share of the worlds of a training.
 
     `env_config` holds `make` (a reference to a function of runner and number of runners that
