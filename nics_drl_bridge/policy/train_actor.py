@@ -36,9 +36,10 @@ class Actor(torch.nn.Module):
         normaliser: tuple[Array, Array],
     ) -> None:
         super().__init__()
-        discrete = isinstance(actions, gymnasium.spaces.Discrete)
-        count = int(actions.n if discrete else np.prod(actions.shape))
-        self.discrete = discrete
+        if isinstance(actions, gymnasium.spaces.Discrete):
+            self.discrete, count = True, int(actions.n)
+        else:
+            self.discrete, count = False, int(np.prod(actions.shape))
         self.normaliser = Normaliser(observations, *normaliser)
         self.layers = layers_of([self.normaliser.features_dim, *hidden, count], ACTION_GAIN)
 

@@ -27,7 +27,14 @@ from stable_baselines3.common.logger import configure
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.policy.train import CHECKPOINT, Tell, Trained, check_same, make_train_env
+from nics_drl_bridge.policy.train import (
+    CHECKPOINT,
+    SEEDS,
+    Tell,
+    Trained,
+    check_same,
+    make_train_env,
+)
 from nics_drl_bridge.policy.train_algorithms import LEAST_RATE, RECENT, check_serves
 from nics_drl_bridge.policy.train_checkpoint import read_checkpoint, write_content
 from nics_drl_bridge.policy.train_normaliser import observed
@@ -222,7 +229,7 @@ def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -
     rng = np.random.default_rng(seed)
     env = make_train_env(settings, model, scenes)
     check_serves(settings, env)
-    env.seed(int(rng.integers(2**40)))
+    env.seed(int(rng.integers(SEEDS)))
     normaliser = observed(env, rng)
     spaces = env.observation_space, env.action_space
     env.close()

@@ -6,6 +6,7 @@ longer than the simulator. This one keeps arrays, and cuts them into episodes at
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -21,9 +22,9 @@ from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
+from nics_drl_bridge.policy.train import SEEDS
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 
-SEEDS = 2**40
 ENDED, SUCCESS, COLLISION, STEPPING = "ended", "success", "collision", "stepping_s"
 """Names of what a runner counts: episodes, and time in the simulator [s]."""
 
@@ -87,7 +88,8 @@ class WorldsRunner(SingleAgentEnvRunner):
         """Makes the worlds of this runner; each runner draws other episodes."""
         chosen = self.config.env_config
         torch.set_num_threads(chosen["threads"])
-        make = ray.get(chosen["make"])
+        # Arrays that Ray shares are read-only; the kernels would be compiled anew for them.
+        make = copy.deepcopy(ray.get(chosen["make"]))
         self.env: TrainVecEnv = make(self.worker_index - 1, self.num_workers)
         self.num_envs = self.env.num_envs
         rng = np.random.default_rng([*chosen["seed"], self.worker_index])
