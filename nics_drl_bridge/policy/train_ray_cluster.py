@@ -28,8 +28,8 @@ def connected(address: str | None, runners: int | None, worlds: int) -> Iterator
         ConfigError: no cluster answers there, or it is too small.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # RLlib's own warnings are many
-    logging.getLogger("ray.rllib").setLevel(logging.ERROR)
+    # A lost worker is no error here, and Ray's words about it would run through the progress bar.
+    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")    logging.getLogger("ray.rllib").setLevel(logging.CRITICAL)
     local = {"include_dashboard": False} if address is None else {}
     try:
         ray.init(address or LOCAL, log_to_driver=False, logging_level="ERROR", **local)
