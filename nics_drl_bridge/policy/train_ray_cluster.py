@@ -29,7 +29,8 @@ def connected(address: str | None, runners: int | None, worlds: int) -> Iterator
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     # A lost worker is no error here, and Ray's words about it would run through the progress bar.
-    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")    logging.getLogger("ray.rllib").setLevel(logging.CRITICAL)
+    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")
+    logging.getLogger("ray.rllib").setLevel(logging.CRITICAL)
     local = {"include_dashboard": False} if address is None else {}
     try:
         ray.init(address or LOCAL, log_to_driver=False, logging_level="ERROR", **local)
