@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -11,7 +12,9 @@ import ray
 
 from nics_drl_bridge.errors import ConfigError
 
-LOCAL = "local"
+LOCAL, AUTO = "local", "auto"
+TRIED_S = 5.0
+"""How long an address is tried [s]."""
 
 
 @contextmanager
@@ -33,17 +36,25 @@ def connected(address: str | None, runners: int | None, worlds: int) -> Iterator
     logging.getLogger("ray.rllib").setLevel(logging.CRITICAL)
     local = {"include_dashboard": False} if address is None else {}
     try:
+        _check_listens(address)
         ray.init(address or LOCAL, log_to_driver=False, logging_level="ERROR", **local)
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except (OSError, OverflowError, ValueError, RuntimeError) as error:
         first = str(error).strip().partition("\n")[0].rstrip(".")
         raise ConfigError(
             f"--address {address}: no Ray cluster answers ({first}); start one on the first "
-            "machine with 'ray start --head', and name the address that it prints."
+            "machine with 'ray start --head', and name the HOST:PORT that it prints."
         ) from None
     try:
         yield _runners(runners, int(ray.cluster_resources().get("CPU", 0)), worlds)
     finally:
         ray.shutdown()
+
+
+def _check_listens(address: str | None) -> None:
+    """Raises OSError where nobody listens; Ray itself would try for minutes."""
+    if address not in (None, AUTO):
+        host, _, port = str(address).rpartition(":")
+        socket.create_connection((host, int(port)), TRIED_S).close()
 
 
 def _runners(runners: int | None, cpus: int, worlds: int) -> int:

@@ -185,6 +185,13 @@ def test_what_a_cluster_can_not_train_gives_one_sentence(cluster, tmp_path, argu
     assert "Traceback" not in done.output
 
 
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "nonsense"])
+def test_an_address_where_no_cluster_is_gives_one_sentence(address, tmp_path):
+    done = nics("--engine", "ray", "--address", address, "--out", tmp_path)
+    assert done.exit_code == 2
+    assert f"--address {address}: no Ray cluster answers" in " ".join(done.output.split())
+
+
 def test_env_runners_share_all_worlds_among_them():
     from nics_drl_bridge.generator import open_model
 
