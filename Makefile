@@ -138,6 +138,7 @@ $(JAZZY)/.ready: $(DESCRIBED_BY)
 
 # RLlib holds Gymnasium at a version of its own.
 RAY := .venv-ray
+RAY_EXTRAS := deploy,distributed,test,train
 RAY_TESTS := test/policy/test_train_ray.py test/policy/test_train_vec_env.py
 
 test-ray: $(RAY)/.ready ## training on a Ray cluster of two nodes on this machine, in .venv-ray
@@ -145,7 +146,7 @@ test-ray: $(RAY)/.ready ## training on a Ray cluster of two nodes on this machin
 
 $(RAY)/.ready: $(DESCRIBED_BY) constraints-ray.txt
 	$(call BUILD_APART,$(RAY),(grep -v '^gymnasium==' constraints.txt; cat constraints-ray.txt),\
-		'.[deploy,distributed,test,train]')
+		'.[$(RAY_EXTRAS)]')
 
 benchmark: setup ## run every benchmark and print its table
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python "$$script"; done
