@@ -41,7 +41,7 @@ DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Ma
 
 OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
 
-.PHONY: help setup demo test test-jazzy ros-status lint format types pytest benchmark clean distclean
+.PHONY: help setup demo test test-jazzy test-ray ros-status lint format types pytest benchmark clean distclean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 12
@@ -109,8 +109,19 @@ types: setup ## mypy
 pytest: setup
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
-# The node tests on another distribution: its wheels have the names of ours, so they need an
-# environment of their own. What is pinned is the same but for ROS.
+# Environments apart, of what clashes with .venv; what they share with it has the same pins.
+# $(1): folder. $(2): command that prints its constraints. $(3): what it holds.
+define BUILD_APART
+@echo "Building $(1) with Python $(VERSION); the first time takes a minute or more."
+@test -x $(1)/bin/python || $(CLEAN_ENV) $(BASE) -m venv $(1)
+@$(2) > $(1)/constraints.txt
+@export PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_CONSTRAINT=$(1)/constraints.txt; \
+	$(CLEAN_ENV) $(1)/bin/python -m pip install -qq setuptools; \
+	$(CLEAN_ENV) $(1)/bin/python -m pip install -qq --no-build-isolation --editable $(3)
+@touch $@
+endef
+
+# The wheels of another distribution have the names of ours.
 JAZZY := .venv-jazzy
 JAZZY_WHEELS := ros-jazzy-rclpy ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp
 JAZZY_EXTRAS := bags,deploy,mujoco,multi,test
@@ -122,14 +133,20 @@ $(JAZZY)/.ready: $(DESCRIBED_BY)
 	@if [ "$(ROS)" != wheels ]; then \
 		echo "make test-jazzy: needs Linux on x86-64 and a shell without a sourced ROS 2." >&2; \
 		exit 1; fi
-	@echo "Building $(JAZZY) with Python $(VERSION); the first time takes a minute or more."
-	@test -x $(JAZZY)/bin/python || $(CLEAN_ENV) $(BASE) -m venv $(JAZZY)
-	@grep -v '^ros-' constraints.txt > $(JAZZY)/constraints.txt
-	@export PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_CONSTRAINT=$(JAZZY)/constraints.txt; \
-		$(CLEAN_ENV) $(JAZZY)/bin/python -m pip install -qq setuptools; \
-		$(CLEAN_ENV) $(JAZZY)/bin/python -m pip install -qq --no-build-isolation \
-			--editable '.[$(JAZZY_EXTRAS)]' onnx $(JAZZY_WHEELS)
-	@touch $@
+	$(call BUILD_APART,$(JAZZY),grep -v '^ros-' constraints.txt,'.[$(JAZZY_EXTRAS)]' onnx \
+		$(JAZZY_WHEELS))
+
+# RLlib holds Gymnasium at a version of its own.
+RAY := .venv-ray
+RAY_EXTRAS := deploy,distributed,test,train
+RAY_TESTS := test/policy/test_train_ray.py test/policy/test_train_vec_env.py
+
+test-ray: $(RAY)/.ready ## training on a Ray cluster of two nodes on this machine, in .venv-ray
+	$(CLEAN_ENV) $(RAY)/bin/python -m pytest $(RAY_TESTS) $(PYTEST_ARGS)
+
+$(RAY)/.ready: $(DESCRIBED_BY) constraints-ray.txt
+	$(call BUILD_APART,$(RAY),(grep -v '^gymnasium==' constraints.txt; cat constraints-ray.txt),\
+		'.[$(RAY_EXTRAS)]')
 
 benchmark: setup ## run every benchmark and print its table
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python "$$script"; done
@@ -138,5 +155,5 @@ clean: ## remove what building and testing left behind
 	rm -rf build dist install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +
 
-distclean: clean ## the same, and .venv, .venv-jazzy and runs/
-	rm -rf $(VENV) $(JAZZY) runs
+distclean: clean ## the same, and .venv, .venv-jazzy, .venv-ray and runs/
+	rm -rf $(VENV) $(JAZZY) $(RAY) runs

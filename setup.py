@@ -44,6 +44,9 @@ EXTRAS = {
         "tensorboard>=2.16",
         "torch>=2.3,<2.14",
     ],
+    # RLlib holds Gymnasium at a version of its own: for an environment apart, as `make test-ray`
+    # builds one, and no part of `dev`.
+    "distributed": ["ray[rllib]>=2.60,<2.61"],
     "deploy": ["onnx>=1.16", "onnxruntime>=1.18"],
     "test": [
         "build",
@@ -63,7 +66,8 @@ EXTRAS = {
     ],
 }
 # What `make setup` installs: where a ROS 2 is sourced, and where none is.
-EXTRAS["dev-without-ros"] = [one for name in EXTRAS if name != "ros" for one in EXTRAS[name]]
+APART = ("ros", "distributed")
+EXTRAS["dev-without-ros"] = [one for name in EXTRAS if name not in APART for one in EXTRAS[name]]
 EXTRAS["dev"] = EXTRAS["dev-without-ros"] + EXTRAS["ros"]
 
 

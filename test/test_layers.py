@@ -55,6 +55,7 @@ HOMES = {
     "onnx": ("policy/*",),
     "onnxruntime": ("policy/*",),
     "pettingzoo": ("env/pettingzoo_env.py",),
+    "ray": ("policy/train_ray*.py",),
     "rosbags": ("kinematics/*",),
     "threadpoolctl": ("threads.py",),
 }

@@ -244,7 +244,7 @@ def test_a_sourced_ros_2_replaces_the_ros_wheels_and_nothing_else(metadata: Mess
         for extra in ("", "dev", "dev-without-ros", "ros")
     )
     assert everything - without_ros == ros - core
-    for extra in metadata.get_all("Provides-Extra", []):
+    for extra in set(metadata.get_all("Provides-Extra", [])) - {"distributed"}:
         assert {one.name for one in requirements(metadata, extra)} <= everything
 
 

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import shlex
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from nics_drl_bridge.commands.console import one_sentence, progress_bar
+
+ENGINES = ("sb3", "ray")
 
 
 def train(
@@ -33,8 +38,22 @@ def train(
     episodes: Annotated[int, typer.Option(min=1, help="Of the evaluation, in each world.")] = 500,
     out: Annotated[Path | None, typer.Option(help="Folder of the run.")] = None,
     resume: Annotated[bool, typer.Option(help="Go on where --out was interrupted.")] = False,
+    engine: Annotated[
+        str, typer.Option(help="sb3 (Stable-Baselines3, this process) or ray (RLlib, a cluster).")
+    ] = "sb3",
+    address: Annotated[
+        str | None,
+        typer.Option(
+            help="Of the Ray cluster: auto (the one this machine is part of) or HOST:PORT; by "
+            "default one is started here."
+        ),
+    ] = None,
+    env_runners: Annotated[
+        int | None,
+        typer.Option(min=1, help="Processes on Ray that share the worlds; by default one per CPU."),
+    ] = None,
 ) -> None:
-    """Trains policies with Stable-Baselines3 in the fast simulator, and evaluates them."""
+    """Trains policies in the fast simulator, and evaluates them."""
     with one_sentence():
         from nics_drl_bridge.errors import ConfigError
         from nics_drl_bridge.policy.training_settings import chosen_settings
@@ -59,12 +78,42 @@ def train(
         else:
             chosen = chosen_settings(task, settings, named)
         folder = out or Path("runs") / chosen.title
-        _run(train_run, chosen, [*(seeds or [0]), *(more_seeds or [])], folder, episodes, resume)
+        command = shlex.join(["nics", *sys.argv[1:]])
+        every = [*(seeds or [0]), *(more_seeds or [])]
+        order = train_run.TrainOrder(chosen, every, folder, episodes, resume, command)
+        with _learner(engine, address, env_runners, chosen.num_envs) as learn:
+            _run(train_run, order, learn)
 
 
-def _run(
-    train_run: Any, settings: Any, seeds: list[int], folder: Path, episodes: int, resume: bool
-) -> None:
+@contextmanager
+def _learner(
+    engine: str, address: str | None, env_runners: int | None, worlds: int
+) -> Iterator[Any]:
+    """What trains one policy; while it is open, it is connected with its cluster."""
+    from nics_drl_bridge.errors import ConfigError, nearest
+    from nics_drl_bridge.policy.train import train
+
+    if engine not in ENGINES:
+        raise ConfigError(f"unknown engine {engine!r}; {nearest(engine, ENGINES)}")
+    if engine == "sb3":
+        for name, value in (("address", address), ("env-runners", env_runners)):
+            if value is not None:
+                raise ConfigError(f"--{name}: belongs to --engine ray; add that, or leave it out.")
+        yield train
+        return
+    try:
+        from nics_drl_bridge.policy.train_ray import train_on_ray
+        from nics_drl_bridge.policy.train_ray_cluster import connected
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"--engine ray needs the module {error.name!r}; pip install "
+            "'nics_drl_bridge[train,distributed]' into an environment of its own."
+        ) from None
+    with connected(address, env_runners, worlds) as runners:
+        yield functools.partial(train_on_ray, runners=runners)
+
+
+def _run(train_run: Any, order: Any, learn: Any) -> None:
     def told(progress: Any) -> None:
         tell(
             f"seed {progress.seed}: success {100 * progress.success:.1f} %, "
@@ -80,7 +129,6 @@ def _run(
             typer.echo(f"  {world}: {train_run.line_of(summary)}")
 
     with progress_bar() as tell:
-        command = shlex.join(["nics", *sys.argv[1:]])
-        order = train_run.TrainOrder(settings, seeds, folder, episodes, resume, command)
-        train_run.run(order, told, done)
+        train_run.run(order, told, done, learn)
+    folder = order.out
     typer.echo(f"policy files, checkpoints and logs: {folder}; tensorboard --logdir {folder}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,15 +16,18 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy.evaluation_batch import FIRST_SEED, Outcomes, drive_worlds
+from nics_drl_bridge.policy.train_actor import Actor
 from nics_drl_bridge.policy.train_algorithms import act_of, make_algorithm
 from nics_drl_bridge.policy.train_checkpoint import read_checkpoint, resume, save_checkpoint
 from nics_drl_bridge.policy.train_normaliser import observed
 from nics_drl_bridge.policy.train_progress import Companion, Progress
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
+from nics_drl_bridge.sim.world import World
 
 CHECKPOINT = "checkpoint.pt"
 SEEDS = 2**40
+Tell = Callable[[Progress], None]
 LOG_EVERY = {"ppo": 1, "sac": 1000}
 """Rollouts, or episodes, between two entries of TensorBoard."""
 
@@ -34,15 +37,13 @@ class Trained:
     """A training that has ended.
 
     Attributes:
-        algorithm: with its policy.
-        env: that it learned on.
+        algorithm: with its policy; on Ray only the part that acts.
         steps: environment steps of all.
         wall_s: time that this process spent on it [s].
         stepping_s: of which in the simulator [s].
     """
 
-    algorithm: BaseAlgorithm
-    env: TrainVecEnv
+    algorithm: BaseAlgorithm | Actor
     steps: int
     wall_s: float
     stepping_s: float
@@ -52,7 +53,7 @@ def train(
     settings: TrainingSettings,
     seed: int,
     folder: Path,
-    tell: Callable[[Progress], None] = lambda _: None,
+    tell: Tell = lambda _: None,
     resumed: bool = False,
 ) -> Trained:
     """Trains one policy.
@@ -91,16 +92,27 @@ def train(
         save()
     algorithm.logger.close()
     taken = time.perf_counter() - begin
-    return Trained(algorithm, env, algorithm.num_timesteps, taken, env.stepping_s - busy)
+    return Trained(algorithm, algorithm.num_timesteps, taken, env.stepping_s - busy)
 
 
-def make_train_env(settings: TrainingSettings, model: SimulatorModel | None = None) -> TrainVecEnv:
-    """The worlds that settings name, side by side."""
+def make_train_env(
+    settings: TrainingSettings,
+    model: SimulatorModel | None = None,
+    scenes: Mapping[str, World] | None = None,
+) -> TrainVecEnv:
+    """The worlds that settings name, side by side.
+
+    Args:
+        settings: of the training.
+        model: of the robot, where it is open already.
+        scenes: name -> world, where they are loaded already.
+    """
     model = model or open_model(settings.robot)
     return TrainVecEnv(
         *(
             BridgeVectorEnv(
-                count, model, world, settings.task, settings.task_options,
+                count, model, (scenes or {}).get(world, world), settings.task,
+                settings.task_options,
                 settings.max_episode_steps, "SameStep", randomisation=settings.randomisation,
             )
             for world, count in settings.worlds.items()
@@ -124,25 +136,33 @@ def _again(
     path: Path,
 ) -> BaseAlgorithm:
     """The algorithm of a checkpoint. Raises ConfigError when it is of another training."""
-    old, new = content["about"]["settings"], about["settings"]
-    for key in new:
-        if old.get(key) != new[key]:
-            raise ConfigError(
-                f"{path}: was trained with {key} {old.get(key)!r}, not {new[key]!r}; resume it "
-                "with the same settings, or train anew in another folder."
-            )
-    if content["about"]["seed"] != about["seed"]:
-        raise ConfigError(
-            f"{path}: is of seed {content['about']['seed']}, not {about['seed']}; name that one."
-        )
+    check_same(content["about"], about, path)
     size = int(np.prod(env.observation_space.shape))
     algorithm = make_algorithm(settings, env, about["seed"], (np.zeros(size), np.ones(size)))
     resume(content, algorithm, env)
     return algorithm
 
 
+def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
+    """Raises ConfigError unless a checkpoint is of the settings and seed of a training.
+
+    Args:
+        old: seed and settings that the checkpoint is of.
+        new: those of the training.
+        path: of the checkpoint.
+    """
+    for key, value in new["settings"].items():
+        if old["settings"].get(key) != value:
+            raise ConfigError(
+                f"{path}: was trained with {key} {old['settings'].get(key)!r}, not {value!r}; "
+                "resume it with the same settings, or train anew in another folder."
+            )
+    if old["seed"] != new["seed"]:
+        raise ConfigError(f"{path}: is of seed {old['seed']}, not {new['seed']}; name that one.")
+
+
 def evaluate(
-    algorithm: BaseAlgorithm,
+    algorithm: BaseAlgorithm | Actor,
     settings: TrainingSettings,
     world: str,
     episodes: int,

@@ -13,6 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.policy.evaluation_batch import Act
+from nics_drl_bridge.policy.train_actor import Actor
 from nics_drl_bridge.policy.train_normaliser import Normaliser
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import PpoSettings, SacSettings, TrainingSettings
@@ -38,7 +39,7 @@ def make_algorithm(
     Raises:
         ConfigError: the algorithm does not serve the task.
     """
-    _check(settings, env)
+    check_serves(settings, env)
     torch.set_num_threads(settings.threads)
     shared: dict[str, Any] = {"seed": seed, "device": "cpu", "stats_window_size": RECENT}
     network = {
@@ -51,10 +52,11 @@ def make_algorithm(
     return _sac(settings.sac, env, network, shared)
 
 
-def _check(settings: TrainingSettings, env: TrainVecEnv) -> None:
+def check_serves(settings: TrainingSettings, env: TrainVecEnv) -> None:
+    """Raises ConfigError when the algorithm does not serve the task."""
     if len(env.observation_space.shape) != 1:
         raise ConfigError(
-            f"task {settings.task!r}: shows {env.observation_space.shape}, and Stable-Baselines3 "
+            f"task {settings.task!r}: shows {env.observation_space.shape}, and training "
             "takes vectors only; train a task of one robot."
         )
     if settings.algorithm == "sac" and not isinstance(env.action_space, gymnasium.spaces.Box):
@@ -109,13 +111,15 @@ def _sac(
     )
 
 
-def act_of(algorithm: BaseAlgorithm) -> Act:
+def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
     """What the policy of an algorithm does at its best: without the noise of exploration."""
-    policy: Any = algorithm.policy
 
     def act(observations: NDArray[np.float32]) -> NDArray[Any]:
+        seen = torch.as_tensor(observations)
         with torch.no_grad():
-            chosen = policy._predict(torch.as_tensor(observations), deterministic=True)
-        return np.asarray(chosen.numpy())
+            if isinstance(algorithm, Actor):
+                return np.asarray(algorithm.best(seen).numpy())
+            policy: Any = algorithm.policy
+            return np.asarray(policy._predict(seen, deterministic=True).numpy())
 
     return act

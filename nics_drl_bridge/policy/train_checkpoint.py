@@ -55,16 +55,25 @@ def save_checkpoint(
         "random": _random_state(algorithm),
         "envs": [_tensors(snapshot(one)) for one in env.envs],
     }
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    write_bytes(path, sealed(buffer.getvalue()))
+    write_content(path, content)
 
 
 _LAST = ("_last_obs", "_last_episode_starts")
 
 
-def read_checkpoint(path: Path) -> dict[str, Any]:
+def write_content(path: Path, content: dict[str, Any]) -> None:
+    """Writes a checkpoint of tensors, numbers and text, whole or not at all."""
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    write_bytes(path, sealed(buffer.getvalue()))
+
+
+def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
     """The content of a checkpoint; `about` is that of `save_checkpoint`.
+
+    Args:
+        path: the file.
+        kind: which format it is to have.
 
     Raises:
         ConfigError: there is none, or it is damaged or of another kind.
@@ -74,9 +83,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     try:
         data = io.BytesIO(unsealed(path.read_bytes()))
         content = torch.load(data, map_location="cpu", weights_only=True)
-        if content["format"] != FORMAT:
-            raise KeyError("format")
-        return {**content, "about": json.loads(content["about"])}
+        found = str(content["format"])
+        read = {**content, "about": json.loads(content["about"])}
     except (
         RuntimeError, pickle.UnpicklingError, zipfile.BadZipFile, EOFError, OSError, KeyError,
         TypeError, ValueError,
@@ -85,6 +93,9 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             f"{path}: is no checkpoint of a training, or a damaged one; leave out --resume to "
             "begin anew."
         ) from None
+    if found != kind:
+        raise ConfigError(f"{path}: is a {found!r}, not a {kind!r}; resume with the same --engine.")
+    return read
 
 
 def resume(content: dict[str, Any], algorithm: BaseAlgorithm, env: TrainVecEnv) -> None:

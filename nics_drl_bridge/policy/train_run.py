@@ -15,12 +15,13 @@ from nics_drl_bridge.files import write_text
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.policy.evaluation_batch import Summary, summarise
 from nics_drl_bridge.policy.evaluation_intervals import Estimate
-from nics_drl_bridge.policy.train import CHECKPOINT, Trained, evaluate, train
+from nics_drl_bridge.policy.train import CHECKPOINT, Tell, Trained, evaluate, train
 from nics_drl_bridge.policy.train_export import export_policy
-from nics_drl_bridge.policy.train_progress import Progress
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
 SETTINGS, EVALUATION, POLICY = "settings.yaml", "evaluation.json", "policy.onnx"
+Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]
+"""As `train`: of settings, seed, folder, whom to tell, and whether it was begun before."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,9 @@ class TrainOrder:
 
 def run(
     order: TrainOrder,
-    tell: Callable[[Progress], None] = lambda _: None,
+    tell: Tell = lambda _: None,
     done: Callable[[SeedResult], None] = lambda _: None,
+    learn: Learn = train,
 ) -> list[SeedResult]:
     """Trains seed after seed and evaluates each in the worlds that it learned in.
 
@@ -70,6 +72,7 @@ def run(
         order: what to do.
         tell: is told of the progress.
         done: is told of each seed that is through.
+        learn: trains one policy.
 
     Raises:
         ConfigError: the folder holds a run already, or none to resume.
@@ -81,7 +84,7 @@ def run(
     for seed in order.seeds:
         folder = order.out / f"seed_{seed}"
         begun = (folder / CHECKPOINT).is_file()
-        trained = train(settings, seed, folder, tell, order.resumed and begun)
+        trained = learn(settings, seed, folder, tell, order.resumed and begun)
         result = SeedResult(seed, trained, _evaluated(settings, trained, order.episodes))
         plain = {world: dataclasses.asdict(one) for world, one in result.summaries.items()}
         write_text(folder / EVALUATION, json.dumps(plain, indent=2) + "\n")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from importlib.util import find_spec
 
 import pytest
 from typer.testing import CliRunner
@@ -60,6 +61,9 @@ def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed
         (["--resume", "--steps", "5", "--out", "x"], "--steps: a resumed run has its own settings"),
         (["--resume", "--out", "nowhere"], "nowhere: holds no settings.yaml"),
         (["--seeds", "1", "1", "--out", "run"], "give one or more, none twice"),
+        (["--engine", "rai"], "unknown engine 'rai'; did you mean 'ray'"),
+        (["--address", "auto"], "--address: belongs to --engine ray; add that, or leave it out."),
+        (["--env-runners", "2"], "--env-runners: belongs to --engine ray"),
     ],
 )
 def test_what_can_not_be_trained_gives_one_sentence(
@@ -70,3 +74,14 @@ def test_what_can_not_be_trained_gives_one_sentence(
     assert done.exit_code == 2
     assert sentence in " ".join(done.output.split())
     assert "Traceback" not in done.output
+
+
+@pytest.mark.skipif(find_spec("ray") is not None, reason="Ray is there")
+def test_where_ray_is_missing_one_sentence_says_what_to_install(tmp_path):
+    done = nics("--engine", "ray", "--out", tmp_path)
+    assert done.exit_code == 2
+    words = " ".join(done.output.split())
+    assert "--engine ray needs the module 'ray'" in words
+    assert (
+        "pip install 'nics_drl_bridge[train,distributed]' into an environment of its own" in words
+    )

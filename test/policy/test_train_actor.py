@@ -1,0 +1,46 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from robots import direct_model
+
+from nics_drl_bridge.env.tasks import make_task
+from nics_drl_bridge.policy.policy_file import load_policy
+from nics_drl_bridge.policy.train_actor import Actor
+from nics_drl_bridge.policy.train_algorithms import act_of
+from nics_drl_bridge.policy.train_export import export_policy
+
+MODEL = direct_model()
+
+
+@pytest.mark.parametrize("actions", ["continuous", "discrete"])
+def test_a_policy_file_made_of_an_actor_does_what_the_actor_does(actions, tmp_path):
+    task = make_task("navigation", MODEL, {"actions": actions})
+    size = task.observation_space.shape[0]
+    rng = np.random.default_rng(0)
+    torch.manual_seed(0)
+    normaliser = rng.uniform(-1.0, 1.0, size), rng.uniform(0.1, 2.0, size)
+    actor = Actor(task.observation_space, task.action_space, [16, 8], normaliser)
+    torch.nn.init.normal_(actor.layers[-1].weight)  # at the start all actions are near zero
+    export_policy(actor, task, MODEL, tmp_path / "policy.onnx")
+    seen = rng.uniform(-1.0, 1.0, (50, size)).astype(np.float32)
+    wanted = act_of(actor)(seen)
+    if actions == "continuous":
+        wanted = np.clip(wanted, -1.0, 1.0)
+    else:
+        assert len(set(wanted.tolist())) > 1
+    deployed = load_policy(tmp_path / "policy.onnx").act(seen)
+    np.testing.assert_allclose(deployed, wanted, atol=1e-5)
+
+
+def test_an_actor_normalises_what_it_sees_and_cuts_it():
+    task = make_task("navigation", MODEL)
+    size = task.observation_space.shape[0]
+    mean, std = np.full(size, 2.0), np.full(size, 0.5)
+    actor = Actor(task.observation_space, task.action_space, [4], (mean, std))
+    bare = Actor(task.observation_space, task.action_space, [4], (0.0 * mean, std / std))
+    bare.layers.load_state_dict(actor.layers.state_dict())
+    with torch.no_grad():
+        assert torch.equal(actor(torch.full((1, size), 3.0)), bare(torch.full((1, size), 2.0)))
+        assert torch.equal(actor(torch.full((1, size), 99.0)), bare(torch.full((1, size), 5.0)))
