@@ -71,6 +71,7 @@ class PolicyNode(ManagedNode):
         self._policy, self._task = open_policy(name, model)
         self._goal: NDArray[np.float64] = self._declared_goal()
         self._pace, self._deadline = self._declared_pace(model.control_period)
+        self._acted_ns = 0
         view = rehearse(model)
         self._task.judge(view, {"goal": np.zeros(2)})
         self._command(view, np.zeros(2))
