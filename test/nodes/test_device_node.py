@@ -222,8 +222,6 @@ def test_a_car_is_driven_by_speed_and_steering_angle(stamped):
     stamped.peer.until(turns, "a turn to the left")
 
 
-
-
 @pytest.mark.skipif(not HAS_TF, reason="needs tf2_msgs: make test-messages")
 def test_its_transforms_are_those_of_rep_105_and_the_mount_is_told_to_late_comers(stamped):
     kind = import_module("tf2_msgs.msg").TFMessage
