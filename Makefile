@@ -41,7 +41,7 @@ DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Ma
 
 OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
 
-.PHONY: help setup demo test test-jazzy test-ray ros-status lint format types pytest benchmark clean distclean
+.PHONY: help setup demo test test-jazzy test-ray test-messages ros-status lint format types pytest benchmark clean distclean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 12
@@ -148,6 +148,23 @@ $(RAY)/.ready: $(DESCRIBED_BY) constraints-ray.txt
 	$(call BUILD_APART,$(RAY),(grep -v '^gymnasium==' constraints.txt; cat constraints-ray.txt),\
 		'.[$(RAY_EXTRAS)]')
 
+# Message packages that have no wheels are built from the few fields that they have.
+MESSAGES := .venv-messages
+
+test-messages: setup $(MESSAGES)/.ready ## the tests that need tf2_msgs and ackermann_msgs, built here
+	source $(MESSAGES)/setup.bash && $(CLEAN_ENV) PYTHONPATH="$$PYTHONPATH" \
+		LD_LIBRARY_PATH="$$LD_LIBRARY_PATH" \
+		$(BIN)/python -m pytest test/nodes/test_device_node.py $(PYTEST_ARGS)
+
+$(MESSAGES)/.ready: test/build_messages.sh $(wildcard test/messages/*/msg/*.msg)
+	@if [ "$(ROS)" != wheels ]; then \
+		echo "make test-messages: needs Linux on x86-64 and a shell without a sourced ROS 2." >&2; \
+		exit 1; fi
+	@echo "Building $(MESSAGES); it takes some minutes."
+	@rm -rf $(MESSAGES)
+	@$(CLEAN_ENV) test/build_messages.sh $(BASE) $(MESSAGES) constraints.txt
+	@touch $@
+
 benchmark: setup ## run every benchmark and print its table
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python "$$script"; done
 
@@ -155,5 +172,4 @@ clean: ## remove what building and testing left behind
 	rm -rf build dist install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +
 
-distclean: clean ## the same, and .venv, .venv-jazzy, .venv-ray and runs/
-	rm -rf $(VENV) $(JAZZY) $(RAY) runs
+	rm -rf $(VENV) $(JAZZY) $(RAY) $(MESSAGES) runs

@@ -1,8 +1,8 @@
 """A simulator, and on its topics all that runs on a vehicle.
 
 ros2 launch nics_drl_bridge simulation.launch.py
-ros2 service call /command_gate/arm std_srvs/Trigger
-ros2 topic pub --once /goal_pose geometry_msgs/PoseStamped '{pose: {position: {x: 1.0}}}'
+ros2 service call /command_gate/arm std_srvs/srv/Trigger
+ros2 topic pub --once /goal_pose geometry_msgs/msg/PoseStamped '{pose: {position: {x: 1.0}}}'
 """
 
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription

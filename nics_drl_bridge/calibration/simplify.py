@@ -27,7 +27,10 @@ def simplify(problem: Problem, refined: Refined) -> Refined:
         coefficients = best.model.coefficients.copy()
         coefficients[weakest] = 0.0
         shorter = replace(best.model, coefficients=coefficients)
-        again = refine(problem, shorter, best.calibration)
+        try:
+            again = refine(problem, shorter, best.calibration)
+        except np.linalg.LinAlgError:  # what is left is unstable: its slopes overflow
+            continue
         if again.error < limit:
             best = again
     used = np.abs(best.model.coefficients).sum(axis=0) > 0.0

@@ -33,7 +33,9 @@ QUEUE = 100
 NAP_S = 0.05
 PATIENCE_S = 60.0
 DISCOVERY_S = 1.0
-"""Time for subscribers to find the topics before the first message [s]."""
+"""Time for subscribers to find the topics before the first message [s];"""
+ALONE_S = 5.0
+"""and time for a first one, after which it is played to nobody [s]."""
 NANO = 1_000_000_000
 
 
@@ -93,8 +95,12 @@ class _Player:
 
     def ready(self) -> None:
         """Waits for the node to keep in step with, or a while for whoever listens."""
-        until = time.monotonic() + PATIENCE_S
+        began = time.monotonic()
+        until = began + PATIENCE_S
         self._stopping.wait(DISCOVERY_S)
+        while not self._heard() and time.monotonic() < began + ALONE_S:
+            if self._stopping.wait(NAP_S):
+                return
         while not self._matched() and time.monotonic() < until and not self._stopping.is_set():
             self._stopping.wait(NAP_S)
         while self._barrier is not None and not self._barrier.service_is_ready():
@@ -106,6 +112,10 @@ class _Player:
                     "or correct its name, namespace or ROS_DOMAIN_ID."
                 )
             self._stopping.wait(NAP_S)
+
+    def _heard(self) -> bool:
+        """Whether anybody listens to any of the topics."""
+        return any(each.get_subscription_count() for each in self._publishers.values())
 
     def _matched(self) -> bool:
         """Whether all subscribers that are known of have found the topics."""

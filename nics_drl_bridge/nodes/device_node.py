@@ -115,6 +115,7 @@ class DeviceNode(QosWatch):
         )
         self._real_time = RealTime(step_ns, self._time.rate)
         self._timer = None
+        self._soon = self.create_guard_condition(self._on_time)
         if self._time.mode == "realtime":
             period = step_ns / conversions.NANO / self._time.rate
             # A tick of which the step is a multiple.
@@ -165,9 +166,12 @@ class DeviceNode(QosWatch):
                 throttle_duration_sec=5.0,
             )
             self._real_time.begin(steady_ns, self._now_ns + self._time.step_ns)
-        for _ in range(self._real_time.behind(steady_ns, self._now_ns)):
+        behind = self._real_time.behind(steady_ns, self._now_ns)
+        if behind:
             self._stop_the_silent()
             self._advance()
+        if behind > 1:
+            self._soon.trigger()  # not here: commands that have come in are for the next step
         self._outbox.flush(max(self._now_ns, self._real_time.time_at(steady_ns)))
 
     def _on_free_time(self) -> None:

@@ -102,10 +102,13 @@ class Link:
 
     def call(self, client: Any, request: Any, timeout_s: float) -> Any:
         """Calls a service; the executor's thread completes the future. Raises BackendError."""
-        done = threading.Event()
+        done, deadline = threading.Event(), time.monotonic() + timeout_s
+        # A server that hung for long was given up, and has to be found anew.
+        while not client.service_is_ready() and time.monotonic() < deadline:
+            time.sleep(POLL_S)
         future = client.call_async(request)
         future.add_done_callback(lambda _: done.set())
-        if not done.wait(timeout_s):
+        if not done.wait(max(0.0, deadline - time.monotonic())):
             client.remove_pending_request(future)
             raise BackendError(
                 f"service {client.srv_name}: no answer within {timeout_s:g} s; look at the "

@@ -60,7 +60,7 @@ class PolicyNode(ManagedNode):
         about = "Longest time of an inference [s]; NaN: half the control period."
         declare(self, "deadline", float("nan"), about, read_only=True)
         about = "So many late inferences in a row command zero."
-        declare(self, "late_limit", 3, about, read_only=True)
+        declare(self, "late_limit", 3, about, low=1, high=1000, read_only=True)
         self._acted_ns = 0
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
@@ -71,6 +71,7 @@ class PolicyNode(ManagedNode):
         self._policy, self._task = open_policy(name, model)
         self._goal: NDArray[np.float64] = self._declared_goal()
         self._pace, self._deadline = self._declared_pace(model.control_period)
+        self._acted_ns = 0
         view = rehearse(model)
         self._task.judge(view, {"goal": np.zeros(2)})
         self._command(view, np.zeros(2))

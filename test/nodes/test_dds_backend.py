@@ -270,7 +270,7 @@ def test_in_a_namespace_it_notices_the_death_of_its_simulator(own_simulator):
     backend, process, _ = own_simulator
     drive(backend)
     process._process.kill()
-    backend._timeout_s = SHORT_S
+    backend.timeout_s = SHORT_S
     with pytest.raises(StaleDataError, match="no fresh data within 2") as caught:
         backend.step(np.array([0.5, 0.0]))
     assert caught.value.topic == "odom"
@@ -283,11 +283,11 @@ def test_a_simulator_that_hangs_is_noticed_and_serves_again_when_it_wakes(own_si
     backend, process, _ = own_simulator
     drive(backend)
     process._process.send_signal(signal.SIGSTOP)
-    backend._timeout_s, hung_ns = 0.5, backend._now_ns
+    backend.timeout_s, hung_ns = 0.5, backend._now_ns
     with pytest.raises(StaleDataError):
         backend.step(np.array([0.5, 0.0]))
     process._process.send_signal(signal.SIGCONT)
-    backend._timeout_s = TIMEOUT_S
+    backend.timeout_s = TIMEOUT_S
     drive(backend)
     assert backend._now_ns > hung_ns
 

@@ -204,10 +204,25 @@ def test_a_publisher_of_the_other_type_is_named_with_both_types(stamped):
     stamped.peer.until(said, "a warning")
 
 
-HAS_TF = find_spec("tf2_msgs") is not None
+HAS_TF, HAS_ACKERMANN = (find_spec(name) is not None for name in ("tf2_msgs", "ackermann_msgs"))
 
 
-@pytest.mark.skipif(not HAS_TF, reason="needs tf2_msgs, for which there is no wheel")
+@pytest.mark.skipif(not HAS_ACKERMANN, reason="needs ackermann_msgs: make test-messages")
+def test_a_car_is_driven_by_speed_and_steering_angle(stamped):
+    kind = import_module("ackermann_msgs.msg").AckermannDriveStamped
+    topic = stamped.stranger.speak(kind, "ackermann_cmd")
+    message = kind()
+    message.drive.speed, message.drive.steering_angle = 0.5, 0.3
+
+    def turns():
+        topic.publish(message)
+        twist = stamped.odom[-1].twist.twist if stamped.odom else None
+        return twist is not None and twist.linear.x > 0.4 and twist.angular.z > 0.1
+
+    stamped.peer.until(turns, "a turn to the left")
+
+
+@pytest.mark.skipif(not HAS_TF, reason="needs tf2_msgs: make test-messages")
 def test_its_transforms_are_those_of_rep_105_and_the_mount_is_told_to_late_comers(stamped):
     kind = import_module("tf2_msgs.msg").TFMessage
     moving = stamped.peer.listen(kind, "/tf", qos.TRANSFORMS)
