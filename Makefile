@@ -172,4 +172,5 @@ clean: ## remove what building and testing left behind
 	rm -rf build dist install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +
 
+distclean: clean ## the same, and all environments (.venv and those of test-...) and runs/
 	rm -rf $(VENV) $(JAZZY) $(RAY) $(MESSAGES) runs

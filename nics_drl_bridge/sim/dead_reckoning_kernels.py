@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from numba import njit
-from numpy.typing import NDArray
-
-Array = NDArray[Any]
 
 
-@njit(cache=True, nogil=True)
-def propagate(covariance: Array, before: Array, after: Array, added: Array) -> None:
+@njit(cache=True, nogil=True, _nrt=False)
+def propagate(covariance, before, after, added):  # type: ignore[no-untyped-def]
     """P = F P F^T + Q for each robot, in place; see `dead_reckoning.propagate`."""
     for m in range(len(covariance)):
         p = covariance[m]
