@@ -11,9 +11,9 @@ pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 import bags
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.files import npz_arrays
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.middleware.playback import estimate, write_estimate
+from nics_drl_bridge.npz import npz_arrays
 
 DURATION_S = 6.0
 MODEL = builtin_model("ackermann")
