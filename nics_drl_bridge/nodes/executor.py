@@ -94,6 +94,8 @@ class StandingExecutor(SingleThreadedExecutor):
         """Lets rclpy handle all that is ready now."""
         with contextlib.suppress(TimeoutException):
             for _ in range(MOST_AT_ONCE):
+                if not self.context.ok():  # a callback may have ended it
+                    raise ExternalShutdownException
                 task, _, _ = self.wait_for_ready_callbacks(timeout_sec=0.0)
                 task()
                 task.result()  # raises what the callback did
