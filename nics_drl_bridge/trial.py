@@ -28,7 +28,7 @@ LABELS = {
     VEHICLE: "on the vehicle",
 }
 DEFAULT_ROBOT = "ackermann"
-START_S = 90.0
+START_S = 180.0
 """How long a node may take to come up; its kernels may have to be compiled."""
 Told = Callable[[Episode], None]
 Say = Callable[[str], None]

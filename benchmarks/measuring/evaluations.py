@@ -1,0 +1,62 @@
+"""Runs of `nics evaluate`, each in a process and a ROS domain of its own, two at a time."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+AT_ONCE = 2
+DOMAINS = range(1, 102)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One evaluation: a policy, the robot, the world, how many episodes, the first seed."""
+
+    policy: str
+    robot: str
+    world: str
+    episodes: int
+    seed: int
+    out: Path
+
+
+def evaluations(runs: Mapping[str, Run]) -> dict[str, dict[str, Any]]:
+    """What `evaluation.json` says of each run's policy: place -> figures.
+
+    Raises:
+        RuntimeError: one failed; its own words are in it.
+    """
+    domains = random.sample(DOMAINS, len(runs))
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        waiting = {
+            name: pool.submit(_evaluate, run, domain)
+            for (name, run), domain in zip(runs.items(), domains, strict=True)
+        }
+        return {name: future.result() for name, future in waiting.items()}
+
+
+def _evaluate(run: Run, domain: int) -> dict[str, Any]:
+    words: Sequence[object] = (
+        "evaluate", run.policy, "--model", run.robot, "--world", run.world, "--episodes",
+        run.episodes, "--seed", run.seed, "--out", run.out,
+    )  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-m", "nics_drl_bridge.cli", *map(str, words)],
+        env=os.environ | {"ROS_DOMAIN_ID": str(domain)},
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode:
+        raise RuntimeError(f"nics {' '.join(map(str, words))}: {done.stderr.strip()}")
+    told = json.loads((run.out / "evaluation.json").read_text(encoding="utf-8"))
+    figures: dict[str, Any] = told["policies"][run.policy]
+    return figures

@@ -1,0 +1,161 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags", reason="needs the extra 'bags'")
+
+import bags
+
+from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.errors import ConfigError, RecordingError
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.policy.policies import make_policy
+from nics_drl_bridge.policy.shadow import Shadow, shadow
+
+MODEL = builtin_model("ackermann")
+SEED, PERIOD = 4, 0.1
+LATE = {"/odom": 0.005, "/scan": 0.01, "/cmd_vel": 0.02}
+
+
+def scan(t, ranges, lidar=MODEL.lidar):
+    fields = [float(value) for value in lidar.header]
+    ranges = np.array(ranges, np.float32)
+    return bags.new(
+        "sensor_msgs/msg/LaserScan", bags.header(t, "laser"), *fields, ranges,
+        np.zeros(0, np.float32),
+    )  # fmt: skip
+
+
+def odometry(t, pose, twist):
+    zeros = np.zeros(36)
+    where = bags.new("geometry_msgs/PoseWithCovariance", bags.pose(*pose), zeros)
+    speed = bags.new("geometry_msgs/TwistWithCovariance", bags.twist(*twist), zeros)
+    return bags.new("nav_msgs/msg/Odometry", bags.header(t, "odom"), "base_link", where, speed)
+
+
+def driven_by(name):
+    """Goal and messages of an episode that a policy drives with the estimator."""
+    env = BridgeEnv(model=MODEL, world="circles", estimator=True)
+    policy = make_policy(name, env.task)
+    observation, info = env.reset(seed=SEED)
+    topics, ended, k = {topic: [] for topic in LATE}, False, 1
+    while not ended and k < 60:
+        t, data = PERIOD * k, env._backend.simulator.data
+        action = policy.act(observation)
+        twist = MODEL.robot.to_cmd_vel(env.task.command(action))
+        told = {
+            "/scan": scan(t, data.ranges[0, 0]),
+            "/odom": odometry(t, data.odom[0, 0], data.twist[0, 0]),
+            "/cmd_vel": bags.twist_stamped(t, *twist),
+        }
+        for topic, message in told.items():
+            topics[topic].append((t + LATE[topic], message))
+        observation, _, ended, _, _ = env.step(action)
+        k += 1
+    env.close()
+    return info["goal"], topics
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """The goal of a drive of go_to_goal, and its bag."""
+    goal, topics = driven_by("go_to_goal")
+    return goal, bags.write(tmp_path_factory.mktemp("drive") / "bag", topics), len(topics["/scan"])
+
+
+def test_a_policy_in_the_shadow_of_its_own_drive_commands_what_was_driven(recorded):
+    goal, bag, count = recorded
+    made = shadow(bag, MODEL, "go_to_goal", {}, goal)
+    assert len(made.time) == count
+    assert np.abs(made.policy - made.driven).max() < 1e-4
+    assert np.abs(made.driven).max() > 0.1
+    assert all(figures["opposite"] == 0.0 for figures in made.differences().values())
+
+
+def test_another_policy_differs(recorded):
+    goal, bag, _ = recorded
+    told = shadow(bag, MODEL, "random", {}, goal).differences()
+    assert all(figures["mean_size"] > 0.1 for figures in told.values())
+    assert told["steering_command"]["opposite"] > 0.2
+
+
+def test_without_a_goal_it_is_where_the_robot_was_later(recorded):
+    _, bag, _ = recorded
+    made = shadow(bag, MODEL, "go_to_goal", {}, ahead_s=2.0)
+    ahead = round(2.0 / PERIOD)
+    assert made.goal[0] == pytest.approx(made.pose[ahead, :2], abs=1e-6)
+
+
+def test_the_same_bag_gives_the_same_commands_to_the_bit(recorded):
+    goal, bag, _ = recorded
+    one, other = (shadow(bag, MODEL, "dynamic_window", {}, goal) for _ in range(2))
+    assert one.policy.tobytes() == other.policy.tobytes()
+
+
+def test_figures_are_those_of_the_definition():
+    wanted = np.array([[1.0], [-1.0], [0.02], [0.5]])
+    driven = np.array([[0.5], [1.0], [-1.0], [0.5]])
+    where = np.zeros((4, 3))
+    one = Shadow(
+        ("speed",), ("m/s",), np.arange(4.0), where, where[:, :2], wanted, driven, np.ones(1), {}
+    )
+    told = one.differences()["speed"]
+    assert told["mean"] == pytest.approx((0.5 - 2.0 + 1.02 + 0.0) / 4.0)
+    assert told["mean_size"] == pytest.approx((0.5 + 2.0 + 1.02 + 0.0) / 4.0)
+    assert told["greatest"] == pytest.approx(2.0)
+    assert told["opposite"] == pytest.approx(1.0 / 3.0)  # 0.02 is too small to have a sign
+
+
+@pytest.mark.parametrize(
+    ("topics", "goal", "ahead", "words"),
+    [
+        ({"scan": "/scna"}, None, 4.0, "/scna"),
+        ({}, None, 0.0, "--ahead 0"),
+        ({}, (0.0, 0.0), 4.0, "nothing to compare"),
+    ],
+)
+def test_what_can_not_be_compared_is_told(recorded, topics, goal, ahead, words):
+    _, bag, _ = recorded
+    if goal is not None:  # at the goal all the time
+        bag = bags.write(bag.parent / "standing", driven_standing())
+        goal = (0.0, 0.0)
+    with pytest.raises((RecordingError, ConfigError), match=words):
+        shadow(bag, MODEL, "go_to_goal", topics, goal, ahead)
+
+
+def driven_standing():
+    free = np.full(MODEL.lidar.beams, 2.0)
+    moments = [PERIOD * k for k in range(1, 8)]
+    return {
+        "/scan": [(t + LATE["/scan"], scan(t, free)) for t in moments],
+        "/odom": [(t, odometry(t, np.zeros(3), np.zeros(3))) for t in moments],
+        "/cmd_vel": [(t, bags.twist(0.0, 0.0, 0.0)) for t in moments],
+    }
+
+
+def test_a_bag_without_commands_is_refused(tmp_path):
+    topics = driven_standing()
+    del topics["/cmd_vel"]
+    bag = bags.write(tmp_path / "bag", topics)
+    with pytest.raises(RecordingError, match="has no cmd_vel"):
+        shadow(bag, MODEL, "go_to_goal", {})
+
+
+def test_the_command_writes_a_table_a_picture_and_json(recorded, tmp_path):
+    goal, bag, count = recorded
+    words = ["evaluate", "go_to_goal", "--shadow", str(bag), "--model", "ackermann"]
+    words += [f"--goal={goal[0]},{goal[1]}", "--out", str(tmp_path / "out")]
+    done = subprocess.run(
+        [sys.executable, "-m", "nics_drl_bridge.cli", *words],
+        capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert f"compared at {count} times" in done.stdout
+    told = json.loads((tmp_path / "out" / "shadow_go_to_goal.json").read_text(encoding="utf-8"))
+    assert told["commands"]["speed_command"]["greatest"] < 1e-4
+    assert (tmp_path / "out" / "shadow_go_to_goal.png").read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,140 @@
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+
+import pytest
+from domains import claimed_domain
+
+from nics_drl_bridge.config import dump_yaml
+from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.policy.policies import shipped_policies
+
+PNG = b"\x89PNG"
+DEADLINE_S = 300.0
+missing = [name for name in ("rclpy", "mujoco") if find_spec(name) is None]
+needs_nodes = pytest.mark.skipif(bool(missing), reason=f"needs {' and '.join(missing)}")
+
+
+def nics(*words, cwd, domain_id=0):
+    return subprocess.run(
+        [sys.executable, "-m", "nics_drl_bridge.cli", *map(str, words)],
+        cwd=cwd,
+        env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE_S,
+    )
+
+
+@pytest.mark.ros
+@needs_nodes
+def test_the_same_episodes_are_driven_in_three_worlds(tmp_path):
+    with claimed_domain() as domain_id:
+        words = ("evaluate", "go_to_goal", "--model", "differential", "--episodes", 2)
+        done = nics(*words, "--out", "out", cwd=tmp_path, domain_id=domain_id)
+    assert done.returncode == 0, done.stderr
+    told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
+    places = told["policies"]["go_to_goal"]
+    assert list(places) == ["fast", "dds", "mujoco_dds"]
+    for figures in places.values():
+        assert [one["seed"] for one in figures["each"]] == [1_000_000, 1_000_001]
+        assert figures["episodes"] == 2
+    fast, dds, mujoco = places.values()
+    assert dds["same"] == 1.0
+    assert dds["greatest_deviation"] < 1e-6  # the same numbers, by way of messages
+    assert 0.001 < mujoco["greatest_deviation"] < 1.0  # another machine, the same road
+    assert [one["goal"] for one in fast["each"]] == [one["goal"] for one in mujoco["each"]]
+    picture = tmp_path / "out" / "trajectories_go_to_goal.png"
+    assert picture.read_bytes().startswith(PNG)
+    assert "go_to_goal: success in process " in done.stdout.splitlines()[-2]
+
+
+def test_several_policies_drive_the_same_episodes_in_one_table(tmp_path):
+    words = ("evaluate", "go_to_goal", "random", "--in", "fast", "--episodes", 3, "--seed", 7)
+    done = nics(*words, "--model", "ackermann", "--out", "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
+    one, other = (policy["fast"]["each"] for policy in told["policies"].values())
+    assert [each["goal"] for each in one] == [each["goal"] for each in other]
+    assert [each["path"][0] for each in one] == [each["path"][0] for each in other]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "evaluation.json", "trajectories_go_to_goal.png", "trajectories_random.png",
+    }  # fmt: skip
+
+
+@pytest.mark.skipif("differential" not in shipped_policies(), reason="no policy is shipped")
+def test_a_shipped_policy_brings_its_own_robot(tmp_path):
+    words = ("evaluate", "differential", "--in", "fast", "--episodes", 2, "--out", "out")
+    done = nics(*words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
+    assert told["robot"] == "differential"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("go_to_gaol",), "go_to_goal"),
+        (("go_to_goal", "--in", "gazebo"), "--in 'gazebo'"),
+        (("go_to_goal", "--world", "areena", "--in", "fast"), "arena"),
+        (("nowhere.onnx",), "nowhere.onnx"),
+        (("go_to_goal", "--hardware"), "--backend dds"),
+        (("go_to_goal", "--backend", "sim"), "--backend 'sim'"),
+        (("go_to_goal", "--goal", "there"), "--goal 'there'"),
+        (("go_to_goal", "--shadow", "nothing"), "nothing"),
+        (("go_to_goal", "--backend", "dds", "--hardware", "--in", "dds"), "--in"),
+        (("go_to_goal", "random", "--backend", "dds", "--hardware"), "one policy at a time"),
+    ],
+)
+def test_bad_input_ends_it_with_one_sentence(tmp_path, words, said):
+    done = nics("evaluate", *words, cwd=tmp_path)
+    assert done.returncode == 2
+    (sentence,) = [line for line in done.stderr.splitlines() if not line.startswith("driving")]
+    assert sentence.startswith("nics: ")
+    assert said in sentence
+
+
+@pytest.mark.ros
+@needs_nodes
+def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path):
+    from nics_drl_bridge.nodes.processes import NodeProcess
+
+    limits = {
+        one.name: {"min": one.min, "max": one.max, "rate": 20.0, "jerk": 400.0}
+        for one in load_robot("differential").command
+    }
+    file = tmp_path / "limits.yaml"
+    file.write_text(dump_yaml({"robot": "differential", "commands": limits}), encoding="utf-8")
+    model = {"model": "differential"}
+    gate = model | {"limits": str(file), "black_box": str(tmp_path / "black_box")}
+    with claimed_domain() as domain_id:
+        vehicle = NodeProcess(
+            "simulator_node", tmp_path / "logs", model | {"world": "empty"}, domain_id
+        )
+        middleware = NodeProcess("middleware_node", tmp_path / "logs", model, domain_id)
+        with vehicle, middleware, NodeProcess("command_gate", tmp_path / "logs", gate, domain_id):
+            words = ("evaluate", "go_to_goal", "--backend", "dds", "--hardware", "--yes", "--arm")
+            where = ("--model", "differential", "--world", "empty", "--start", "present")
+            done = nics(*words, *where, "--out", "out", cwd=tmp_path, domain_id=domain_id)
+    assert done.returncode == 0, done.stderr
+    assert "command_gate is armed" in done.stderr
+    told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
+    on_it, beside = (told["policies"]["go_to_goal"][place] for place in ("vehicle", "fast"))
+    assert on_it["success"][0] == beside["success"][0] == 1.0
+    assert on_it["each"][0]["path"][0] == beside["each"][0]["path"][0]
+    assert 0.0 < beside["greatest_deviation"] < 1.0
+
+
+@pytest.mark.ros
+@needs_nodes
+def test_a_vehicle_that_does_not_fit_its_model_is_not_driven(tmp_path):
+    with claimed_domain() as domain_id:  # nobody is there
+        words = ("evaluate", "go_to_goal", "--backend", "dds", "--hardware", "--yes")
+        done = nics(*words, "--out", "out", cwd=tmp_path, domain_id=domain_id)
+    assert done.returncode == 2
+    assert "the vehicle is not driven: " in done.stderr.splitlines()[-1]
+    assert not (tmp_path / "out").exists()
