@@ -23,12 +23,22 @@ def demo(
     ),
     robot: RobotOption = "ackermann",
     world: WorldOption = "arena",
-    episodes: Annotated[int, typer.Option(min=1, help="How many episodes.")] = 5,
+    episodes: Annotated[
+        int, typer.Option(min=1, help="How many, in process and again over DDS.")
+    ] = 5,
+    policy: Annotated[
+        str | None,
+        typer.Option(help="Train none; drive with a policy file, a shipped one or a baseline."),
+    ] = None,
+    train_steps: Annotated[
+        int | None, typer.Option(min=1, help="Environment steps of the training.")
+    ] = None,
 ) -> None:
-    """Goes the whole road once: generate, drive in process, drive over DDS, report."""
+    """Goes the whole road once: generate, train, evaluate, drive over DDS, deploy, report."""
     with one_sentence():
-        from nics_drl_bridge.demo import Plan, run
+        from nics_drl_bridge.demo.plan import Plan
+        from nics_drl_bridge.demo.run import run
 
-        plan = Plan(out, robot, world, recording, episodes)
+        plan = Plan(out, robot, world, recording, episodes, policy, train_steps)
         outcome = run(plan, lambda line: typer.echo(line))
         typer.echo(outcome.line())
