@@ -7,11 +7,10 @@ from typing import Annotated
 
 import typer
 
-from nics_drl_bridge.commands.console import (
-    RobotOption,
-    WorldOption,
-    one_sentence,
-)
+from nics_drl_bridge.commands.console import WorldOption, one_sentence
+
+QUICK_TO_LEARN, RECORDED = "differential", "ackermann"
+"""The robot of a demo that names none: without and with a recording."""
 
 
 def demo(
@@ -21,7 +20,13 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for everything the demo writes.")] = Path(
         "runs/demo"
     ),
-    robot: RobotOption = "ackermann",
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            help="A shipped robot or a YAML file; by default differential, and the car, ackermann, "
+            "for a recording."
+        ),
+    ] = None,
     world: WorldOption = "arena",
     episodes: Annotated[
         int, typer.Option(min=1, help="How many, in process and again over DDS.")
@@ -39,6 +44,7 @@ def demo(
         from nics_drl_bridge.demo.plan import Plan
         from nics_drl_bridge.demo.run import run
 
+        robot = robot or (RECORDED if recording else QUICK_TO_LEARN)
         plan = Plan(out, robot, world, recording, episodes, policy, train_steps)
         outcome = run(plan, lambda line: typer.echo(line))
         typer.echo(outcome.line())

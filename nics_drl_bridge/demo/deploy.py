@@ -18,7 +18,8 @@ from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import load_world
 
-TIMEOUT_S = 60.0
+START_S, ARRIVE_S = 60.0, 40.0
+"""How long a node may take to come up, and the robot to arrive."""
 FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05
 """The gate's limits in the demo: from zero to the greatest command, and to its greatest change."""
 
@@ -86,19 +87,19 @@ def _watched(
         processes = []
         for node, parameters in nodes.items():
             processes.append(stack.enter_context(NodeProcess(node, logs, parameters, domain_id)))
-            if node == "simulator_node" and not witness.sees(TIMEOUT_S):
+            if node == "simulator_node" and not witness.sees(START_S):
                 processes[0].check()
                 raise BackendError(
-                    f"{node} publishes nothing after {TIMEOUT_S:g} s; look at its log, "
+                    f"{node} publishes nothing after {START_S:g} s; look at its log, "
                     f"{processes[0].log}."
                 )
-        refused = witness.arms("command_gate", TIMEOUT_S)
+        refused = witness.arms("command_gate", START_S)
         for process in processes:
             process.check()
         if refused:
             raise BackendError(f"command_gate can't be armed: {refused}")
         say("  command_gate is armed; no emergency stop is required of a simulation")
-        arrived = witness.arrives(goal, near, TIMEOUT_S)
+        arrived = witness.arrives(goal, near, ARRIVE_S)
         for process in processes:
             process.check()
         return arrived, witness.path

@@ -24,7 +24,7 @@ class Plan:
     """
 
     out: Path
-    robot: str = "ackermann"
+    robot: str = "differential"
     world: str = "arena"
     recording: Path | None = None
     episodes: int = 5
