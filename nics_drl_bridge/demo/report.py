@@ -51,7 +51,7 @@ class Shown:
 
 def report(plan: Plan, shown: Shown) -> str:
     """The page, as HTML."""
-    sections = [
+    sections: list[tuple[str, Sequence[Block]]] = [
         ("The model", _model(plan, shown)),
         ("The policy", _policy(plan, shown)),
         ("The same episodes, in process and over DDS", _episodes(plan, shown)),
