@@ -16,8 +16,10 @@ from pathlib import Path
 import pytest
 from domains import claimed_domain
 
-DEADLINE_S = 90.0
-LAST_LINE = r"demo: in process 2/2, over DDS 2/2, report (.+/report\.html)"
+DEADLINE_S = 300.0
+LAST_LINE = r"demo: in process ([0-2])/2, over DDS ([0-2])/2, report (.+/report\.html)"
+READY_MADE = ("--policy", "go_to_goal")
+DEVIATION = r"<td>([0-9.e+-]+)</td></tr>"
 
 
 def needs_ros(test):
@@ -95,43 +97,76 @@ class Sources(HTMLParser):
         self.loads += [value for name, value in attrs if name in ("src", "href", "data")]
 
 
-@needs_ros
-def test_it_goes_the_whole_road_and_leaves_a_report(tmp_path):
-    with demo("--episodes", 2, "--out", "out", cwd=tmp_path) as running:
+def section(text: str, heading: str) -> str:
+    """What stands below a heading of a page."""
+    return text.partition(f"<h2>{heading}")[2].partition("<h2>")[0]
+
+
+def whole_road(*words: object, cwd: Path) -> tuple[Running, tuple[str, str], str]:
+    """A demo of two episodes that is left to its end: itself, its successes, its report."""
+    with demo("--episodes", 2, "--out", "out", *words, cwd=cwd) as running:
         assert running.process.wait(DEADLINE_S) == 0, running.process.stderr.read()
         running.until("^demo: ")
-        (report,) = re.fullmatch(LAST_LINE, running.lines[-1]).groups()
-        assert processes_below(tmp_path) == []
+        here, there, report = re.fullmatch(LAST_LINE, running.lines[-1]).groups()
+        assert processes_below(cwd) == []
+    return running, (here, there), (cwd / report).read_text(encoding="utf-8")
+
+
+@needs_ros
+def test_it_goes_the_whole_road_and_leaves_a_report(tmp_path):
+    running, successes, text = whole_road(*READY_MADE, cwd=tmp_path)
+    assert successes == ("2", "2")
     assert any("the deployed nodes reached the goal" in line for line in running.lines)
-    text = (tmp_path / report).read_text(encoding="utf-8")
     page = Sources()
     page.feed(text)
     assert page.tags.count("img") == 6  # the drives, the fit, and what was calibrated
-    assert page.tags.count("tr") == 3  # a heading, and two episodes
     assert page.loads  # all of it is inside
     assert all(source.startswith("data:image/png;base64,") for source in page.loads)
     assert "script" not in page.tags
     for words in ("Fit report", "2 of 2 episodes", "over DDS", "The robot reached its goal"):
         assert words in text
     # Commands go through a quaternion and back at most: the two drives are the same drive.
-    deviations = re.findall(r"<td>([0-9.e+-]+)</td></tr>", text)
+    episodes = section(text, "The same episodes")
+    assert episodes.count("<tr>") == 3  # a heading, and two episodes
+    deviations = re.findall(DEVIATION, episodes)
     assert len(deviations) == 2
     assert max(map(float, deviations)) < 1e-6
 
 
 @needs_ros
+@pytest.mark.skipif(find_spec("stable_baselines3") is None, reason="needs the extra train")
+@pytest.mark.timeout(400)
+def test_it_deploys_the_policy_file_that_it_trained(tmp_path):
+    running, (here, there), text = whole_road("--train-steps", 9000, cwd=tmp_path)
+    assert here == there  # learned little, but drives the same
+    told = [line for line in running.lines if re.match("  [0-9,]+ steps: success ", line)]
+    assert len(told) == 2  # rollouts of 8192 steps
+    assert "img" in section(text, "The policy")
+    assert "500 unseen episodes" in section(text, "The policy")
+    assert max(map(float, re.findall(DEVIATION, section(text, "The same episodes")))) < 1e-6
+    assert (tmp_path / "out" / "policy.onnx").is_file()
+    deployed = (tmp_path / "out" / "logs" / "realtime" / "policy_node.yaml").read_text()
+    assert "policy: out/policy.onnx" in deployed
+    assert sum(" took " in line for line in running.lines) == 6
+
+
+@needs_ros
 @pytest.mark.parametrize(
-    ("phase", "pattern", "episodes"),
+    ("phase", "pattern", "episodes", "policy"),
     [
-        ("in process", "^  seed 0: ", 1000),
-        ("over DDS", "^driving the same .* over DDS", 50),
-        ("in real time", "^deploying ", 1),
+        ("training", "^  .* steps: success", 1, ()),
+        ("in process", "^  seed 0: ", 1000, READY_MADE),
+        ("over DDS", "^driving the same .* over DDS", 50, READY_MADE),
+        ("in real time", "^deploying ", 1, READY_MADE),
     ],
 )
-def test_ctrl_c_ends_it_and_all_that_it_started(tmp_path, phase, pattern, episodes):
-    with demo("--episodes", episodes, "--world", "empty", "--out", "out", cwd=tmp_path) as running:
+def test_ctrl_c_ends_it_and_all_that_it_started(tmp_path, phase, pattern, episodes, policy):
+    if phase == "training":
+        pytest.importorskip("stable_baselines3")
+    words = ("--episodes", episodes, "--world", "empty", "--out", "out", *policy)
+    with demo(*words, cwd=tmp_path) as running:
         running.until(pattern)
-        if phase != "in process":
+        if phase in ("over DDS", "in real time"):
             wait_for(lambda: len(processes_below(tmp_path)) > 1, "a node")
         os.kill(running.process.pid, signal.SIGINT)
         assert running.process.wait(30.0) == 130
@@ -149,7 +184,8 @@ def wait_for(condition, what):
 
 
 @pytest.mark.parametrize("words", [("--recording", "drive"), ("--robot", "ackerman"),
-                                   ("--world", "areena"), ("--out", "file")])  # fmt: skip
+                                   ("--world", "areena"), ("--out", "file"),
+                                   ("--policy", "go_to_gaol")])  # fmt: skip
 def test_bad_input_ends_it_with_code_2_and_one_sentence(tmp_path, words):
     (tmp_path / "drive").mkdir()
     (tmp_path / "drive" / "cmd.csv").write_text("0.5,nan,0.0\n", encoding="utf-8")

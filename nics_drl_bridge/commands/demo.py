@@ -7,11 +7,10 @@ from typing import Annotated
 
 import typer
 
-from nics_drl_bridge.commands.console import (
-    RobotOption,
-    WorldOption,
-    one_sentence,
-)
+from nics_drl_bridge.commands.console import WorldOption, one_sentence
+
+QUICK_TO_LEARN, RECORDED = "differential", "ackermann"
+"""The robot of a demo that names none: without and with a recording."""
 
 
 def demo(
@@ -21,14 +20,31 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for everything the demo writes.")] = Path(
         "runs/demo"
     ),
-    robot: RobotOption = "ackermann",
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            help="A shipped robot or a YAML file; by default differential, and the car, ackermann, "
+            "for a recording."
+        ),
+    ] = None,
     world: WorldOption = "arena",
-    episodes: Annotated[int, typer.Option(min=1, help="How many episodes.")] = 5,
+    episodes: Annotated[
+        int, typer.Option(min=1, help="How many, in process and again over DDS.")
+    ] = 5,
+    policy: Annotated[
+        str | None,
+        typer.Option(help="Train none; drive with a policy file, a shipped one or a baseline."),
+    ] = None,
+    train_steps: Annotated[
+        int | None, typer.Option(min=1, help="Environment steps of the training.")
+    ] = None,
 ) -> None:
-    """Goes the whole road once: generate, drive in process, drive over DDS, report."""
+    """Goes the whole road once: generate, train, evaluate, drive over DDS, deploy, report."""
     with one_sentence():
-        from nics_drl_bridge.demo import Plan, run
+        from nics_drl_bridge.demo.plan import Plan
+        from nics_drl_bridge.demo.run import run
 
-        plan = Plan(out, robot, world, recording, episodes)
+        robot = robot or (RECORDED if recording else QUICK_TO_LEARN)
+        plan = Plan(out, robot, world, recording, episodes, policy, train_steps)
         outcome = run(plan, lambda line: typer.echo(line))
         typer.echo(outcome.line())

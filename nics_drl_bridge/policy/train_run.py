@@ -88,14 +88,21 @@ def run(
         result = SeedResult(seed, trained, _evaluated(settings, trained, order.episodes))
         plain = {world: dataclasses.asdict(one) for world, one in result.summaries.items()}
         write_text(folder / EVALUATION, json.dumps(plain, indent=2) + "\n")
-        _export(settings, result, order.command, folder / POLICY)
+        export(settings, result, order.command, folder / POLICY)
         done(result)
         results.append(result)
     return results
 
 
-def _export(settings: TrainingSettings, result: SeedResult, command: str, path: Path) -> None:
-    """Writes the policy file, which tells how the policy came about and how well it drives."""
+def export(settings: TrainingSettings, result: SeedResult, command: str, path: Path) -> None:
+    """Writes the policy file, which tells how the policy came about and how well it drives.
+
+    Args:
+        settings: of the training.
+        result: of one seed.
+        command: what the user called.
+        path: of the file, `*.onnx`.
+    """
     model = open_model(settings.robot)
     task = make_task(settings.task, model, settings.task_options)
     rates = {f"success in {world}": one.success.value for world, one in result.summaries.items()}
