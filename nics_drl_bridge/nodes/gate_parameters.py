@@ -77,6 +77,7 @@ def declare_gate(node: Node) -> GateParameters:
         estimate_std=get(
             "estimate_std", DEFAULTS.estimate_std, "Of the estimate [m, rad].", low=1e-3, high=1e3
         ),
+        odom_std=model.noise.odometry,
         shield=_declare_shield(node, model),
     )
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")

@@ -73,7 +73,7 @@ def estimator_converged(config: GateConfig, state: GateState, request: Arm, now:
     if state.estimate.std.max() > config.estimate_std:
         worst = float(state.estimate.std.max())
         return f"odometry/filtered is uncertain by {worst:.2f}, the limit is {config.estimate_std}"
-    return "" if stands_still(state.estimate.twist) else "odometry/filtered shows motion"
+    return "" if stands_still(config, state.estimate.twist) else "odometry/filtered shows motion"
 
 
 def one_publisher(config: GateConfig, state: GateState, request: Arm, now: float) -> str:

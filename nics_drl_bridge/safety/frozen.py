@@ -18,7 +18,9 @@ RESPONSE = 0.1
 LEAST_PATH, LEAST_TURN = 0.03, 0.25
 """if it is told more than this within the time [m, rad]."""
 STILL_LINEAR, STILL_TURN = 0.05, 0.1
-"""A robot that moves less stands still; odometry is noisy [m/s, rad/s]."""
+"""A robot that moves less stands still [m/s, rad/s],"""
+NOISE = 3.0
+"""or less than that and so many standard deviations of its odometry."""
 
 
 def compare(state: GateState, scan: Scan) -> Sameness:
@@ -32,9 +34,11 @@ def compare(state: GateState, scan: Scan) -> Sameness:
     )
 
 
-def stands_still(twist: NDArray[np.float64]) -> bool:
-    """Whether a body twist (3,) is that of a robot at rest."""
-    return bool(np.hypot(twist[0], twist[1]) < STILL_LINEAR and abs(twist[2]) < STILL_TURN)
+def stands_still(config: GateConfig, twist: NDArray[np.float64]) -> bool:
+    """Whether a body twist (3,) is that of a robot at rest, as far as its noise lets one tell."""
+    linear, turn = (NOISE * std for std in config.odom_std)
+    slow = np.hypot(twist[0], twist[1]) < STILL_LINEAR + linear
+    return bool(slow and abs(twist[2]) < STILL_TURN + turn)
 
 
 def watch_motion(config: GateConfig, state: GateState, now: float) -> GateState:

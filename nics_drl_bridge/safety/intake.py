@@ -150,5 +150,5 @@ def _take_odometry(
     if fault:
         jumped = ODOM if fault == "jumped" else ""
         return replace(state, odometries=arrivals, jumped=jumped), f"odom: its stamp {fault}"
-    restless = state.restless_s if frozen.stands_still(odometry.twist) else now
+    restless = state.restless_s if frozen.stands_still(config, odometry.twist) else now
     return replace(state, odometries=arrivals, odometry=odometry, restless_s=restless), ""

@@ -64,6 +64,7 @@ class GateConfig:
         estimate_silence_s: greatest age of the estimate for that [s].
         frozen_distance: identical scans over such a path are frozen [m, or rad of turning].
         stuck_s: no motion within such a time while commanded is a stop [s].
+        odom_std: noise of a twist by odometry, linear [m/s] and angular [rad/s].
         shield: see there; None for none.
     """
 
@@ -89,6 +90,7 @@ class GateConfig:
     estimate_silence_s: float = 0.5
     frozen_distance: float = 0.2
     stuck_s: float = 1.0
+    odom_std: tuple[float, float] = (0.0, 0.0)
     shield: ShieldConfig | None = None
 
 

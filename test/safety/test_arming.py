@@ -154,3 +154,12 @@ def test_a_latched_stop_is_named():
     assert failed(rig) == {"nothing_latched"}
     assert rig.give(Reset()).granted
     assert rig.arm().granted
+
+
+def test_a_robot_with_noisy_odometry_stands_still_although_it_seems_to_move():
+    noisy, quiet = (Rig(config(odom_std=std)) for std in ((0.03, 0.1), (0.0, 0.0)))
+    for rig in (noisy, quiet):
+        rig.speed = 0.08
+        rig.run(1.5)
+    assert noisy.arm().granted
+    assert "standing_still" in failed(quiet)
