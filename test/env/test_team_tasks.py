@@ -172,7 +172,7 @@ def test_each_robot_of_an_estimating_team_has_an_estimate_of_its_own():
     )
     env.reset(seed=0)
     for _ in range(5):
-        info = env.step(np.array([[0.5, 0.0, 0.0], [0.0, 0.5, 0.2], [-0.5, 0.0, 0.0]]))[4]
+        info = env.step(np.array([0.5, 0.0, 0.0, 0.0, 0.5, 0.2, -0.5, 0.0, 0.0]))[4]
     assert info["pose"].shape == (3, 3)
     assert info["pose"] == pytest.approx(info["true_pose"], abs=0.05)
 

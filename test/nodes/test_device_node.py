@@ -159,8 +159,11 @@ def stamped(launch, meet):
 def test_scan_and_odometry_have_rates_of_their_own(stamped):
     known = len(stamped.stamps("scan"))
     stamped.peer.until(lambda: len(stamped.stamps("scan")) > known + 5, "scans")
-    assert set(np.diff(stamped.stamps("scan"))) == {NANO // 10}
-    assert set(np.diff(stamped.stamps("odom"))) == {NANO // 50}
+    for topic, rate in (("scan", 10), ("odom", 50)):
+        steps = np.diff(stamped.stamps(topic)) / (NANO // rate)
+        # A listener on a busy machine may miss one.
+        assert np.array_equal(steps, steps.round())
+        assert np.median(steps) == steps.min() == 1.0
 
 
 def test_a_scan_is_told_as_late_as_the_latency_says_but_stamped_when_it_was_measured(stamped):
