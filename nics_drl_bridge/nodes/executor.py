@@ -58,22 +58,24 @@ class StandingExecutor(SingleThreadedExecutor):
         Raises:
             ExternalShutdownException: the context is shut down.
         """
+        received: list[Received] = []
         if self.stands:
             try:
-                received, others = self._wait(timeout_sec)
+                received = self._wait(timeout_sec)
             except PARTS_MISSING as error:
                 self._fall_back(error)
         if not self.stands:
             super().spin_once(timeout_sec)
             return
+        # Before anything else is looked at: somebody may wait for the answer to a message.
         for callback, arguments in received:
             callback(*arguments)
-        if others:
+        if self._others_ready():
             self._changed = True  # whoever adds an end to a node triggers a guard condition
             self._handle_others()
 
-    def _wait(self, timeout_sec: float | None) -> tuple[list[Received], bool]:
-        """Waits; what subscriptions received, and whether anything else is ready."""
+    def _wait(self, timeout_sec: float | None) -> list[Received]:
+        """Waits; what subscriptions received."""
         try:
             ends = self._gathered()
             ends.wait(-1 if timeout_sec is None else int(timeout_sec * NANO))
@@ -82,7 +84,17 @@ class StandingExecutor(SingleThreadedExecutor):
                 raise
         if not self.context.ok():
             raise ExternalShutdownException
-        return ends.taken(), ends.others_ready()
+        return ends.taken()
+
+    def _others_ready(self) -> bool:
+        """Whether anything but subscriptions was ready; a callback may have shut all down."""
+        if self._ends is None or not self.context.ok():
+            return False
+        try:
+            return self._ends.others_ready()
+        except PARTS_MISSING as error:
+            self._fall_back(error)
+            return False
 
     def _fall_back(self, error: Exception) -> None:
         """Goes on as rclpy's own executor."""
