@@ -33,31 +33,45 @@ class _Mailbox:
     """The newest message of each topic, handed from the executor's thread to the caller's.
 
     The caller is woken once, when all that it waits for is there: each waking costs as much as a
-    good part of a step.
+    good part of a step. Odometry that it waits for is worked in by the executor's thread, while
+    the scan is still on its way.
 
     Args:
-        topics: of which there are messages.
+        topics: that the caller waits for.
+        work: takes stamp [ns], arrival [ns] and message of an odometry.
     """
 
-    def __init__(self, topics: tuple[str, ...]) -> None:
+    def __init__(self, topics: tuple[str, ...], work: Callable[[int, int, Any], None]) -> None:
+        self._topics, self._work = topics, work
         self._messages: dict[str, Any] = {}
         self._stamps = dict.fromkeys(topics, -1)
         self._arrivals: dict[str, int] = {}
         self._lock, self._complete = threading.Lock(), threading.Event()
-        self._awaited: tuple[str, ...] = ()
-        self._awaited_ns = -1
+        self._awaited_ns, self._worked_ns = -1, -1
+        self._failure: Exception | None = None
 
     def put(self, topic: str, message: Any) -> None:
         stamp_ns = conversions.stamp_from_ros(message.header.stamp)
         with self._lock:
             self._messages[topic], self._stamps[topic] = message, stamp_ns
             self._arrivals[topic] = time.monotonic_ns()
-            if self._late() is None:
+            try:
+                self._work_in()
+            except Exception as error:  # noqa: BLE001  (it is raised in the caller's thread)
+                self._failure = error
+            if self._failure is not None or self._late() is None:
                 self._complete.set()
+
+    def _work_in(self) -> None:
+        """Works in the odometry that is waited for, once."""
+        awaited = self._awaited_ns
+        if self._stamps[ODOM] == awaited != self._worked_ns:
+            self._worked_ns = awaited
+            self._work(awaited, self._arrivals[ODOM], self._messages[ODOM])
 
     def _late(self) -> str | None:
         """The first topic whose newest message is older than what is waited for."""
-        for topic in self._awaited:
+        for topic in self._topics:
             if self._stamps[topic] < self._awaited_ns:
                 return topic
         return None
@@ -71,25 +85,36 @@ class _Mailbox:
         arrival_ns = self._arrivals.get(topic)
         return math.inf if arrival_ns is None else (time.monotonic_ns() - arrival_ns) * 1e-9
 
-    def wait(
-        self, topics: tuple[str, ...], stamp_ns: int, timeout_s: float
-    ) -> list[tuple[Any, int]]:
+    def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, tuple[Any, int]]:
         """Message and arrival [ns] of each topic, once each is at least as new as a stamp.
 
         Raises:
             StaleDataError: one does not come.
         """
         with self._lock:
-            self._awaited, self._awaited_ns = topics, stamp_ns
+            self._awaited_ns, self._worked_ns, self._failure = stamp_ns, -1, None
             self._complete.clear()
+            self._work_in()
             late = self._late()
-        if late is not None and not self._complete.wait(timeout_s):
-            with self._lock:
-                late = self._late()
-            if late is not None:
-                raise StaleDataError(late, self.age_s(late), timeout_s)
+        if late is not None:
+            self._complete.wait(timeout_s)
         with self._lock:
-            return [(self._messages[topic], self._arrivals[topic]) for topic in topics]
+            self._awaited_ns = -1
+            if self._failure is not None:
+                raise self._failure
+            for topic in self._topics:
+                if self._stamps[topic] < stamp_ns:
+                    raise StaleDataError(topic, self.age_s(topic), timeout_s)
+            return {t: (message, self._arrivals[t]) for t, message in self._messages.items()}
+
+
+def _worker(middleware: Middleware) -> Callable[[int, int, Any], None]:
+    """What works in odometry; it knows nothing of the backend, which may be garbage."""
+
+    def work(stamp_ns: int, arrival_ns: int, message: Odometry) -> None:
+        middleware.odometry(stamp_ns, arrival_ns, *conversions.odometry_from_ros(message))
+
+    return work
 
 
 class DdsBackend:
@@ -128,7 +153,7 @@ class DdsBackend:
         self._middleware = Middleware(model)
         self._period_ns = round(model.control_period * conversions.NANO)
         self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *((TRUTH,) if truth else ()))
-        self._now_ns, self._mail = 0, _Mailbox(self._topics)
+        self._now_ns, self._mail = 0, _Mailbox(self._topics, _worker(self._middleware))
         self._link = Link(namespace, domain_id)
         types = {SCAN: LaserScan, ODOM: Odometry, TRUTH: Odometry}
         for topic in self._topics:
@@ -217,19 +242,16 @@ class DdsBackend:
     def _measure(self, timeout_s: float) -> tuple[RobotView, dict[str, Any]]:
         """The view at the present stamp. Raises BackendError when the data are of another one."""
         now = self._now_ns
-        # Odometry comes first, and is worked in while the scan is still on its way.
-        ((message, arrival),) = self._mail.wait((ODOM,), now, timeout_s)
-        self._check_stamp(ODOM)
-        self._middleware.odometry(now, arrival, *conversions.odometry_from_ros(message))
-        (message, arrival), *others = self._mail.wait(self._topics[1:], now, timeout_s)
+        messages = self._mail.wait(now, timeout_s)
         self._check_stamps()
+        message, arrival = messages[SCAN]
         self._middleware.scan(now, arrival, conversions.scan_from_ros(self._lidar, message))
         facts: dict[str, Any] = {
             "stamp_ns": now,
             **data_facts(self._middleware, time.monotonic_ns()),
         }
         if TRUTH in self._topics:
-            facts["true_pose"] = conversions.odometry_from_ros(others[0][0])[0]
+            facts["true_pose"] = conversions.odometry_from_ros(messages[TRUTH][0])[0]
         return self._middleware.view(now), facts
 
     def halt(self) -> None:
