@@ -364,13 +364,14 @@ def refusals():
         command = [sys.executable, "-m", "nics_drl_bridge.nodes.simulator_node", "--ros-args", "-p"]
         started = {
             parameter: subprocess.Popen(
-                [*command, parameter],
+                # In namespaces apart: a second node of the same name would be refused for that.
+                [*command, parameter, "-r", f"__ns:=/refused_{number}"],
                 env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
                 text=True,
             )
-            for parameter in REFUSED
+            for number, parameter in enumerate(REFUSED)
         }
         try:
             yield {
