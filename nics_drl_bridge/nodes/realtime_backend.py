@@ -58,6 +58,7 @@ class RealtimeBackend:
         self._period_ns = round((chosen.period_s or model.control_period) * NANO)
         self._deadline_ns = self._misses = 0
         rehearse(model)
+        self._simulated = False
         self._link = Link(
             chosen.namespace, chosen.domain_id, chosen.command_topic,
             stamped=chosen.stamped or chosen.gated,
@@ -88,13 +89,22 @@ class RealtimeBackend:
         self._link.check_open()
         with self._link.zero_after_an_error():
             self._link.halt()
-            vehicle = self._options.vehicle
-            if vehicle or (vehicle is None and not self._episodes.there):
+            if self._is_vehicle():
                 self._await_start(start)
             else:
                 self._begin(start)
             self._misses, self._deadline_ns = 0, time.monotonic_ns() + self._period_ns
             return self._fresh_view()[0]
+
+    def _is_vehicle(self) -> bool:
+        """What the options say; else a robot without a simulator's services is one.
+
+        What was a simulator once stays one: it may be out of sight for a while.
+        """
+        if self._options.vehicle is not None:
+            return self._options.vehicle
+        self._simulated = self._simulated or self._episodes.there
+        return not self._simulated
 
     def _begin(self, start: Start) -> None:
         timeout_s = self._options.timeout_s
