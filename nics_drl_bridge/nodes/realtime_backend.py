@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 NANO = 1_000_000_000
 POLL_S = 0.01
 SAY_EVERY_S = 2.0
+SERVICES_S = 0.5
+"""What has shown no services so long after its topics is a vehicle."""
 STILL = (0.02, 0.05)
 """A robot that is slower stands [m/s, rad/s]."""
 ADVICE = (
@@ -75,6 +77,10 @@ class RealtimeBackend:
             self._link.begin()
             clients = self._episodes.clients if chosen.vehicle is False else []
             self._link.wait_for_peers(self._topics.expected, clients, chosen.timeout_s, ADVICE)
+            # A simulator's services may be found later than its topics.
+            deadline = time.monotonic() + SERVICES_S
+            while self._is_vehicle() and chosen.vehicle is None and time.monotonic() < deadline:
+                time.sleep(POLL_S)
         except BaseException:
             self.close()
             raise
@@ -91,7 +97,7 @@ class RealtimeBackend:
             self._link.halt()
             if self._is_vehicle():
                 self._await_start(start)
-            else:
+            if not self._is_vehicle():
                 self._begin(start)
             self._misses, self._deadline_ns = 0, time.monotonic_ns() + self._period_ns
             return self._fresh_view()[0]
@@ -119,10 +125,13 @@ class RealtimeBackend:
             time.sleep(POLL_S)
 
     def _await_start(self, start: Start) -> None:
-        """Waits until a vehicle stands at its start, and says what is missing."""
+        """Waits until a vehicle stands at its start, and says what is missing.
+
+        Ends as well when services show that it is a simulator.
+        """
         say = self._options.say or self._link.node.get_logger().info
         began, said = time.monotonic(), -math.inf
-        while missing := self._missing(start):
+        while self._is_vehicle() and (missing := self._missing(start)):
             now = time.monotonic()
             if now - began > self._options.start_timeout_s:
                 raise BackendError(
