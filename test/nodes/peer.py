@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rcl_interfaces.srv import SetParametersAtomically
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -73,6 +73,13 @@ class Peer:
         self.until(future.done, f"an answer of {service}", deadline_s)
         self.node.destroy_client(client)
         return future.result()
+
+    def be_known_to(self, node: str) -> None:
+        """Waits until a node knows all that listens here: its answer shows that it does.
+
+        Listeners are announced in order, and the one of the answer is the last.
+        """
+        self.call(GetParameters, f"{node}/get_parameters")
 
     def set_parameters(self, node: str, **values: Any) -> Any:
         """What a node says to new values of its parameters."""

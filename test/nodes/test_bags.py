@@ -159,6 +159,7 @@ def test_a_replay_in_lock_step_gives_the_same_estimate_bit_for_bit(
     told = []
     for _ in range(2):
         node = launch("middleware_node", domain_id, use_sim_time=True)
+        peer.be_known_to("middleware_node")
         player = nics(domain_id, "bag", "replay", bag, "--lockstep", "middleware_node")
         peer.until(lambda: len(filtered) >= 40, "all estimates", 2 * ENDS_S)
         _, err, code = ended(player)
