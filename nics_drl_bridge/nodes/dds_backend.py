@@ -25,7 +25,8 @@ from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
 SCAN, ODOM, TRUTH = "scan", "odom", "ground_truth"
-RESET_PATIENCE_S = 1.0
+AGAIN_S = 0.5
+"""What does not come for so long is asked for again."""
 ADVICE = "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and namespace."
 
 
@@ -92,7 +93,7 @@ class _Mailbox:
             StaleDataError: one does not come.
         """
         with self._lock:
-            self._awaited_ns, self._worked_ns, self._failure = stamp_ns, -1, None
+            self._awaited_ns, self._failure = stamp_ns, None
             self._complete.clear()
             self._work_in()
             late = self._late()
@@ -158,7 +159,7 @@ class DdsBackend:
         types = {SCAN: LaserScan, ODOM: Odometry, TRUTH: Odometry}
         for topic in self._topics:
             self._link.node.create_subscription(
-                types[topic], topic, _putter(self._mail, topic), qos.SENSOR_RELIABLE
+                types[topic], topic, _putter(self._mail, topic), qos.SENSOR
             )
         self._episodes = Episodes(self._link, simulator, model, world)
         self._link.begin()
@@ -178,9 +179,7 @@ class DdsBackend:
         """
         with self._link.zero_after_an_error():
             self.choose(start)
-            return insist(
-                lambda patience_s: self.first(self.begin(), start.pose, patience_s), self.timeout_s
-            )
+            return self.first(self.begin(), start.pose)
 
     def choose(self, start: Start) -> None:
         """The first part of a reset: says which episode `begin` begins."""
@@ -192,11 +191,11 @@ class DdsBackend:
         """The second part: begins it; the stamp of its first data [ns]."""
         return self._episodes.begin(self.timeout_s)
 
-    def first(self, stamp_ns: int, pose: Array, patience_s: float) -> RobotView:
+    def first(self, stamp_ns: int, pose: Array) -> RobotView:
         """The last part: waits for the data of a stamp, of a robot that stands at a pose (3,)."""
         self._now_ns = stamp_ns
         self._middleware.reset(stamp_ns, pose)
-        return self._measure(patience_s)[0]
+        return self._measure()[0]
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Publishes a command and waits for the data after it; see `interface.Backend`.
@@ -212,19 +211,19 @@ class DdsBackend:
         """The first half of a step: checks and publishes a command (C,)."""
         self._link.check_open()
         with self._link.zero_after_an_error():
-            self._link.check_alone()
             # Data that are there before the command would be taken for its answer.
             self._check_stamps()
             twist = self._robot.to_cmd_vel(command)
             self._link.send(twist)
-            # Booked while the simulator is at work.
+            # While the simulator is at work.
+            self._link.check_alone()
             self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
             self._now_ns += self._period_ns
 
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
         """The second half: waits for the data after the command, and for `info` about them."""
         with self._link.zero_after_an_error():
-            return self._measure(self.timeout_s)
+            return self._measure()
 
     def _check_stamps(self) -> None:
         for topic in self._topics:
@@ -234,15 +233,16 @@ class DdsBackend:
         """Raises BackendError when the newest datum is not stamped with the present step."""
         off_ns = self._mail.stamp_ns(topic) - self._now_ns
         if off_ns:
+            self._link.check_alone()
             raise BackendError(
                 f"topic {topic!r}: stamped {off_ns / conversions.NANO:+.3f} s off the step; start "
                 "the simulator with mode:=lockstep, and move it from here alone."
             )
 
-    def _measure(self, timeout_s: float) -> tuple[RobotView, dict[str, Any]]:
+    def _measure(self) -> tuple[RobotView, dict[str, Any]]:
         """The view at the present stamp. Raises BackendError when the data are of another one."""
         now = self._now_ns
-        messages = self._mail.wait(now, timeout_s)
+        messages = self._await(now)
         self._check_stamps()
         message, arrival = messages[SCAN]
         self._middleware.scan(now, arrival, conversions.scan_from_ros(self._lidar, message))
@@ -254,6 +254,21 @@ class DdsBackend:
             facts["true_pose"] = conversions.odometry_from_ros(messages[TRUTH][0])[0]
         return self._middleware.view(now), facts
 
+    def _await(self, stamp_ns: int) -> dict[str, tuple[Any, int]]:
+        """What the mailbox gives for a stamp; what does not come is asked for again.
+
+        It may be lost, and what was sent before the simulator knew of a subscription is.
+        """
+        deadline = time.monotonic() + self.timeout_s
+        while True:
+            try:
+                left_s = max(0.0, deadline - time.monotonic())
+                return self._mail.wait(stamp_ns, min(AGAIN_S, left_s))
+            except StaleDataError as error:
+                if left_s <= AGAIN_S:
+                    raise StaleDataError(error.topic, error.age_s, self.timeout_s) from None
+                self._episodes.repeat()
+
     def halt(self) -> None:
         """Publishes a zero command; the episode is over."""
         self._link.halt()
@@ -261,28 +276,6 @@ class DdsBackend:
     def close(self) -> None:
         """Publishes a zero command and ends the node."""
         self._link.close()
-
-
-def insist(begin: Callable[[float], RobotView], timeout_s: float) -> RobotView:
-    """Begins an episode, and again while its data do not arrive, until a time is over.
-
-    The simulator may not have discovered a subscription yet, and what it sends before that is
-    lost.
-
-    Args:
-        begin: begins it and waits so long [s]; raises StaleDataError.
-        timeout_s: when to give up.
-
-    Raises:
-        StaleDataError: its data do not arrive.
-    """
-    deadline = time.monotonic() + timeout_s
-    while True:
-        try:
-            return begin(min(RESET_PATIENCE_S, max(0.0, deadline - time.monotonic())))
-        except StaleDataError as error:
-            if time.monotonic() >= deadline:
-                raise StaleDataError(error.topic, error.age_s, timeout_s) from None
 
 
 def _putter(mail: _Mailbox, topic: str) -> Callable[[Any], None]:

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from numpy.typing import NDArray
 from rclpy.clock import Clock as SteadyClock
 from rclpy.clock import ClockType
@@ -52,7 +53,8 @@ class DeviceNode(QosWatch):
     node's own. Stamps are simulated time, as on `/clock`: it begins at the system's time and never
     runs backwards, also not at a reset. `~/reset` begins the episode of the parameters
     `episode_seed` and `episode_start`; its answer is JSON with the stamp of the first data. In
-    lock-step the world moves when each robot has a command.
+    lock-step the world moves when each robot has a command, and `~/repeat` publishes its present
+    data again.
 
     Args:
         name: of the node.
@@ -103,6 +105,7 @@ class DeviceNode(QosWatch):
         ]
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
+        self.create_service(Trigger, "~/repeat", self._on_repeat)
         Diagnostics(self, "simulator", self._look)
 
     def _start_time(self) -> None:
@@ -231,17 +234,28 @@ class DeviceNode(QosWatch):
         response.success, response.message = True, "paused" if self._paused else "running"
         return response
 
+    def _on_repeat(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Tells the present again to who has lost a part of it; in real time the next one comes."""
+        response.success = self._time.lockstep
+        if self._time.lockstep:
+            self._tell(conversions.stamp_to_ros(self._now_ns), odom_due=True, scan_due=True)
+        response.message = "" if self._time.lockstep else "data are repeated in lock-step alone"
+        return response
+
     def _publish(self) -> None:
         """Publishes what is due of the present."""
-        now_ns, outbox = self._now_ns, self._outbox
+        now_ns = self._now_ns
         now = conversions.stamp_to_ros(now_ns)
         if self._clock_topic.get_subscription_count():
             self._clock_message.clock = now
             self._clock_topic.publish(self._clock_message)
         odom_due, scan_due = self._odom_pace.due(now_ns), self._scan_pace.due(now_ns)
-        if not (odom_due or scan_due):
-            return
-        moving = []
+        if odom_due or scan_due:
+            self._tell(now, odom_due, scan_due)
+
+    def _tell(self, now: Time, odom_due: bool, scan_due: bool) -> None:
+        """Publishes what the robots' devices say of the present."""
+        now_ns, outbox, moving = self._now_ns, self._outbox, []
         for k, port in enumerate(self._ports):
             sensed = self._world.sensed(k)
             if odom_due:

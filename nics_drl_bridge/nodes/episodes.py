@@ -33,6 +33,8 @@ class Episodes:
             SetParametersAtomically, f"{simulator}/set_parameters_atomically"
         )
         self._reset = link.node.create_client(Trigger, f"{simulator}/reset")
+        self._repeat = link.node.create_client(Trigger, f"{simulator}/repeat")
+        self._repeating: Any = None
         self.clients = [self._reset, self._parameters]
 
     @property
@@ -51,6 +53,11 @@ class Episodes:
         result = self._link.call(self._parameters, request, timeout_s).result
         if not result.successful:
             raise BackendError(f"the simulator refused the episode: {result.reason}")
+
+    def repeat(self) -> None:
+        """Asks for the present data again, without waiting; not while the last asking goes on."""
+        if self._repeating is None or self._repeating.done():
+            self._repeating = self._repeat.call_async(Trigger.Request())
 
     def begin(self, timeout_s: float) -> int:
         """Begins the chosen episode; the stamp of its first data [ns].

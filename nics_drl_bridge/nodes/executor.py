@@ -71,7 +71,6 @@ class StandingExecutor(SingleThreadedExecutor):
         for callback, arguments in received:
             callback(*arguments)
         if self._others_ready():
-            self._changed = True  # whoever adds an end to a node triggers a guard condition
             self._handle_others()
 
     def _wait(self, timeout_sec: float | None) -> list[Received]:
@@ -91,7 +90,10 @@ class StandingExecutor(SingleThreadedExecutor):
         if self._ends is None or not self.context.ok():
             return False
         try:
-            return self._ends.others_ready()
+            woken, others = self._ends.others_ready(self._guard)
+            self._changed |= woken or others  # whoever adds an end to a node wakes the executor
+            # So does rclpy itself, after each callback; then there is nothing to handle.
+            return others or (woken and bool(self._tasks))
         except PARTS_MISSING as error:
             self._fall_back(error)
             return False
@@ -181,14 +183,18 @@ class _Ends:
                     received.append((subscription.callback, taken[:arguments]))
         return received
 
-    def others_ready(self) -> bool:
-        """Whether anything else is ready."""
+    def others_ready(self, own: Any) -> tuple[bool, bool]:
+        """Whether the executor's own guard condition is ready, and whether anything else is."""
         ready = self._wait_set.get_ready_entities
-        triggered = ready("guard_condition")
+        triggered = list(ready("guard_condition"))
         for guard in self.all[1]:
             if guard.handle.pointer in triggered:
                 guard._executor_triggered = True  # waiting has reset it; rclpy sets it anew
-        return bool(triggered or ready("timer") or ready("client") or ready("service")) or any(
+        woken = own is not None and own.handle.pointer in triggered
+        if woken:
+            triggered.remove(own.handle.pointer)
+        others = bool(triggered or ready("timer") or ready("client") or ready("service"))
+        return woken, others or any(
             waitable.is_ready(self._wait_set) for waitable in self._waitables
         )
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import RobotView, Start, stacked
-from nics_drl_bridge.nodes.dds_backend import DdsBackend, insist
+from nics_drl_bridge.nodes.dds_backend import DdsBackend
 from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
@@ -58,15 +58,11 @@ class FleetBackend:
     def reset(self, start: Start) -> RobotView:
         """Begins one episode for all, at poses (M, 3); see `DdsBackend.reset`."""
         leader = self._robots[0]
-
-        def begin(patience_s: float) -> RobotView:
-            stamp_ns = leader.begin()
-            both = zip(self._robots, start.pose, strict=True)
-            return stacked([robot.first(stamp_ns, pose, patience_s) for robot, pose in both])
-
         with self._zero_after_an_error():
             leader.choose(start)
-            return insist(begin, leader.timeout_s)
+            stamp_ns = leader.begin()
+            both = zip(self._robots, start.pose, strict=True)
+            return stacked([robot.first(stamp_ns, pose) for robot, pose in both])
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Publishes all commands (M, C) and waits for all data after them."""

@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.runner import open_context
 
-DEADLINE_S = 30.0
+DEADLINE_S = 90.0
 NUMBERS = itertools.count()
 
 

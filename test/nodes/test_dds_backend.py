@@ -165,6 +165,28 @@ def test_each_view_is_of_the_step_and_one_control_period_after_the_last(connect,
     drive(backend)
 
 
+@pytest.mark.parametrize("topic", ["odom", "scan"])
+def test_what_is_lost_on_the_way_is_asked_for_again_and_counts_once(connect, monkeypatch, topic):
+    backend = connect()
+    drive(backend)
+    whole = backend.step(np.array([0.5, 0.1]))
+    drive(backend)
+    put, lost = backend._mail.put, []
+
+    def lossy(kind, message):
+        if kind == topic and not lost:
+            lost.append(kind)
+        else:
+            put(kind, message)
+
+    monkeypatch.setattr(backend._mail, "put", lossy)
+    holed = backend.step(np.array([0.5, 0.1]))
+    assert lost == [topic]
+    for name in ("pose", "twist", "ranges"):
+        assert np.array_equal(getattr(holed[0], name), getattr(whole[0], name)), name
+    assert holed[1][f"{topic}_stamp_ns"] == holed[1]["stamp_ns"]
+
+
 def test_another_model_is_refused_by_its_fingerprint(connect):
     other = builtin_model("differential")
     backend = connect(model=other)

@@ -137,6 +137,17 @@ def test_stamps_at_another_pace_than_the_receipt_are_a_simulators():
         drive.log.check()
 
 
+def test_odometry_that_comes_late_and_all_at_once_is_at_its_pace():
+    drive = Drive()
+    for k in range(10):
+        drive.hears(k)
+        late = [START_NS + 4 * PERIOD_NS] * 4 + [drive.now_ns] * 6
+        drive.log._odom._receive[-1] = late[k]
+    heard, stamped = drive.log._odom.spans
+    assert stamped / heard > 1.5
+    drive.log.check()
+
+
 def test_stamps_of_several_clocks_do_not_lose_a_drive_that_is_over():
     drive = Drive().goes(0, 20)
     for k in range(20, 40):

@@ -119,6 +119,22 @@ def test_each_command_brings_exactly_one_scan_and_odometry_one_period_later(lock
         assert lockstep.step(0.5, 0.1) == dict.fromkeys(TOPICS, expected)
 
 
+def test_it_tells_its_present_again_when_asked(lockstep):
+    lockstep.reset()
+    told = {topic: lockstep.said[topic][-1] for topic in TOPICS}
+    known = {topic: len(lockstep.said[topic]) for topic in TOPICS}
+    assert lockstep.peer.call(Trigger, "simulator_node/repeat").success
+    lockstep.peer.until(
+        lambda: all(len(lockstep.said[topic]) > known[topic] for topic in TOPICS), "it again"
+    )
+    assert {topic: lockstep.said[topic][-1] for topic in TOPICS} == told
+
+
+def test_in_real_time_the_next_data_come_anyway(realtime):
+    answer = realtime.peer.call(Trigger, "simulator_node/repeat")
+    assert (answer.success, answer.message) == (False, "data are repeated in lock-step alone")
+
+
 def test_without_a_command_its_time_stands_still(lockstep, period_ns):
     now = lockstep.reset()["stamp_ns"]
     for _ in range(5):  # each call makes the node spin
