@@ -143,7 +143,7 @@ class ShapeFile(Schema):
     shapes: tuple[Shape, ...] = Field(min_length=1)
 
 
-def load_shapes(path: Path) -> tuple[Shape, ...]:
+def load_shapes(path: str | Path) -> tuple[Shape, ...]:
     """The shapes of a YAML file. Raises ConfigError with file, key and fix."""
     return load_yaml(path, ShapeFile).shapes
 
