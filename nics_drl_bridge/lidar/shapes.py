@@ -174,7 +174,8 @@ def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
     poses = np.asarray(poses, dtype=np.float64)
     bodies = np.empty((*poses.shape[:-1], BODY))
     bodies[..., :3] = poses
-    bodies[..., COS], bodies[..., SIN] = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    with np.errstate(invalid="ignore"):  # what is turned by infinity is nowhere, and not seen
+        bodies[..., COS], bodies[..., SIN] = np.cos(poses[..., 2]), np.sin(poses[..., 2])
     bodies[..., RADIUS], bodies[..., SHAPE] = radii, shapes
     return bodies
 
