@@ -191,6 +191,28 @@ def look_alone(  # type: ignore[no-untyped-def]
         )  # fmt: skip
 
 
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
+def look_or_wait(  # type: ignore[no-untyped-def]
+    n, together, pose, bodies, ranges, steps, faults, age, velocity, past, walls, crowded, view,
+    sensors, crowding, dt, substeps,
+):  # fmt: skip
+    """Scans of world n, unless `look_together` can take them; how many worlds now wait for it.
+
+    Args:
+        n: which world.
+        together: how many waited before.
+        pose and others: see `look_alone`.
+    """
+    if crowded or needs_own(n, age, faults):
+        look_alone(
+            n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, crowded, view,
+            sensors, crowding, dt, substeps,
+        )  # fmt: skip
+        return together
+    sensors[1][together] = n
+    return together + 1
+
+
 @njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def look_together(together, pose, bodies, ranges, first, walls, view, sensors):  # type: ignore[no-untyped-def]
     """Scans the first `together` worlds of the list in `sensors`, as they stand."""
