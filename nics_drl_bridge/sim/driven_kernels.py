@@ -10,6 +10,7 @@ from numba import njit
 
 from nics_drl_bridge.sim import cell_kernels as crowd
 from nics_drl_bridge.sim import sensing_kernels as sensing
+from nics_drl_bridge.sim import sight_kernels as sight
 from nics_drl_bridge.sim.kernels import steer_world
 from nics_drl_bridge.sim.robot_kernels import place_robot
 
@@ -70,9 +71,9 @@ def end_period(packed, true, before, wheels, counted):  # type: ignore[no-untype
                 row[m, sensing.TWIST + i] = true[n, m, i]
         if crowded:
             crowd.sort_bodies(bodies, n, crowding[0])
-        together = sensing.look_or_wait(
+        together = sight.look_or_wait(
             n, together, pose, bodies, ranges, steps, faults, age, velocity, past, walls,
             scattered, view, sensors, crowding, dt, substeps,
         )  # fmt: skip
-    sensing.look_together(together, pose, bodies, ranges, first, walls, view, sensors)
-    sensing.distort(0, pose.shape[0], ranges, faults, steps, seeds, view)
+    sight.look_together(together, pose, bodies, ranges, first, walls, view, sensors)
+    sight.distort(0, pose.shape[0], ranges, faults, steps, seeds, view)

@@ -20,6 +20,7 @@ from nics_drl_bridge.sim import cell_kernels as crowd
 from nics_drl_bridge.sim import motion_kernels as obstacles
 from nics_drl_bridge.sim import robot_kernels as robots
 from nics_drl_bridge.sim import sensing_kernels as sensing
+from nics_drl_bridge.sim import sight_kernels as sight
 
 
 @structref.register
@@ -103,14 +104,12 @@ def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[n
             _measure(n, skip, fields, motion, single, sensors[0])
             if crowded:
                 _note_ways(cells, sensors[0], skip, pose, n)
-            together = sensing.look_or_wait(
+            together = sight.look_or_wait(
                 n, together, pose, bodies, ranges, steps, faults, age, velocity, past, walls,
                 scattered, view, sensors, crowding, dt, substeps,
             )  # fmt: skip
-        sensing.look_together(
-            together, pose, bodies, ranges, velocity.shape[1], walls, view, sensors
-        )
-        sensing.distort(low, high, ranges, faults, steps, seeds, view)
+        sight.look_together(together, pose, bodies, ranges, velocity.shape[1], walls, view, sensors)
+        sight.distort(low, high, ranges, faults, steps, seeds, view)
 
 
 @njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
@@ -200,8 +199,8 @@ def _look(fields, scene, view, room, chosen):  # type: ignore[no-untyped-def]
     sensors = room[4]
     for i in range(chosen.shape[0]):
         sensors[1][i] = chosen[i]
-    sensing.look_together(
+    sight.look_together(
         chosen.shape[0], pose, bodies, ranges, velocity.shape[1], scene[0], view, sensors
     )
     for n in chosen:
-        sensing.distort(n, n + 1, ranges, faults, steps, seeds, view)
+        sight.distort(n, n + 1, ranges, faults, steps, seeds, view)
