@@ -220,8 +220,9 @@ def _inner_models(annotation: Any) -> list[type[BaseModel]]:
     ]
 
 
-def read_text(path: Path) -> str:
+def read_text(path: str | Path) -> str:
     """Reads a UTF-8 file, with one sentence when that fails."""
+    path = Path(path)
     try:
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise ConfigError(f"{path}: is a device or a pipe, not a file; copy it to one.")
@@ -236,8 +237,9 @@ def read_text(path: Path) -> str:
         raise ConfigError(f"{path}: can't be read ({error.strerror}).") from None
 
 
-def load_yaml(path: Path, schema: type[SchemaT]) -> SchemaT:
+def load_yaml(path: str | Path, schema: type[SchemaT]) -> SchemaT:
     """Reads and checks a YAML file. Raises ConfigError with file, key and fix."""
+    path = Path(path)
     if path.is_file() and path.stat().st_size > MAX_BYTES:
         limit = MAX_BYTES // 2**20
         raise ConfigError(f"{path}: is larger than {limit} MB; give a configuration instead.")
@@ -263,7 +265,7 @@ def share_folder() -> Path:
     )
 
 
-def find_config(name: str, kind: str) -> Path:
+def find_config(name: str | Path, kind: str) -> Path:
     """Finds a configuration by the name of a shipped one, or by path.
 
     Args:
@@ -276,6 +278,7 @@ def find_config(name: str, kind: str) -> Path:
     Raises:
         ConfigError: there is none, with the nearest valid name.
     """
+    name = str(name)
     if name.endswith((".yaml", ".yml")):
         return Path(name)
     folder = share_folder() / "config" / kind

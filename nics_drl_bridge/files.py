@@ -25,13 +25,14 @@ def _fsync(path: Path) -> None:
         os.close(descriptor)
 
 
-def write_bytes(path: Path, data: bytes) -> None:
+def write_bytes(path: str | Path, data: bytes) -> None:
     """Writes a file through a temporary one, fsynced and renamed.
 
     Args:
         path: the file; its folder is made when missing.
         data: the whole content.
     """
+    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
@@ -47,12 +48,12 @@ def write_bytes(path: Path, data: bytes) -> None:
     _fsync(path.parent)
 
 
-def write_text(path: Path, text: str) -> None:
+def write_text(path: str | Path, text: str) -> None:
     """Writes a UTF-8 text file through a temporary one, fsynced and renamed."""
     write_bytes(path, text.encode())
 
 
-def check_folder(path: Path, marker: str) -> Path:
+def check_folder(path: str | Path, marker: str) -> Path:
     """Makes sure that `whole_folder` can make a folder, without making anything.
 
     Returns:
@@ -62,7 +63,7 @@ def check_folder(path: Path, marker: str) -> Path:
         ConfigError: `path` is a file, a folder of another kind, or lies where nothing can be
             written.
     """
-    path = path.resolve()
+    path = Path(path).resolve()
     if path.exists() and not path.is_dir():
         raise ConfigError(f"{path}: is a file, not a folder; give the name of a folder.")
     if path.is_dir() and any(path.iterdir()) and not (path / marker).exists():
@@ -87,7 +88,7 @@ def check_above(path: Path) -> None:
 
 
 @contextmanager
-def whole_folder(path: Path, marker: str) -> Iterator[Path]:
+def whole_folder(path: str | Path, marker: str) -> Iterator[Path]:
     """Gives a temporary folder that takes the place of `path` when the block ends well.
 
     Args:

@@ -187,10 +187,11 @@ def builtin_model(robot: str) -> SimulatorModel:
     return generate(drive, spec, load_lidar(DEFAULT_LIDAR), ())[0]
 
 
-def open_model(name: str) -> SimulatorModel:
+def open_model(name: str | Path) -> SimulatorModel:
     """A model by its folder, or by the name of a shipped robot (`ackermann`)."""
+    name = str(name)
     if Path(name).is_dir():
-        return load_model(Path(name))
+        return load_model(name)
     if "/" in name:
         raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
     try:
@@ -200,7 +201,7 @@ def open_model(name: str) -> SimulatorModel:
         raise ModelError(f"{reason}; there is no folder of this name either.") from None
 
 
-def check_place(folder: Path) -> None:
+def check_place(folder: str | Path) -> None:
     """Makes sure, before the work of a fit, that `save_model` can write to a folder.
 
     Raises:
@@ -209,7 +210,7 @@ def check_place(folder: Path) -> None:
     check_folder(folder, MODEL_FILE)
 
 
-def save_model(model: SimulatorModel, folder: Path) -> None:
+def save_model(model: SimulatorModel, folder: str | Path) -> None:
     """Writes a model as a folder, whole or not at all.
 
     Raises:
@@ -227,12 +228,13 @@ def _seal(text: str) -> str:
     return f"sha256: {sha256(text.encode())}\n"
 
 
-def load_model(folder: Path) -> SimulatorModel:
+def load_model(folder: str | Path) -> SimulatorModel:
     """Reads a model that `save_model` wrote.
 
     Raises:
         ConfigError, ModelError: a file is missing, damaged or of another format.
     """
+    folder = Path(folder)
     path = folder / MODEL_FILE
     if not path.is_file():
         raise ModelError(f"{folder}: holds no {MODEL_FILE}; make a model with `nics generate`.")

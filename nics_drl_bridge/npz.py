@@ -29,10 +29,9 @@ DAMAGE = (
     EOFError,
     KeyError,
     MemoryError,
-    NotImplementedError,
     OSError,
     OverflowError,
-    RuntimeError,
+    RuntimeError,  # of a way to pack that zipfile does not know, or a password
     SyntaxError,
     TypeError,
     struct.error,

@@ -19,13 +19,13 @@ HEADS = (
 
 
 def evaluate_shadow(
-    bag: Path,
+    bag: str | Path,
     policy: str,
     model: str | None,
     topics: Mapping[str, str],
     goal: tuple[float, float] | None,
     ahead_s: float,
-    out: Path,
+    out: str | Path,
 ) -> Shadow:
     """Compares a policy with a recorded drive, and writes `shadow_POLICY.png` and `.json`.
 
@@ -43,7 +43,7 @@ def evaluate_shadow(
     """
     name = model or robot_of(policy)
     made = shadow(bag, open_model(name), policy, topics, goal, ahead_s)
-    place = out / f"shadow_{Path(policy).stem}"
+    place = Path(out) / f"shadow_{Path(policy).stem}"
     write_bytes(place.with_suffix(".png"), shadow_picture(made))
     told = {
         "bag": str(bag),

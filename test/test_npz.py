@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 
 import numpy as np
@@ -69,6 +70,24 @@ def test_every_flipped_bit_and_every_cut_is_a_value_error(tmp_path, packed):
             npz_mapped(path)
         with pytest.raises(ValueError, match=r".+"):
             npz_arrays(path.read_bytes())
+
+
+@pytest.mark.parametrize("field", [{"method": 99}, {"flags": 1}], ids=["packing", "password"])
+def test_entries_that_zipfile_can_not_unpack_are_a_value_error(tmp_path, field):
+    data = bytearray(npz_bytes({"a": np.arange(1000)}))
+    for signature, flags, method in ((b"PK\x03\x04", 6, 8), (b"PK\x01\x02", 8, 10)):
+        begin = data.index(signature)
+        data[begin + (flags if "flags" in field else method)] = next(iter(field.values()))
+    path = tmp_path / "arrays.npz"
+    path.write_bytes(sealed_anew(data))
+    with pytest.raises(ValueError, match=r"compression|password|encrypted"):
+        npz_mapped(path)
+    with pytest.raises(ValueError, match=r"compression|password|encrypted"):
+        npz_arrays(path.read_bytes())
+
+
+def sealed_anew(data):
+    return data[:-64] + hashlib.sha256(data[:-64]).hexdigest().encode()
 
 
 def test_objects_are_refused_since_they_would_have_to_be_unpickled():

@@ -28,6 +28,30 @@ def _sinc(half):  # type: ignore[no-untyped-def]
     return 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
 
 
+@njit(cache=True, forceinline=True)
+def _follow_derivatives(now, values, dof, free, arc, along_x, along_y, dt):  # type: ignore[no-untyped-def]
+    """Moves the derivatives (3, P) of a pose along one arc: (dx, dy, turn)."""
+    dx, dy, turn = arc
+    for p in range(now.shape[1]):
+        value, d = values[free[p]], dof[free[p]]
+        lean = now[2, p]
+        if d == 2:
+            lean += 0.5 * dt * value
+        now[0, p] -= lean * dy
+        now[1, p] += lean * dx
+        if d == 0:
+            now[0, p] += along_x * value
+            now[1, p] += along_y * value
+        elif d == 1:
+            now[0, p] -= along_y * value
+            now[1, p] += along_x * value
+        else:
+            shorter = -turn / 12.0 * dt * value
+            now[0, p] += shorter * dx
+            now[1, p] += shorter * dy
+            now[2, p] += dt * value
+
+
 @njit(cache=True)
 def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-untyped-def]
     """Integrates body twists along courses of X that no coefficient changes.
@@ -72,24 +96,7 @@ def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-un
             c, s = math.cos(heading + turn / 2.0), math.sin(heading + turn / 2.0)
             along = dt * sinc
             dx, dy = along * (c * vx - s * vy), along * (s * vx + c * vy)
-            for p in range(params):
-                value, d = values[free[p]], dof[free[p]]
-                lean = now[2, p]
-                if d == 2:
-                    lean += 0.5 * dt * value
-                now[0, p] -= lean * dy
-                now[1, p] += lean * dx
-                if d == 0:
-                    now[0, p] += along * c * value
-                    now[1, p] += along * s * value
-                elif d == 1:
-                    now[0, p] -= along * s * value
-                    now[1, p] += along * c * value
-                else:
-                    shorter = -turn / 12.0 * dt * value
-                    now[0, p] += shorter * dx
-                    now[1, p] += shorter * dy
-                    now[2, p] += dt * value
+            _follow_derivatives(now, values, dof, free, (dx, dy, turn), along * c, along * s, dt)
             px, py, heading = px + dx, py + dy, heading + turn
         if share[w] > 0.0:
             a, b = 1.0 - share[w], share[w]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
@@ -19,8 +19,15 @@ from nics_drl_bridge.env.kernels import episode_seeds
 from nics_drl_bridge.env.sim_backend import NANO
 from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, give, override
 from nics_drl_bridge.env.tasks import make_task
-from nics_drl_bridge.env.vector_parts import chosen_worlds, flat, joined, mode_of, over_robots
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.env.vector_facts import EVERY, Rows, VectorFacts
+from nics_drl_bridge.env.vector_parts import (
+    chosen_worlds,
+    flat,
+    joined,
+    mode_of,
+    named_seeds,
+    over_robots,
+)
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.lidar.scanner import Renderer
@@ -32,8 +39,6 @@ from nics_drl_bridge.sim.world import World, load_world
 Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
-Rows = slice | NDArray[np.intp]
-EVERY = slice(None)
 
 
 class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
@@ -114,7 +119,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         )
         self._each = (num_envs, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
-        self._period_ns = round(self.model.control_period * NANO)
+        self._facts = VectorFacts(self.simulator, round(self.model.control_period * NANO))
         self._allocate()
 
     def _allocate(self) -> None:
@@ -153,41 +158,19 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = chosen_worlds(options, self.num_envs)
-        self._seed(seed, chosen)
+        seeds, fresh = named_seeds(seed, chosen, self._episode < 0, self.np_random)
+        self._first[fresh], self._episode[fresh] = seeds[fresh], -1
         if self.memory and not chosen.all():  # the others see what they saw
             self.task.observe_into(self._out, self._view(slice(None)), self.memory)
         rows = np.flatnonzero(chosen)
         self._begin(rows, self._out, options)
         infos: dict[str, Any] = {}
-        facts = self._known(rows) | self._beginnings(rows)
+        facts = self._known(rows) | self._facts.beginnings(self._starts, self._bodies, rows)
         vector_info.put_rows(infos, facts, rows, self.num_envs)
         return flat(self._out.copy() if self.copy else self._out), infos
 
-    def _seed(self, seed: int | Sequence[int | None] | None, chosen: Flags) -> None:
-        """Names the next episode of the chosen worlds."""
-        if isinstance(seed, Sequence | np.ndarray):
-            if len(seed) != self.num_envs:
-                raise ConfigError(f"{len(seed)} seeds for {self.num_envs} worlds; give one each.")
-            given = chosen & np.array([one is not None for one in seed])
-            seeds = np.array([0 if one is None else one for one in seed], np.int64)
-        else:
-            given = chosen & (seed is not None)
-            seeds = (seed or 0) + np.arange(self.num_envs, dtype=np.int64)
-        new = chosen & (self._episode < 0) & ~given
-        if new.any():
-            seeds = np.where(
-                new, int(self.np_random.integers(2**31)) + np.arange(self.num_envs), seeds
-            )
-        fresh = given | new
-        self._first[fresh], self._episode[fresh] = seeds[fresh], -1
-        if (self._first[chosen] < 0).any():
-            raise ConfigError("a seed must not be negative.")
-
     def _begin(
-        self,
-        worlds: NDArray[np.intp],
-        out: Observation,
-        options: dict[str, Any] | None = None,
+        self, worlds: NDArray[np.intp], out: Observation, options: dict[str, Any] | None = None
     ) -> None:
         """Begins the next episode in some worlds and writes what they see into their rows."""
         if not len(worlds):
@@ -201,8 +184,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             give(starts, "start", options["start"])
         scenes = self.simulator.reset(seeds, worlds, starts)
         self._bodies[worlds] = scenes.bodies
-        data = self.simulator.data
-        self._starts[worlds] = data.pose[worlds]
+        self._starts[worlds] = self.simulator.data.pose[worlds]
         fresh = self.task.reset(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))
         override(fresh, options)
         for name, rows in fresh.items():
@@ -226,24 +208,21 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         given = check_action(actions, self.action_space, "actions").reshape(self._each)
         out = np.empty_like(self._out) if self.copy else self._out
         begun = self._over.copy()  # these ignore their action and begin anew
-        outcome = self._all_parts(lambda part: self._advance(part, given[part], out, begun))
+        outcome = joined(
+            self.simulator.run_parts(lambda part: self._advance(part, given[part], out, begun))
+        )
         terminated = self.ended.all(axis=1) & ~begun
         truncated = (self.simulator.data.steps >= self._limit) & ~begun
         reward = np.where(begun, 0.0, over_robots(self._reward))
         over = terminated | truncated
         infos: dict[str, Any] = {}
-        facts = self._facts(outcome)
+        facts = self._facts.of_step(outcome)
         if self._mode is AutoresetMode.SAME_STEP:
             self._end_at_once(out, over, facts, infos)
         else:
             self._over = over
             self._tell(infos, facts, begun)
         return flat(out), reward, terminated, truncated, infos
-
-    def _all_parts(self, advance: Callable[[slice], Outcome]) -> Outcome:
-        """Runs every part of the simulator's worlds and puts what they came to together."""
-        done = self.simulator.run_parts(advance)
-        return done[0] if len(done) == 1 else joined(done)
 
     def _advance(
         self, part: slice, actions: NDArray[Any], out: Observation, begun: Flags
@@ -295,50 +274,12 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         if len(rows) < self.num_envs:
             vector_info.put_all(infos, facts, begun)
         if len(rows):
-            vector_info.put_rows(infos, self._beginnings(rows), rows, self.num_envs)
+            beginnings = self._facts.beginnings(self._starts, self._bodies, rows)
+            vector_info.put_rows(infos, beginnings, rows, self.num_envs)
 
     def _known(self, rows: Rows = EVERY) -> dict[str, Any]:
-        """What `info` tells at any time, of some worlds, in arrays of its own."""
-        pose = self._own(self.simulator.data.odom[rows])
-        shown = {name: self._own(self.memory[name][rows]) for name in self.task.shown}
-        ages = np.zeros(len(pose))
-        return {**shown, "pose": pose, "scan_age_s": ages, "odom_age_s": ages.copy()}
-
-    def _beginnings(self, rows: Rows) -> dict[str, Any]:
-        """What `info` tells of episodes that begin."""
-        data = self.simulator.data
-        return {
-            "episode_seed": data.seeds[rows],
-            "start": self._row(self._starts[rows]),
-            "bodies": self._bodies[rows],
-            **self._drawn(rows),
-        }
-
-    def _drawn(self, rows: Rows) -> dict[str, Any]:
-        """What the randomisation drew for episodes that begin."""
-        named = {
-            name: self._row(values[rows]) if values.ndim > 1 else values[rows]
-            for name, values in self.simulator.drawn.items()
-        }
-        return {"randomisation": named} if named else {}
-
-    def _facts(self, outcome: Outcome) -> dict[str, Any]:
-        """What `info` tells of a step, of every world, in arrays of its own."""
-        data = self.simulator.data
-        return {
-            "stamp_ns": data.steps * self._period_ns,
-            "true_pose": self._own(data.pose),
-            "true_collision": self._row(data.collided).astype(np.bool_),
-            **{name: self._own(values) for name, values in outcome.info.items()},
-            "reward_terms": {name: self._own(term) for name, term in outcome.terms.items()},
-        }
-
-    def _own(self, rows: NDArray[Any]) -> NDArray[Any]:
-        return self._row(rows).copy()
-
-    def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
-        """(N, ...) of the one robot of each world, or (N, M, ...) of teams."""
-        return rows[:, 0] if self.robots == 1 else rows
+        shown = {name: self.memory[name] for name in self.task.shown}
+        return self._facts.known(shown, rows)
 
     def render(self) -> tuple[Any, ...] | None:
         """A picture of every world; see Gymnasium."""
@@ -350,10 +291,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
                 drawing.Picture(self.model, self.world, self.render_mode, RENDER_FPS)
                 for _ in range(self.num_envs)
             ]
-        drawn, bodies = [], self.simulator.obstacles
+        drawn, data, bodies = [], self.simulator.data, self.simulator.obstacles
         for n, picture in enumerate(self._pictures):
             memory = {name: rows[n : n + 1] for name, rows in self.memory.items()}
-            data = self.simulator.data
             drawn.append(picture.draw(data.pose[n], data.ranges[n], bodies[n], memory))
         return tuple(drawn)
 

@@ -33,6 +33,8 @@ def over_robots(rewards: Array) -> Array:
 
 def joined(parts: Sequence[Outcome]) -> Outcome:
     """What worlds came to, of parts that follow each other."""
+    if len(parts) == 1:
+        return parts[0]
 
     def join(one: Callable[[Outcome], dict[str, Any]]) -> dict[str, Any]:
         return {name: np.concatenate([one(part)[name] for part in parts]) for name in one(parts[0])}
@@ -61,3 +63,38 @@ def chosen_worlds(options: dict[str, Any] | None, count: int) -> Flags:
             "bool with at least one True."
         )
     return chosen.copy()
+
+
+def named_seeds(
+    seed: int | Sequence[int | None] | None, chosen: Flags, unnamed: Flags, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], Flags]:
+    """The seeds that a reset gives to worlds.
+
+    Args:
+        seed: of the first world, or of each (None keeps what it has), or None for all.
+        chosen: (N,) worlds that are reset.
+        unnamed: (N,) worlds that never had a seed; they draw one if they are given none.
+        rng: to draw by.
+
+    Returns:
+        Seeds (N,), and (N,) which worlds begin a series of episodes by them.
+
+    Raises:
+        ConfigError: wrong number of seeds, or a negative one.
+    """
+    count = len(chosen)
+    if isinstance(seed, Sequence | np.ndarray):
+        if len(seed) != count:
+            raise ConfigError(f"{len(seed)} seeds for {count} worlds; give one each.")
+        given = chosen & np.array([one is not None for one in seed])
+        seeds = np.array([0 if one is None else one for one in seed], np.int64)
+    else:
+        given = chosen & (seed is not None)
+        seeds = (seed or 0) + np.arange(count, dtype=np.int64)
+    new = chosen & unnamed & ~given
+    if new.any():
+        seeds = np.where(new, int(rng.integers(2**31)) + np.arange(count), seeds)
+    fresh = given | new
+    if (seeds[fresh] < 0).any():
+        raise ConfigError("a seed must not be negative.")
+    return seeds, fresh

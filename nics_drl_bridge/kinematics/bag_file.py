@@ -44,8 +44,9 @@ class Message:
     content: Any
 
 
-def is_bag(path: Path) -> bool:
+def is_bag(path: str | Path) -> bool:
     """Whether a path is a rosbag2 recording: its folder, or one of its files."""
+    path = Path(path)
     if path.is_dir():
         return (path / METADATA).is_file() or any(is_storage(p) for p in path.iterdir())
     return is_storage(path)
@@ -58,7 +59,7 @@ def is_storage(path: Path) -> bool:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[BagFile]:
+def opened(path: str | Path) -> Iterator[BagFile]:
     """Opens a bag; whatever a damaged one makes the library raise becomes one sentence.
 
     Args:
@@ -75,6 +76,7 @@ def opened(path: Path) -> Iterator[BagFile]:
             f"{path}: reading a bag needs the library rosbags; install it with "
             "pip install 'nics_drl_bridge[bags]'."
         ) from None
+    path = Path(path)
     try:
         place = _place(path)
         _check_name(place)

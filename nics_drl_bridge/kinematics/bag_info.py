@@ -74,12 +74,13 @@ class BagInfo:
     topics: tuple[BagTopic, ...]
 
 
-def bag_info(path: Path) -> BagInfo:
+def bag_info(path: str | Path) -> BagInfo:
     """Reads all of a bag, and tells what is in it.
 
     Raises:
         RecordingError: it is damaged.
     """
+    path = Path(path)
     with opened(path) as bag:
         received = {topic: _received(bag, topic) for topic in sorted(bag.types)}
         times = np.concatenate([ns for ns, _ in received.values()])

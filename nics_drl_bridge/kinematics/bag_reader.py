@@ -31,7 +31,7 @@ from nics_drl_bridge.kinematics.topic_roles import TopicRoles, assign
 QUATERNION_TOLERANCE = 0.05
 
 
-def load_bag(path: Path, mapping: TopicRoles, spec: RobotSpec) -> Recording:
+def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recording:
     """Reads a drive of a robot from a bag.
 
     Args:

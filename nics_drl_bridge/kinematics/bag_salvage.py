@@ -73,7 +73,7 @@ class _Found:
     told: bool = True
 
 
-def salvage(path: Path, out: Path, storage: Storage = "mcap") -> Salvage:
+def salvage(path: str | Path, out: str | Path, storage: Storage = "mcap") -> Salvage:
     """Writes what is intact of a bag as a bag of its own.
 
     Of an MCAP file these are all chunks whose checksum is right, or, where there are none, all
@@ -88,7 +88,7 @@ def salvage(path: Path, out: Path, storage: Storage = "mcap") -> Salvage:
     Raises:
         RecordingError: nothing is left, or `out` is there already.
     """
-    found = _Found()
+    path, found = Path(path), _Found()
     for file in _files(path):
         _read(file, found)
     messages = sorted(_decodable(found), key=lambda message: message[1])

@@ -94,7 +94,7 @@ class BagSink:
 
 
 @contextmanager
-def bag_sink(path: Path, storage: Storage = "mcap") -> Iterator[BagSink]:
+def bag_sink(path: str | Path, storage: Storage = "mcap") -> Iterator[BagSink]:
     """Gives a bag to write into, which stands at `path` when the block ends well.
 
     It is written into a hidden folder `.NAME.*` beside it. After an error nothing is left; a
@@ -115,6 +115,7 @@ def bag_sink(path: Path, storage: Storage = "mcap") -> Iterator[BagSink]:
             f"{path}: writing a bag needs the library rosbags; install it with "
             "pip install 'nics_drl_bridge[bags]'."
         ) from None
+    path = Path(path)
     if path.exists():
         raise RecordingError(f"{path}: is there already; give the name of a new folder.")
     check_above(path)

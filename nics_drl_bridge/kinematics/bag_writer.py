@@ -29,7 +29,7 @@ FRAMES = ("odom", "base_link")
 
 def write_bag(
     recording: Recording,
-    path: Path,
+    path: str | Path,
     spec: RobotSpec,
     storage: Storage = "mcap",
 ) -> None:

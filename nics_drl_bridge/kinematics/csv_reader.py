@@ -28,7 +28,7 @@ MAX_DURATION_S = 1e6
 MAX_DURATION_RATIO = 100.0
 
 
-def load_csv_folder(path: Path) -> Recording:
+def load_csv_folder(path: str | Path) -> Recording:
     """Reads a drive of a car, recorded as five CSV files without a header.
 
     `cmd.csv` and `vrpn.csv` must be there; the wheels are read when both are. The heading is
@@ -45,6 +45,7 @@ def load_csv_folder(path: Path) -> Recording:
         RecordingError: a file is missing, empty, or holds a row that can't be used; one
             sentence with the file, the row and the fix.
     """
+    path = Path(path)
     if not path.is_dir():
         raise RecordingError(f"{path}: no such folder; check the path.")
     for name in REQUIRED:

@@ -15,12 +15,13 @@ from nics_drl_bridge.kinematics.spec import RobotSpec
 NPZ = ".npz"
 
 
-def check_out(path: Path) -> Path:
+def check_out(path: str | Path) -> Path:
     """The `.npz` file, or the folder of a rosbag2, that a recording is to be written to.
 
     Raises:
         ConfigError: it is there already, or has a suffix that is neither's.
     """
+    path = Path(path)
     if path.exists():
         raise ConfigError(f"{path}: is there already; give another name, or remove it.")
     if path.suffix not in (NPZ, ""):
@@ -36,12 +37,13 @@ def check_out(path: Path) -> Path:
     return path
 
 
-def write_drive(recording: Recording, path: Path, spec: RobotSpec) -> None:
+def write_drive(recording: Recording, path: str | Path, spec: RobotSpec) -> None:
     """Writes a recording, whole or not at all: `.npz`, or else a rosbag2 in MCAP.
 
     Raises:
         RecordingError: it can't be written.
     """
+    path = Path(path)
     if path.suffix == NPZ:
         save_recording(recording, path)
         return

@@ -220,7 +220,7 @@ def _check_stream(place: str, stream: Stream, width: int) -> None:
         )
 
 
-def save_recording(recording: Recording, path: Path) -> None:
+def save_recording(recording: Recording, path: str | Path) -> None:
     """Writes a recording as `.npz`: `NAME_t`, `NAME` per stream, and `meta`, a JSON text."""
     arrays: dict[str, NDArray[Any]] = {}
     clocks = {}
@@ -236,14 +236,14 @@ def save_recording(recording: Recording, path: Path) -> None:
     write_bytes(path, npz_bytes({"meta": np.array(json.dumps(meta)), **arrays}))
 
 
-def load_npz(path: Path) -> Recording:
+def load_npz(path: str | Path) -> Recording:
     """Reads a recording that `save_recording` wrote.
 
     Raises:
         RecordingError: no such file, not an `.npz`, damaged, or a stream is missing.
     """
     try:
-        data = path.read_bytes()
+        data = Path(path).read_bytes()
         sealed, arrays = is_sealed(data), npz_arrays(data, seal_needed=False)
         meta = json.loads(str(arrays["meta"]))
         if meta["format"] == FORMAT and not sealed:

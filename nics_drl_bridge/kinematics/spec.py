@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -213,7 +214,7 @@ def _edges_cross(corners: NDArray[np.float64]) -> bool:
     )
 
 
-def load_robot(name: str) -> RobotSpec:
+def load_robot(name: str | Path) -> RobotSpec:
     """Loads a shipped robot by name (`ackermann`), or any by the path of its YAML file.
 
     Raises:

@@ -95,7 +95,7 @@ class TopicRoles(Schema):
     stamps: Stamps = "auto"
 
 
-def topic_roles(file: Path | None = None, options: Iterable[str] = ()) -> TopicRoles:
+def topic_roles(file: str | Path | None = None, options: Iterable[str] = ()) -> TopicRoles:
     """The roles that a YAML file and the options `ROLE=TOPIC` of a command line give.
 
     Args:

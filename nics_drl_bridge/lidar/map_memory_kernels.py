@@ -9,6 +9,7 @@ lanes declare that they are not in it. All indices must be within the array and 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
@@ -29,28 +30,27 @@ def _address(context: Any, builder: Any, signature: Any, args: Any) -> Any:
     return builder.gep(array.data, [args[1]])
 
 
-@intrinsic
-def peek(typing, array, index):  # type: ignore[no-untyped-def]
-    """array[index] of the map (C-contiguous, 1-d), which nothing writes meanwhile."""
+def _load(belonging: str) -> Callable[..., Any]:
+    """What generates a read; `belonging` is how it belongs to the scope of the map."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         value = builder.load(_address(context, builder, signature, args))
-        value.set_metadata("alias.scope", _scope(builder))
+        value.set_metadata(belonging, _scope(builder))
         return value
 
-    return array.dtype(array, types.int64), generate
+    return generate
+
+
+@intrinsic
+def peek(typing, array, index):  # type: ignore[no-untyped-def]
+    """array[index] of the map (C-contiguous, 1-d), which nothing writes meanwhile."""
+    return array.dtype(array, types.int64), _load("alias.scope")
 
 
 @intrinsic
 def get(typing, array, index):  # type: ignore[no-untyped-def]
     """array[index] of lanes (C-contiguous, 1-d), which are not the map."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value = builder.load(_address(context, builder, signature, args))
-        value.set_metadata("noalias", _scope(builder))
-        return value
-
-    return array.dtype(array, types.int64), generate
+    return array.dtype(array, types.int64), _load("noalias")
 
 
 @intrinsic

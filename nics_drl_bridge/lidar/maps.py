@@ -83,7 +83,7 @@ def load_map(
     Raises:
         ConfigError: the YAML file or the image is missing, wrong or too large.
     """
-    path = find_config(str(name), "maps")
+    path = find_config(name, "maps")
     file = load_yaml(path, MapFile)
     grey, opaque = read_image(path.parent / file.image, str(path))
     cells = np.ascontiguousarray(cells_of(grey, opaque, file)[::-1])

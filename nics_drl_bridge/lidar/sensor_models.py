@@ -128,7 +128,7 @@ class SensorModelFile(Schema):
     sensor_model: SensorModels = Field(min_length=1)
 
 
-def load_sensor_models(path: Path) -> tuple[SensorModel, ...]:
+def load_sensor_models(path: str | Path) -> tuple[SensorModel, ...]:
     """The sensor models of a YAML file. Raises ConfigError with file, key and fix."""
     return load_yaml(path, SensorModelFile).sensor_model
 

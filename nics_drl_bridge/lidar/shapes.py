@@ -143,7 +143,7 @@ class ShapeFile(Schema):
     shapes: tuple[Shape, ...] = Field(min_length=1)
 
 
-def load_shapes(path: Path) -> tuple[Shape, ...]:
+def load_shapes(path: str | Path) -> tuple[Shape, ...]:
     """The shapes of a YAML file. Raises ConfigError with file, key and fix."""
     return load_yaml(path, ShapeFile).shapes
 
@@ -174,7 +174,8 @@ def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
     poses = np.asarray(poses, dtype=np.float64)
     bodies = np.empty((*poses.shape[:-1], BODY))
     bodies[..., :3] = poses
-    bodies[..., COS], bodies[..., SIN] = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    with np.errstate(invalid="ignore"):  # what is turned by infinity is nowhere, and not seen
+        bodies[..., COS], bodies[..., SIN] = np.cos(poses[..., 2]), np.sin(poses[..., 2])
     bodies[..., RADIUS], bodies[..., SHAPE] = radii, shapes
     return bodies
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -147,6 +148,6 @@ class LidarSpec(Schema):
         return self.faults.parameters(self.noise_std)
 
 
-def load_lidar(name: str) -> LidarSpec:
+def load_lidar(name: str | Path) -> LidarSpec:
     """Loads a shipped lidar by name (`paper`), or any by the path of its YAML file."""
     return load_yaml(find_config(name, "lidars"), LidarSpec)

@@ -234,7 +234,7 @@ class LidarTable:
         return crc
 
     @classmethod
-    def load(cls, path: Path, checksum: str | None = None) -> LidarTable:
+    def load(cls, path: str | Path, checksum: str | None = None) -> LidarTable:
         """Maps a table that `dump` made into memory; processes that do so share it.
 
         Args:
@@ -244,6 +244,7 @@ class LidarTable:
         Raises:
             ModelError: the file can't be read, is another one, damaged, or no table.
         """
+        path = Path(path)
         try:
             path.open("rb").close()
             if checksum is not None and sha256(path.read_bytes()) != checksum:

@@ -71,7 +71,7 @@ class Estimate:
         return sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
 
 
-def estimate(path: Path, model: SimulatorModel, topics: Mapping[str, str]) -> Estimate:
+def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str]) -> Estimate:
     """Runs a bag through the middleware, in process.
 
     Args:
@@ -109,7 +109,7 @@ def _row(middleware: Middleware, stamp_ns: int) -> tuple[int, Array, Array, Arra
     return stamp_ns, view.pose, view.twist, estimator.covariance[:3, :3]
 
 
-def played(path: Path, topics: Mapping[str, str]) -> dict[str, list[Message]]:
+def played(path: str | Path, topics: Mapping[str, str]) -> dict[str, list[Message]]:
     """The messages of each role that is played.
 
     Args:
@@ -282,9 +282,9 @@ def in_order(messages: Mapping[str, list[Message]]) -> Iterator[tuple[str, Messa
         yield role, message
 
 
-def write_estimate(made: Estimate, path: Path) -> None:
+def write_estimate(made: Estimate, path: str | Path) -> None:
     """Writes an estimate as `.npz`, or else as CSV whose numbers read back exactly."""
-    if path.suffix == ".npz":
+    if Path(path).suffix == ".npz":
         arrays = {
             "stamp_ns": made.stamp_ns, "pose": made.pose, "twist": made.twist,
             "covariance": made.covariance,

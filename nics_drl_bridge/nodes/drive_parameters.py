@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rclpy.node import Node
 
@@ -40,10 +40,7 @@ def declare_drive(node: Node) -> DriveParameters:
     Raises:
         ConfigError: a value can't be used.
     """
-
-    def get(name: str, default: Any, description: str, **limits: Any) -> Any:
-        return declare(node, name, default, description, read_only=True, **limits)
-
+    get = partial(declare, node, read_only=True)
     robot = load_robot(get("robot", "ackermann", "A shipped robot, or its YAML file."))
     out = check_out(
         Path(get("out", "drive.npz", "File *.npz of the recording, or folder of a rosbag2."))

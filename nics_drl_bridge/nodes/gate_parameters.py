@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rclpy.node import Node
@@ -44,9 +44,7 @@ def declare_gate(node: Node) -> GateParameters:
     Raises:
         ConfigError: a value can't be used.
     """
-
-    def get(name: str, default: Any, description: str, **limits: Any) -> Any:
-        return declare(node, name, default, description, read_only=True, **limits)
+    get = partial(declare, node, read_only=True)
 
     def seconds(name: str, default: float, description: str) -> float:
         return float(get(name, default, f"{description} [s].", low=0.01, high=10.0))

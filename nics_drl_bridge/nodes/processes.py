@@ -9,8 +9,8 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from nics_drl_bridge.config import dump_yaml
@@ -58,7 +58,7 @@ def _dies_with_parent() -> Callable[[], None] | None:
     return ask
 
 
-class NodeProcess:
+class NodeProcess(AbstractContextManager["NodeProcess", None]):
     """One node in a process of its own; a context manager that ends it.
 
     On Linux the node also ends when the thread that started it does.
@@ -136,13 +136,5 @@ class NodeProcess:
                 self._process.kill()
         return self._process.wait()
 
-    def __enter__(self) -> NodeProcess:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

@@ -96,12 +96,7 @@ def run_node(
             node.start()
         warn_of_unknown(node)
         starting.clear()
-        executor = StandingExecutor(context)
-        executor.add_node(node)
-        with contextlib.suppress(ExternalShutdownException):
-            while context.ok() and not stopping.is_set():
-                executor.spin_once(timeout_sec=SPIN_S)
-        executor.shutdown(timeout_sec=1.0)
+        _spin(node, stopping)
     except (BridgeError, ParameterException) as error:
         sys.stderr.write(f"{' '.join(str(error).split())}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
@@ -118,6 +113,16 @@ def run_node(
         if context is not None:
             context.try_shutdown()
         alone.close()
+
+
+def _spin(node: Node, stopping: threading.Event) -> None:
+    """Serves a node until it is asked to end, or its context has been shut down."""
+    executor = StandingExecutor(node.context)
+    executor.add_node(node)
+    with contextlib.suppress(ExternalShutdownException):
+        while node.context.ok() and not stopping.is_set():
+            executor.spin_once(timeout_sec=SPIN_S)
+    executor.shutdown(timeout_sec=1.0)
 
 
 def declare_model(node: Node) -> SimulatorModel:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from types import TracebackType
+from contextlib import AbstractContextManager
 
 import numpy as np
 from nav_msgs.msg import Odometry
@@ -20,7 +20,7 @@ ASK_AGAIN_S = 0.2
 ANSWER_S = 2.0
 
 
-class Witness:
+class Witness(AbstractContextManager["Witness", None]):
     """Collects `ground_truth` in a thread of its own; a context manager.
 
     Args:
@@ -100,15 +100,7 @@ class Witness:
             threading.Event().wait(ASK_AGAIN_S)
         return reason
 
-    def __enter__(self) -> Witness:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._context.try_shutdown()
         self._thread.join(timeout=2.0)
         self._node.destroy_node()

@@ -93,7 +93,7 @@ class _Moment:
 
 
 def shadow(
-    path: Path,
+    path: str | Path,
     model: SimulatorModel,
     policy: str,
     topics: Mapping[str, str],

@@ -112,7 +112,7 @@ class TrainingSettings(Schema):
         return sum(self.worlds.values())
 
 
-def load_training(name: str) -> TrainingSettings:
+def load_training(name: str | Path) -> TrainingSettings:
     """Settings by the name of a shipped file (`navigation_differential`), or by path.
 
     Raises:

@@ -181,7 +181,7 @@ KINDS: dict[str, Sequence[str]] = {
 """The message types of each role; what is of another is not looked into."""
 
 
-def facts_of_bag(path: Path, namespace: str = "") -> Facts:
+def facts_of_bag(path: str | Path, namespace: str = "") -> Facts:
     """What a bag tells of a robot.
 
     Raises:

@@ -30,7 +30,7 @@ LEAST_SHARE = 1e-12
 LEAST_RATE = 1e-6
 
 
-def write_pictures(spec: RobotSpec, identified: Identified, folder: Path) -> tuple[Path, ...]:
+def write_pictures(spec: RobotSpec, identified: Identified, folder: str | Path) -> tuple[Path, ...]:
     """Writes the pictures of a fit and of its calibration as PNG files.
 
     Args:
@@ -41,6 +41,7 @@ def write_pictures(spec: RobotSpec, identified: Identified, folder: Path) -> tup
     Returns:
         The files.
     """
+    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     files = []
     drawn = {**fit_pictures(spec, identified), **calibration_pictures(spec, identified)}

@@ -60,7 +60,7 @@ class BlackBox:
         return tuple(self._entries)
 
 
-def write(config: GateConfig, entries: tuple[Entry, ...], path: Path) -> None:
+def write(config: GateConfig, entries: tuple[Entry, ...], path: str | Path) -> None:
     """Writes entries (at least one) to a file, whole or not at all."""
     lines = [{"format": FORMAT, "config": to_plain(config), "state": to_plain(entries[0].before)}]
     for entry in entries:
@@ -106,7 +106,7 @@ class Replay:
         return [*lines, f"{total} inputs over {end - self.entries[0].now:.3f} s: {verdict}"]
 
 
-def replay(path: Path) -> Replay:
+def replay(path: str | Path) -> Replay:
     """Decides on everything in a file anew.
 
     Raises:
@@ -128,7 +128,7 @@ def replay(path: Path) -> Replay:
     return Replay(tuple(entries), tuple(differing))
 
 
-def _lines(path: Path) -> list[dict[str, Any]]:
+def _lines(path: str | Path) -> list[dict[str, Any]]:
     text = read_text(path)
     try:
         lines = [json.loads(line) for line in text.splitlines()]

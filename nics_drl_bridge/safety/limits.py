@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,7 +78,7 @@ class Limits:
     turn: NDArray[np.bool_]
 
 
-def load_limits(name: str, robot: RobotSpec) -> Limits:
+def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     """Reads the limits of a robot.
 
     Args:

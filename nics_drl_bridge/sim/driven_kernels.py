@@ -10,7 +10,9 @@ from numba import njit
 
 from nics_drl_bridge.sim import cell_kernels as crowd
 from nics_drl_bridge.sim import sensing_kernels as sensing
-from nics_drl_bridge.sim.kernels import place_robot, steer_world
+from nics_drl_bridge.sim import sight_kernels as sight
+from nics_drl_bridge.sim.kernels import steer_world
+from nics_drl_bridge.sim.robot_kernels import place_robot
 
 
 @njit(cache=True, nogil=True)
@@ -69,13 +71,9 @@ def end_period(packed, true, before, wheels, counted):  # type: ignore[no-untype
                 row[m, sensing.TWIST + i] = true[n, m, i]
         if crowded:
             crowd.sort_bodies(bodies, n, crowding[0])
-        if scattered or sensing.needs_own(n, age, faults):
-            sensing.look_alone(
-                n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, scattered,
-                view, sensors, crowding, dt, substeps,
-            )  # fmt: skip
-        else:
-            sensors[1][together] = n
-            together += 1
-    sensing.look_together(together, pose, bodies, ranges, first, walls, view, sensors)
-    sensing.distort(0, pose.shape[0], ranges, faults, steps, seeds, view)
+        together = sight.look_or_wait(
+            n, together, pose, bodies, ranges, steps, faults, age, velocity, past, walls,
+            scattered, view, sensors, crowding, dt, substeps,
+        )  # fmt: skip
+    sight.look_together(together, pose, bodies, ranges, first, walls, view, sensors)
+    sight.distort(0, pose.shape[0], ranges, faults, steps, seeds, view)

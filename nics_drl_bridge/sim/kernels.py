@@ -16,11 +16,11 @@ import numpy as np
 from numba import njit, types
 from numba.experimental import structref
 
-from nics_drl_bridge.kinematics.kernels import delayed, move, rates, run, wrap
 from nics_drl_bridge.sim import cell_kernels as crowd
-from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import motion_kernels as obstacles
+from nics_drl_bridge.sim import robot_kernels as robots
 from nics_drl_bridge.sim import sensing_kernels as sensing
+from nics_drl_bridge.sim import sight_kernels as sight
 
 
 @structref.register
@@ -39,181 +39,6 @@ structref.define_proxy(Packed, PackedType, ["content"])
 def pack(content):  # type: ignore[no-untyped-def]
     """Makes one argument of nested tuples of arrays."""
     return Packed(content)
-
-
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
-def move_freely(begin, end, pose, state, history, coefficient, delay, lanes, motion):  # type: ignore[no-untyped-def]
-    """Moves the robots of the worlds [begin, end) for one period as if nothing were in the way.
-
-    Args:
-        begin, end: which worlds.
-        pose: (N, M, 3).
-        state: (N, M, S).
-        history: (N, M, H, C) commands, newest first.
-        coefficient: (N, M, T) of the kinematic terms.
-        delay: (N, M) of the commands [substeps].
-        lanes: pose (6, L), x (V + 1, L), dq (D, L) of `kinematics.kernels.run`, coefficient
-            (T, L) and late (L,), L >= n M; they hold the result.
-        motion: dof, factors, count of the terms, series, (step [s], substeps per period).
-    """
-    where, x, dq, own, late = lanes
-    dof, factors, count, series, (dt, substeps) = motion
-    robots, size = pose.shape[1], state.shape[2]
-    for n in range(begin, end):
-        for m in range(robots):
-            i = (n - begin) * robots + m
-            where[0, i], where[1, i], where[4, i] = pose[n, m, 0], pose[n, m, 1], pose[n, m, 2]
-            where[2, i], where[3, i] = math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2])
-            where[5, i] = 0.0
-            for s in range(size):
-                x[s, i] = state[n, m, s]
-            for t in range(own.shape[0]):
-                own[t, i] = coefficient[n, m, t]
-            late[i] = delay[n, m] % substeps  # its command changes once, after so many substeps
-    at, used = 0, (end - begin) * robots
-    while at < substeps:
-        until = substeps
-        for i in range(used):
-            if late[i] > at:
-                until = min(until, late[i])
-            if late[i] == at or at == 0:
-                n, m = begin + i // robots, i % robots
-                row = delayed(at, delay[n, m], substeps, history.shape[2])
-                for c in range(history.shape[3]):
-                    x[size + c, i] = history[n, m, row, c]
-        run(where, x, dq, (dof, own, factors, count), series, dt, until - at)
-        at = until
-
-
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
-def move_carefully(  # type: ignore[no-untyped-def]
-    n, meets, near, state, history, coefficient, delay, bodies, velocity, moving, walls, grid,
-    collided, pose, outlines, motion, room,
-):  # fmt: skip
-    """Moves robots of one world for one period, looking for touches after each substep.
-
-    A robot that touches something is marked and gets no deeper into it; it may leave. A free
-    one moves exactly as by `move_freely`.
-
-    Args:
-        n: which world.
-        meets: (M,) what each robot may meet; those that meet nothing are left alone.
-        near: see `contact_kernels.find_near`.
-        state, history, coefficient, delay, motion: see `move_freely`.
-        bodies: (N, K + M, 7) obstacles, then robots, see `lidar.shapes.BODY`; in place.
-        velocity, moving: of the obstacles, and whether any has one.
-        walls: (W, 4).
-        grid: see `collision_kernels`.
-        collided: (N, M) set to 1 by a touch.
-        pose: (N, M, 3), in place.
-        outlines: corners and where each outline begins.
-        room: x (V + 1,), dq (D,), trial (7,), spare (F, 2), start (K, 3): scratch.
-    """
-    x, dq, trial, spare, start = room
-    dof, factors, count, series, (dt, substeps) = motion
-    size, first = state.shape[2], velocity.shape[1]
-    world = bodies[n]
-    for m in range(meets.shape[0]):
-        if meets[m] != contacts.FREE:
-            place_robot(bodies, n, first + m, pose[n, m])
-    for j in range(substeps):
-        if moving:
-            contacts.move_obstacles(bodies, start, velocity, n, (j + 1) * dt)
-        for m in range(meets.shape[0]):
-            if meets[m] == contacts.FREE:
-                continue
-            me = first + m
-            row = delayed(j, delay[n, m], substeps, history.shape[2])
-            for s in range(size):
-                x[s] = state[n, m, s]
-            for c in range(history.shape[3]):
-                x[size + c] = history[n, m, row, c]
-            rates(dq, x, (dof, coefficient[n, m], factors, count))
-            turn = dq[2] * dt
-            trial[0], trial[1], trial[3], trial[4] = move(
-                world[me, 0], world[me, 1], world[me, 3], world[me, 4], dq[0], dq[1], turn, dt,
-                series,
-            )  # fmt: skip
-            trial[2] = world[me, 2] + turn
-            trial[5], trial[6] = world[me, 5], world[me, 6]
-            for s in range(size):
-                state[n, m, s] += dt * dq[3 + s]
-            free, whom = contacts.contact(
-                trial, m, meets[m], near, world, walls, grid, outlines, spare
-            )
-            if free < 0.0:
-                collided[n, m] = 1
-                before, _ = contacts.contact(
-                    world[me], m, meets[m], near, world, walls, grid, outlines, spare
-                )
-                if before < 0.0 and free < before:
-                    continue
-                if whom >= first:
-                    collided[n, whom - first] = 1
-            for i in range(5):
-                world[me, i] = trial[i]
-    for m in range(meets.shape[0]):
-        if meets[m] != contacts.FREE:
-            for i in range(3):
-                pose[n, m, i] = world[first + m, i]
-
-
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
-def move_world(  # type: ignore[no-untyped-def]
-    n, skip, pose, state, history, coefficient, delay, bodies, velocity, walls, grid, collided,
-    crowded, outlines, lanes, motion, cells, found, robot, room,
-):  # fmt: skip
-    """Moves obstacles and robots of one world: freely, and carefully where it is tight.
-
-    Args:
-        n: which world.
-        skip: the lane of its first robot.
-        crowded: whether its bodies are to be sorted into cells.
-        cells, found: see `cell_kernels`.
-        robot: near (M, 1 + SEVERAL), meets (M,), way (M,), reach (K + M,), and one more: scratch.
-        pose and others: see the functions above.
-    """
-    where, x = lanes[0], lanes[1]
-    near, meets, way, reach, _ = robot
-    start = room[4]
-    dt, substeps = motion[4]
-    robots, size, first = pose.shape[1], state.shape[2], velocity.shape[1]
-    for m in range(robots):
-        way[m] = where[5, skip + m]
-    longest, moving = contacts.reaches(reach, bodies, velocity, way, n, dt * substeps)
-    if crowded:
-        crowd.sort_bodies(bodies, n, cells)
-        cells[3][crowd.MOVED] = longest
-    tight = False
-    for m in range(robots):
-        meets[m] = contacts.find_near(near, m, reach, bodies, n, walls, grid, crowded, cells, found)
-        tight = tight or meets[m] != contacts.FREE
-    for m in range(robots):
-        if meets[m] == contacts.FREE:
-            i = skip + m
-            pose[n, m, 0], pose[n, m, 1], pose[n, m, 2] = where[0, i], where[1, i], where[4, i]
-            for s in range(size):
-                state[n, m, s] = x[s, i]
-    if moving:
-        for k in range(first):
-            for i in range(3):
-                start[k, i] = bodies[n, k, i]
-    if tight:
-        move_carefully(
-            n, meets, near, state, history, coefficient, delay, bodies, velocity, moving, walls,
-            grid, collided, pose, outlines, motion, room,
-        )  # fmt: skip
-    elif moving:
-        contacts.move_obstacles(bodies, start, velocity, n, substeps * dt)
-    for m in range(robots):
-        pose[n, m, 2] = wrap(pose[n, m, 2])
-
-
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
-def place_robot(bodies, n, k, pose):  # type: ignore[no-untyped-def]
-    """Puts body k of world n to a robot's pose (3,)."""
-    bodies[n, k, 0], bodies[n, k, 1], bodies[n, k, 2] = pose[0], pose[1], pose[2]
-    bodies[n, k, 3], bodies[n, k, 4] = math.cos(pose[2]), math.sin(pose[2])
 
 
 @njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
@@ -254,70 +79,77 @@ def step_worlds(packed, commands, begin):  # type: ignore[no-untyped-def]
 def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[no-untyped-def]
     """See `step_worlds`; no counting of references, which took longer than the step."""
     (
-        pose, state, history, bodies, odom, twist, ranges, collided, steps, seeds, faults,
-        coefficient, delay, age, noise, velocity, past, marks,
+        pose, state, history, bodies, _, _, ranges, collided, steps, seeds, faults, coefficient,
+        delay, age, _, velocity, past, _,
     ) = fields  # fmt: skip
-    walls, grid, outlines, crowded, scattered, movers = scene
+    walls, grid, outlines, crowded, scattered, _ = scene
     lanes, single, robot, crowding, sensors = room
     cells, found = crowding
-    dof, factors, count, series, (dt, substeps) = motion
-    x, dq, before = single[0], single[1], sensors[0]
-    robots, first, end = pose.shape[1], velocity.shape[1], begin + commands.shape[0]
+    dt, substeps = motion[4]
+    many, end = pose.shape[1], begin + commands.shape[0]
     _send(history, commands, begin)
-    block = lanes[0].shape[1] // robots
+    block = lanes[0].shape[1] // many
     for low in range(begin, end, block):
         high = min(low + block, end)
-        for n in range(low, high):
-            if movers[0]:
-                steer_world(
-                    n, velocity, marks, bodies, pose, past, steps[n], walls, movers, seeds[n],
-                    dt * substeps, robot[4],
-                )  # fmt: skip
-            for m in range(robots):
-                i = (n - low) * robots + m
-                before[i, 0], before[i, 1], before[i, 2] = (
-                    pose[n, m, 0],
-                    pose[n, m, 1],
-                    pose[n, m, 2],
-                )
-                if steps[n] == 0:
-                    sensing.begin(past, n, m, pose, odom, twist)
-        move_freely(low, high, pose, state, history, coefficient, delay, lanes, motion)
+        _begin_period(low, high, fields, scene, motion, room)
+        robots.move_freely(low, high, pose, state, history, coefficient, delay, lanes, motion)
         together = np.int64(0)
         for n in range(low, high):
             steps[n] += 1
-            move_world(
-                n, (n - low) * robots, pose, state, history, coefficient, delay, bodies, velocity,
-                walls, grid, collided, crowded, outlines, lanes, motion, cells, found, robot,
-                single,
+            skip = (n - low) * many
+            robots.move_world(
+                n, skip, pose, state, history, coefficient, delay, bodies, velocity, walls, grid,
+                collided, crowded, outlines, lanes, motion, cells, found, robot, single,
             )  # fmt: skip
-            for m in range(robots):
-                counter = steps[n] * robots + m
-                if collided[n, m] == 0:
-                    sensing.disturb(
-                        pose, state, noise, n, m, seeds[n], counter, dt * substeps, series
-                    )
-                place_robot(bodies, n, first + m, pose[n, m])
-                _rates_now(
-                    dq, x, state, history, n, m, delay[n, m], substeps,
-                    (dof, coefficient[n, m], factors, count),
-                )  # fmt: skip
-                sensing.measure(
-                    odom, twist, past, before[(n - low) * robots + m], pose, n, m, dq, noise,
-                    steps[n], seeds[n], counter, age[n, m], dt, substeps, series,
-                )  # fmt: skip
+            _measure(n, skip, fields, motion, single, sensors[0])
             if crowded:
-                _note_ways(cells, before, (n - low) * robots, pose, n)
-            if scattered or sensing.needs_own(n, age, faults):
-                sensing.look_alone(
-                    n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, scattered,
-                    view, sensors, crowding, dt, substeps,
-                )  # fmt: skip
-            else:
-                sensors[1][together] = n
-                together += 1
-        sensing.look_together(together, pose, bodies, ranges, first, walls, view, sensors)
-        sensing.distort(low, high, ranges, faults, steps, seeds, view)
+                _note_ways(cells, sensors[0], skip, pose, n)
+            together = sight.look_or_wait(
+                n, together, pose, bodies, ranges, steps, faults, age, velocity, past, walls,
+                scattered, view, sensors, crowding, dt, substeps,
+            )  # fmt: skip
+        sight.look_together(together, pose, bodies, ranges, velocity.shape[1], walls, view, sensors)
+        sight.distort(low, high, ranges, faults, steps, seeds, view)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
+def _begin_period(low, high, fields, scene, motion, room):  # type: ignore[no-untyped-def]
+    """Sets the velocities of the obstacles of the worlds [low, high), and notes the poses."""
+    pose, bodies, odom, twist = fields[0], fields[3], fields[4], fields[5]
+    steps, seeds, velocity, past, marks = fields[8], fields[9], fields[15], fields[16], fields[17]
+    walls, movers, (dt, substeps), before = scene[0], scene[5], motion[4], room[4][0]
+    for n in range(low, high):
+        if movers[0]:
+            steer_world(
+                n, velocity, marks, bodies, pose, past, steps[n], walls, movers, seeds[n],
+                dt * substeps, room[2][4],
+            )  # fmt: skip
+        for m in range(pose.shape[1]):
+            i = (n - low) * pose.shape[1] + m
+            before[i, 0], before[i, 1], before[i, 2] = pose[n, m, 0], pose[n, m, 1], pose[n, m, 2]
+            if steps[n] == 0:
+                sensing.begin(past, n, m, pose, odom, twist)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
+def _measure(n, skip, fields, motion, single, before):  # type: ignore[no-untyped-def]
+    """Lets the robots of world n drift, puts their bodies there, and reads their wheels."""
+    (
+        pose, state, history, bodies, odom, twist, _, collided, steps, seeds, _, coefficient,
+        delay, age, noise, velocity, past, _,
+    ) = fields  # fmt: skip
+    dof, factors, count, series, (dt, substeps) = motion
+    x, dq = single[0], single[1]
+    for m in range(pose.shape[1]):
+        counter, terms = steps[n] * pose.shape[1] + m, (dof, coefficient[n, m], factors, count)
+        if collided[n, m] == 0:
+            sensing.disturb(pose, state, noise, n, m, seeds[n], counter, dt * substeps, series)
+        robots.place_robot(bodies, n, velocity.shape[1] + m, pose[n, m])
+        robots.rates_at(substeps - 1, dq, x, state, history, n, m, delay[n, m], substeps, terms)
+        sensing.measure(
+            odom, twist, past, before[skip + m], pose, n, m, dq, noise, steps[n], seeds[n],
+            counter, age[n, m], dt, substeps, series,
+        )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
@@ -367,20 +199,8 @@ def _look(fields, scene, view, room, chosen):  # type: ignore[no-untyped-def]
     sensors = room[4]
     for i in range(chosen.shape[0]):
         sensors[1][i] = chosen[i]
-    sensing.look_together(
+    sight.look_together(
         chosen.shape[0], pose, bodies, ranges, velocity.shape[1], scene[0], view, sensors
     )
     for n in chosen:
-        sensing.distort(n, n + 1, ranges, faults, steps, seeds, view)
-
-
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
-def _rates_now(dq, x, state, history, n, m, delay, substeps, terms):  # type: ignore[no-untyped-def]
-    """Rates at the end of a period, under the command that was in effect last."""
-    row = delayed(substeps - 1, delay, substeps, history.shape[2])
-    size = state.shape[2]
-    for s in range(size):
-        x[s] = state[n, m, s]
-    for c in range(history.shape[3]):
-        x[size + c] = history[n, m, row, c]
-    rates(dq, x, terms)
+        sight.distort(n, n + 1, ranges, faults, steps, seeds, view)

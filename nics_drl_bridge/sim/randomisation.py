@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +26,7 @@ FAULT_COLUMNS = (
 """Columns of the faults, see `lidar.fault_kernels`."""
 
 
-def load_randomisation(name: str) -> Randomisation:
+def load_randomisation(name: str | Path) -> Randomisation:
     """Loads a shipped randomisation by name (`mild`), or any by the path of its YAML file."""
     return load_yaml(find_config(name, "randomisation"), Randomisation)
 

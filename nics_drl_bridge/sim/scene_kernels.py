@@ -165,6 +165,15 @@ def _apart(x, y, others, m, least):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _in_ring(seed, counter, x, y, least, greatest):  # type: ignore[no-untyped-def]
+    """A point evenly in the ring of these distances [m] around another."""
+    turn = 2.0 * math.pi * _uniform(seed, counter)
+    share = _uniform(seed, counter + 1)
+    far = math.sqrt(least * least + share * (greatest * greatest - least * least))
+    return x + far * math.cos(turn), y + far * math.sin(turn)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _place_robots(  # type: ignore[no-untyped-def]
     seed, counter, rules, where, still, static, outlines, bodies, none, starts, goals, disc,
     search, spare,
@@ -180,11 +189,8 @@ def _place_robots(  # type: ignore[no-untyped-def]
             area = area_of(x, y, static)
             if area == 0 or not _free(disc, x, y, rules, static, bodies, none, outlines, spare):
                 continue
-            if around > 0.0:  # evenly in the ring of these distances
-                turn = 2.0 * math.pi * _uniform(seed, counter)
-                share = _uniform(seed, counter + 1)
-                far = math.sqrt(least * least + share * (greatest * greatest - least * least))
-                gx, gy = x + far * math.cos(turn), y + far * math.sin(turn)
+            if around > 0.0:
+                gx, gy = _in_ring(seed, counter, x, y, least, greatest)
             else:
                 gx, gy, _ = _spot(seed, counter, goal_places, cells, static)
             counter += 4

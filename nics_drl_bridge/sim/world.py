@@ -197,7 +197,7 @@ class World(Schema):
         return np.array([*sides, *self.walls], dtype=np.float64).reshape(-1, 4)
 
 
-def load_world(name: str) -> World:
+def load_world(name: str | Path) -> World:
     """Loads a shipped world by name (`arena`), or any by the path of its YAML file.
 
     Raises:

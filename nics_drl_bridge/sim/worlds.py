@@ -165,7 +165,7 @@ def arguments(
         are sorted, whether that serves the scans, and `movers`: whether any obstacle moves, and
         plans, half size and distances of `motion_kernels`; view: the lidar's arguments, its map,
         whether it scans exactly, mount, limits, time of a sweep; motion, see
-        `kernels.move_freely`; and scratch, see `_scratch`.
+        `robot_kernels.move_freely`; and scratch, see `_scratch`.
     """
     lidar, grid = model.lidar, scanner.grid
     dof, _, factors, count = term_arrays(model.kinematics)

@@ -272,6 +272,7 @@ def test_a_body_without_radius_is_not_there(renderer):
 @pytest.mark.parametrize("renderer", RENDERERS)
 @pytest.mark.parametrize("wrong", [np.nan, np.inf])
 @pytest.mark.parametrize("column", [0, 1, 2])
+@pytest.mark.filterwarnings("error")
 def test_a_pose_that_is_no_number_neither_hangs_nor_harms_the_others(renderer, wrong, column):
     scanner = make_scanner(lidar(), [SQUARE], renderer)
     good = np.array([(1.0, 0.2, 0.3), (-0.8, 0.1, 1.0)])

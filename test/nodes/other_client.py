@@ -9,7 +9,8 @@ import sys
 import time
 from dataclasses import dataclass
 
-PATIENCE_S, DRIVE_S, SPEED = 20.0, 2.0, 0.3
+PATIENCE_S, SPEED = 20.0, 0.3
+NEARER_M, FAR_M = 0.5, 99.0
 CYCLONE = """<CycloneDDS><Domain><General><Interfaces>
 <NetworkInterface name="lo" multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast>
 </General><Discovery><Peers><Peer address="127.0.0.1"/></Peers>
@@ -19,16 +20,19 @@ CYCLONE = """<CycloneDDS><Domain><General><Interfaces>
 
 
 def drive(read, write) -> None:
-    """Reads a scan, commands for a while, reads another."""
-    before = read()
-    end = time.monotonic() + DRIVE_S
-    while time.monotonic() < end:
+    """Reads a scan, and commands after each one until what is ahead is nearer, or time is up."""
+    ranges = read()
+    before = after = ahead(ranges)
+    end = time.monotonic() + PATIENCE_S
+    while after > before - NEARER_M and time.monotonic() < end:
         write()
-        time.sleep(0.05)
-        after = read()
-    middle = len(before) // 2
-    seen = [min(r, 99.0) for r in (before[middle], after[middle])]
-    print(json.dumps({"beams": len(before), "ahead": seen}))
+        after = ahead(read())
+    print(json.dumps({"beams": len(ranges), "ahead": [before, after]}))
+
+
+def ahead(ranges) -> float:
+    """The range of the middle beam [m]."""
+    return min(ranges[len(ranges) // 2], FAR_M)
 
 
 def rosless(domain: int) -> None:
@@ -38,9 +42,6 @@ def rosless(domain: int) -> None:
         library.subscribe("/scan", domain=domain, wait=PATIENCE_S) as scans,
         library.advertise("/cmd_vel", "geometry_msgs/msg/Twist", domain=domain) as commands,
     ):
-        end = time.monotonic() + PATIENCE_S
-        while commands.subscriber_count < 1 and time.monotonic() < end:
-            time.sleep(0.05)
         drive(
             lambda: scans.read(timeout=PATIENCE_S).ranges,
             lambda: commands.send({"linear": {"x": SPEED}}),
@@ -63,12 +64,10 @@ def cyclonedds(domain: int) -> None:
     writer = DataWriter(participant, Topic(participant, "rt/cmd_vel", Twist), reliable)
 
     def read():
-        end = time.monotonic() + PATIENCE_S
-        while time.monotonic() < end:
-            if taken := reader.take(1):
-                return taken[-1].ranges
-            time.sleep(0.01)
-        raise SystemExit("no scan")
+        scan = next(reader.take_iter(timeout=duration(seconds=PATIENCE_S)), None)
+        if scan is None:
+            raise SystemExit("no scan")
+        return scan.ranges
 
     forwards = Twist(Vector3(SPEED, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
     drive(read, lambda: writer.write(forwards))

@@ -64,52 +64,52 @@ def test_the_shares_hold_both_policies():
     assert {file.name for file in Path(FOLDER).iterdir()} == {"policy.xml", "recording.xml"}
 
 
+@pytest.fixture(scope="module")
+def graph(launch, meet, module_domain_id, tmp_path_factory):
+    """Asks the graph of a running stack what a node does."""
+    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+    started = [launch(node, module_domain_id) for node in NODES]
+    out = str(tmp_path_factory.mktemp("drive") / "drive.npz")
+    options = {"robot": "ackermann", "out": out}
+    alone = launch("record_node", module_domain_id, "recording", model="", **options)
+    peer = meet(module_domain_id)
+    look = peer.node
+
+    def does(node, space="/"):
+        asked = {
+            "publish": look.get_publisher_names_and_types_by_node,
+            "subscribe": look.get_subscriber_names_and_types_by_node,
+            "reply": look.get_service_names_and_types_by_node,
+            "request": look.get_client_names_and_types_by_node,
+        }
+        prefix = space.rstrip("/")
+        return {
+            (what, name.removeprefix(prefix))
+            for what, ask in asked.items()
+            for name, _ in ask(node, space)
+        }
+
+    def complete():
+        there = look.get_node_names()
+        return set(NODES) <= set(there) and all(
+            end in does(node)
+            for node, end in (
+                ("simulator_node", ("reply", "/simulator_node/pause")),
+                ("middleware_node", ("publish", "/odometry/filtered")),
+                ("policy_node", ("subscribe", "/odom")),
+                ("command_gate", ("reply", "/command_gate/e_stop")),
+            )
+        )
+
+    peer.until(complete, "all nodes")
+    yield does, peer
+    for process in started:
+        process.check()
+    del alone
+
+
 @pytest.mark.ros
 class TestWhatTheNodesDo:
-    @staticmethod
-    @pytest.fixture(scope="class")
-    def graph(launch, meet, module_domain_id, tmp_path_factory):
-        """Asks the graph of a running stack what a node does."""
-        pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-        started = [launch(node, module_domain_id) for node in NODES]
-        out = str(tmp_path_factory.mktemp("drive") / "drive.npz")
-        options = {"robot": "ackermann", "out": out}
-        alone = launch("record_node", module_domain_id, "recording", model="", **options)
-        peer = meet(module_domain_id)
-        look = peer.node
-
-        def does(node, space="/"):
-            asked = {
-                "publish": look.get_publisher_names_and_types_by_node,
-                "subscribe": look.get_subscriber_names_and_types_by_node,
-                "reply": look.get_service_names_and_types_by_node,
-                "request": look.get_client_names_and_types_by_node,
-            }
-            prefix = space.rstrip("/")
-            return {
-                (what, name.removeprefix(prefix))
-                for what, ask in asked.items()
-                for name, _ in ask(node, space)
-            }
-
-        def complete():
-            there = look.get_node_names()
-            return set(NODES) <= set(there) and all(
-                end in does(node)
-                for node, end in (
-                    ("simulator_node", ("reply", "/simulator_node/pause")),
-                    ("middleware_node", ("publish", "/odometry/filtered")),
-                    ("policy_node", ("subscribe", "/odom")),
-                    ("command_gate", ("reply", "/command_gate/e_stop")),
-                )
-            )
-
-        peer.until(complete, "all nodes")
-        yield does, peer
-        for process in started:
-            process.check()
-        del alone
-
     @pytest.mark.parametrize("node", NODES)
     def test_every_node_may_do_what_it_does_and_nothing_else(self, graph, node):
         does, peer = graph

@@ -1,0 +1,127 @@
+"""Whatever takes a place in the file system takes it as a Path and as plain text."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge.config import load_yaml, read_text, share_folder
+from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.generator import (
+    TABLE_FILE,
+    builtin_model,
+    check_place,
+    load_model,
+    open_model,
+    save_model,
+)
+from nics_drl_bridge.kinematics.csv_reader import load_csv_folder
+from nics_drl_bridge.kinematics.drive_file import check_out, write_drive
+from nics_drl_bridge.kinematics.readers import read_recording
+from nics_drl_bridge.kinematics.recording import load_npz, save_recording
+from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
+from nics_drl_bridge.kinematics.textbook import record
+from nics_drl_bridge.kinematics.topic_roles import topic_roles
+from nics_drl_bridge.lidar.maps import load_map
+from nics_drl_bridge.lidar.sensor_models import load_sensor_models
+from nics_drl_bridge.lidar.shapes import load_shapes
+from nics_drl_bridge.lidar.spec import load_lidar
+from nics_drl_bridge.lidar.table import LidarTable
+from nics_drl_bridge.middleware.playback import Estimate, write_estimate
+from nics_drl_bridge.policy.policy_file import load_policy, shipped
+from nics_drl_bridge.policy.training_settings import load_training
+from nics_drl_bridge.report.doctor_facts import facts_of_bag
+from nics_drl_bridge.safety.black_box import replay
+from nics_drl_bridge.safety.limits import load_limits
+from nics_drl_bridge.sim.randomisation import load_randomisation
+from nics_drl_bridge.sim.world import load_world
+
+CAR = load_robot("ackermann")
+CONFIG = share_folder() / "config"
+KINDS = pytest.mark.parametrize("kind", [str, lambda path: path], ids=["text", "path"])
+
+
+@KINDS
+def test_a_model_is_saved_and_opened_at_either(tmp_path, kind):
+    place, model = kind(tmp_path / "model"), builtin_model("ackermann")
+    check_place(place)
+    save_model(model, place)
+    assert load_model(place).fingerprint == open_model(place).fingerprint == model.fingerprint
+    assert LidarTable.load(kind(tmp_path / "model" / TABLE_FILE)).density == model.table.density
+
+
+@KINDS
+@pytest.mark.parametrize("name", ["drive.npz", "drive"])
+def test_a_drive_is_written_and_read_at_either(tmp_path, kind, name):
+    if not name.endswith(".npz"):
+        pytest.importorskip("rosbags")
+    place, drive = kind(tmp_path / name), record(CAR, np.random.default_rng(0), duration=20.0)
+    assert check_out(place) == tmp_path / name
+    write_drive(drive, place, CAR)
+    assert len(read_recording(place, CAR).pose.t) == len(drive.pose.t)
+
+
+@KINDS
+def test_a_recording_is_saved_and_loaded_at_either(tmp_path, kind):
+    place, drive = kind(tmp_path / "drive.npz"), record(CAR, np.random.default_rng(0), duration=5.0)
+    save_recording(drive, place)
+    assert np.array_equal(load_npz(place).pose.values, drive.pose.values)
+
+
+@KINDS
+def test_a_bag_is_saved_told_and_looked_through_at_either(tmp_path, kind):
+    pytest.importorskip("rosbags")
+    from nics_drl_bridge.kinematics.bag_file import is_bag
+    from nics_drl_bridge.kinematics.bag_info import bag_info
+    from nics_drl_bridge.kinematics.bag_salvage import salvage
+    from nics_drl_bridge.kinematics.bag_writer import write_bag
+
+    place, rest = kind(tmp_path / "drive"), kind(tmp_path / "rest")
+    write_bag(record(CAR, np.random.default_rng(0), duration=5.0), place, CAR)
+    salvage(place, rest)
+    assert is_bag(rest)
+    assert bag_info(rest).messages == bag_info(place).messages
+    assert facts_of_bag(place).topics.keys() == facts_of_bag(rest).topics.keys()
+
+
+@KINDS
+@pytest.mark.parametrize("name", ["estimate.npz", "estimate.csv"])
+def test_an_estimate_is_written_to_either(tmp_path, kind, name):
+    none = np.zeros((0, 3))
+    made = Estimate(np.zeros(0, np.int64), none, none, np.zeros((0, 3, 3)), {})
+    write_estimate(made, kind(tmp_path / name))
+    assert (tmp_path / name).is_file()
+
+
+@KINDS
+@pytest.mark.parametrize(
+    ("load", "file"),
+    [
+        (load_robot, "robots/ackermann.yaml"),
+        (load_lidar, "lidars/paper.yaml"),
+        (load_world, "worlds/arena.yaml"),
+        (load_map, "maps/room.yaml"),
+        (load_randomisation, "randomisation/mild.yaml"),
+        (load_training, "training/navigation_differential.yaml"),
+        (lambda name: load_limits(name, CAR), "limits/ackermann.yaml"),
+        (lambda name: load_yaml(name, RobotSpec), "robots/ackermann.yaml"),
+        (read_text, "robots/ackermann.yaml"),
+    ],
+)
+def test_a_configuration_is_loaded_from_either(kind, load, file):
+    assert load(kind(CONFIG / file))
+
+
+@KINDS
+def test_a_policy_is_loaded_from_either(kind):
+    file = next(shipped().glob("*.onnx"))
+    assert load_policy(kind(file)).path == file
+
+
+@KINDS
+@pytest.mark.parametrize(
+    "load", [load_csv_folder, load_npz, load_sensor_models, load_shapes, replay, topic_roles]
+)
+def test_what_is_not_there_is_one_sentence_for_either(tmp_path, kind, load):
+    with pytest.raises(BridgeError, match=r"gone: no such f"):
+        load(kind(tmp_path / "gone"))
