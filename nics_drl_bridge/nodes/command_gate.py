@@ -57,8 +57,8 @@ class CommandGate(QosWatch):
         self._log = GateLog(parameters, self.get_logger())
         if not self._config.e_stop_required:
             self.get_logger().warning(
-                "e_stop_required is false: silence of e_stop does not stop the robot. That is for "
-                "simulations; set it on a vehicle."
+                "e_stop_required is false: an e_stop that was never heard does not stop the robot. "
+                "That is for simulations; set it on a vehicle."
             )
         self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
         self._listen()
