@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.kinematics.spec import RobotSpec
@@ -243,7 +244,7 @@ def load_npz(path: Path) -> Recording:
         RecordingError: no such file, not an `.npz`, damaged, or a stream is missing.
     """
     try:
-        data = path.read_bytes()
+        data = no_device(path).read_bytes()
         sealed, arrays = is_sealed(data), npz_arrays(data, seal_needed=False)
         meta = json.loads(str(arrays["meta"]))
         if meta["format"] == FORMAT and not sealed:
@@ -260,7 +261,7 @@ def load_npz(path: Path) -> Recording:
         return Recording(**streams, source=str(path), variables=tuple(meta["variables"]))
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
-    except (AttributeError, KeyError, TypeError) as error:
+    except (AttributeError, KeyError, RecursionError, TypeError) as error:
         raise RecordingError(
             f"{path}: is not a recording of this package ({error}); write it with "
             "nics_drl_bridge.kinematics.recording.save_recording."
