@@ -19,6 +19,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.kinematics.latency import Latency
 from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.npz import is_sealed, npz_arrays, npz_bytes
 
@@ -70,6 +71,7 @@ class Recording:
             where it was recorded beside a pose of its own.
         source: where it came from, for reports and errors.
         variables: names of X = [state, command] of the robot that drove, where known.
+        latency: of its scan and odometry, where the recording shows it.
     """
 
     command: Stream
@@ -80,6 +82,7 @@ class Recording:
     odometry: Stream | None = None
     source: str = "recording"
     variables: tuple[str, ...] = ()
+    latency: Latency = field(default_factory=Latency)
 
     @property
     def streams(self) -> dict[str, Stream]:
@@ -234,6 +237,8 @@ def save_recording(recording: Recording, path: Path) -> None:
         "clocks": clocks,
         "variables": recording.variables,
     }
+    if recording.latency.measured:
+        meta["latency"] = recording.latency.model_dump(mode="json")
     write_bytes(path, npz_bytes({"meta": np.array(json.dumps(meta)), **arrays}))
 
 
@@ -258,7 +263,10 @@ def load_npz(path: Path) -> Recording:
             name: Stream(arrays[f"{name}_t"].astype(float), arrays[name].astype(float), clock)
             for name, clock in meta["clocks"].items()
         }
-        return Recording(**streams, source=str(path), variables=tuple(meta["variables"]))
+        latency = Latency.model_validate(meta.get("latency", {}))
+        return Recording(
+            **streams, source=str(path), variables=tuple(meta["variables"]), latency=latency
+        )
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
     except (AttributeError, KeyError, RecursionError, TypeError) as error:
