@@ -51,8 +51,8 @@ setup: $(READY) ## build .venv: the package (editable) and all that tests and de
 $(READY): $(DESCRIBED_BY)
 	@if [ -z "$(BASE)" ]; then \
 		echo "make setup: $(PYTHON) does not run here; $(OTHER_PYTHON)." >&2; exit 1; fi
-	@case "$(VERSION)" in 3.10|3.11|3.12|3.13) ;; *) \
-		echo "make setup: $(PYTHON) is Python $(VERSION), but 3.10 to 3.13 is needed;" \
+	@case "$(VERSION)" in 3.10|3.11|3.12|3.13|3.14) ;; *) \
+		echo "make setup: $(PYTHON) is Python $(VERSION), but 3.10 to 3.14 is needed;" \
 			"$(OTHER_PYTHON)." >&2; exit 1;; esac
 	@if ! $(BASE) -c 'import ensurepip, venv' 2>/dev/null; then \
 		echo "make setup: $(BASE) has no venv module; install it (Debian, Ubuntu: apt install" \
