@@ -206,6 +206,16 @@ def test_a_topic_that_falls_silent_stops_the_robot_until_it_speaks_again(robot, 
     robot.gets(*robot.wish)
 
 
+def test_another_publisher_of_commands_is_told_of_as_long_as_it_is_there(robot):
+    robot.drives()
+    other = robot.peer.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
+    robot.peer.until(
+        lambda: "others publish on cmd_vel, too (1)" in robot.diagnosed()[""], "the warning"
+    )
+    robot.peer.node.destroy_publisher(other)
+    robot.peer.until(lambda: "others publish" not in robot.diagnosed()[""], "its end")
+
+
 def test_an_e_stop_that_falls_silent_stops_the_robot_by_default_and_stays(robot):
     robot.drives()
     robot.silent = {"e_stop"}
