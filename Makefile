@@ -41,7 +41,7 @@ DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Ma
 
 OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
 
-.PHONY: help setup demo test test-jazzy test-ray test-messages ros-status lint format types pytest benchmark clean distclean
+.PHONY: help setup demo test test-jazzy test-ray test-messages test-clients ros-status lint format types pytest benchmark clean distclean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 12
@@ -51,8 +51,8 @@ setup: $(READY) ## build .venv: the package (editable) and all that tests and de
 $(READY): $(DESCRIBED_BY)
 	@if [ -z "$(BASE)" ]; then \
 		echo "make setup: $(PYTHON) does not run here; $(OTHER_PYTHON)." >&2; exit 1; fi
-	@case "$(VERSION)" in 3.10|3.11|3.12|3.13) ;; *) \
-		echo "make setup: $(PYTHON) is Python $(VERSION), but 3.10 to 3.13 is needed;" \
+	@case "$(VERSION)" in 3.10|3.11|3.12|3.13|3.14) ;; *) \
+		echo "make setup: $(PYTHON) is Python $(VERSION), but 3.10 to 3.14 is needed;" \
 			"$(OTHER_PYTHON)." >&2; exit 1;; esac
 	@if ! $(BASE) -c 'import ensurepip, venv' 2>/dev/null; then \
 		echo "make setup: $(BASE) has no venv module; install it (Debian, Ubuntu: apt install" \
@@ -165,6 +165,21 @@ $(MESSAGES)/.ready: test/build_messages.sh $(wildcard test/messages/*/msg/*.msg)
 	@$(CLEAN_ENV) test/build_messages.sh $(BASE) $(MESSAGES) constraints.txt
 	@touch $@
 
+# Clients that speak DDS without ROS 2, apart from the wheels, whose libraries they must not load.
+CLIENTS := .venv-clients
+CLIENT_LIBRARIES := cyclonedds==11.0.1 rosless==0.5.0 roswell==0.1.0
+
+test-clients: setup $(CLIENTS)/.ready ## clients of other make read a simulator and drive it
+	$(CLEAN_ENV) OTHER_CLIENTS_PYTHON=$(CLIENTS)/bin/python \
+		$(BIN)/python -m pytest test/nodes/test_other_clients.py $(PYTEST_ARGS)
+
+$(CLIENTS)/.ready: Makefile
+	@echo "Building $(CLIENTS) with Python $(VERSION)."
+	@test -x $(CLIENTS)/bin/python || $(CLEAN_ENV) $(BASE) -m venv $(CLIENTS)
+	@$(CLEAN_ENV) PIP_DISABLE_PIP_VERSION_CHECK=1 \
+		$(CLIENTS)/bin/python -m pip install -qq $(CLIENT_LIBRARIES)
+	@touch $@
+
 benchmark: setup ## run every benchmark and print its table
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python "$$script"; done
 
@@ -173,4 +188,4 @@ clean: ## remove what building and testing left behind
 	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +
 
 distclean: clean ## the same, and all environments (.venv and those of test-...) and runs/
-	rm -rf $(VENV) $(JAZZY) $(RAY) $(MESSAGES) runs
+	rm -rf $(VENV) $(JAZZY) $(RAY) $(MESSAGES) $(CLIENTS) runs

@@ -100,7 +100,7 @@ setup(
     maintainer=text_of("maintainer"),
     maintainer_email=MANIFEST.find("maintainer").get("email"),
     license=text_of("license"),
-    python_requires=">=3.10,<3.14",
+    python_requires=">=3.10,<3.15",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={PACKAGE: ["py.typed"]},
     data_files=data_files(),

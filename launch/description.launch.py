@@ -19,6 +19,8 @@ RVIZ = PathJoinSubstitution([SHARE, "config", "rviz", "bridge.rviz"])
 INSTALLED = str("robot_state_publisher" in get_packages_with_prefixes()).lower()
 # RViz names topics absolutely; here they are those of the robot's namespace.
 TOPICS = ["scan", "odom", "odometry/filtered", "ground_truth", "goal_pose", "robot_description"]
+# A robot in a namespace has transforms of its own there, as Nav2 does it.
+TF = [("/tf", "tf"), ("/tf_static", "tf_static")]
 
 
 def generate_launch_description():
@@ -41,6 +43,7 @@ def generate_launch_description():
                 name="robot_state_publisher",
                 namespace=namespace,
                 parameters=[{"use_sim_time": use_sim_time, "robot_description": urdf}],
+                remappings=TF,
                 arguments=logging,
                 output="screen",
                 condition=IfCondition(LaunchConfiguration("use_robot_state_pub")),
@@ -51,7 +54,7 @@ def generate_launch_description():
                 name="rviz2",
                 namespace=namespace,
                 parameters=[{"use_sim_time": use_sim_time}],
-                remappings=[(f"/{topic}", topic) for topic in TOPICS],
+                remappings=[*TF, *((f"/{topic}", topic) for topic in TOPICS)],
                 arguments=["-d", LaunchConfiguration("rviz_config"), *logging],
                 output="screen",
                 condition=IfCondition(LaunchConfiguration("use_rviz")),

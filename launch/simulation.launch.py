@@ -46,6 +46,7 @@ def generate_launch_description():
                 name=[value("simulator"), "_node"],
                 namespace=value("namespace"),
                 parameters=[value("params_file")],
+                remappings=[("/tf", "tf"), ("/tf_static", "tf_static")],
                 arguments=["--ros-args", "--log-level", value("log_level")],
                 output="screen",
             ),

@@ -220,13 +220,22 @@ def _inner_models(annotation: Any) -> list[type[BaseModel]]:
     ]
 
 
+def no_device(path: Path) -> Path:
+    """The path itself, unless what lies there is a device or a pipe: reading it may never end.
+
+    Raises:
+        ConfigError: it is one.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise ConfigError(f"{path}: is a device or a pipe, not a file; copy it to one.")
+    return path
+
+
 def read_text(path: str | Path) -> str:
     """Reads a UTF-8 file, with one sentence when that fails."""
     path = Path(path)
     try:
-        if path.exists() and not (path.is_file() or path.is_dir()):
-            raise ConfigError(f"{path}: is a device or a pipe, not a file; copy it to one.")
-        return path.read_text(encoding="utf-8")
+        return no_device(path).read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; check the path.") from None
     except IsADirectoryError:

@@ -19,6 +19,7 @@ from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, val
 from nics_drl_bridge.errors import ConfigError, ModelError
 from nics_drl_bridge.files import check_folder, sha256, whole_folder, write_bytes, write_text
 from nics_drl_bridge.kinematics import fit, textbook
+from nics_drl_bridge.kinematics.latency import Latency
 from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
@@ -59,6 +60,7 @@ class SimulatorModel:
         noise: of sensors and motion, see `Noise`.
         control_period: time between commands [s]; a whole number of `kinematics.dt`.
         report: how the model came about, as text for people.
+        latency: of scan and odometry, where the recording showed it.
     """
 
     robot: RobotSpec
@@ -69,6 +71,7 @@ class SimulatorModel:
     noise: Noise = field(default_factory=Noise)
     control_period: float = CONTROL_PERIOD_S
     report: str = ""
+    latency: Latency = field(default_factory=Latency)
 
     def __post_init__(self) -> None:
         if self.kinematics.variables != self.robot.variable_names:
@@ -99,6 +102,9 @@ class SimulatorModel:
     def text(self) -> str:
         """The content of `model.yaml`."""
         table = self.table.dump()
+        measured = (
+            {"latency": self.latency.model_dump(mode="json")} if self.latency.measured else {}
+        )
         return dump_yaml(
             {
                 "format": FORMAT,
@@ -108,6 +114,7 @@ class SimulatorModel:
                 "calibration": self.calibration.to_dict(),
                 "lidar": self.lidar.model_dump(mode="json"),
                 "noise": self.noise.model_dump(mode="json"),
+                **measured,
                 "lidar_table_sha256": sha256(table),
             }
         )
@@ -128,6 +135,7 @@ class _File(Schema):
     calibration: dict[str, Any]
     lidar: LidarSpec
     noise: Noise
+    latency: Latency = Field(default_factory=Latency)
     lidar_table_sha256: str
     report_sha256: str
     sha256: str | None = None
@@ -167,7 +175,7 @@ def generate(
     model = SimulatorModel(
         robot, identified.model, identified.calibration, lidar, table,
         identified.noise,
-        report=fit_report(recording.source, robot, identified),
+        report=fit_report(recording.source, robot, identified), latency=recording.latency,
     )  # fmt: skip
     return model, identified
 
@@ -262,6 +270,7 @@ def load_model(folder: str | Path) -> SimulatorModel:
             file.noise,
             file.control_period,
             report,
+            file.latency,
         )
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from None

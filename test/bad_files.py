@@ -20,6 +20,11 @@ def _loop(path: Path) -> None:
     path.symlink_to(path)
 
 
+def _pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
 def _nothing(path: Path) -> None:
     path.unlink()
     path.symlink_to(os.devnull)
@@ -34,6 +39,7 @@ FILES: dict[str, Callable[[Path], object]] = {
     "a folder": _folder,
     "a loop of links": _loop,
     "the null device": _nothing,
+    "a pipe": _pipe,
     "empty": _text(lambda _: b""),
     "zeros": _text(lambda whole: bytes(len(whole))),
     "noise": _text(lambda whole: bytes(range(256)) * 8),

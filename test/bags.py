@@ -85,6 +85,14 @@ def odometry(t: float | None, *place: float) -> Any:
     return new(kinds.ODOMETRY, header(t, "odom"), "base_link", inner, speed)
 
 
+def scan(t: float | None, beams: int = 4, time_increment: float = 0.0) -> Any:
+    ranges = np.ones(beams, np.float32)
+    return new(
+        "sensor_msgs/LaserScan", header(t, "laser"), -1.0, 1.0, 2.0 / (beams - 1),
+        time_increment, 0.1, 0.05, 3.0, ranges, np.zeros(0, np.float32),
+    )  # fmt: skip
+
+
 def transform(
     t: float | None, place: Iterable[float], frame: str = "world", child: str = "car"
 ) -> Any:

@@ -10,10 +10,12 @@ from bad_files import FILES, TEXTS, VALUES
 
 from nics_drl_bridge.config import MAX_BYTES, share_folder
 from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.kinematics.recording import load_npz
 from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.kinematics.topic_roles import topic_roles
 from nics_drl_bridge.lidar.maps import load_map
 from nics_drl_bridge.lidar.spec import load_lidar
+from nics_drl_bridge.lidar.table import LidarTable
 from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.safety.black_box import replay
@@ -34,6 +36,8 @@ OTHERS = {
     "policy.onnx": load_policy,
     "stop.jsonl": replay,
     "topics.yaml": topic_roles,
+    "drive.npz": load_npz,
+    "table.npz": LidarTable.load,
 }
 
 
@@ -108,3 +112,9 @@ def test_a_byte_order_mark_and_the_line_ends_of_windows_change_nothing(copy, beg
     wanted = load_lidar(str(path))
     path.write_bytes(begin + path.read_bytes().replace(b"\n", b"\r\n"))
     assert load_lidar(str(path)) == wanted
+
+
+def test_a_black_box_of_endless_brackets_is_refused(tmp_path):
+    path = tmp_path / "stop.jsonl"
+    path.write_text("[" * 100_000)
+    refused(replay, path)

@@ -73,3 +73,10 @@ def test_generate_takes_what_is_intact_when_told_to(damaged, tmp_path):
     assert told.returncode == 0, told.stderr
     assert "are lost" in told.stderr
     assert (tmp_path / "model" / "model.yaml").is_file()
+
+
+def test_what_a_salvaged_bag_lacks_is_said_of_the_users_own(tmp_path):
+    bag = bags.write(tmp_path / "drive", {"/cmd_vel": bags.commands()})
+    told = nics("generate", bag, "--salvage", "--out", tmp_path / "model")
+    assert told.returncode == 2
+    assert told.stderr.splitlines()[-1].startswith(f"nics: {bag}: ")

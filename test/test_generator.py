@@ -23,6 +23,7 @@ from nics_drl_bridge.generator import (
     open_model,
     save_model,
 )
+from nics_drl_bridge.kinematics.latency import Delay, Latency
 from nics_drl_bridge.sim.simulator import FastSimulator
 
 ROBOTS = ("ackermann", "differential", "mecanum")
@@ -68,6 +69,16 @@ def test_a_saved_model_is_the_same_to_the_bit(robot, tmp_path):
 
 def one_radius(model):
     return [circles(2, (model.table.shapes[0].radius,))]
+
+
+def test_a_measured_latency_is_kept_and_one_that_nothing_showed_leaves_no_trace(tmp_path):
+    model = builtin_model("ackermann")
+    late = replace(model, latency=Latency(scan=Delay(least=0.012, jitter=0.01)))
+    save_model(late, tmp_path / "model")
+    assert load_model(tmp_path / "model").latency == late.latency
+    assert "latency:" in (tmp_path / "model" / MODEL_FILE).read_text()
+    assert "\nlatency:" not in model.text
+    assert late.fingerprint != model.fingerprint
 
 
 def test_saving_twice_gives_the_same_bytes(saved, tmp_path):

@@ -59,6 +59,13 @@ def test_arguments_reach_every_node() -> None:
     assert nodes["rviz2"]["remappings"]["/scan"] == "scan"
 
 
+def test_the_transforms_of_a_robot_stay_in_its_namespace() -> None:
+    nodes = Launched(values={"use_rviz": "true"}).run("simulation.launch.py").nodes
+    for name in ("simulator_node", "robot_state_publisher", "rviz2"):
+        remapped = nodes[name]["remappings"]
+        assert (remapped["/tf"], remapped["/tf_static"]) == ("tf", "tf_static")
+
+
 def test_without_robot_state_publisher_the_rest_starts_all_the_same() -> None:
     assert Launched(installed=()).run("vehicle.launch.py").nodes.keys() == BRIDGE
 

@@ -56,10 +56,17 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
         "Noise that the simulator and the estimator use (standard deviations):",
         *(f"  {line}" for line in identified.noise.sentences()),
         "",
+        *_latency(identified),
         "Found, and not learnt:",
         *(_item(note) for note in identified.notes or ("Nothing had to be corrected.",)),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _latency(identified: Identified) -> list[str]:
+    lines = identified.recording.latency.sentences()
+    head = "Latency of the device, which simulator_node has too:"
+    return [head, *(f"  {line}" for line in lines), ""] if lines else []
 
 
 def equations_with_errors(model: TaylorModel) -> list[str]:

@@ -7,6 +7,7 @@ from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from inspect import Parameter, signature
 from pathlib import Path
+from traceback import extract_tb
 from typing import Any
 
 import numpy as np
@@ -109,7 +110,7 @@ def _class_of(name: str) -> type[Task]:
             hint = nearest(name, TASKS)
             raise ConfigError(f"unknown task {name!r}; {hint} Or give path/to/file.py:ClassName.")
         return _class_of(TASKS[name])
-    module = _load(Path(path)) if path.endswith(".py") else import_module(path)
+    module = _load(Path(path)) if path.endswith(".py") else _import(path)
     found = getattr(module, attribute, None)
     if not (isinstance(found, type) and issubclass(found, Task)):
         tasks = [n for n, v in vars(module).items() if isinstance(v, type) and _own(v, module)]
@@ -121,8 +122,21 @@ def _own(found: type, module: Any) -> bool:
     return issubclass(found, Task) and found.__module__ == module.__name__
 
 
+def _import(name: str) -> Any:
+    try:
+        return import_module(name)
+    except (ImportError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"task {name!r}: can't be imported ({error}); give path/to/file.py:ClassName."
+        ) from None
+
+
 def _load(path: Path) -> Any:
-    """The module of a file, loaded anew only when the file has changed."""
+    """The module of a file, loaded anew only when the file has changed.
+
+    Raises:
+        ConfigError: it is missing, or is no Python that runs; the line is named.
+    """
     if not path.is_file():
         raise ConfigError(f"task {str(path)!r}: no such file; give path/to/file.py:ClassName.")
     digest = sha256(str(path.resolve()).encode() + path.read_bytes())[:16]
@@ -135,7 +149,19 @@ def _load(path: Path) -> Any:
     module = sys.modules[name] = module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except BaseException:
+    except BaseException as error:
         del sys.modules[name]
-        raise
+        if not isinstance(error, Exception):
+            raise
+        raise ConfigError(_unfit(path, error)) from error
     return module
+
+
+def _unfit(path: Path, error: Exception) -> str:
+    """Why a user's file can't be imported, and at which of its lines."""
+    frames = extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if Path(frame.filename) == path.absolute()]
+    line = error.lineno if isinstance(error, SyntaxError) else (lines or [None])[-1]
+    place = f"{path}, line {line}" if line else str(path)
+    reason = " ".join(str(error).split())
+    return f"task {place}: can't be imported ({type(error).__name__}: {reason}); mend the file."

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import BridgeError, RecordingError
 from nics_drl_bridge.kinematics.bag_messages import typestore
 from nics_drl_bridge.kinematics.bag_qos import Offer, offers_of
@@ -80,6 +81,8 @@ def opened(path: str | Path) -> Iterator[BagFile]:
     try:
         place = _place(path)
         _check_name(place)
+        for file in (place, *(place.iterdir() if place.is_dir() else ())):
+            no_device(file)
         with Reader(place) as reader:
             for storage in _storages(reader):
                 _check_storage(path, Path(str(storage.path)))

@@ -12,6 +12,7 @@ import numpy as np
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.kinematics import topic_roles
 from nics_drl_bridge.kinematics.bag_file import BagFile, Message, opened
+from nics_drl_bridge.kinematics.bag_latency import latency_of
 from nics_drl_bridge.kinematics.bag_messages import (
     Row,
     command_row,
@@ -59,8 +60,10 @@ def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recordin
             data |= _joints(bag, topics["joint_states"], spec, mapping)
         if "imu" in topics:
             data["imu"] = _table(bag, topics["imu"], bag.messages(topics["imu"]), imu_row)
+        latency = latency_of(bag, topics.get("odom"))
     made = streams(data, mapping.stamps, str(path))
-    return check(Recording(**made, source=str(path), variables=spec.variable_names), spec)
+    recording = Recording(**made, source=str(path), variables=spec.variable_names, latency=latency)
+    return check(recording, spec)
 
 
 def _table(

@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from nics_drl_bridge.config import parse_yaml
+from nics_drl_bridge.config import no_device, parse_yaml
 from nics_drl_bridge.errors import BridgeError, RecordingError
 from nics_drl_bridge.kinematics.bag_file import COMPRESSED, DATABASE, METADATA, is_storage
 from nics_drl_bridge.kinematics.bag_messages import typestore
@@ -112,7 +112,11 @@ def salvaged(path: Path, wanted: bool) -> Iterator[tuple[Path, tuple[str, ...]]]
         return
     with TemporaryDirectory() as folder:
         out = Path(folder) / "salvaged"
-        yield out, salvage(path, out).lines()
+        lines = salvage(path, out).lines()
+        try:
+            yield out, lines
+        except RecordingError as error:  # it names the copy, of which the user knows nothing
+            raise RecordingError(str(error).replace(str(out), str(path))) from None
 
 
 def _files(path: Path) -> list[Path]:
@@ -184,7 +188,7 @@ def _promised(path: Path) -> dict[str, int] | None:
     """How many messages of each topic there were by the bag's metadata, if they can be read."""
     file = (path if path.is_dir() else path.parent) / METADATA
     try:
-        data: Any = parse_yaml(file.read_text(encoding="utf-8"), str(file))
+        data: Any = parse_yaml(no_device(file).read_text(encoding="utf-8"), str(file))
         topics = data["rosbag2_bagfile_information"]["topics_with_message_count"]
         return {t["topic_metadata"]["name"]: int(t["message_count"]) for t in topics}
     except (BridgeError, OSError, ValueError, TypeError, KeyError):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.kinematics.recording import SLOWEST_SAMPLING_S, Recording, Stream
 
@@ -68,7 +69,7 @@ def _read(path: Path) -> Array:
     """The numbers of a file, checked row by row; time is the last column."""
     columns = COLUMNS[path.name]
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with no_device(path).open(newline="", encoding="utf-8") as file:
             rows = [(line, row) for line, row in enumerate(csv.reader(file), 1) if row]
     except UnicodeDecodeError:
         raise RecordingError(

@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.kinematics.latency import Latency
 from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.npz import is_sealed, npz_arrays, npz_bytes
 
@@ -69,6 +71,7 @@ class Recording:
             where it was recorded beside a pose of its own.
         source: where it came from, for reports and errors.
         variables: names of X = [state, command] of the robot that drove, where known.
+        latency: of its scan and odometry, where the recording shows it.
     """
 
     command: Stream
@@ -79,6 +82,7 @@ class Recording:
     odometry: Stream | None = None
     source: str = "recording"
     variables: tuple[str, ...] = ()
+    latency: Latency = field(default_factory=Latency)
 
     @property
     def streams(self) -> dict[str, Stream]:
@@ -233,6 +237,8 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         "clocks": clocks,
         "variables": recording.variables,
     }
+    if recording.latency.measured:
+        meta["latency"] = recording.latency.model_dump(mode="json")
     write_bytes(path, npz_bytes({"meta": np.array(json.dumps(meta)), **arrays}))
 
 
@@ -243,7 +249,7 @@ def load_npz(path: str | Path) -> Recording:
         RecordingError: no such file, not an `.npz`, damaged, or a stream is missing.
     """
     try:
-        data = Path(path).read_bytes()
+        data = no_device(Path(path)).read_bytes()
         sealed, arrays = is_sealed(data), npz_arrays(data, seal_needed=False)
         meta = json.loads(str(arrays["meta"]))
         if meta["format"] == FORMAT and not sealed:
@@ -257,10 +263,13 @@ def load_npz(path: str | Path) -> Recording:
             name: Stream(arrays[f"{name}_t"].astype(float), arrays[name].astype(float), clock)
             for name, clock in meta["clocks"].items()
         }
-        return Recording(**streams, source=str(path), variables=tuple(meta["variables"]))
+        latency = Latency.model_validate(meta.get("latency", {}))
+        return Recording(
+            **streams, source=str(path), variables=tuple(meta["variables"]), latency=latency
+        )
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
-    except (AttributeError, KeyError, TypeError) as error:
+    except (AttributeError, KeyError, RecursionError, TypeError) as error:
         raise RecordingError(
             f"{path}: is not a recording of this package ({error}); write it with "
             "nics_drl_bridge.kinematics.recording.save_recording."

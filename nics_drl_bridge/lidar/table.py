@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from nics_drl_bridge.config import Schema
+from nics_drl_bridge.config import Schema, no_device
 from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.lidar.baked_kernels import (
@@ -246,7 +246,7 @@ class LidarTable:
         """
         path = Path(path)
         try:
-            path.open("rb").close()
+            no_device(path).open("rb").close()
             if checksum is not None and sha256(path.read_bytes()) != checksum:
                 raise ModelError(f"{path}: does not match its checksum; generate the model anew.")
             arrays = npz_mapped(path)

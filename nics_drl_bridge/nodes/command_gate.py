@@ -14,7 +14,7 @@ from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.diagnostics import Diagnostics
+from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
 from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.gate_parameters import declare_gate
 from nics_drl_bridge.nodes.qos_watch import QosWatch
@@ -57,14 +57,14 @@ class CommandGate(QosWatch):
         self._log = GateLog(parameters, self.get_logger())
         if not self._config.e_stop_required:
             self.get_logger().warning(
-                "e_stop_required is false: silence of e_stop does not stop the robot. That is for "
-                "simulations; set it on a vehicle."
+                "e_stop_required is false: an e_stop that was never heard does not stop the robot. "
+                "That is for simulations; set it on a vehicle."
             )
         self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
         self._listen()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD_S, lambda: self._decide(Tick()), clock=steady)
-        Diagnostics(self, "gate", lambda: self._log.finding(self._state))
+        Diagnostics(self, "gate", self._look)
 
     def _listen(self) -> None:
         self.create_subscription(LaserScan, "scan", self._on_scan, qos.SENSOR)
@@ -126,6 +126,16 @@ class CommandGate(QosWatch):
             self._out.publish(conversions.twist_to_ros(decision.twist))
         self._log.note(Entry(now, given, before, decision))
         return decision
+
+    def _look(self) -> Finding:
+        """What `/diagnostics` tells; also who else moves the robot, which no gate can prevent."""
+        found = self._log.finding(self._state)
+        others = self.count_publishers(self._out.topic_name) - 1
+        if others < 1:
+            return found
+        told = f"others publish on cmd_vel, too ({others}), and move the robot past this gate"
+        self.get_logger().warning(told, throttle_duration_sec=10.0)
+        return found._replace(message=f"{found.message}; {told}", warns=True)
 
     def stop(self) -> None:
         """Leaves a zero command behind."""

@@ -85,7 +85,7 @@ class DeviceNode(QosWatch):
         self._begin()
 
     def _open_topics(self, model: SimulatorModel) -> None:
-        self._outbox = Outbox(self._time.jitter_ns)
+        self._outbox = Outbox()
         self._clock_topic = self.create_publisher(Clock, "/clock", qos.SENSOR_RELIABLE)
         self._clock_message = Clock()
         self._transforms = Transforms(self)
@@ -265,4 +265,4 @@ class DeviceNode(QosWatch):
             if scan_due:
                 port.tell_scan(now, sensed, outbox, now_ns)
         if moving:
-            self._transforms.tell(moving, outbox, now_ns, self._time.latency_ns[1])
+            self._transforms.tell(moving, outbox, now_ns, self._time.odom_late_ns)

@@ -14,6 +14,7 @@ from rclpy.parameter import Parameter
 
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.kinematics.latency import Delay
 from nics_drl_bridge.nodes.pace import NANO, common_step
 from nics_drl_bridge.nodes.runner import declare
 
@@ -34,8 +35,9 @@ class Timing:
         step_ns: by which the world moves.
         odom_ns: between two odometries.
         scan_ns: between two scans.
-        latency_ns: by which scan, odometry are told later than they were measured.
-        jitter_ns: greatest further delay.
+        scan_late_ns: least delay from a scan's measurement until it is told, and how much more the
+            greatest is.
+        odom_late_ns: the same of odometry.
     """
 
     mode: str
@@ -43,8 +45,8 @@ class Timing:
     step_ns: int
     odom_ns: int
     scan_ns: int
-    latency_ns: tuple[int, int]
-    jitter_ns: int
+    scan_late_ns: tuple[int, int]
+    odom_late_ns: tuple[int, int]
 
     @property
     def lockstep(self) -> bool:
@@ -54,7 +56,7 @@ class Timing:
     @property
     def late(self) -> bool:
         """Whether anything is told later than it was measured."""
-        return any((*self.latency_ns, self.jitter_ns))
+        return any((*self.scan_late_ns, *self.odom_late_ns))
 
 
 @dataclass(frozen=True)
@@ -102,9 +104,12 @@ def _declare_time(node: Node) -> None:
         ("rate", 1.0, 0.01, 1000.0, "Simulated seconds per second in realtime."),
         ("odom_rate", 0.0, 0.0, 1000.0, "Of odom [Hz]; 0 for one per control period."),
         ("scan_rate", 0.0, 0.0, 1000.0, "Of scan [Hz]; 0 for the lidar's own."),
-        ("scan_latency", 0.0, 0.0, 10.0, "From the stamp of a scan to its publication [s]."),
-        ("odom_latency", 0.0, 0.0, 10.0, "From the stamp of odom to its publication [s]."),
-        ("latency_jitter", 0.0, 0.0, 10.0, "Greatest further delay of both, drawn evenly [s]."),
+        ("scan_latency", MODELS_OWN, MODELS_OWN, 10.0,
+         "From the end of a scan to its publication [s]; -1 for the measured one of the model."),
+        ("odom_latency", MODELS_OWN, MODELS_OWN, 10.0,
+         "From the stamp of odom to its publication [s]; -1 for the measured one of the model."),
+        ("latency_jitter", MODELS_OWN, MODELS_OWN, 10.0,
+         "Greatest further delay of both, drawn evenly [s]; -1 for the measured ones."),
         ("command_latency", MODELS_OWN, MODELS_OWN, 10.0,
          "From a command to its effect [s]; -1 for the measured one of the model."),
     ):  # fmt: skip
@@ -116,25 +121,32 @@ def timing(node: Node, model: SimulatorModel) -> Timing:
     mode = choice(node, "mode", MODES)
     value = {
         name: float(node.get_parameter(name).value or 0.0)
-        for name in (
-            "rate", "odom_rate", "scan_rate", "scan_latency", "odom_latency", "latency_jitter"
-        )
-    }  # fmt: skip
+        for name in ("rate", "odom_rate", "scan_rate")
+    }
     if mode == LOCKSTEP:
         period = round(model.control_period * NANO)
-        return Timing(mode, 1.0, period, period, period, (0, 0), 0)
+        return Timing(mode, 1.0, period, period, period, (0, 0), (0, 0))
     odom = 1.0 / value["odom_rate"] if value["odom_rate"] else model.control_period
     scan = 1.0 / (value["scan_rate"] or model.lidar.rate)
     dt = model.timing[0]
     step = common_step(dt, (odom, scan)) * dt
-    nanoseconds = [
-        round(seconds * NANO)
-        for seconds in (step, odom, scan, value["scan_latency"], value["odom_latency"],
-                        value["latency_jitter"])
-    ]  # fmt: skip
-    step_ns, odom_ns, scan_ns, scan_late_ns, odom_late_ns, jitter_ns = nanoseconds
-    latency = (scan_late_ns, odom_late_ns)
-    return Timing(mode, value["rate"], step_ns, odom_ns, scan_ns, latency, jitter_ns)
+    step_ns, odom_ns, scan_ns = (round(seconds * NANO) for seconds in (step, odom, scan))
+    late = [_late_ns(node, topic, model) for topic in ("scan", "odom")]
+    return Timing(mode, value["rate"], step_ns, odom_ns, scan_ns, *late)
+
+
+def _late_ns(node: Node, topic: str, model: SimulatorModel) -> tuple[int, int]:
+    """The least delay of a topic and its jitter [ns]: as asked for, else as the model has them."""
+    own = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
+    asked = (
+        float(node.get_parameter(name).value or 0.0)
+        for name in (f"{topic}_latency", "latency_jitter")
+    )
+    least, jitter = (
+        given if given >= 0.0 else measured
+        for given, measured in zip(asked, (own.least, own.jitter), strict=True)
+    )
+    return round(least * NANO), round(jitter * NANO)
 
 
 def timed_model(node: Node, model: SimulatorModel, time: Timing) -> SimulatorModel:

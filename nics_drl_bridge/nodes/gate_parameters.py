@@ -52,7 +52,7 @@ def declare_gate(node: Node) -> GateParameters:
     model = declare_model(node)
     lidar, robot = model.lidar, model.robot
     limits = get("limits", "", "Limits of the robot: a shipped file, or a YAML file; no default.")
-    needs_e_stop = "Whether silence of e_stop counts as pressed; set it on every vehicle."
+    needs_e_stop = "Whether e_stop must have been heard before arming; set it on every vehicle."
     needs_estimate = "Whether arming needs odometry/filtered."
     folder = "Where a stop's last 30 s are written; ~/.ros/black_box if empty."
     config = GateConfig(

@@ -18,21 +18,29 @@ class Outbox:
     it may use it again.
 
     Args:
-        jitter_ns: greatest further delay, drawn uniformly for each message.
-        seed: of the draws.
+        seed: of the draws of the jitter.
     """
 
-    def __init__(self, jitter_ns: int = 0, seed: int = 0) -> None:
-        self._jitter_ns, self._random = jitter_ns, np.random.default_rng(seed)
+    def __init__(self, seed: int = 0) -> None:
+        self._random = np.random.default_rng(seed)
         self._waiting: list[tuple[int, int, Publisher, bytes]] = []
         self._latest: dict[Publisher, int] = {}
         self._numbers = itertools.count()
 
-    def send(self, publisher: Publisher, message: Any, now_ns: int, latency_ns: int) -> None:
-        """Publishes a message now, or notes when to."""
-        delay = latency_ns
-        if self._jitter_ns:
-            delay += int(self._random.integers(self._jitter_ns + 1))
+    def send(
+        self, publisher: Publisher, message: Any, now_ns: int, late_ns: tuple[int, int]
+    ) -> None:
+        """Publishes a message now, or notes when to.
+
+        Args:
+            publisher: to publish with.
+            message: to publish.
+            now_ns: the present.
+            late_ns: least delay, and the greatest further one, drawn evenly for each message.
+        """
+        delay, jitter = late_ns
+        if jitter:
+            delay += int(self._random.integers(jitter + 1))
         if not delay:
             publisher.publish(message)
             return

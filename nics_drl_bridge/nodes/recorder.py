@@ -19,6 +19,7 @@ from nics_drl_bridge.kinematics.drive_file import check_out
 from nics_drl_bridge.kinematics.drive_plan import DrivePlan
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
+from nics_drl_bridge.kinematics.topic_roles import topic_roles
 from nics_drl_bridge.report.drive_picture import drive_picture
 
 NODE = "nics_drl_bridge.nodes.record_node"
@@ -111,6 +112,7 @@ def preview(order: Order) -> tuple[str, ...]:
         ConfigError: the order can't be carried out.
     """
     robot, out = load_robot(order.robot), check_out(order.out)
+    topic_roles(order.topics)  # a wrong file is told of before anybody drives
     plan = DrivePlan(robot, order.bound, order.duration, order.speed, order.seed)
     pattern = plan.preview()
     picture = out.parent / f"{out.stem}_preview.png"

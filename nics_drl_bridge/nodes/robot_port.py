@@ -78,13 +78,13 @@ class RobotPort:
 
     def tell_odometry(self, now: Time, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
         """Publishes where the robot takes itself to be, and what only a simulator knows."""
-        latency_ns = self._time.latency_ns[1]
+        late_ns = self._time.odom_late_ns
         fill_odometry(self._odom, sensed.odom, sensed.twist, now)
         self._odom.pose.covariance.reshape(6, 6)[conversions.PLANAR] = sensed.covariance
-        outbox.send(self._odoms, self._odom, now_ns, latency_ns)
+        outbox.send(self._odoms, self._odom, now_ns, late_ns)
         if self._joints.get_subscription_count():
             joints = conversions.joints_to_ros(self._model.robot, sensed.state, now_ns)
-            outbox.send(self._joints, joints, now_ns, latency_ns)
+            outbox.send(self._joints, joints, now_ns, late_ns)
         if self._truths.get_subscription_count():
             fill_odometry(self._truth, sensed.pose, sensed.true_twist, now)
             self._truths.publish(self._truth)
@@ -94,7 +94,7 @@ class RobotPort:
         message, sweep = self._scan, 0 if self._time.lockstep else self._sweep_ns
         message.header.stamp = conversions.stamp_to_ros(now_ns - sweep) if sweep else now
         message.ranges = array.array("f", to_device(sensed.ranges, self._model.lidar).tobytes())
-        outbox.send(self._scans, message, now_ns, self._time.latency_ns[0])
+        outbox.send(self._scans, message, now_ns, self._time.scan_late_ns)
 
 
 def scan_message(model: SimulatorModel, frame: str, time: Timing) -> LaserScan:

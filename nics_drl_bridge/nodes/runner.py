@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, MutableMapping, Sequence
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -27,17 +27,25 @@ from nics_drl_bridge.nodes.sole import sole
 SPIN_S = 0.1
 DELIVERY_S = 0.5
 EXIT_BAD_INPUT = 2
+OLDEST_DISTRIBUTION = "humble"
 RANGES = {
     int: (IntegerRange, "integer_range"),
     float: (FloatingPointRange, "floating_point_range"),
 }
 
 
+def stay_on_this_machine(environment: MutableMapping[str, str]) -> None:
+    """Limits discovery to this machine in an environment that does not say how far it goes."""
+    environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    if environment.get("ROS_DISTRO") == OLDEST_DISTRIBUTION:  # it knows no ranges
+        environment.setdefault("ROS_LOCALHOST_ONLY", "1")
+
+
 def open_context(args: Sequence[str] | None = None, domain_id: int | None = None) -> Context:
     """A context of one's own, with discovery on this machine unless the environment names a range.
 
-    A robot that should be seen by others sets `ROS_AUTOMATIC_DISCOVERY_RANGE`; a simulator
-    started in a lab does not move somebody's robot.
+    A robot that should be seen by others sets `ROS_AUTOMATIC_DISCOVERY_RANGE` (on Humble
+    `ROS_LOCALHOST_ONLY=0`); a simulator started in a lab does not move somebody's robot.
 
     Args:
         args: ROS arguments.
@@ -46,7 +54,7 @@ def open_context(args: Sequence[str] | None = None, domain_id: int | None = None
     Raises:
         BackendError: the arguments are wrong, or no ROS 2 middleware is there.
     """
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    stay_on_this_machine(os.environ)
     context = Context()
     try:
         context.init(None if args is None else list(args), domain_id=domain_id)

@@ -64,9 +64,13 @@ class Transforms:
             self._fixed.publish(self._kind(transforms=transforms))
 
     def tell(
-        self, transforms: list[TransformStamped], outbox: Outbox, now_ns: int, latency_ns: int
+        self,
+        transforms: list[TransformStamped],
+        outbox: Outbox,
+        now_ns: int,
+        late_ns: tuple[int, int],
     ) -> None:
         """Publishes what changes, as late as the odometry that it comes from."""
         if self.published:
             self._message.transforms = transforms
-            outbox.send(self._moving, self._message, now_ns, latency_ns)
+            outbox.send(self._moving, self._message, now_ns, late_ns)

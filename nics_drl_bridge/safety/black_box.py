@@ -132,7 +132,7 @@ def _lines(path: str | Path) -> list[dict[str, Any]]:
     text = read_text(path)
     try:
         lines = [json.loads(line) for line in text.splitlines()]
-    except json.JSONDecodeError:
+    except (json.JSONDecodeError, RecursionError):
         raise ConfigError(f"{path}: is no JSON, line by line; it can't be replayed.") from None
     if not lines or not isinstance(lines[0], dict) or lines[0].get("format") != FORMAT:
         raise ConfigError(f"{path}: is no black box of the gate ({FORMAT}).")

@@ -27,9 +27,11 @@ def e_stop_pressed(config: GateConfig, state: GateState, now: float) -> Cause | 
 
 
 def e_stop_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """Its cable may be cut."""
+    """Its cable may be cut. Where none is required, only one that was heard can fall silent."""
     heard = state.e_stop.heard_s
+    if heard is None and not config.e_stop_required:
+        return None
     old, limit = float("inf") if heard is None else now - heard, config.e_stop_silence_s
-    if not config.e_stop_required or old <= limit:
+    if old <= limit:
         return None
     return Cause("e_stop_silent", TOPIC, "its heartbeat is silent, as if pressed", old, limit)

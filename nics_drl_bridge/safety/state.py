@@ -57,7 +57,8 @@ class GateConfig:
         rate_tolerance: share by which a rate may differ from the declared one.
         clock_jump_s: a stamp this far ahead of the steady clock, or back, is a jump [s].
         gap_s: the longest time between two ticks [s].
-        e_stop_required: whether silence of the emergency stop counts as pressed.
+        e_stop_required: whether an emergency stop that was never heard counts as pressed; one that
+            was heard and falls silent always does.
         e_stop_silence_s: such a silence [s].
         estimate_required: whether arming needs an estimator that has converged.
         estimate_std: greatest standard deviation of position [m] and heading [rad] for that.

@@ -91,6 +91,31 @@ def test_a_wrong_task_gives_one_sentence(task, options, sentence):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("x = 1\nclass Own(:\n", "line 2: can't be imported (SyntaxError"),
+        ("import nowhere_to_be_found\n", "line 1: can't be imported (ModuleNotFoundError"),
+        ("x = 1\n\ny = 1 / 0\n", "line 3: can't be imported (ZeroDivisionError"),
+        ("\0", "can't be imported ("),
+    ],
+)
+def test_a_file_of_a_task_that_is_no_python_that_runs_is_told_of_with_its_line(
+    tmp_path, text, told
+):
+    (tmp_path / "own.py").write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        make_task(f"{tmp_path}/own.py:Own", direct_model())
+    assert f"task {tmp_path}/own.py" in str(caught.value)
+    assert told in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_task_of_a_module_that_is_not_there_is_one_sentence():
+    with pytest.raises(ConfigError, match="task 'nowhere': can't be imported"):
+        make_task("nowhere:Own", direct_model())
+
+
 def test_the_discrete_actions_are_the_papers_drives():
     """efc-robot/MultiVehicleEnv, basic.py: stop, then ahead and back, each straight and turning."""
     car = load_robot("ackermann")  # it can't reverse: speed from 0 to 1

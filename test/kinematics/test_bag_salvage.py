@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import re
 
 import numpy as np
@@ -185,3 +186,10 @@ def test_sentences_of_damage_name_the_place(sealed):
     with pytest.raises(RecordingError) as caught:
         bag_info(sealed)
     assert re.search(r"sealed\.mcap is damaged at byte \d+", str(caught.value))
+
+
+def test_metadata_that_are_a_pipe_are_not_waited_for(sealed, tmp_path):
+    (sealed / "metadata.yaml").unlink()
+    os.mkfifo(sealed / "metadata.yaml")
+    assert salvage(sealed, tmp_path / "kept").lost == 0
+    assert held(tmp_path / "kept") == held(sealed)

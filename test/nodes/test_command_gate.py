@@ -27,7 +27,10 @@ pytestmark = pytest.mark.ros
 SOON_S = 0.5  # what the gate is made for, on a machine with time
 LATE_S = 5.0
 PERIOD_S = 0.1
-PATIENT = {"scan_age": 1.0, "odom_age": 1.0, "command_age": 1.0, "rate_tolerance": 0.6}
+PATIENT = {
+    "scan_age": 1.0, "odom_age": 1.0, "command_age": 1.0, "rate_tolerance": 0.6,
+    "e_stop_silence": 1.0,
+}  # fmt: skip
 """This machine may be busy with other tests."""
 
 
@@ -201,6 +204,26 @@ def test_a_topic_that_falls_silent_stops_the_robot_until_it_speaks_again(robot, 
     robot.stops()
     robot.silent = set()
     robot.gets(*robot.wish)
+
+
+def test_another_publisher_of_commands_is_told_of_as_long_as_it_is_there(robot):
+    robot.drives()
+    other = robot.peer.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
+    robot.peer.until(
+        lambda: "others publish on cmd_vel, too (1)" in robot.diagnosed()[""], "the warning"
+    )
+    robot.peer.node.destroy_publisher(other)
+    robot.peer.until(lambda: "others publish" not in robot.diagnosed()[""], "its end")
+
+
+def test_an_e_stop_that_falls_silent_stops_the_robot_by_default_and_stays(robot):
+    robot.drives()
+    robot.silent = {"e_stop"}
+    robot.stops()
+    assert robot.diagnosed()[""].startswith("e_stop_silent: topic=e_stop")
+    assert robot.call("reset").success
+    assert "e_stop_silent" in robot.call("arm").message
+    robot.drives()
 
 
 def test_the_e_stop_by_topic_stops_and_a_reset_alone_does_not_move(robot):

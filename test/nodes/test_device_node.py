@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
 
@@ -12,11 +13,15 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from domains import claimed_domain
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.kinematics.latency import Delay, Latency
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.device_parameters import declare_device, timing
+from nics_drl_bridge.nodes.runner import open_context
 from nodes.peer import stamp_ns
 
 pytestmark = pytest.mark.ros
@@ -177,6 +182,32 @@ def test_a_scan_is_told_as_late_as_the_latency_says_but_stamped_when_it_was_meas
             late.append((clock - stamp) / NANO)
     assert np.median(late) >= 0.02  # the clock ticks every 20 ms
     assert stamped.odom[-1].header.frame_id == "car/odom"
+
+
+@pytest.mark.parametrize(
+    ("given", "scan_ns", "odom_ns"),
+    [
+        ({}, (12_000_000, 10_000_000), (3_000_000, 0)),
+        ({"scan_latency": 0.0, "odom_latency": 0.0, "latency_jitter": 0.0}, (0, 0), (0, 0)),
+        ({"scan_latency": 0.05}, (50_000_000, 10_000_000), (3_000_000, 0)),
+        ({"latency_jitter": 0.002}, (12_000_000, 2_000_000), (3_000_000, 2_000_000)),
+        ({"mode": "lockstep"}, (0, 0), (0, 0)),
+    ],
+)
+def test_a_device_is_as_late_as_was_measured_unless_told_otherwise_and_never_in_lockstep(
+    model, domain_id, given, scan_ns, odom_ns
+):
+    latency = Latency(scan=Delay(least=0.012, jitter=0.01), odom=Delay(least=0.003, jitter=0.0))
+    asked = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
+    context = open_context(["node", "--ros-args", *asked], domain_id)
+    try:
+        node = Node("device", context=context)
+        declare_device(node, "laser")
+        time = timing(node, replace(model, latency=latency))
+        node.destroy_node()
+    finally:
+        context.try_shutdown()
+    assert (time.scan_late_ns, time.odom_late_ns) == (scan_ns, odom_ns)
 
 
 @pytest.mark.parametrize("age_ns", [0, None], ids=["fresh", "without a stamp"])

@@ -57,7 +57,18 @@ def test_a_silent_e_stop_stays_a_stop_when_it_is_heard_again():
     assert not rig.moves
 
 
-def test_without_an_e_stop_required_its_silence_means_nothing():
+def test_an_e_stop_that_was_heard_and_falls_silent_counts_as_pressed_though_none_is_required():
+    rig = driving(e_stop_required=False)
+    rig.until_stopped(WITHIN_S, without="e_stop")
+    assert rig.rule == "e_stop_silent"
+    rig.speed = 0.0
+    rig.run(2.0, without="e_stop")
+    assert rig.give(Reset()).granted
+    assert "e_stop_silent" in rig.arm().answer
+    assert not rig.moves
+
+
+def test_without_an_e_stop_required_one_that_was_never_heard_means_nothing():
     rig = Rig(config(e_stop_required=False))
     rig.run(2.0, without="e_stop")
     assert rig.arm().granted
