@@ -306,6 +306,8 @@ def test_a_policy_that_dies_or_hangs_stops_the_robot(launch, meet, domain_id, ho
     deadline = time.monotonic() + DEADLINE_S
     while not (answer := peer.call(Trigger, "command_gate/arm")).success:
         assert time.monotonic() < deadline, answer.message
+        if "nothing_latched" in answer.message:  # a simulator that catches up makes its stamps jump
+            peer.call(Trigger, "command_gate/reset")
     peer.until(lambda: passed and passed[-1].linear.x > 0.0, "the robot drives")
     policy._process.send_signal(how)
     began = time.monotonic()

@@ -119,22 +119,6 @@ def test_each_command_brings_exactly_one_scan_and_odometry_one_period_later(lock
         assert lockstep.step(0.5, 0.1) == dict.fromkeys(TOPICS, expected)
 
 
-def test_it_tells_its_present_again_when_asked(lockstep):
-    lockstep.reset()
-    told = {topic: lockstep.said[topic][-1] for topic in TOPICS}
-    known = {topic: len(lockstep.said[topic]) for topic in TOPICS}
-    assert lockstep.peer.call(Trigger, "simulator_node/repeat").success
-    lockstep.peer.until(
-        lambda: all(len(lockstep.said[topic]) > known[topic] for topic in TOPICS), "it again"
-    )
-    assert {topic: lockstep.said[topic][-1] for topic in TOPICS} == told
-
-
-def test_in_real_time_the_next_data_come_anyway(realtime):
-    answer = realtime.peer.call(Trigger, "simulator_node/repeat")
-    assert (answer.success, answer.message) == (False, "data are repeated in lock-step alone")
-
-
 def test_without_a_command_its_time_stands_still(lockstep, period_ns):
     now = lockstep.reset()["stamp_ns"]
     for _ in range(5):  # each call makes the node spin
@@ -162,6 +146,17 @@ def test_the_clock_and_all_stamps_only_ever_grow_also_across_resets(lockstep):
     for said in lockstep.said.values():
         assert all(stamp_ns(a) < stamp_ns(b) for a, b in itertools.pairwise(said))
     assert abs(clock[0] * 1e-9 - time.time()) < 600.0  # it began at the system's time
+
+
+def test_it_tells_its_present_again_when_asked(lockstep):
+    lockstep.reset()
+    told = {topic: lockstep.said[topic][-1] for topic in TOPICS}
+    known = {topic: len(lockstep.said[topic]) for topic in TOPICS}
+    assert lockstep.peer.call(Trigger, "simulator_node/repeat").success
+    lockstep.peer.until(
+        lambda: all(len(lockstep.said[topic]) > known[topic] for topic in TOPICS), "it again"
+    )
+    assert {topic: lockstep.said[topic][-1] for topic in TOPICS} == told
 
 
 def test_a_reset_answers_with_the_first_stamp_and_what_it_runs(lockstep, model):
@@ -305,6 +300,11 @@ def test_in_real_time_it_publishes_at_about_the_rate(realtime, period_ns):
     assert 10.0 < rate < 24.0
     stamps = [stamp_ns(scan) for scan in scans[known:]]
     assert set(np.diff(stamps)) == {period_ns}
+
+
+def test_in_real_time_the_next_data_come_anyway(realtime):
+    answer = realtime.peer.call(Trigger, "simulator_node/repeat")
+    assert (answer.success, answer.message) == (False, "data are repeated in lock-step alone")
 
 
 def test_in_real_time_it_stops_the_robot_when_commands_end(realtime):
