@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -70,7 +70,10 @@ class StandingExecutor(SingleThreadedExecutor):
         # Before anything else is looked at: somebody may wait for the answer to a message.
         for callback, arguments in received:
             callback(*arguments)
-        if self._others_ready():
+        others = self._others_ready()
+        for callback, arguments in self._come_since() if received else ():
+            callback(*arguments)
+        if others:
             self._handle_others()
 
     def _wait(self, timeout_sec: float | None) -> list[Received]:
@@ -84,6 +87,10 @@ class StandingExecutor(SingleThreadedExecutor):
         if not self.context.ok():
             raise ExternalShutdownException
         return ends.taken()
+
+    def _come_since(self) -> list[Received]:
+        """What has come while callbacks ran; to take it costs less than to wait for it."""
+        return [] if self._ends is None or not self.context.ok() else self._ends.come()
 
     def _others_ready(self) -> bool:
         """Whether anything but subscriptions was ready; a callback may have shut all down."""
@@ -174,14 +181,14 @@ class _Ends:
         self._wait_set.wait(timeout_ns)
 
     def taken(self) -> list[Received]:
-        """What the subscriptions received that have a message."""
-        is_ready, received = self._wait_set.is_ready, []
-        for i, (subscription, arguments) in enumerate(self._subscriptions):
-            if is_ready("subscription", i):
-                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-                if taken is not None:
-                    received.append((subscription.callback, taken[:arguments]))
-        return received
+        """What the subscriptions received that waiting found ready."""
+        is_ready = self._wait_set.is_ready
+        found = enumerate(self._subscriptions)
+        return _take(entry for i, entry in found if is_ready("subscription", i))
+
+    def come(self) -> list[Received]:
+        """What any subscription has received by now."""
+        return _take(self._subscriptions)
 
     def others_ready(self, own: Any) -> tuple[bool, bool]:
         """Whether the executor's own guard condition is ready, and whether anything else is."""
@@ -201,6 +208,16 @@ class _Ends:
     def close(self) -> None:
         """Lets go of the handles."""
         self._open.close()
+
+
+def _take(subscriptions: Iterable[tuple[Any, int]]) -> list[Received]:
+    """One message of each subscription that has one, for its callback of so many arguments."""
+    received = []
+    for subscription, arguments in subscriptions:
+        taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        if taken is not None:
+            received.append((subscription.callback, taken[:arguments]))
+    return received
 
 
 def _arguments(callback: Callable[..., Any]) -> int:
