@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import TwistStamped
-from measuring.faulty_robot import ALL, NANO, ROBOT, Robot
+from measuring.faulty_robot import ALL, NANO, ROBOT, NoMotionError, Robot
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.errors import BackendError
@@ -32,6 +32,7 @@ from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
 WATCHED_S = 0.8
+LOG_CHARACTERS, MOST_IDLE = 500, 3
 GATE, POLICY = "command_gate", "policy_node"
 
 Injection = Callable[[Robot, NodeProcess | None], object]
@@ -196,9 +197,13 @@ def measure(names: Sequence[str], repeats: int, told: Callable[[str], None]) -> 
             stack.enter_context(NodeProcess(GATE, folder, gate, domain_id))
             robot = Robot(domain_id, FAULTS[name].policy)
             stack.callback(robot.close)
-            while len(results[name].times) < repeats:
+            idle = 0
+            while (known := len(results[name].times)) < repeats:
                 _some(robot, folder, domain_id, name, repeats, results[name])
                 told(f"{name}: {len(results[name].times)} of {repeats}")
+                idle = idle + 1 if known == len(results[name].times) else 0
+                if idle == MOST_IDLE:
+                    raise NoMotionError(f"{name}: {MOST_IDLE} policies in turn did not drive")
     return results
 
 
@@ -211,7 +216,14 @@ def _some(
         return
     with NodeProcess(POLICY, folder, {"model": ROBOT, "goal": [1e6, 0.0]}, domain_id) as policy:
         while len(result.times) < repeats:
-            inject(robot, policy, name, result)
+            try:
+                inject(robot, policy, name, result)
+            except (
+                NoMotionError
+            ) as error:  # nothing was injected yet; who was killed may leave DDS ill
+                told = policy.log.read_text(encoding="utf-8", errors="replace")[-LOG_CHARACTERS:]
+                sys.stderr.write(f"{name}: {error}; another policy is started. {told}\n")
+                return
             try:
                 os.kill(policy.pid, signal.SIGCONT)
                 policy.check()

@@ -25,6 +25,10 @@ NANO = conversions.NANO
 ALL = frozenset({"scan", "odom", "odometry/filtered", "cmd_vel_raw", "e_stop"})
 
 
+class NoMotionError(RuntimeError):
+    """The gate was armed, but no command that moves the robot came."""
+
+
 class Robot:
     """A robot's topics, whole or broken. It does what `cmd_vel` says, unless it is stuck.
 
@@ -114,13 +118,19 @@ class Robot:
         """Presses the emergency stop, by its topic."""
         self._topics["e_stop"].publish(Bool(data=True))
 
-    def until(self, condition: Callable[[], object], seconds: float, what: str = "") -> None:
+    def until(
+        self,
+        condition: Callable[[], object],
+        seconds: float,
+        what: str = "",
+        failure: type[RuntimeError] = RuntimeError,
+    ) -> None:
         """Lives on until something is the case; raises after the time, if it is to be named."""
         end = time.monotonic() + seconds
         while not condition():
             if time.monotonic() > end:
                 if what:
-                    raise RuntimeError(f"not within {seconds} s: {what}")
+                    raise failure(f"not within {seconds} s: {what}")
                 return
             self._executor.spin_once(timeout_sec=0.01)
 
@@ -151,7 +161,7 @@ class Robot:
             return bool(response.success)
 
         self.until(armed, PATIENCE_S, f"arming ({answers[-1]})")
-        self.until(lambda: self.moves, PATIENCE_S, "motion")
+        self.until(lambda: self.moves, PATIENCE_S, "motion", NoMotionError)
         self.until(lambda: False, 0.5)
 
     def close(self) -> None:
