@@ -20,7 +20,7 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.runner import open_context
 
 ROBOT, PERIOD_S, SPEED = "ackermann", 0.1, 0.5
-PATIENCE_S = 60.0
+PATIENCE_S, MOTION_S = 60.0, 10.0
 NANO = conversions.NANO
 ALL = frozenset({"scan", "odom", "odometry/filtered", "cmd_vel_raw", "e_stop"})
 
@@ -118,19 +118,13 @@ class Robot:
         """Presses the emergency stop, by its topic."""
         self._topics["e_stop"].publish(Bool(data=True))
 
-    def until(
-        self,
-        condition: Callable[[], object],
-        seconds: float,
-        what: str = "",
-        failure: type[RuntimeError] = RuntimeError,
-    ) -> None:
+    def until(self, condition: Callable[[], object], seconds: float, what: str = "") -> None:
         """Lives on until something is the case; raises after the time, if it is to be named."""
         end = time.monotonic() + seconds
         while not condition():
             if time.monotonic() > end:
                 if what:
-                    raise failure(f"not within {seconds} s: {what}")
+                    raise RuntimeError(f"not within {seconds} s: {what}")
                 return
             self._executor.spin_once(timeout_sec=0.01)
 
@@ -148,9 +142,21 @@ class Robot:
         return bool(self.heard) and bool(self.heard[-1][1].any())
 
     def drive(self) -> None:
-        """Arms the gate and drives, so that a fault finds the robot in motion."""
+        """Arms the gate and drives, so that a fault finds the robot in motion.
+
+        A busy machine may hold up this process itself, which the gate takes for a fault.
+        """
         self.mend()
         self.until(lambda: False, 3 * PERIOD_S)  # of good data
+        end = time.monotonic() + PATIENCE_S
+        while not self.moves:
+            if time.monotonic() > end:
+                raise NoMotionError(f"not within {PATIENCE_S} s: motion")
+            self._arm()
+            self.until(lambda: self.moves, MOTION_S)
+        self.until(lambda: False, 0.5)
+
+    def _arm(self) -> None:
         self.call("reset")
         answers = [""]
 
@@ -161,8 +167,6 @@ class Robot:
             return bool(response.success)
 
         self.until(armed, PATIENCE_S, f"arming ({answers[-1]})")
-        self.until(lambda: self.moves, PATIENCE_S, "motion", NoMotionError)
-        self.until(lambda: False, 0.5)
 
     def close(self) -> None:
         """Leaves the graph."""
