@@ -32,21 +32,26 @@ def model_folder(model: SimulatorModel, tmp_path_factory: pytest.TempPathFactory
     return str(folder)
 
 
-@pytest.fixture
-def domain_id() -> Iterator[int]:
-    with claimed_domain() as claimed:
+@pytest.fixture(scope="module")
+def domains() -> Iterator[ExitStack]:
+    """The domains of a module, which stay its own as long as anybody of it may live in them."""
+    with ExitStack() as claimed:
         yield claimed
+
+
+@pytest.fixture
+def domain_id(domains: ExitStack) -> int:
+    return domains.enter_context(claimed_domain())
 
 
 @pytest.fixture(scope="module")
-def module_domain_id() -> Iterator[int]:
-    with claimed_domain() as claimed:
-        yield claimed
+def module_domain_id(domains: ExitStack) -> int:
+    return domains.enter_context(claimed_domain())
 
 
 @pytest.fixture(scope="module")
 def launch(
-    model_folder: str, tmp_path_factory: pytest.TempPathFactory
+    domains: ExitStack, model_folder: str, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Callable[..., Any]]:
     """Starts nodes, `launch(node, domain_id, **parameters)`; they end with the module."""
     from nics_drl_bridge.nodes.processes import NodeProcess
@@ -70,7 +75,7 @@ def launch(
 
 
 @pytest.fixture(scope="module")
-def meet() -> Iterator[Callable[..., Any]]:
+def meet(domains: ExitStack) -> Iterator[Callable[..., Any]]:
     """Makes peers, `meet(domain_id)`; all are closed with the module."""
     from nodes.peer import Peer
 

@@ -9,7 +9,6 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
-from domains import claimed_domain
 from geometry_msgs.msg import Twist
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
@@ -314,18 +313,19 @@ def test_a_simulator_that_hangs_is_noticed_and_serves_again_when_it_wakes(own_si
     assert backend._now_ns > hung_ns
 
 
-def test_two_backends_in_two_domains_do_not_hear_each_other(connect, launch, model, arena):
-    with claimed_domain() as other_domain:
-        launch("simulator_node", other_domain, mode="lockstep")
-        one = connect()
-        two = connect(domain_id=other_domain)
-        alone = SimBackend(model, arena, estimator=True)
-        for backend in (one, two, alone):
-            backend.reset(START)
-        for k in range(10):
-            one.step(np.array([0.9, 0.5]))
-            two.step(np.array([0.2, 0.1 * k]))
-            alone.step(np.array([0.9, 0.5]))
-        here, there, expected = (b.step(np.zeros(2))[0] for b in (one, two, alone))
-        assert here.pose.tolist() == expected.pose.tolist()
-        assert np.abs(there.pose - expected.pose).max() > 0.1
+def test_two_backends_in_two_domains_do_not_hear_each_other(
+    connect, launch, model, arena, domain_id
+):
+    launch("simulator_node", domain_id, mode="lockstep")
+    one = connect()
+    two = connect(domain_id=domain_id)
+    alone = SimBackend(model, arena, estimator=True)
+    for backend in (one, two, alone):
+        backend.reset(START)
+    for k in range(10):
+        one.step(np.array([0.9, 0.5]))
+        two.step(np.array([0.2, 0.1 * k]))
+        alone.step(np.array([0.9, 0.5]))
+    here, there, expected = (b.step(np.zeros(2))[0] for b in (one, two, alone))
+    assert here.pose.tolist() == expected.pose.tolist()
+    assert np.abs(there.pose - expected.pose).max() > 0.1

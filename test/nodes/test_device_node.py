@@ -143,22 +143,22 @@ class Stamped:
 
 
 @pytest.fixture(scope="module")
-def stamped(launch, meet):
-    with claimed_domain() as domain_id:
-        process = launch(
-            "simulator_node",
-            domain_id,
-            world="empty",
-            enable_stamped_cmd_vel=True,
-            odom_rate=50.0,
-            scan_latency=0.05,
-            frame_prefix="car/",
-        )
-        robot = Stamped(meet(domain_id))
-        robot.process, robot.stranger = process, meet(domain_id)
-        robot.peer.until(lambda: len(robot.stamps("scan")) > 2, "scans")
-        yield robot
-        process.check()
+def stamped(launch, meet, domains):
+    domain_id = domains.enter_context(claimed_domain())
+    process = launch(
+        "simulator_node",
+        domain_id,
+        world="empty",
+        enable_stamped_cmd_vel=True,
+        odom_rate=50.0,
+        scan_latency=0.05,
+        frame_prefix="car/",
+    )
+    robot = Stamped(meet(domain_id))
+    robot.process, robot.stranger = process, meet(domain_id)
+    robot.peer.until(lambda: len(robot.stamps("scan")) > 2, "scans")
+    yield robot
+    process.check()
 
 
 def test_scan_and_odometry_have_rates_of_their_own(stamped):
