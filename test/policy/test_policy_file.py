@@ -343,7 +343,7 @@ def test_a_file_that_is_not_there_or_too_large_is_refused(tmp_path):
 @pytest.mark.parametrize("changes", [{"beams": 720}, {"range_max": 12.0}, {"rate": 5.0}])
 def test_any_lidar_that_fills_its_sectors_fits(file, changes):
     model = model_of(**changes)
-    load_policy(file).make_task(model)
+    assert load_policy(file).make_task(model) is not None
 
 
 def misfit_model(**changes):

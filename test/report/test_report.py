@@ -120,7 +120,9 @@ def test_another_path_gives_another_picture():
 
 def test_a_run_that_ended_early_is_drawn_as_far_as_it_went():
     runs = {"all": [episode(0), episode(1)], "short": [episode(0)]}
-    decoded(trajectories(runs, WORLD, 0.2))
+    drawn_short = decoded(trajectories(runs, WORLD, 0.2))
+    whole = {"all": runs["all"], "short": runs["all"]}
+    assert not np.array_equal(drawn_short, decoded(trajectories(whole, WORLD, 0.2)))
 
 
 def drawn(world, bodies):
