@@ -32,6 +32,7 @@ class GateLog:
         self._passing = False
         # Beside the gate: a disk may take its time.
         self._writer = ThreadPoolExecutor(1, "black_box")
+        self._writer.submit(lambda: None)  # its thread is there before the first stop
 
     def note(self, entry: Entry) -> None:
         """Takes a decision into account."""

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from nics_drl_bridge.config import read_text
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import sha256, write_text
+from nics_drl_bridge.files import sha256, write_parts
 from nics_drl_bridge.safety.gate import decide
 from nics_drl_bridge.safety.inputs import Input
 from nics_drl_bridge.safety.plain import from_plain, to_plain
@@ -62,17 +64,30 @@ class BlackBox:
 
 def write(config: GateConfig, entries: tuple[Entry, ...], path: str | Path) -> None:
     """Writes entries (at least one) to a file, whole or not at all."""
-    lines = [{"format": FORMAT, "config": to_plain(config), "state": to_plain(entries[0].before)}]
+    write_parts(path, _sealed(_records(config, entries)))
+
+
+def _records(config: GateConfig, entries: tuple[Entry, ...]) -> Iterator[dict[str, Any]]:
+    """The lines of a file, one after the other: the gate must not grow at each stop."""
+    yield {"format": FORMAT, "config": to_plain(config), "state": to_plain(entries[0].before)}
     for entry in entries:
         parts = {"now": entry.now, "given": entry.given, "decision": entry.decision}
-        lines.append({key: to_plain(part) for key, part in parts.items()})
-    text = "".join(json.dumps(line) + "\n" for line in lines)
-    write_text(path, text + _seal(text))
+        yield {key: to_plain(part) for key, part in parts.items()}
 
 
-def _seal(text: str) -> str:
-    """The last line of a file, for the text before it."""
-    return json.dumps({"sha256": sha256(text.encode())}) + "\n"
+def _sealed(records: Iterable[dict[str, Any]]) -> Iterator[bytes]:
+    """Lines, and a last one with their checksum."""
+    digest = hashlib.sha256()
+    for record in records:
+        line = (json.dumps(record) + "\n").encode()
+        digest.update(line)
+        yield line
+    yield _seal(digest.hexdigest()).encode()
+
+
+def _seal(digest: str) -> str:
+    """The last line of a file."""
+    return json.dumps({"sha256": digest}) + "\n"
 
 
 @dataclass(frozen=True)
@@ -136,6 +151,7 @@ def _lines(path: str | Path) -> list[dict[str, Any]]:
         raise ConfigError(f"{path}: is no JSON, line by line; it can't be replayed.") from None
     if not lines or not isinstance(lines[0], dict) or lines[0].get("format") != FORMAT:
         raise ConfigError(f"{path}: is no black box of the gate ({FORMAT}).")
-    if text != (rest := text[: -len(_seal(""))]) + _seal(rest):
+    rest = text[: -len(_seal(sha256(b"")))]
+    if text != rest + _seal(sha256(rest.encode())):
         raise ConfigError(f"{path}: is damaged (its checksum does not fit); it can't be replayed.")
     return lines[:-1]
