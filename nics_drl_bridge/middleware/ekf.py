@@ -62,6 +62,15 @@ class Belief(NamedTuple):
     outliers: tuple[int, int, int]
 
 
+class _Foreseen(NamedTuple):
+    """What a prediction comes to: time [ns], mean, covariance, and the twist to measure then."""
+
+    time_ns: int
+    mean: Array
+    covariance: Array
+    expected: tuple[Array, Array]
+
+
 class Estimator:
     """Pose and state of one robot, predicted by the fitted model, corrected by measurements.
 
@@ -95,6 +104,7 @@ class Estimator:
         self._observe_pose = np.eye(3, 3 + size)
         self._log = CommandLog(len(model.robot.command))
         self._filter = ExtendedKalmanFilter(dim_x=3 + size, dim_z=3)
+        self._foreseen: _Foreseen | None = None  # of the present belief and commands
         self.reset(0, np.zeros(3))
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
@@ -119,6 +129,7 @@ class Estimator:
     @belief.setter
     def belief(self, belief: Belief) -> None:
         self.time_ns, self._filter.x, self._filter.P, self._outliers = belief
+        self._foreseen = None
 
     @property
     def covariance(self) -> Array:
@@ -149,6 +160,7 @@ class Estimator:
             False when there is one of that very time, which stays.
         """
         needed_ns = self.time_ns if needed_ns is None else needed_ns
+        self._foreseen = None
         possible = np.minimum(np.maximum(command, self._least), self._most)
         return self._log.add(self.effective_ns(stamp_ns), possible, needed_ns)
 
@@ -168,11 +180,25 @@ class Estimator:
         """Moves the estimate forward to a time; an earlier time changes nothing."""
         if time_ns <= self.time_ns:
             return
-        self._filter.x, self._filter.P = kernels.forecast(
+        if self._foreseen is None or self._foreseen.time_ns != time_ns:
+            self._foreseen = self._forecast(time_ns)
+        self.time_ns, self._filter.x, self._filter.P, _ = self._foreseen
+
+    def foresee(self, time_ns: int) -> None:
+        """Does now what `predict` to that time would do, which then only takes it over.
+
+        For whoever has time now and none when the data come; the estimate is the same to the bit.
+        """
+        self._foreseen = self._forecast(time_ns) if time_ns > self.time_ns else None
+
+    def _forecast(self, time_ns: int) -> _Foreseen:
+        log = self._log.arrays
+        mean, covariance = kernels.forecast(
             self._filter.x, self._filter.P, self._process, self.time_ns, time_ns,
-            self._timing, self._log.arrays, self._terms, SERIES,
+            self._timing, log, self._terms, SERIES,
         )  # fmt: skip
-        self.time_ns = time_ns
+        expected = kernels.expect(mean, time_ns, log, self._terms)
+        return _Foreseen(time_ns, mean, covariance, expected)
 
     def update_twist(self, twist: ArrayLike) -> Verdict:
         """Corrects by a measured body twist (3,) at the time of the estimate."""
@@ -216,15 +242,19 @@ class Estimator:
         if self._outliers[kind] and not (outcome is Outcome.JUMP and kind is Kind.TWIST):
             self._count(kind, 0)
         kernels.settle(self._filter.x, self._filter.P, *self._limits)
+        self._foreseen = None
         return Verdict(distance, outcome)
 
     def _expect(self, kind: Kind) -> tuple[Array, Array]:
         """What a sensor should measure (n,), and its derivative (n, 3 + S)."""
         if kind is Kind.POSE:
             return self._filter.x[:3], self._observe_pose
-        twist, derivative = kernels.expect(
-            self._filter.x, self.time_ns, self._log.arrays, self._terms
-        )
+        if self._foreseen is not None and self._foreseen.mean is self._filter.x:
+            twist, derivative = self._foreseen.expected
+        else:
+            twist, derivative = kernels.expect(
+                self._filter.x, self.time_ns, self._log.arrays, self._terms
+            )
         return (twist, derivative) if kind is Kind.TWIST else (twist[2:], derivative[2:])
 
     def _surprise(self, kind: Kind, innovation: Array, derivative: Array, noise: Array) -> Outcome:

@@ -106,6 +106,10 @@ class Middleware:
             return False
         return True
 
+    def foresee(self, stamp_ns: int) -> None:
+        """Prepares for an odometry of a stamp [ns], the next that is expected."""
+        self.estimator.foresee(stamp_ns)
+
     def scan(self, stamp_ns: int, arrival_ns: int, ranges: NDArray[np.float32]) -> bool:
         """Takes a scan (B,); says whether it was used. Of scans only the newest counts."""
         fault = self._stamps.fault(stamp_ns, arrival_ns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any
@@ -66,8 +67,9 @@ class CommandInlet:
         self._node.create_subscription(kind, topic, self._on_ackermann, quality)
 
     def _on_twist(self, message: Twist) -> None:
-        twist = conversions.twist_from_ros(message)
-        if np.isfinite(twist).all():
+        linear = message.linear
+        twist = linear.x, linear.y, message.angular.z
+        if all(map(math.isfinite, twist)):
             self._take(self._robot.from_cmd_vel(twist))
         else:
             self._complain("NaN or inf ignored")

@@ -21,7 +21,8 @@ def fast_simulator(node: Node, model: SimulatorModel, world: World, robots: int)
     """The fast simulator, with the lidar that the parameter `renderer` names."""
     declare(node, "renderer", "baked", "Lidar: baked or exact.", read_only=True)
     renderer = cast(Renderer, choice(node, "renderer", RENDERERS))
-    return FastSimulator(model, world, robots=robots, renderer=renderer)
+    tell = node.get_logger().warning
+    return FastSimulator(model, world, robots=robots, renderer=renderer, tell=tell)
 
 
 def simulator_node(context: Context) -> DeviceNode:

@@ -18,7 +18,7 @@ from nics_drl_bridge.sim import kernels
 from nics_drl_bridge.sim.motion import distance_arrays, plan_arrays
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
-from nics_drl_bridge.sim.validity import CommandBox, OutsideValidityWarning
+from nics_drl_bridge.sim.validity import CommandBox, OutsideValidityWarning, warn
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.worlds import SLICES, Sizes, Worlds, allocate, arguments, split
 from nics_drl_bridge.threads import Crew
@@ -47,6 +47,7 @@ class FastSimulator:
             model's by default, or what the randomisation may draw.
         longest_age: greatest age of scan and odometry that `data.age` may be given [substeps];
             more if the randomisation may draw it.
+        tell: is told when commands leave the range that the model was fitted to.
 
     Attributes:
         data: all that changes, see `Worlds`.
@@ -68,6 +69,7 @@ class FastSimulator:
         randomisation: str | Randomisation | None = None,
         longest_delay: int | None = None,
         longest_age: int = 0,
+        tell: Callable[[str], None] = warn,
     ) -> None:
         if worlds < 1 or robots < 1:
             raise ConfigError(
@@ -102,7 +104,9 @@ class FastSimulator:
         self._sizes = Sizes(worlds, robots, self.sampler.count, delay, longest_age)
         self.data = allocate(model, self._sizes)
         self.parts = split(worlds, threads)
-        self._boxes = {part.start: CommandBox(model.kinematics, model.robot) for part in self.parts}
+        self._boxes = {
+            part.start: CommandBox(model.kinematics, model.robot, tell) for part in self.parts
+        }
         self._crew = Crew(len(self.parts))
 
     @cached_property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,11 @@ class OutsideValidityWarning(UserWarning):
     """Commands lie outside the range that the model's recording covered."""
 
 
+def warn(message: str) -> None:
+    """Says it to whoever steps a simulator in their own program."""
+    warnings.warn(message, OutsideValidityWarning, stacklevel=4)
+
+
 class CommandBox:
     """The range of commands that a model was fitted to.
 
@@ -31,9 +37,13 @@ class CommandBox:
     Args:
         model: the kinematics.
         robot: names and limits of the commands.
+        tell: is given what there is to say.
     """
 
-    def __init__(self, model: TaylorModel, robot: RobotSpec) -> None:
+    def __init__(
+        self, model: TaylorModel, robot: RobotSpec, tell: Callable[[str], None] = warn
+    ) -> None:
+        self._tell = tell
         margin = TOLERANCE * (robot.command_high - robot.command_low)
         first = len(robot.state)
         self._low: Array = model.low[first:] - margin
@@ -62,12 +72,10 @@ class CommandBox:
             self._armed = False
             i = int(np.argmax(outside))
             value = least[i] if least[i] < self._low[i] else most[i]
-            warnings.warn(
+            self._tell(
                 f"{self._names[i]} is {value:.4g}, but the model was fitted to "
                 f"{self._range[0][i]:.4g} to {self._range[1][i]:.4g} only: its motion there is "
-                "extrapolated; record a drive that covers it.",
-                OutsideValidityWarning,
-                stacklevel=3,
+                "extrapolated; record a drive that covers it."
             )
 
 

@@ -86,7 +86,7 @@ def lockstep(launch, meet, module_domain_id):
         "simulator_node", module_domain_id, mode="lockstep", renderer="exact", **FRAMES
     )
     watched = Watched(peer, 0.0)
-    watched.ready_s = time.monotonic() - began
+    watched.ready_s, watched.log = time.monotonic() - began, process.log
     watched.reset()
     yield watched
     process.check()
@@ -214,6 +214,14 @@ def test_a_command_that_is_no_number_is_ignored(lockstep, period_ns, bad):
     lockstep.command(0.0, bad)
     assert lockstep.step(0.5) == {topic: [now + period_ns] for topic in TOPICS}
     assert np.isfinite(conversions.odometry_from_ros(lockstep.said["odom"][-1])[0]).all()
+
+
+def test_a_command_beyond_what_its_model_was_fitted_to_is_said_in_its_log(lockstep):
+    lockstep.reset()
+    sentence = "speed_command is 9, but the model was fitted to"
+    said = lockstep.log.read_text().count(sentence)
+    lockstep.step(9.0)
+    lockstep.peer.until(lambda: lockstep.log.read_text().count(sentence) > said, "a warning")
 
 
 def test_the_header_of_its_scan_equals_the_lidar(lockstep, model):
