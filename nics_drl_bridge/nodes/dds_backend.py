@@ -16,8 +16,9 @@ from sensor_msgs.msg import LaserScan
 from nics_drl_bridge.errors import BackendError, StaleDataError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import RobotView, Start
+from nics_drl_bridge.lidar.rep117 import from_device
 from nics_drl_bridge.middleware.view import Middleware
-from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes import conversions, qos, wire
 from nics_drl_bridge.nodes.episodes import Episodes
 from nics_drl_bridge.nodes.link import Link
 from nics_drl_bridge.nodes.robot_topics import data_facts
@@ -25,13 +26,13 @@ from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
 SCAN, ODOM, TRUTH = "scan", "odom", "ground_truth"
-AGAIN_S = 0.5
+AGAIN_S = 0.05
 """What does not come for so long is asked for again."""
 ADVICE = "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and namespace."
 
 
 class _Mailbox:
-    """The newest message of each topic, handed from the executor's thread to the caller's.
+    """The newest message of each topic, serialised, from the executor's thread to the caller's.
 
     The caller is woken once, when all that it waits for is there: each waking costs as much as a
     good part of a step. Odometry that it waits for is worked in by the executor's thread, while
@@ -42,21 +43,20 @@ class _Mailbox:
         work: takes stamp [ns], arrival [ns] and message of an odometry.
     """
 
-    def __init__(self, topics: tuple[str, ...], work: Callable[[int, int, Any], None]) -> None:
+    def __init__(self, topics: tuple[str, ...], work: Callable[[int, int, bytes], None]) -> None:
         self._topics, self._work = topics, work
-        self._messages: dict[str, Any] = {}
+        self._messages: dict[str, bytes] = {}
         self._stamps = dict.fromkeys(topics, -1)
         self._arrivals: dict[str, int] = {}
         self._lock, self._complete = threading.Lock(), threading.Event()
         self._awaited_ns, self._worked_ns = -1, -1
         self._failure: Exception | None = None
 
-    def put(self, topic: str, message: Any) -> None:
-        stamp_ns = conversions.stamp_from_ros(message.header.stamp)
+    def put(self, topic: str, message: bytes) -> None:
         with self._lock:
-            self._messages[topic], self._stamps[topic] = message, stamp_ns
-            self._arrivals[topic] = time.monotonic_ns()
             try:
+                self._stamps[topic] = wire.stamp_of(message)
+                self._messages[topic], self._arrivals[topic] = message, time.monotonic_ns()
                 self._work_in()
             except Exception as error:  # noqa: BLE001  (it is raised in the caller's thread)
                 self._failure = error
@@ -86,7 +86,7 @@ class _Mailbox:
         arrival_ns = self._arrivals.get(topic)
         return math.inf if arrival_ns is None else (time.monotonic_ns() - arrival_ns) * 1e-9
 
-    def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, tuple[Any, int]]:
+    def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, tuple[bytes, int]]:
         """Message and arrival [ns] of each topic, once each is at least as new as a stamp.
 
         Raises:
@@ -109,11 +109,11 @@ class _Mailbox:
             return {t: (message, self._arrivals[t]) for t, message in self._messages.items()}
 
 
-def _worker(middleware: Middleware) -> Callable[[int, int, Any], None]:
+def _worker(middleware: Middleware) -> Callable[[int, int, bytes], None]:
     """What works in odometry; it knows nothing of the backend, which may be garbage."""
 
-    def work(stamp_ns: int, arrival_ns: int, message: Odometry) -> None:
-        middleware.odometry(stamp_ns, arrival_ns, *conversions.odometry_from_ros(message))
+    def work(stamp_ns: int, arrival_ns: int, message: bytes) -> None:
+        middleware.odometry(stamp_ns, arrival_ns, *wire.odometry_of(message))
 
     return work
 
@@ -159,7 +159,7 @@ class DdsBackend:
         types = {SCAN: LaserScan, ODOM: Odometry, TRUTH: Odometry}
         for topic in self._topics:
             self._link.node.create_subscription(
-                types[topic], topic, _putter(self._mail, topic), qos.SENSOR
+                types[topic], topic, _putter(self._mail, topic), qos.SENSOR, raw=True
             )
         self._episodes = Episodes(self._link, simulator, model, world)
         self._link.begin()
@@ -219,6 +219,7 @@ class DdsBackend:
             self._link.check_alone()
             self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
             self._now_ns += self._period_ns
+            self._middleware.foresee(self._now_ns)
 
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
         """The second half: waits for the data after the command, and for `info` about them."""
@@ -245,16 +246,16 @@ class DdsBackend:
         messages = self._await(now)
         self._check_stamps()
         message, arrival = messages[SCAN]
-        self._middleware.scan(now, arrival, conversions.scan_from_ros(self._lidar, message))
+        self._middleware.scan(now, arrival, from_device(wire.ranges_of(message), self._lidar))
         facts: dict[str, Any] = {
             "stamp_ns": now,
             **data_facts(self._middleware, time.monotonic_ns()),
         }
         if TRUTH in self._topics:
-            facts["true_pose"] = conversions.odometry_from_ros(messages[TRUTH][0])[0]
+            facts["true_pose"] = wire.odometry_of(messages[TRUTH][0])[0]
         return self._middleware.view(now), facts
 
-    def _await(self, stamp_ns: int) -> dict[str, tuple[Any, int]]:
+    def _await(self, stamp_ns: int) -> dict[str, tuple[bytes, int]]:
         """What the mailbox gives for a stamp; what does not come is asked for again.
 
         It may be lost, and what was sent before the simulator knew of a subscription is.
@@ -278,5 +279,5 @@ class DdsBackend:
         self._link.close()
 
 
-def _putter(mail: _Mailbox, topic: str) -> Callable[[Any], None]:
+def _putter(mail: _Mailbox, topic: str) -> Callable[[bytes], None]:
     return lambda message: mail.put(topic, message)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -33,7 +32,6 @@ from nics_drl_bridge.nodes.robot_port import RobotPort
 from nics_drl_bridge.nodes.runner import declare_model
 from nics_drl_bridge.nodes.transforms import Transforms
 from nics_drl_bridge.sim.device_world import DeviceWorld
-from nics_drl_bridge.sim.validity import OutsideValidityWarning
 from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]
@@ -187,11 +185,7 @@ class DeviceNode(QosWatch):
         self._world.commands[self._now_ns - self._command_ns > self._timeout_ns()] = 0.0
 
     def _advance(self) -> None:
-        with warnings.catch_warnings(record=True) as raised:
-            warnings.simplefilter("always", OutsideValidityWarning)
-            self._world.advance()
-        for warning in raised:
-            self.get_logger().warning(str(warning.message))
+        self._world.advance()
         self._heard[:] = False
         self._now_ns += self._time.step_ns
         self._publish()
@@ -259,10 +253,10 @@ class DeviceNode(QosWatch):
         for k, port in enumerate(self._ports):
             sensed = self._world.sensed(k)
             if odom_due:
-                port.tell_odometry(now, sensed, outbox, now_ns)
+                port.tell_odometry(sensed, outbox, now_ns)
                 if self._transforms.published:
                     moving += port.moving(now, sensed)
             if scan_due:
-                port.tell_scan(now, sensed, outbox, now_ns)
+                port.tell_scan(sensed, outbox, now_ns)
         if moving:
             self._transforms.tell(moving, outbox, now_ns, self._time.odom_late_ns)

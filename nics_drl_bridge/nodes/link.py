@@ -23,6 +23,7 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.qos_watch import QosWatch
 from nics_drl_bridge.nodes.runner import last_word, open_context
+from nics_drl_bridge.nodes.wire import TwistWriter
 
 SPIN_S = 0.2
 POLL_S = 0.002
@@ -59,6 +60,7 @@ class Link:
             start_parameter_services=False, parameter_overrides=overrides,
         )  # fmt: skip
         self._kind = TwistStamped if stamped else Twist
+        self._twists = TwistWriter()
         self.commands = self.node.create_publisher(self._kind, command_topic, qos.COMMAND)
         self._closing: weakref.finalize[Any, Any] | None = None
 
@@ -74,11 +76,12 @@ class Link:
 
     def send(self, twist: ArrayLike, stamp_ns: int = 0) -> None:
         """Publishes linear.x, linear.y, angular.z (3,), stamped if the topic is."""
-        message = conversions.twist_to_ros(twist)
-        if self._kind is TwistStamped:
-            message = TwistStamped(twist=message)
-            message.header.stamp = conversions.stamp_to_ros(stamp_ns)
-            message.header.frame_id = "base_link"
+        if self._kind is Twist:
+            self.commands.publish(self._twists.write(twist))
+            return
+        message = TwistStamped(twist=conversions.twist_to_ros(twist))
+        message.header.stamp = conversions.stamp_to_ros(stamp_ns)
+        message.header.frame_id = "base_link"
         self.commands.publish(message)
 
     def halt(self) -> None:

@@ -34,7 +34,7 @@ class Outbox:
 
         Args:
             publisher: to publish with.
-            message: to publish.
+            message: to publish, or its bytes.
             now_ns: the present.
             late_ns: least delay, and the greatest further one, drawn evenly for each message.
         """
@@ -46,8 +46,8 @@ class Outbox:
             return
         due = max(now_ns + delay, self._latest.get(publisher, 0))
         self._latest[publisher] = due
-        entry = (due, next(self._numbers), publisher, serialize_message(message))
-        heapq.heappush(self._waiting, entry)
+        content = message if isinstance(message, bytes) else serialize_message(message)
+        heapq.heappush(self._waiting, (due, next(self._numbers), publisher, content))
 
     def flush(self, now_ns: int) -> None:
         """Publishes what is due."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import array
-
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
@@ -15,7 +13,7 @@ from sensor_msgs.msg import JointState, LaserScan
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.rep117 import to_device
-from nics_drl_bridge.nodes import conversions, qos, transforms
+from nics_drl_bridge.nodes import conversions, qos, transforms, wire
 from nics_drl_bridge.nodes.device_parameters import Frames, Timing
 from nics_drl_bridge.nodes.outbox import Outbox
 from nics_drl_bridge.sim.dead_reckoning import LEAST_VARIANCE, variances
@@ -48,16 +46,13 @@ class RobotPort:
         self._odoms = node.create_publisher(Odometry, f"{namespace}odom", quality)
         self._truths = node.create_publisher(Odometry, f"{namespace}ground_truth", quality)
         self._joints = node.create_publisher(JointState, f"{namespace}joint_states", quality)
-        self._scan = scan_message(model, frames.laser, time)
+        scan, odom = scan_message(model, frames.laser, time), odometry_message(frames)
         # Beam 0 of a device that turns counter-clockwise was measured first.
-        self._sweep_ns = round(
-            max(0.0, self._scan.time_increment) * (model.lidar.beams - 1) * conversions.NANO
-        )
-        self._odom = odometry_message(frames.odom, frames.base)
-        self._odom.twist.covariance[DIAGONAL[PLANAR]] = variances(model.noise.odometry)
-        self._truth = odometry_message(frames.map, frames.base)
-        for covariance in (self._truth.pose.covariance, self._truth.twist.covariance):
-            covariance[DIAGONAL[PLANAR]] = LEAST_VARIANCE
+        sweep_s = max(0.0, scan.time_increment) * (model.lidar.beams - 1)
+        self._sweep_ns = 0 if time.lockstep else round(sweep_s * conversions.NANO)
+        odom.twist.covariance[DIAGONAL[PLANAR]] = variances(model.noise.odometry)
+        self._scan, self._odom = wire.ScanWriter(scan), wire.OdometryWriter(odom)
+        self._truth = wire.OdometryWriter(truth_message(frames))
         self._moving = [transforms.transform_message(frames.odom, frames.base)]
         if node.get_parameter("publish_map_to_odom").value:
             self._moving.append(transforms.transform_message(frames.map, frames.odom))
@@ -76,51 +71,48 @@ class RobotPort:
             transforms.fill(message, geometry.compose(sensed.pose, home), now)
         return self._moving
 
-    def tell_odometry(self, now: Time, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
+    def tell_odometry(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
         """Publishes where the robot takes itself to be, and what only a simulator knows."""
         late_ns = self._time.odom_late_ns
-        fill_odometry(self._odom, sensed.odom, sensed.twist, now)
-        self._odom.pose.covariance.reshape(6, 6)[conversions.PLANAR] = sensed.covariance
-        outbox.send(self._odoms, self._odom, now_ns, late_ns)
+        odometry = self._odom.write(now_ns, sensed.odom, sensed.twist, sensed.covariance)
+        outbox.send(self._odoms, odometry, now_ns, late_ns)
         if self._joints.get_subscription_count():
             joints = conversions.joints_to_ros(self._model.robot, sensed.state, now_ns)
             outbox.send(self._joints, joints, now_ns, late_ns)
         if self._truths.get_subscription_count():
-            fill_odometry(self._truth, sensed.pose, sensed.true_twist, now)
-            self._truths.publish(self._truth)
+            self._truths.publish(self._truth.write(now_ns, sensed.pose, sensed.true_twist))
 
-    def tell_scan(self, now: Time, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
+    def tell_scan(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
         """Publishes what the robot's lidar sees, stamped with the time of beam 0."""
-        message, sweep = self._scan, 0 if self._time.lockstep else self._sweep_ns
-        message.header.stamp = conversions.stamp_to_ros(now_ns - sweep) if sweep else now
-        message.ranges = array.array("f", to_device(sensed.ranges, self._model.lidar).tobytes())
+        ranges = to_device(sensed.ranges, self._model.lidar)
+        message = self._scan.write(now_ns - self._sweep_ns, ranges)
         outbox.send(self._scans, message, now_ns, self._time.scan_late_ns)
 
 
 def scan_message(model: SimulatorModel, frame: str, time: Timing) -> LaserScan:
     """A scan whose ranges and stamp are still to be filled in."""
-    message = LaserScan()
-    message.header.frame_id = frame
-    for field, value in model.lidar.header._asdict().items():
-        setattr(message, field, value)
+    free = np.full(model.lidar.beams, np.inf, np.float32)
+    message = conversions.scan_to_ros(model.lidar, free, 0, frame)
     message.scan_time = time.scan_ns / conversions.NANO
     return message
 
 
-def odometry_message(parent: str, child: str) -> Odometry:
+def odometry_message(frames: Frames) -> Odometry:
     """An odometry whose numbers are still to be filled in; what a plane lacks is unknown."""
+    return _planar_message(frames.odom, frames.base)
+
+
+def truth_message(frames: Frames) -> Odometry:
+    """The same of what is exact."""
+    message = _planar_message(frames.map, frames.base)
+    for covariance in (message.pose.covariance, message.twist.covariance):
+        covariance[DIAGONAL[PLANAR]] = LEAST_VARIANCE
+    return message
+
+
+def _planar_message(parent: str, child: str) -> Odometry:
     message = Odometry(child_frame_id=child)
     message.header.frame_id = parent
     for covariance in (message.pose.covariance, message.twist.covariance):
         covariance[DIAGONAL] = conversions.UNUSED_VARIANCE
     return message
-
-
-def fill_odometry(message: Odometry, pose: Array, twist: Array, now: Time) -> None:
-    """Writes pose (3,) and body twist (3,) into an odometry."""
-    x, y, heading = pose.tolist()
-    message.header.stamp = now
-    message.pose.pose.position.x, message.pose.pose.position.y = x, y
-    message.pose.pose.orientation = conversions.heading_to_ros(heading)
-    velocity = message.twist.twist
-    velocity.linear.x, velocity.linear.y, velocity.angular.z = twist.tolist()

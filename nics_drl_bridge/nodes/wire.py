@@ -1,0 +1,166 @@
+"""Scans, odometry and twists as the bytes that travel, without a Python object for each number.
+
+rclpy copies each field of a message between Python and C, both ways, and checks it: for an
+odometry that takes longer than to simulate its step. What is sent and received in each step is
+therefore written into, and read from, its serialised form. That is the Common Data Representation
+of DDS, with its numbers aligned to their size, counted from behind four bytes that name the order
+of the bytes (OMG DDS-XTypes 7.4.3, "plain CDR"). `test/nodes/test_wire.py` holds it against
+rclpy's own serialisation.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import numpy as np
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+from numpy.typing import ArrayLike, NDArray
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import LaserScan
+
+from nics_drl_bridge.nodes.conversions import NANO, PLANAR
+
+Array = NDArray[np.float64]
+Bytes = bytes | bytearray
+HEAD = 4
+"""The bytes before the first that counts for alignment; the second of them tells the order."""
+STAMP = 4
+"""Where the stamp of a header begins."""
+FRAME = 12
+"""Where its frame begins."""
+PLAIN = (0, 1)
+"""Big-endian and little-endian plain CDR."""
+DOUBLES = 7 + 36 + 6 + 36
+"""Of an odometry: pose, its covariance, twist, its covariance."""
+POSE_COVARIANCE, TWIST = 7, 7 + 36
+SCAN_FIELDS = 7
+"""Floats of a scan between its header and its ranges."""
+
+
+def _order(content: Bytes) -> str:
+    """The order of bytes, for `struct`. Raises ValueError when it is no plain CDR."""
+    if len(content) < HEAD or content[0] != 0 or content[1] not in PLAIN:
+        raise ValueError(f"the bytes {bytes(content[:HEAD]).hex()} begin no plain CDR")
+    return "<" if content[1] else ">"
+
+
+def _after_text(content: Bytes, place: int, order: str) -> int:
+    """Where the text ends that begins, with its length, at the next multiple of 4."""
+    place = _aligned(place, 4)
+    (length,) = struct.unpack_from(f"{order}I", content, place)
+    return place + 4 + int(length)
+
+
+def _aligned(place: int, size: int) -> int:
+    """The next place at which a number of a size may stand."""
+    return place + (HEAD - place) % size
+
+
+def _doubles(content: Bytes, order: str) -> int:
+    """Where the numbers of an odometry begin."""
+    return _aligned(_after_text(content, _after_text(content, FRAME, order), order), 8)
+
+
+def stamp_of(content: Bytes) -> int:
+    """The stamp of a message that begins with a header [ns]."""
+    seconds, nanoseconds = struct.unpack_from(f"{_order(content)}iI", content, STAMP)
+    return int(seconds) * NANO + int(nanoseconds)
+
+
+def odometry_of(content: Bytes) -> tuple[Array, Array]:
+    """Pose (3,) and body twist (3,) of a serialised Odometry.
+
+    Raises:
+        ValueError: it is no plain CDR, or cut short.
+        struct.error: it is cut short.
+    """
+    order = _order(content)
+    values = np.frombuffer(content, f"{order}f8", DOUBLES, _doubles(content, order))
+    x, y, _, qx, qy, qz, qw = values[:7].tolist()
+    heading = math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
+    vx, vy, wz = values[TWIST], values[TWIST + 1], values[TWIST + 5]
+    return np.array([x, y, heading]), np.array([vx, vy, wz])
+
+
+def ranges_of(content: Bytes) -> NDArray[np.float32]:
+    """The ranges (B,) of a serialised LaserScan, as the device reports them; raises as above."""
+    order = _order(content)
+    place = _aligned(_after_text(content, FRAME, order), 4) + 4 * SCAN_FIELDS
+    (beams,) = struct.unpack_from(f"{order}I", content, place)
+    return np.frombuffer(content, f"{order}f4", beams, place + 4)
+
+
+class OdometryWriter:
+    """Odometries of one robot.
+
+    Args:
+        message: with its frames and whatever else stays as it is.
+    """
+
+    def __init__(self, message: Odometry) -> None:
+        self._content = bytearray(serialize_message(message))
+        order = _order(self._content)
+        place = _doubles(self._content, order)
+        numbers = np.frombuffer(self._content, f"{order}f8", DOUBLES, place)
+        self._covariance = numbers[POSE_COVARIANCE:TWIST].reshape(6, 6)
+        self._stamp = struct.Struct(f"{order}iI")
+        self._two, self._place = struct.Struct(f"{order}2d"), place
+        self._angular = place + 8 * (TWIST + 5)
+        self._one = struct.Struct(f"{order}d")
+
+    def write(
+        self, stamp_ns: int, pose: Array, twist: Array, covariance: Array | None = None
+    ) -> bytes:
+        """One of pose (3,), body twist (3,), and covariance (3, 3) of the pose."""
+        content, place = self._content, self._place
+        x, y, heading = pose.tolist()
+        vx, vy, wz = twist.tolist()
+        self._stamp.pack_into(content, STAMP, *divmod(stamp_ns, NANO))
+        self._two.pack_into(content, place, x, y)
+        self._two.pack_into(
+            content, place + 8 * 5, math.sin(heading / 2.0), math.cos(heading / 2.0)
+        )
+        self._two.pack_into(content, place + 8 * TWIST, vx, vy)
+        self._one.pack_into(content, self._angular, wz)
+        if covariance is not None:
+            self._covariance[PLANAR] = covariance
+        return bytes(content)
+
+
+class ScanWriter:
+    """Scans of one lidar.
+
+    Args:
+        message: with its header and its ranges (B,), and whatever else stays as it is.
+    """
+
+    def __init__(self, message: LaserScan) -> None:
+        self._content = bytearray(serialize_message(message))
+        order = _order(self._content)
+        self._stamp = struct.Struct(f"{order}iI")
+        ranges = ranges_of(self._content)
+        self._ranges = np.frombuffer(self._content, ranges.dtype, len(ranges), self._first(order))
+
+    def _first(self, order: str) -> int:
+        return _aligned(_after_text(self._content, FRAME, order), 4) + 4 * (SCAN_FIELDS + 1)
+
+    def write(self, stamp_ns: int, ranges: NDArray[np.float32]) -> bytes:
+        """One of ranges (B,), as the device reports them."""
+        self._stamp.pack_into(self._content, STAMP, *divmod(stamp_ns, NANO))
+        self._ranges[:] = ranges
+        return bytes(self._content)
+
+
+class TwistWriter:
+    """Twists in the plane."""
+
+    def __init__(self) -> None:
+        self._content: bytes = serialize_message(Twist())
+        self._six = struct.Struct(f"{_order(self._content)}6d")
+
+    def write(self, twist: ArrayLike) -> bytes:
+        """One of linear.x, linear.y, angular.z (3,)."""
+        x, y, w = np.asarray(twist, np.float64).tolist()
+        return self._content[:HEAD] + self._six.pack(x, y, 0.0, 0.0, 0.0, w)

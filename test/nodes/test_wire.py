@@ -1,0 +1,129 @@
+"""What is written into bytes and read from them is what rclpy makes of the same message."""
+
+import struct
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import LaserScan
+
+from nics_drl_bridge.nodes import conversions, wire
+
+STAMP_NS = 1_763_000_000_123_456_789
+POSE, TWIST = np.array([1.25, -3.5, 2.0]), np.array([0.5, -0.25, 0.125])
+COVARIANCE = np.array([[4.0, 0.5, 0.25], [0.5, 3.0, 0.125], [0.25, 0.125, 2.0]])
+TEXTS = ["", "a", "odom", "car_1/odom", "a frame with a long name"]
+"""Of lengths that leave the numbers behind them at every place they can stand."""
+
+
+def odometry(frame, child):
+    message = conversions.odometry_to_ros(
+        [7.0, 8.0, 9.0], [1.0, 2.0, 3.0], 5, (frame, child), (0.1, 0.2, 0.3, 0.4)
+    )
+    message.pose.pose.position.z, message.twist.twist.angular.x = 0.75, -0.75
+    return message
+
+
+@pytest.mark.parametrize("child", TEXTS)
+@pytest.mark.parametrize("frame", TEXTS)
+def test_an_odometry_is_read_as_rclpy_reads_it(frame, child):
+    message = odometry(frame, child)
+    content = serialize_message(message)
+    assert wire.stamp_of(content) == 5
+    for mine, theirs in zip(
+        wire.odometry_of(content), conversions.odometry_from_ros(message), strict=True
+    ):
+        assert np.array_equal(mine, theirs)
+
+
+@pytest.mark.parametrize("child", TEXTS)
+@pytest.mark.parametrize("frame", TEXTS)
+def test_an_odometry_is_written_so_that_rclpy_reads_it_and_nothing_else_has_changed(frame, child):
+    message = odometry(frame, child)
+    content = wire.OdometryWriter(message).write(STAMP_NS, POSE, TWIST, COVARIANCE)
+
+    message.header.stamp = conversions.stamp_to_ros(STAMP_NS)
+    message.pose.pose.position.x, message.pose.pose.position.y = POSE[:2].tolist()
+    message.pose.pose.orientation = conversions.heading_to_ros(float(POSE[2]))
+    message.pose.covariance.reshape(6, 6)[conversions.PLANAR] = COVARIANCE
+    velocity = message.twist.twist
+    velocity.linear.x, velocity.linear.y, velocity.angular.z = TWIST.tolist()
+    assert deserialize_message(content, Odometry) == message
+
+
+def test_an_odometry_without_a_covariance_keeps_that_of_its_message():
+    message = odometry("odom", "base_link")
+    writer = wire.OdometryWriter(message)
+    read = deserialize_message(writer.write(STAMP_NS, POSE, TWIST), Odometry)
+    assert np.array_equal(read.pose.covariance, message.pose.covariance)
+
+
+def test_what_was_written_before_stays_as_it_was_when_the_next_is_written():
+    writer = wire.OdometryWriter(odometry("odom", "base_link"))
+    first = writer.write(STAMP_NS, POSE, TWIST)
+    writer.write(STAMP_NS + 1, 2.0 * POSE, 2.0 * TWIST)
+    assert wire.stamp_of(first) == STAMP_NS
+    assert wire.odometry_of(first)[0][0] == POSE[0]
+
+
+def scan(frame, beams):
+    message = LaserScan(angle_min=-1.5, angle_max=1.5, range_max=6.0)
+    message.header.frame_id, message.scan_time = frame, 0.125
+    message.ranges, message.intensities = [1.0] * beams, [0.5] * 3
+    return message
+
+
+@pytest.mark.parametrize("frame", TEXTS)
+@pytest.mark.parametrize("beams", [0, 1, 720])
+def test_a_scan_is_written_and_read_as_by_rclpy(frame, beams):
+    message = scan(frame, beams)
+    ranges = np.linspace(-1.0, 6.0, beams, dtype=np.float32)
+    ranges[:3] = np.array([np.inf, -np.inf, np.nan])[:beams]
+    content = wire.ScanWriter(message).write(STAMP_NS, ranges)
+
+    read = deserialize_message(content, LaserScan)
+    assert conversions.stamp_from_ros(read.header.stamp) == wire.stamp_of(content) == STAMP_NS
+    assert np.array_equal(np.array(read.ranges, np.float32), ranges, equal_nan=True)
+    assert np.array_equal(wire.ranges_of(content), ranges, equal_nan=True)
+    message.header.stamp, message.ranges = read.header.stamp, read.ranges
+    assert repr(read) == repr(message)  # NaN is not equal to itself
+
+
+def test_a_twist_is_written_so_that_rclpy_reads_it():
+    content = wire.TwistWriter().write(TWIST)
+    assert deserialize_message(content, Twist) == conversions.twist_to_ros(TWIST)
+
+
+def test_bytes_in_the_other_order_are_read_too():
+    body = struct.pack(">iI", 3, 4) + struct.pack(">I", 1) + b"\0" + bytes(3)
+    odom = body + struct.pack(">I", 1) + b"\0" + bytes(3)
+    numbers = np.zeros(wire.DOUBLES)
+    numbers[[0, 1, 6, wire.TWIST]] = 1.0, 2.0, 1.0, 3.0
+    content = bytes([0, 0, 0, 0]) + odom + numbers.astype(">f8").tobytes()
+    pose, twist = wire.odometry_of(content)
+    assert wire.stamp_of(content) == 3 * conversions.NANO + 4
+    assert pose.tolist() == [1.0, 2.0, 0.0]
+    assert twist.tolist() == [3.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("read", [wire.stamp_of, wire.odometry_of, wire.ranges_of])
+def test_bytes_that_are_no_plain_message_are_refused_and_not_read_beyond(read):
+    kind = scan("laser", 8) if read is wire.ranges_of else odometry("odom", "base_link")
+    content = serialize_message(kind)
+    read(content)
+    with pytest.raises(ValueError, match="begin no plain CDR"):
+        read(b"\0\7" + content[2:])
+    for length in (0, 3, 4, 9, 15, 17):
+        if read is wire.stamp_of and length > 11:
+            continue
+        with pytest.raises((ValueError, struct.error)):
+            read(content[:length])
+    longer = bytearray(content)
+    longer[12:16] = struct.pack("<I", 2**31)
+    if read is not wire.stamp_of:
+        with pytest.raises((ValueError, struct.error)):
+            read(bytes(longer))
