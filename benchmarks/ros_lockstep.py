@@ -191,7 +191,7 @@ def main() -> None:
     """Prints a table, or one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--chunks", type=int, default=40)
+    parser.add_argument("--chunks", type=int, default=150)
     parser.add_argument("--size", type=int, default=100, help="steps in a chunk")
     parser.add_argument("--answer", metavar="NAMESPACE", help=argparse.SUPPRESS)
     given = parser.parse_args()

@@ -20,7 +20,9 @@ from nics_drl_bridge.lidar.rep117 import from_device
 from nics_drl_bridge.middleware.view import Middleware
 from nics_drl_bridge.nodes import conversions, qos, wire
 from nics_drl_bridge.nodes.episodes import Episodes
+from nics_drl_bridge.nodes.executor import HANDED_OVER
 from nics_drl_bridge.nodes.link import Link
+from nics_drl_bridge.nodes.one_core import OneCore
 from nics_drl_bridge.nodes.robot_topics import data_facts
 from nics_drl_bridge.sim.world import World
 
@@ -51,8 +53,11 @@ class _Mailbox:
         self._lock, self._complete = threading.Lock(), threading.Event()
         self._awaited_ns, self._worked_ns = -1, -1
         self._failure: Exception | None = None
+        self._core = OneCore()
 
-    def put(self, topic: str, message: bytes) -> None:
+    def put(self, topic: str, message: bytes) -> object:
+        """Takes a message; returns `HANDED_OVER` when the caller now goes on."""
+        self._core.help()
         with self._lock:
             try:
                 self._stamps[topic] = wire.stamp_of(message)
@@ -62,6 +67,8 @@ class _Mailbox:
                 self._failure = error
             if self._failure is not None or self._late() is None:
                 self._complete.set()
+                return HANDED_OVER
+        return None
 
     def _work_in(self) -> None:
         """Works in the odometry that is waited for, once."""
@@ -98,7 +105,8 @@ class _Mailbox:
             self._work_in()
             late = self._late()
         if late is not None:
-            self._complete.wait(timeout_s)
+            with self._core:
+                self._complete.wait(timeout_s)
         with self._lock:
             self._awaited_ns = -1
             if self._failure is not None:
@@ -279,5 +287,5 @@ class DdsBackend:
         self._link.close()
 
 
-def _putter(mail: _Mailbox, topic: str) -> Callable[[bytes], None]:
+def _putter(mail: _Mailbox, topic: str) -> Callable[[bytes], object]:
     return lambda message: mail.put(topic, message)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import itertools
+import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from typing import Any
@@ -25,6 +26,10 @@ PARTS_MISSING = (AttributeError, TypeError)
 """What Python raises where rclpy is another one than is known here."""
 Received = tuple[Callable[..., Any], tuple[Any, ...]]
 """A callback and its arguments."""
+HANDED_OVER = object()
+"""What a callback returns that has woken another thread of this process. The executor then rests,
+for less than an exchange of messages takes, rather than be in that thread's way."""
+REST_S = 1e-4
 MOST_AT_ONCE = 32
 """A timer without a period is always ready, and who spins wants to look after other things too."""
 
@@ -38,7 +43,8 @@ class StandingExecutor(SingleThreadedExecutor):
     services, clients, events, tasks) is left to rclpy's own executor.
 
     Callbacks of subscriptions are plain functions of the message, or of it and what is known about
-    it; they are called in the thread that spins, one after the other.
+    it; they are called in the thread that spins, one after the other. See `HANDED_OVER` for what
+    they may return.
 
     That needs parts of rclpy that no interface promises. With an rclpy that lacks one of them it
     says so once in the log, and is rclpy's own executor from then on.
@@ -68,8 +74,11 @@ class StandingExecutor(SingleThreadedExecutor):
             super().spin_once(timeout_sec)
             return
         # Before anything else is looked at: somebody may wait for the answer to a message.
+        handed_over = False
         for callback, arguments in received:
-            callback(*arguments)
+            handed_over |= callback(*arguments) is HANDED_OVER
+        if handed_over:
+            time.sleep(REST_S)
         others = self._others_ready()
         for callback, arguments in self._come_since() if received else ():
             callback(*arguments)

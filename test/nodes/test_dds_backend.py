@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
+import threading
 
 import gymnasium
 import numpy as np
@@ -184,6 +186,20 @@ def test_what_is_lost_on_the_way_is_asked_for_again_and_counts_once(connect, mon
     for name in ("pose", "twist", "ranges"):
         assert np.array_equal(getattr(holed[0], name), getattr(whole[0], name)), name
     assert holed[1][f"{topic}_stamp_ns"] == holed[1]["stamp_ns"]
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2,
+    reason="needs two cores and a system that lets threads choose",
+)
+def test_the_executor_shares_a_core_with_whoever_steps_who_stays_free_to_run_anywhere(connect):
+    backend, free = connect(), os.sched_getaffinity(0)
+    backend.reset(START)
+    (helper,) = {t.native_id for t in threading.enumerate() if t.name == "dds_backend"}
+    for _ in range(20):
+        backend.step(np.array([0.5, 0.1]))
+        assert os.sched_getaffinity(0) == free
+    assert len(os.sched_getaffinity(helper)) == 1
 
 
 def test_another_model_is_refused_by_its_fingerprint(connect):

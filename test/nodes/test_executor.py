@@ -10,7 +10,7 @@ from std_msgs.msg import Int32
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.nodes import executor as executor_module
-from nics_drl_bridge.nodes.executor import StandingExecutor
+from nics_drl_bridge.nodes.executor import HANDED_OVER, StandingExecutor
 from nics_drl_bridge.nodes.runner import open_context
 
 pytestmark = pytest.mark.ros
@@ -100,6 +100,26 @@ def test_a_callback_that_asks_for_it_is_told_about_the_message(node, executor):
     data, info = told[0]
     assert isinstance(data, bytes)
     assert info["received_timestamp"] > 0
+
+
+def test_it_rests_after_a_callback_that_woke_another_thread_and_after_no_other(
+    node, executor, monkeypatch
+):
+    answers, rests, heard = [None, True, HANDED_OVER], [], []
+
+    def hear(message):
+        heard.append(message.data)
+        return answers[message.data]
+
+    monkeypatch.setattr(executor_module.time, "sleep", rests.append)
+    publisher = node.create_publisher(Int32, "count", 10)
+    node.create_subscription(Int32, "count", hear, 10)
+    spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched")
+    for number, answer in enumerate(answers):
+        publisher.publish(Int32(data=number))
+        spin_until(executor, lambda number=number: heard[-1:] == [number], "the message")
+        assert bool(rests) == (answer is HANDED_OVER)
+        rests.clear()
 
 
 @pytest.mark.parametrize("part", ["take_message", "wait set", "ends"])
