@@ -41,7 +41,12 @@ def heading_to_ros(heading: float) -> Quaternion:
 
 def heading_from_ros(q: Quaternion) -> float:
     """The heading [rad] of a quaternion."""
-    return math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+    return heading_of(q.x, q.y, q.z, q.w)
+
+
+def heading_of(x: float, y: float, z: float, w: float) -> float:
+    """The heading [rad] of a quaternion by its components."""
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def is_rotation(q: Quaternion) -> bool:

@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from nav_msgs.msg import Odometry
@@ -27,6 +27,7 @@ from nics_drl_bridge.nodes.robot_topics import data_facts
 from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 SCAN, ODOM, TRUTH = "scan", "odom", "ground_truth"
 AGAIN_S = 0.05
 """What does not come for so long is asked for again."""
@@ -60,12 +61,12 @@ class _Mailbox:
         self._core.help()
         with self._lock:
             try:
-                self._stamps[topic] = wire.stamp_of(message)
+                self._stamps[topic] = _read(topic, wire.stamp_of, message)
                 self._messages[topic], self._arrivals[topic] = message, time.monotonic_ns()
                 self._work_in()
             except Exception as error:  # noqa: BLE001  (it is raised in the caller's thread)
                 self._failure = error
-            if self._failure is not None or self._late() is None:
+            if self._awaited_ns >= 0 and (self._failure is not None or self._late() is None):
                 self._complete.set()
                 return HANDED_OVER
         return None
@@ -105,8 +106,7 @@ class _Mailbox:
             self._work_in()
             late = self._late()
         if late is not None:
-            with self._core:
-                self._complete.wait(timeout_s)
+            self._core.wait(self._complete, timeout_s)
         with self._lock:
             self._awaited_ns = -1
             if self._failure is not None:
@@ -121,7 +121,7 @@ def _worker(middleware: Middleware) -> Callable[[int, int, bytes], None]:
     """What works in odometry; it knows nothing of the backend, which may be garbage."""
 
     def work(stamp_ns: int, arrival_ns: int, message: bytes) -> None:
-        middleware.odometry(stamp_ns, arrival_ns, *wire.odometry_of(message))
+        middleware.odometry(stamp_ns, arrival_ns, *_read(ODOM, wire.odometry_of, message))
 
     return work
 
@@ -254,13 +254,14 @@ class DdsBackend:
         messages = self._await(now)
         self._check_stamps()
         message, arrival = messages[SCAN]
-        self._middleware.scan(now, arrival, from_device(wire.ranges_of(message), self._lidar))
+        ranges = from_device(_read(SCAN, wire.ranges_of, message), self._lidar)
+        self._middleware.scan(now, arrival, ranges)
         facts: dict[str, Any] = {
             "stamp_ns": now,
             **data_facts(self._middleware, time.monotonic_ns()),
         }
         if TRUTH in self._topics:
-            facts["true_pose"] = wire.odometry_of(messages[TRUTH][0])[0]
+            facts["true_pose"] = _read(TRUTH, wire.odometry_of, messages[TRUTH][0])[0]
         return self._middleware.view(now), facts
 
     def _await(self, stamp_ns: int) -> dict[str, tuple[bytes, int]]:
@@ -285,6 +286,16 @@ class DdsBackend:
     def close(self) -> None:
         """Publishes a zero command and ends the node."""
         self._link.close()
+
+
+def _read(topic: str, read: Callable[[bytes], T], message: bytes) -> T:
+    """What a message says. Raises BackendError when it is no message of that type."""
+    try:
+        return read(message)
+    except wire.UNREADABLE as error:
+        raise BackendError(
+            f"topic {topic!r}: a message can't be read ({error}); look at who publishes it."
+        ) from None
 
 
 def _putter(mail: _Mailbox, topic: str) -> Callable[[bytes], object]:

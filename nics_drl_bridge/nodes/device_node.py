@@ -9,7 +9,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Time
 from numpy.typing import NDArray
 from rclpy.clock import Clock as SteadyClock
 from rclpy.clock import ClockType
@@ -232,22 +231,21 @@ class DeviceNode(QosWatch):
         """Tells the present again to who has lost a part of it; in real time the next one comes."""
         response.success = self._time.lockstep
         if self._time.lockstep:
-            self._tell(conversions.stamp_to_ros(self._now_ns), odom_due=True, scan_due=True)
+            self._tell(odom_due=True, scan_due=True)
         response.message = "" if self._time.lockstep else "data are repeated in lock-step alone"
         return response
 
     def _publish(self) -> None:
         """Publishes what is due of the present."""
         now_ns = self._now_ns
-        now = conversions.stamp_to_ros(now_ns)
         if self._clock_topic.get_subscription_count():
-            self._clock_message.clock = now
+            self._clock_message.clock = conversions.stamp_to_ros(now_ns)
             self._clock_topic.publish(self._clock_message)
         odom_due, scan_due = self._odom_pace.due(now_ns), self._scan_pace.due(now_ns)
         if odom_due or scan_due:
-            self._tell(now, odom_due, scan_due)
+            self._tell(odom_due, scan_due)
 
-    def _tell(self, now: Time, odom_due: bool, scan_due: bool) -> None:
+    def _tell(self, odom_due: bool, scan_due: bool) -> None:
         """Publishes what the robots' devices say of the present."""
         now_ns, outbox, moving = self._now_ns, self._outbox, []
         for k, port in enumerate(self._ports):
@@ -255,7 +253,7 @@ class DeviceNode(QosWatch):
             if odom_due:
                 port.tell_odometry(sensed, outbox, now_ns)
                 if self._transforms.published:
-                    moving += port.moving(now, sensed)
+                    moving += port.moving(conversions.stamp_to_ros(now_ns), sensed)
             if scan_due:
                 port.tell_scan(sensed, outbox, now_ns)
         if moving:

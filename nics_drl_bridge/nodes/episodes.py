@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from typing import Any
 
 from rcl_interfaces.srv import SetParametersAtomically
@@ -14,6 +15,8 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes.link import Link
 from nics_drl_bridge.sim.world import World
+
+LOST_S = 1.0
 
 
 class Episodes:
@@ -35,6 +38,7 @@ class Episodes:
         self._reset = link.node.create_client(Trigger, f"{simulator}/reset")
         self._repeat = link.node.create_client(Trigger, f"{simulator}/repeat")
         self._repeating: Any = None
+        self._asked_s = 0.0
         self.clients = [self._reset, self._parameters]
 
     @property
@@ -55,9 +59,17 @@ class Episodes:
             raise BackendError(f"the simulator refused the episode: {result.reason}")
 
     def repeat(self) -> None:
-        """Asks for the present data again, without waiting; not while the last asking goes on."""
-        if self._repeating is None or self._repeating.done():
-            self._repeating = self._repeat.call_async(Trigger.Request())
+        """Asks for the present data again, without waiting; not while the last asking goes on.
+
+        An asking that gets no answer for long was lost itself, and is given up.
+        """
+        now, asked = time.monotonic(), self._repeating
+        if asked is not None and not asked.done():
+            if now - self._asked_s < LOST_S:
+                return
+            self._repeat.remove_pending_request(asked)
+        if self._repeat.service_is_ready():
+            self._repeating, self._asked_s = self._repeat.call_async(Trigger.Request()), now
 
     def begin(self, timeout_s: float) -> int:
         """Begins the chosen episode; the stamp of its first data [ns].

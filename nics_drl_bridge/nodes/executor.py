@@ -74,14 +74,10 @@ class StandingExecutor(SingleThreadedExecutor):
             super().spin_once(timeout_sec)
             return
         # Before anything else is looked at: somebody may wait for the answer to a message.
-        handed_over = False
-        for callback, arguments in received:
-            handed_over |= callback(*arguments) is HANDED_OVER
-        if handed_over:
-            time.sleep(REST_S)
+        _call(received)
         others = self._others_ready()
-        for callback, arguments in self._come_since() if received else ():
-            callback(*arguments)
+        if received:
+            _call(self._come_since())
         if others:
             self._handle_others()
 
@@ -227,6 +223,15 @@ def _take(subscriptions: Iterable[tuple[Any, int]]) -> list[Received]:
         if taken is not None:
             received.append((subscription.callback, taken[:arguments]))
     return received
+
+
+def _call(received: Iterable[Received]) -> None:
+    """Calls back, and rests if another thread now goes on."""
+    handed_over = False
+    for callback, arguments in received:
+        handed_over |= callback(*arguments) is HANDED_OVER
+    if handed_over:
+        time.sleep(REST_S)
 
 
 def _arguments(callback: Callable[..., Any]) -> int:

@@ -1,4 +1,4 @@
-"""RobotPort: what one simulated robot tells, in messages that are made once and filled anew."""
+"""RobotPort: what one simulated robot tells, written into messages that are there already."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
-from numpy.typing import NDArray
 from rclpy.node import Node
 from sensor_msgs.msg import JointState, LaserScan
 
@@ -19,7 +18,6 @@ from nics_drl_bridge.nodes.outbox import Outbox
 from nics_drl_bridge.sim.dead_reckoning import LEAST_VARIANCE, variances
 from nics_drl_bridge.sim.device_world import Sensed
 
-Array = NDArray[np.float64]
 PLANAR = np.array([0, 1, 5])
 DIAGONAL = np.arange(0, 36, 7)
 

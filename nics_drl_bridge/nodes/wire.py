@@ -1,7 +1,7 @@
 """Scans, odometry and twists as the bytes that travel, without a Python object for each number.
 
-rclpy copies each field of a message between Python and C, both ways, and checks it: for an
-odometry that takes longer than to simulate its step. What is sent and received in each step is
+rclpy makes a Python object of each field of a message, and back, and checks it: for an odometry
+that takes longer than to simulate its step. What is sent and received in each step is
 therefore written into, and read from, its serialised form. That is the Common Data Representation
 of DDS, with its numbers aligned to their size, counted from behind four bytes that name the order
 of the bytes (OMG DDS-XTypes 7.4.3, "plain CDR"). `test/nodes/test_wire.py` holds it against
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import LaserScan
 
-from nics_drl_bridge.nodes.conversions import NANO, PLANAR
+from nics_drl_bridge.nodes.conversions import NANO, PLANAR, heading_of
 
 Array = NDArray[np.float64]
 Bytes = bytes | bytearray
@@ -30,6 +30,8 @@ STAMP = 4
 """Where the stamp of a header begins."""
 FRAME = 12
 """Where its frame begins."""
+UNREADABLE = (ValueError, struct.error)
+"""What is raised for bytes that are no message of the type."""
 PLAIN = (0, 1)
 """Big-endian and little-endian plain CDR."""
 DOUBLES = 7 + 36 + 6 + 36
@@ -64,28 +66,22 @@ def _doubles(content: Bytes, order: str) -> int:
 
 
 def stamp_of(content: Bytes) -> int:
-    """The stamp of a message that begins with a header [ns]."""
+    """The stamp of a message that begins with a header [ns]. Raises `UNREADABLE`."""
     seconds, nanoseconds = struct.unpack_from(f"{_order(content)}iI", content, STAMP)
     return int(seconds) * NANO + int(nanoseconds)
 
 
 def odometry_of(content: Bytes) -> tuple[Array, Array]:
-    """Pose (3,) and body twist (3,) of a serialised Odometry.
-
-    Raises:
-        ValueError: it is no plain CDR, or cut short.
-        struct.error: it is cut short.
-    """
+    """Pose (3,) and body twist (3,) of a serialised Odometry. Raises `UNREADABLE`."""
     order = _order(content)
     values = np.frombuffer(content, f"{order}f8", DOUBLES, _doubles(content, order))
     x, y, _, qx, qy, qz, qw = values[:7].tolist()
-    heading = math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
     vx, vy, wz = values[TWIST], values[TWIST + 1], values[TWIST + 5]
-    return np.array([x, y, heading]), np.array([vx, vy, wz])
+    return np.array([x, y, heading_of(qx, qy, qz, qw)]), np.array([vx, vy, wz])
 
 
 def ranges_of(content: Bytes) -> NDArray[np.float32]:
-    """The ranges (B,) of a serialised LaserScan, as the device reports them; raises as above."""
+    """The ranges (B,) of a serialised LaserScan, as the device says. Raises `UNREADABLE`."""
     order = _order(content)
     place = _aligned(_after_text(content, FRAME, order), 4) + 4 * SCAN_FIELDS
     (beams,) = struct.unpack_from(f"{order}I", content, place)
@@ -138,13 +134,8 @@ class ScanWriter:
 
     def __init__(self, message: LaserScan) -> None:
         self._content = bytearray(serialize_message(message))
-        order = _order(self._content)
-        self._stamp = struct.Struct(f"{order}iI")
-        ranges = ranges_of(self._content)
-        self._ranges = np.frombuffer(self._content, ranges.dtype, len(ranges), self._first(order))
-
-    def _first(self, order: str) -> int:
-        return _aligned(_after_text(self._content, FRAME, order), 4) + 4 * (SCAN_FIELDS + 1)
+        self._stamp = struct.Struct(f"{_order(self._content)}iI")
+        self._ranges = ranges_of(self._content)  # which, of a bytearray, can be written to
 
     def write(self, stamp_ns: int, ranges: NDArray[np.float32]) -> bytes:
         """One of ranges (B,), as the device reports them."""

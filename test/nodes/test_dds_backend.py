@@ -12,6 +12,9 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import Twist
+from rclpy.serialization import serialize_message
+from rclpy.task import Future
+from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.sim_backend import SimBackend
@@ -19,7 +22,8 @@ from nics_drl_bridge.errors import BackendError, ModelError, StaleDataError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.dds_backend import DdsBackend
+from nics_drl_bridge.nodes.dds_backend import DdsBackend, _Mailbox
+from nics_drl_bridge.nodes.executor import HANDED_OVER
 from nics_drl_bridge.sim.world import load_world
 
 pytestmark = pytest.mark.ros
@@ -200,6 +204,66 @@ def test_the_executor_shares_a_core_with_whoever_steps_who_stays_free_to_run_any
         backend.step(np.array([0.5, 0.1]))
         assert os.sched_getaffinity(0) == free
     assert len(os.sched_getaffinity(helper)) == 1
+
+
+def test_a_lost_asking_is_made_again(connect, monkeypatch):
+    backend = connect()
+    drive(backend)
+    put, ask, lost = backend._mail.put, backend._episodes._repeat.call_async, []
+
+    def lossy(kind, message):
+        if kind == "scan" and "scan" not in lost:
+            lost.append(kind)
+            return None
+        return put(kind, message)
+
+    def deaf(request):
+        if "asking" not in lost:
+            lost.append("asking")
+            return Future()
+        return ask(request)
+
+    monkeypatch.setattr("nics_drl_bridge.nodes.episodes.LOST_S", 0.1)
+    monkeypatch.setattr(backend._mail, "put", lossy)
+    monkeypatch.setattr(backend._episodes._repeat, "call_async", deaf)
+    view, facts = backend.step(np.array([0.5, 0.1]))
+    assert lost == ["scan", "asking"]
+    assert view.scan_age_s == 0.0
+    assert facts["scan_stamp_ns"] == facts["stamp_ns"]
+
+
+@pytest.mark.parametrize("topic", ["odom", "scan", "ground_truth"])
+def test_a_message_that_cant_be_read_is_told_with_its_topic(connect, monkeypatch, topic):
+    backend = connect(truth=True)
+    drive(backend)
+    put = backend._mail.put
+    monkeypatch.setattr(
+        backend._mail, "put", lambda kind, m: put(kind, m[:14] if kind == topic else m)
+    )
+    with pytest.raises(BackendError, match=f"topic '{topic}': a message can't be read"):
+        backend.step(np.array([0.5, 0.1]))
+    monkeypatch.undo()
+    drive(backend)
+
+
+def test_the_executor_rests_only_for_a_caller_that_waits_and_now_has_all():
+    def stamped(second):
+        message = LaserScan()
+        message.header.stamp.sec = second
+        return serialize_message(message)
+
+    worked, got = [], []
+    mail = _Mailbox(("odom", "scan"), lambda stamp, *_: worked.append(stamp))
+    assert mail.put("odom", stamped(1)) is mail.put("scan", stamped(1)) is None
+    caller = threading.Thread(target=lambda: got.append(mail.wait(2 * conversions.NANO, TIMEOUT_S)))
+    caller.start()
+    while mail._awaited_ns < 0:
+        os.sched_yield()
+    assert mail.put("odom", stamped(2)) is None
+    assert worked == [2 * conversions.NANO]
+    assert mail.put("scan", stamped(2)) is HANDED_OVER
+    caller.join(TIMEOUT_S)
+    assert got[0].keys() == {"odom", "scan"}
 
 
 def test_another_model_is_refused_by_its_fingerprint(connect):

@@ -102,6 +102,21 @@ def test_a_callback_that_asks_for_it_is_told_about_the_message(node, executor):
     assert info["received_timestamp"] > 0
 
 
+def test_it_rests_too_when_the_message_that_counts_came_while_another_was_handled(
+    node, executor, monkeypatch
+):
+    rests, late = [], [(lambda _: HANDED_OVER, (Int32(),))]
+    monkeypatch.setattr(executor_module.time, "sleep", rests.append)
+    monkeypatch.setattr(executor, "_come_since", lambda: late)
+    publisher, heard = node.create_publisher(Int32, "count", 10), []
+    node.create_subscription(Int32, "count", heard.append, 10)
+    spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched")
+    assert not rests
+    publisher.publish(Int32())
+    spin_until(executor, lambda: heard, "the message")
+    assert rests == [executor_module.REST_S]
+
+
 def test_it_rests_after_a_callback_that_woke_another_thread_and_after_no_other(
     node, executor, monkeypatch
 ):

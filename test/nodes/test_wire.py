@@ -16,7 +16,7 @@ from nics_drl_bridge.nodes import conversions, wire
 STAMP_NS = 1_763_000_000_123_456_789
 POSE, TWIST = np.array([1.25, -3.5, 2.0]), np.array([0.5, -0.25, 0.125])
 COVARIANCE = np.array([[4.0, 0.5, 0.25], [0.5, 3.0, 0.125], [0.25, 0.125, 2.0]])
-TEXTS = ["", "a", "odom", "car_1/odom", "a frame with a long name"]
+TEXTS = ["", "a", "map", "odom", "car_1/odom", "a frame with a long name"]
 """Of lengths that leave the numbers behind them at every place they can stand."""
 
 
