@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import time
 from collections.abc import Callable
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -29,8 +31,26 @@ class NoMotionError(RuntimeError):
     """The gate was armed, but no command that moves the robot came."""
 
 
+def hear(domain_id: int, out: Connection) -> None:
+    """The base's end of `cmd_vel`: tells when each command came [s] and which; never ends."""
+    context = open_context(domain_id=domain_id)
+    node = Node("base", context=context, start_parameter_services=False)
+
+    def tell(message: Twist) -> None:
+        out.send((time.monotonic(), conversions.twist_from_ros(message)))
+
+    node.create_subscription(Twist, "cmd_vel", tell, qos.COMMAND)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    while True:
+        executor.spin_once()
+
+
 class Robot:
     """A robot's topics, whole or broken. It does what `cmd_vel` says, unless it is stuck.
+
+    Commands are heard in a process of their own, as by a base: who publishes to a process that was
+    killed may be held up for a second by the middleware, and would hear the stop late.
 
     Attributes:
         silent: topics that say nothing.
@@ -58,7 +78,10 @@ class Robot:
         }
         self.heard: list[tuple[float, np.ndarray]] = []
         self._policy = policy
-        self.node.create_subscription(Twist, "cmd_vel", self._hear, qos.COMMAND)
+        spawning = multiprocessing.get_context("spawn")
+        self._ear, out = spawning.Pipe(duplex=False)
+        self._base = spawning.Process(target=hear, args=(domain_id, out), daemon=True)
+        self._base.start()
         self.node.create_subscription(TwistStamped, "cmd_vel_raw", self._hear_policy, qos.COMMAND)
         self._clients = {
             service: self.node.create_client(Trigger, f"command_gate/{service}")
@@ -75,8 +98,9 @@ class Robot:
         self.change: dict[str, Callable[[Any], Any]] = {}
         self.stuck, self.republished, self.jump_ns = False, False, 0
 
-    def _hear(self, message: Twist) -> None:
-        self.heard.append((time.monotonic(), conversions.twist_from_ros(message)))
+    def _listen(self) -> None:
+        while self._ear.poll():
+            self.heard.append(self._ear.recv())
 
     def _hear_policy(self, message: TwistStamped) -> None:
         if self._policy and not self.republished:
@@ -121,12 +145,14 @@ class Robot:
     def until(self, condition: Callable[[], object], seconds: float, what: str = "") -> None:
         """Lives on until something is the case; raises after the time, if it is to be named."""
         end = time.monotonic() + seconds
+        self._listen()
         while not condition():
             if time.monotonic() > end:
                 if what:
                     raise RuntimeError(f"not within {seconds} s: {what}")
                 return
             self._executor.spin_once(timeout_sec=0.01)
+            self._listen()
 
     def call(self, service: str) -> Trigger.Response:
         """Asks the gate for something."""
@@ -173,3 +199,5 @@ class Robot:
         self._executor.shutdown(timeout_sec=1.0)
         self.node.destroy_node()
         self._context.try_shutdown()
+        self._base.terminate()
+        self._base.join()
