@@ -3,7 +3,8 @@
 The env is that of `gymnasium.make`: a command to a simulator node in a process of its own, its
 720-beam scan among ten obstacles and its odometry back, the estimator, observation and reward. The
 bare echo is what ROS 2 itself allows: two processes of rclpy's own executor that exchange the same
-messages, made once, and do nothing else. Both are measured in turns, chunk by chunk, so that
+messages, made once, and do nothing else; with `--executor standing` they are processes of this
+package's executor, whose wait set stands. Both are measured in turns, chunk by chunk, so that
 whatever else the machine does falls on both.
 """
 
@@ -32,6 +33,7 @@ from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.registration import NAVIGATION, register_envs
+from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 from nics_drl_bridge.sim.world import World
 
@@ -44,19 +46,20 @@ WORLD = {
     "goal_distance": [2.0, 4.0],
 }
 DEPTH, PATIENCE_S = 10, 60.0
+EXECUTORS = {"rclpy": SingleThreadedExecutor, "standing": StandingExecutor}
 Exchange = Callable[[], Callable[[], object] | None]
 
 
 class Bare:
-    """One node and rclpy's executor."""
+    """One node and an executor."""
 
-    def __init__(self, name: str, namespace: str) -> None:
+    def __init__(self, name: str, namespace: str, executor: str) -> None:
         self.context = Context()
         self.context.init(None)
         self.node = Node(
             name, namespace=namespace, context=self.context, start_parameter_services=False
         )
-        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor = EXECUTORS[executor](context=self.context)
         self._executor.add_node(self.node)
 
     def spin_until(self, done: Callable[[], bool]) -> None:
@@ -68,9 +71,9 @@ class Bare:
             self._executor.spin_once(timeout_sec=1.0)
 
 
-def answer(namespace: str) -> None:
+def answer(namespace: str, executor: str) -> None:
     """The far end of the bare echo: answers each Twist by an Odometry and a LaserScan."""
-    end, parent = Bare("far_end", namespace), os.getppid()
+    end, parent = Bare("far_end", namespace, executor), os.getppid()
     odometry, scan = Odometry(), LaserScan()
     scan.ranges = array.array("f", [1.0] * BEAMS)
     odometry_topic = end.node.create_publisher(Odometry, "odom", DEPTH)
@@ -86,14 +89,15 @@ def answer(namespace: str) -> None:
 
 
 @contextmanager
-def bare_echo(domain_id: int) -> Iterator[Exchange]:
+def bare_echo(domain_id: int, executor: str) -> Iterator[Exchange]:
     """A function that makes one round trip between two processes."""
     os.environ["ROS_DOMAIN_ID"] = str(domain_id)
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     namespace = f"bare_{os.getpid()}"
-    far = subprocess.Popen([sys.executable, __file__, "--answer", namespace])
+    order = [sys.executable, __file__, "--answer", namespace, "--executor", executor]
+    far = subprocess.Popen(order)
     try:
-        end = Bare("near_end", namespace)
+        end = Bare("near_end", namespace, executor)
         received: list[object] = []
         end.node.create_subscription(Odometry, "odom", received.append, DEPTH)
         end.node.create_subscription(LaserScan, "scan", received.append, DEPTH)
@@ -163,13 +167,13 @@ def chunk(exchange: Exchange, count: int) -> list[float]:
     return times
 
 
-def measure(chunks: int, size: int) -> dict[str, float]:
+def measure(chunks: int, size: int, executor: str) -> dict[str, float]:
     """Steps and echoes per second over all chunks, and how long a step takes."""
     domain_id = free_domain_id()
     with (
         tempfile.TemporaryDirectory() as folder,
         lockstep_env(domain_id, Path(folder)) as step,
-        bare_echo(domain_id) as echo,
+        bare_echo(domain_id, executor) as echo,
     ):
         chunk(step, size), chunk(echo, size)  # as warm as they get
         steps, echoes = [], []
@@ -193,12 +197,13 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--chunks", type=int, default=150)
     parser.add_argument("--size", type=int, default=100, help="steps in a chunk")
+    parser.add_argument("--executor", choices=EXECUTORS, default="rclpy", help="of the bare pair")
     parser.add_argument("--answer", metavar="NAMESPACE", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.answer:
-        answer(given.answer)
+        answer(given.answer, given.executor)
         return
-    result = measure(given.chunks, given.size)
+    result = measure(given.chunks, given.size, given.executor)
     if given.json:
         sys.stdout.write(json.dumps(result) + "\n")
     else:

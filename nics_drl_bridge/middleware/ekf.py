@@ -63,12 +63,17 @@ class Belief(NamedTuple):
 
 
 class _Foreseen(NamedTuple):
-    """What a prediction comes to: time [ns], mean, covariance, and the twist to measure then."""
+    """What a prediction comes to: time [ns], mean, covariance, and the twist to measure then.
+
+    And where there was time for it, what such a measurement makes of it, whatever its value: the
+    gain (3 + S, 3) and the covariance after it.
+    """
 
     time_ns: int
     mean: Array
     covariance: Array
     expected: tuple[Array, Array]
+    update: tuple[Array, Array] | None = None
 
 
 class Estimator:
@@ -103,7 +108,7 @@ class Estimator:
         }
         self._observe_pose = np.eye(3, 3 + size)
         self._log = CommandLog(len(model.robot.command))
-        self._filter = ExtendedKalmanFilter(dim_x=3 + size, dim_z=3)
+        self._filter, self._trial = (ExtendedKalmanFilter(3 + size, 3) for _ in range(2))
         self._foreseen: _Foreseen | None = None  # of the present belief and commands
         self.reset(0, np.zeros(3))
 
@@ -182,14 +187,25 @@ class Estimator:
             return
         if self._foreseen is None or self._foreseen.time_ns != time_ns:
             self._foreseen = self._forecast(time_ns)
-        self.time_ns, self._filter.x, self._filter.P, _ = self._foreseen
+        self.time_ns, self._filter.x, self._filter.P, *_ = self._foreseen
 
     def foresee(self, time_ns: int) -> None:
-        """Does now what `predict` to that time would do, which then only takes it over.
+        """Does now what `predict` to that time, and a twist measured then, would do.
 
-        For whoever has time now and none when the data come; the estimate is the same to the bit.
+        They then only take it over. For whoever has time now and none when the data come; the
+        estimate is the same to the bit.
         """
-        self._foreseen = self._forecast(time_ns) if time_ns > self.time_ns else None
+        self._foreseen = None
+        if time_ns > self.time_ns:
+            foreseen = self._forecast(time_ns)
+            self._foreseen = foreseen._replace(update=self._try(foreseen))
+
+    def _try(self, foreseen: _Foreseen) -> tuple[Array, Array]:
+        """Gain, and covariance afterwards, of a measured twist; neither depends on its value."""
+        trial, (twist, derivative) = self._trial, foreseen.expected
+        trial.x, trial.P = foreseen.mean, foreseen.covariance
+        trial.update(twist, lambda _: derivative, lambda _: twist, R=self._noise[Kind.TWIST])
+        return trial.K, trial.P
 
     def _forecast(self, time_ns: int) -> _Foreseen:
         log = self._log.arrays
@@ -235,6 +251,9 @@ class Estimator:
             return Verdict(distance, outcome)
         if kind is Kind.POSE and outcome is Outcome.JUMP:
             self._jump(value, noise)
+        elif (update := self._update_foreseen(kind, outcome, noise)) is not None:
+            gain, self._filter.P = update
+            self._filter.x = self._filter.x + gain.dot(innovation)
         else:
             self._filter.update(
                 value, lambda _: derivative, lambda _: expected, R=noise, residual=residual
@@ -256,6 +275,16 @@ class Estimator:
                 self._filter.x, self.time_ns, self._log.arrays, self._terms
             )
         return (twist, derivative) if kind is Kind.TWIST else (twist[2:], derivative[2:])
+
+    def _update_foreseen(
+        self, kind: Kind, outcome: Outcome, noise: Array
+    ) -> tuple[Array, Array] | None:
+        """What was tried in advance, if it was for such a measurement of the present belief."""
+        foreseen = self._foreseen
+        if foreseen is None or foreseen.mean is not self._filter.x:
+            return None
+        as_tried = outcome is Outcome.USED and noise is self._noise[Kind.TWIST]
+        return foreseen.update if kind is Kind.TWIST and as_tried else None
 
     def _surprise(self, kind: Kind, innovation: Array, derivative: Array, noise: Array) -> Outcome:
         """What to make of a measurement beyond its gate; a robot that is stuck makes news."""

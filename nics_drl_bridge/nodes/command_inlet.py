@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.nodes import conversions
+from nics_drl_bridge.nodes import conversions, wire
 
 Array = NDArray[np.float64]
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
@@ -50,9 +50,9 @@ class CommandInlet:
         self._node, self._robot, self._take, self._too_old = node, robot, take, too_old
         stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
         self._kind = STAMPED if stamped else TWIST
-        kind, hear = (TwistStamped, self._on_stamped) if stamped else (Twist, self._on_twist)
+        kind, hear = (TwistStamped, self._on_stamped) if stamped else (Twist, self._on_bytes)
         self._topic: str = node.create_subscription(
-            kind, f"{namespace}cmd_vel", hear, quality
+            kind, f"{namespace}cmd_vel", hear, quality, raw=not stamped
         ).topic_name
         self._warned: set[str] = set()
         self._steering = steering_of(robot)
@@ -66,9 +66,13 @@ class CommandInlet:
             return  # an option of those who have it
         self._node.create_subscription(kind, topic, self._on_ackermann, quality)
 
-    def _on_twist(self, message: Twist) -> None:
-        linear = message.linear
-        twist = linear.x, linear.y, message.angular.z
+    def _on_bytes(self, content: bytes) -> None:
+        try:
+            self._obey(wire.twist_of(content))
+        except wire.UNREADABLE as error:
+            self._complain(f"a message that can't be read ({error}) is ignored")
+
+    def _obey(self, twist: tuple[float, float, float]) -> None:
         if all(map(math.isfinite, twist)):
             self._take(self._robot.from_cmd_vel(twist))
         else:
@@ -76,7 +80,8 @@ class CommandInlet:
 
     def _on_stamped(self, message: TwistStamped) -> None:
         if self._is_fresh(message.header.stamp):
-            self._on_twist(message.twist)
+            twist = message.twist
+            self._obey((twist.linear.x, twist.linear.y, twist.angular.z))
 
     def _on_ackermann(self, message: Any) -> None:
         command = np.empty(2)

@@ -88,6 +88,12 @@ def ranges_of(content: Bytes) -> NDArray[np.float32]:
     return np.frombuffer(content, f"{order}f4", beams, place + 4)
 
 
+def twist_of(content: Bytes) -> tuple[float, float, float]:
+    """linear.x, linear.y, angular.z of a serialised Twist. Raises `UNREADABLE`."""
+    x, y, _, _, _, w = struct.unpack_from(f"{_order(content)}6d", content, HEAD)
+    return x, y, w
+
+
 class OdometryWriter:
     """Odometries of one robot.
 

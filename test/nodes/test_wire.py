@@ -93,9 +93,12 @@ def test_a_scan_is_written_and_read_as_by_rclpy(frame, beams):
     assert repr(read) == repr(message)  # NaN is not equal to itself
 
 
-def test_a_twist_is_written_so_that_rclpy_reads_it():
-    content = wire.TwistWriter().write(TWIST)
-    assert deserialize_message(content, Twist) == conversions.twist_to_ros(TWIST)
+def test_a_twist_is_written_so_that_rclpy_reads_it_and_read_as_rclpy_writes_it():
+    content, message = wire.TwistWriter().write(TWIST), conversions.twist_to_ros(TWIST)
+    assert deserialize_message(content, Twist) == message
+
+    message.linear.z, message.angular.x, message.angular.y = 7.0, 8.0, 9.0
+    assert wire.twist_of(serialize_message(message)) == tuple(TWIST)
 
 
 def test_bytes_in_the_other_order_are_read_too():
@@ -108,12 +111,20 @@ def test_bytes_in_the_other_order_are_read_too():
     assert wire.stamp_of(content) == 3 * conversions.NANO + 4
     assert pose.tolist() == [1.0, 2.0, 0.0]
     assert twist.tolist() == [3.0, 0.0, 0.0]
+    assert wire.twist_of(bytes(4) + struct.pack(">6d", *range(6))) == (0.0, 1.0, 5.0)
 
 
-@pytest.mark.parametrize("read", [wire.stamp_of, wire.odometry_of, wire.ranges_of])
+MESSAGES = {
+    wire.stamp_of: odometry("odom", "base_link"),
+    wire.odometry_of: odometry("odom", "base_link"),
+    wire.twist_of: Twist(),
+    wire.ranges_of: scan("laser", 8),
+}
+
+
+@pytest.mark.parametrize("read", MESSAGES)
 def test_bytes_that_are_no_plain_message_are_refused_and_not_read_beyond(read):
-    kind = scan("laser", 8) if read is wire.ranges_of else odometry("odom", "base_link")
-    content = serialize_message(kind)
+    content = serialize_message(MESSAGES[read])
     read(content)
     with pytest.raises(ValueError, match="begin no plain CDR"):
         read(b"\0\7" + content[2:])
@@ -124,6 +135,6 @@ def test_bytes_that_are_no_plain_message_are_refused_and_not_read_beyond(read):
             read(content[:length])
     longer = bytearray(content)
     longer[12:16] = struct.pack("<I", 2**31)
-    if read is not wire.stamp_of:
+    if read not in (wire.stamp_of, wire.twist_of):  # which hold no text
         with pytest.raises((ValueError, struct.error)):
             read(bytes(longer))
