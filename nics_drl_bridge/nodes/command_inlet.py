@@ -15,6 +15,7 @@ from rclpy.qos import QoSProfile
 
 from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.nodes import conversions, wire
+from nics_drl_bridge.nodes.graph import owner
 
 Array = NDArray[np.float64]
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
@@ -107,8 +108,8 @@ class CommandInlet:
     def watch(self) -> None:
         """Warns once of each node that publishes the other type, which is never heard."""
         for end in self._node.get_publishers_info_by_topic(self._topic):
-            kind, who = end.topic_type, f"{end.node_namespace.rstrip('/')}/{end.node_name}"
-            if kind == self._kind or f"{who} {kind}" in self._warned or "_UNKNOWN_" in who:
+            kind, who = end.topic_type, owner(end)
+            if kind == self._kind or who is None or f"{who} {kind}" in self._warned:
                 continue
             self._warned.add(f"{who} {kind}")
             switch = SWITCH[self._kind] if kind in SWITCH else "another type there"

@@ -24,6 +24,7 @@ from nics_drl_bridge.nodes import conversions, device_parameters, qos
 from nics_drl_bridge.nodes.command_inlet import CommandInlet
 from nics_drl_bridge.nodes.device_parameters import declare_device
 from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
+from nics_drl_bridge.nodes.graph import owner
 from nics_drl_bridge.nodes.outbox import Outbox
 from nics_drl_bridge.nodes.pace import Pace, RealTime
 from nics_drl_bridge.nodes.qos_watch import QosWatch
@@ -34,6 +35,7 @@ from nics_drl_bridge.sim.device_world import DeviceWorld
 from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]
+CLOCK = "/clock"
 WATCH_S = 2.0
 LONGEST_TICK_S = 0.005
 """How often it is looked whether something late is due."""
@@ -83,7 +85,8 @@ class DeviceNode(QosWatch):
 
     def _open_topics(self, model: SimulatorModel) -> None:
         self._outbox = Outbox()
-        self._clock_topic = self.create_publisher(Clock, "/clock", qos.SENSOR_RELIABLE)
+        self._clock_topic = self.create_publisher(Clock, CLOCK, qos.SENSOR_RELIABLE)
+        self._clocks = {self.get_fully_qualified_name()}
         self._clock_message = Clock()
         self._transforms = Transforms(self)
         spaces = [f"{name}/" if name else "" for name in self._names]
@@ -127,6 +130,18 @@ class DeviceNode(QosWatch):
     def _watch(self) -> None:
         for inlet in self._inlets:
             inlet.watch()
+        self._watch_clock()
+
+    def _watch_clock(self) -> None:
+        """Warns once of each other node that tells the time: whoever listens would hear both."""
+        ends = self.get_publishers_info_by_topic(CLOCK)
+        names = {name for end in ends if (name := owner(end)) is not None}
+        for name in names - self._clocks:
+            self.get_logger().warning(
+                f"{name} publishes {CLOCK} too, and nodes with use_sim_time hear both; give each "
+                "simulator a ROS_DOMAIN_ID of its own, or let one run all robots (`robots`)."
+            )
+        self._clocks |= names
 
     def _look(self) -> Finding:
         """What `/diagnostics` tells."""

@@ -21,6 +21,7 @@ from rclpy.publisher import Publisher
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.executor import StandingExecutor
+from nics_drl_bridge.nodes.graph import owner
 from nics_drl_bridge.nodes.qos_watch import QosWatch
 from nics_drl_bridge.nodes.runner import last_word, open_context
 from nics_drl_bridge.nodes.wire import TwistWriter
@@ -129,12 +130,10 @@ class Link:
             return
         topic = self.commands.topic_name
         ends = self.node.get_publishers_info_by_topic(topic)
-        names = sorted(f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends)
+        names = sorted(name for end in ends if (name := owner(end)) is not None)
         with contextlib.suppress(ValueError):
             names.remove(self.node.get_fully_qualified_name())
-        # A node's name travels apart from its publishers, and may not be here yet.
-        known = [name for name in names if "_UNKNOWN_" not in name]
-        raise BackendError(f"{', '.join(known) or 'somebody'} publishes {topic} too; stop it.")
+        raise BackendError(f"{', '.join(names) or 'somebody'} publishes {topic} too; stop it.")
 
     def wait_for_peers(self, topics: Sequence[str], clients: Sequence[Any], patience_s: float,
                        advice: str) -> None:  # fmt: skip

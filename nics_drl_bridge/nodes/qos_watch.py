@@ -16,8 +16,9 @@ try:
 except ModuleNotFoundError:  # Humble
     from rclpy.qos_event import PublisherEventCallbacks, SubscriptionEventCallbacks
 
+from nics_drl_bridge.nodes.graph import owner
+
 MOMENT_S = 0.5
-UNKNOWN = "_UNKNOWN_"
 SENTENCE = (
     "{topic}: no message passes between this node and {peer}: the {policy} that the publisher "
     "offers ({offered}) is less than what the subscription asks for ({asked}); let {cure}."
@@ -82,8 +83,7 @@ class QosWatch(Node):
         for peer in reversed(look(topic)):
             pair = (ours, peer.qos_profile) if publishing else (peer.qos_profile, ours)
             if qos_check_compatible(*pair)[0] == Compatibility.ERROR:
-                name = f"{peer.node_namespace.rstrip('/')}/{peer.node_name}"
-                return ("a peer" if UNKNOWN in name else name), peer.qos_profile
+                return owner(peer) or "a peer", peer.qos_profile
         return "a peer", None
 
 

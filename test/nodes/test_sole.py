@@ -18,7 +18,6 @@ from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.nodes.sole import sole
 from nodes.peer import DEADLINE_S
 
@@ -68,7 +67,7 @@ def test_a_node_that_was_just_killed_does_not_keep_the_next_from_starting(launch
 
 
 def test_a_node_of_another_package_with_the_same_name_is_asked_and_found(domain_id, meet):
-    peer, context = meet(domain_id), open_context(domain_id=domain_id)
+    peer, other = meet(domain_id), meet(domain_id)
     name = peer.node.get_name()
     alive = Node(name, context=peer.context)  # with the services of parameters
     peer._executor.add_node(alive)
@@ -78,13 +77,13 @@ def test_a_node_of_another_package_with_the_same_name_is_asked_and_found(domain_
     )
     spinning.start()
     try:
-        with pytest.raises(BackendError, match="runs already"), sole(context, name):
+        other.until(lambda: name in other.node.get_node_names(), "it in the graph")
+        with pytest.raises(BackendError, match="runs already"), sole(other.context, name):
             pass
     finally:
         done.set()
         spinning.join()
         alive.destroy_node()
-        context.try_shutdown()
 
 
 def named(ends):
@@ -119,3 +118,20 @@ def test_robots_in_one_domain_do_not_hear_each_other(launch, meet, domain_id, mo
     two.until(lambda: len(odometry[two]) > 5, "odometry of the other")
     assert all(abs(told.twist.twist.linear.x) < 0.1 for told in odometry[two])
     assert way(odometry[two]) < 0.1
+
+
+def test_two_simulators_that_tell_the_time_in_one_domain_name_each_other(launch, meet, domain_id):
+    peer = meet(domain_id)
+    both = {space: launch("simulator_node", domain_id, space) for space in ("one", "two")}
+    others = {"one": "/two/simulator_node", "two": "/one/simulator_node"}
+
+    def said():
+        return all(
+            f"{others[space]} publishes /clock too" in process.log.read_text()
+            for space, process in both.items()
+        )
+
+    peer.until(said, "the warnings")
+    for process in both.values():
+        assert process.log.read_text().count("/clock too") == 1
+        process.check()
