@@ -22,7 +22,6 @@ from nics_drl_bridge.calibration.report import Findings, sentences
 from nics_drl_bridge.calibration.simplify import simplify
 from nics_drl_bridge.calibration.timing import SEARCH_S
 from nics_drl_bridge.calibration.unexplained import measure_noise
-from nics_drl_bridge.calibration.usefulness import why_useless
 from nics_drl_bridge.calibration.verdict import doubts, refuse_unexcited, unlearnt
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.kinematics.fit import ALPHA, ORDER, Alpha, Fit, fit
@@ -69,7 +68,7 @@ class Identified:
 
 
 @one_blas_thread
-@np.errstate(over="ignore", invalid="ignore")  # of a model that runs away, one sentence tells
+@np.errstate(over="ignore", invalid="ignore")  # its figures tell of a model that runs away
 def identify(
     recording: Recording,
     spec: RobotSpec,
@@ -98,7 +97,7 @@ def identify(
 
     Raises:
         RecordingError: the recording can't be used for this robot.
-        FitError: the drive does not hold enough to fit a model, or the model runs away.
+        FitError: the drive does not hold enough to fit a model.
     """
     check_units(check(recording, spec), spec)
     duration = float(recording.pose.t[-1] - recording.pose.t[0])
@@ -116,8 +115,6 @@ def identify(
     exact = calibration.is_exact
     model, calibration, notes = _refined(linear.model, calibration, training.recording, spec, until)
     held_out, trial = _held_out(model, calibration, whole, spec, until, duration)
-    if held_out is not None and not np.isfinite(held_out.mean_position_error_m):
-        raise FitError(why_useless(held_out, whole, spec, linear.unmoved))
     calibration = replace(calibration, notes=sentences(calibration, findings, spec))
     notes = (
         *training.notes,
