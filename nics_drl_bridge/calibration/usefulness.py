@@ -36,7 +36,7 @@ def is_useless(error: float, standing: float, path: float, radius: float) -> boo
 def why_useless(
     held_out: OpenLoop | None, recording: Recording, spec: RobotSpec, unmoved: tuple[str, ...]
 ) -> str:
-    """One sentence on a model that is of no use; empty if it is, or if nobody tried it.
+    """One sentence on a model of no use; empty if it is of some, or was not tried.
 
     Args:
         held_out: errors of its predictions on unseen data.
