@@ -15,8 +15,9 @@ from nics_drl_bridge.calibration.calibration import Calibration
 from nics_drl_bridge.calibration.fit_report import fit_report
 from nics_drl_bridge.calibration.identify import Identified, identify
 from nics_drl_bridge.calibration.noise_model import Noise
+from nics_drl_bridge.calibration.usefulness import why_useless
 from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, validate
-from nics_drl_bridge.errors import ConfigError, ModelError
+from nics_drl_bridge.errors import ConfigError, FitError, ModelError
 from nics_drl_bridge.files import check_folder, sha256, whole_folder, write_bytes, write_text
 from nics_drl_bridge.kinematics import fit, textbook
 from nics_drl_bridge.kinematics.latency import Latency
@@ -151,6 +152,7 @@ def generate(
     assume: bool = False,
     strict: bool = False,
     budget: int | None = None,
+    anyway: bool = False,
 ) -> tuple[SimulatorModel, Identified]:
     """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
 
@@ -165,11 +167,21 @@ def generate(
         strict: refuse a drive that did not move every input on its own.
         budget: greatest size of the lidar table [bytes], see `lidar.budget`; by default a table
             of the paper's density.
+        anyway: give a model also if it predicts unseen data hardly better than that the robot
+            stands still.
 
     Returns:
         The model, and all that was found out on the way.
+
+    Raises:
+        RecordingError: the recording can't be used for this robot.
+        FitError: the drive does not hold enough to fit a model, or the model is of no use.
     """
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
+    unmoved = identified.fit.unmoved
+    reason = why_useless(identified.held_out, identified.recording, robot, unmoved)
+    if reason and not anyway:
+        raise FitError(reason)
     shapes = (*shapes, footprint_shape(robot))
     table = bake(lidar, shapes) if budget is None else choose(lidar, shapes, budget).table
     model = SimulatorModel(

@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +87,25 @@ def test_generate_makes_a_model_of_a_recording_and_replaces_it(drive, tmp_path):
     assert again.returncode == 0, again.stderr
     assert names(tmp_path / "models") == {"car"}
     assert load_model(tmp_path / "models" / "car").fingerprint != model.fingerprint
+
+
+def test_a_recording_too_coarse_for_a_useful_model_is_one_sentence(tmp_path):
+    spec = load_robot("differential")
+    fine = textbook.record(spec, np.random.default_rng(0), duration=60.0, dt=0.01)
+    pose, state = (
+        replace(stream, t=stream.t[::80], values=stream.values[::80])
+        for stream in (fine.pose, fine.state)
+    )
+    save_recording(replace(fine, pose=pose, state=state), tmp_path / "slow.npz")
+    words = ("generate", "slow.npz", "--robot", "differential", "--out", "car")
+    sentence = refused(nics(*words, cwd=tmp_path))
+    assert "slow.npz: the fitted model is of no use" in sentence
+    assert sentence.endswith("between rows that are 0.8 s apart, so record at a higher rate.")
+    assert names(tmp_path) == {"slow.npz"}
+    wanted = nics(*words, "--anyway", cwd=tmp_path)
+    assert wanted.returncode == 0, wanted.stderr
+    assert "do not train with this model" in " ".join(wanted.stdout.split())
+    assert names(tmp_path / "car") == MODEL_FILES
 
 
 def test_replay_of_something_else_is_one_sentence(tmp_path):

@@ -68,6 +68,7 @@ class Identified:
 
 
 @one_blas_thread
+@np.errstate(over="ignore", invalid="ignore")  # its figures tell of a model that runs away
 def identify(
     recording: Recording,
     spec: RobotSpec,
@@ -175,7 +176,13 @@ def _refined(
             "The training part is too short to refine the model by its errors over seconds; record "
             "a longer drive.",
         )  # fmt: skip
-    refined = simplify(problem, refine(problem, model, calibration))
+    try:
+        refined = simplify(problem, refine(problem, model, calibration))
+    except np.linalg.LinAlgError:  # the model is unstable: its slopes overflow
+        return merged(model, linear, {}), calibration, (
+            "The predictions of the fitted model run away on the training part, so that it could "
+            "not be refined.",
+        )  # fmt: skip
     note = (
         "Coefficients and calibration were refined by the open-loop errors over up to 5 s: "
         f"{refined.error:.4f} m (root mean square) is left on the training part."

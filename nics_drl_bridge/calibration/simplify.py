@@ -26,6 +26,8 @@ def simplify(problem: Problem, refined: Refined) -> Refined:
         tried.add(weakest)
         coefficients = best.model.coefficients.copy()
         coefficients[weakest] = 0.0
+        if not coefficients[:3].any():  # the last one: without it the robot would not move
+            break
         shorter = replace(best.model, coefficients=coefficients)
         try:
             again = refine(problem, shorter, best.calibration)

@@ -116,13 +116,15 @@ def _pose_drift(
     spec: RobotSpec,
     noise: Noise,
 ) -> tuple[Level, Level] | None:
-    """Drift of position and heading; None if the drive is too short."""
+    """Drift of position and heading; None if the drive is too short or the model runs away."""
     duration = float(recording.pose.t[-1] - recording.pose.t[0])
     chosen = windows(recording, calibration, 0.0, duration, HORIZON_S, SPACING_S)
     if len(chosen.start_t) < MIN_WINDOWS:
         return None
     error = geometry.between(_predicted(recording, calibration, model, spec, chosen), chosen.end)
     size = np.hypot(error[:, 0], error[:, 1])
+    if not np.isfinite(size).all():
+        return None
     inside = size <= OUTLYING * max(float(np.median(size)), TINY)
     position, _, heading = noise.pose
     away = np.sum((chosen.end - chosen.start)[inside, :2] ** 2, axis=1)

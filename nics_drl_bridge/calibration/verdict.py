@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import isfinite
+
 from nics_drl_bridge.calibration.calibration import Calibration
 from nics_drl_bridge.calibration.open_loop import OpenLoop
 from nics_drl_bridge.errors import FitError
@@ -100,10 +102,11 @@ def doubts(linear: Fit, held_out: OpenLoop | None, exact: bool) -> tuple[str, ..
         )
     if held_out is not None and held_out.mean_path_m > 0.0:
         share = held_out.mean_position_error_m / held_out.mean_path_m
-        if share > FAR_OFF:
+        end = f"end {share:.0%} of their path away" if isfinite(share) else "run away"
+        if not share <= FAR_OFF:
             notes.append(
-                f"On unseen data the predictions end {share:.0%} of their path away: the response "
-                "does not follow the commands as the model has it; do not train with this model."
+                f"On unseen data the predictions {end}: the response does not follow the commands "
+                "as the model has it; do not train with this model."
             )
     return tuple(notes)
 

@@ -44,6 +44,12 @@ def generate(
         bool,
         typer.Option("--salvage", help="Take what is intact of a damaged bag; tell the rest."),
     ] = False,
+    anyway: Annotated[
+        bool,
+        typer.Option(
+            "--anyway", help="Write the model even if its predictions of unseen data are of no use."
+        ),
+    ] = False,
     pictures: Annotated[
         bool, typer.Option(help="Draw the fit into the folder pictures of the model.")
     ] = False,
@@ -71,7 +77,7 @@ def generate(
             drive = read_recording(whole, spec, topic_roles(topics, topic or ()))
         drive = replace(drive, source=str(recording))
         model, identified = generate_model(
-            drive, spec, sensor, shapes, order, threshold, assume_textbook, strict, size
+            drive, spec, sensor, shapes, order, threshold, assume_textbook, strict, size, anyway
         )
         save_model(model, out)
         if pictures:

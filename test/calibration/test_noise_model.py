@@ -10,6 +10,7 @@ from robots import field
 from nics_drl_bridge import geometry
 from nics_drl_bridge.calibration.identify import identify
 from nics_drl_bridge.calibration.noise_model import MEASURED, Level, Noise
+from nics_drl_bridge.calibration.unexplained import measure_noise
 from nics_drl_bridge.config import dump_yaml, parse_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model, load_model, save_model
@@ -103,6 +104,19 @@ def test_noise_of_the_pose_is_no_drift_of_the_robot(differential):
     assert found.pose_heading.std == pytest.approx(0.01, rel=TOLERANCE)
     assert found.position_drift.std < 0.003
     assert found.heading_drift.std < 0.009
+
+
+def test_the_drift_of_a_model_that_runs_away_is_assumed(car):
+    recording = drive(car, noise=(5e-4, 1e-3), measured_state=False)
+    found = identify(recording, car)
+    coefficients = found.model.coefficients.copy()
+    coefficients[3:] *= -20.0
+    unstable = replace(found.model, coefficients=coefficients)
+    with np.errstate(all="ignore"):
+        noise = measure_noise(recording, found.calibration, unstable, found.samples, car)
+    assert found.noise.position_drift.measured
+    assert noise.position_drift == Noise().position_drift
+    assert not noise.heading_drift.measured
 
 
 def test_without_odometry_its_noise_is_assumed_and_the_report_says_so(differential):
