@@ -19,6 +19,7 @@ from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.gate_parameters import declare_gate
 from nics_drl_bridge.nodes.qos_watch import QosWatch
 from nics_drl_bridge.nodes.runner import last_word, run_node
+from nics_drl_bridge.safety import shield
 from nics_drl_bridge.safety.black_box import Entry
 from nics_drl_bridge.safety.gate import decide
 from nics_drl_bridge.safety.inputs import (
@@ -60,6 +61,8 @@ class CommandGate(QosWatch):
                 "e_stop_required is false: an e_stop that was never heard does not stop the robot. "
                 "That is for simulations; set it on a vehicle."
             )
+        if self._config.shield is not None:
+            shield.rehearse()
         self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
         self._listen()
         steady = Clock(clock_type=ClockType.STEADY_TIME)

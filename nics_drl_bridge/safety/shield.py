@@ -83,6 +83,11 @@ def obstacles(config: GateConfig, ranges: Ranges) -> Array | None:
     return np.concatenate([evidence(config, config.shield, ranges) for evidence in EVIDENCE])
 
 
+def rehearse() -> None:
+    """Compiles what `shield` calls: that takes seconds, which no robot in motion has."""
+    shield_kernels.free(np.zeros((1, 2)), np.zeros((1, 3)), np.zeros(1), 0.0, STEP)
+
+
 def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
     """The greatest part of a motion from which the robot can still stop in time.
 

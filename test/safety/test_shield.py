@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from shapely.geometry import LineString, Point
 
-from nics_drl_bridge.safety.shield import obstacles
+from nics_drl_bridge.safety.shield import obstacles, rehearse
 from nics_drl_bridge.safety.shield_kernels import free, place
 from nics_drl_bridge.safety.state import ShieldConfig
 from safety.rig import LIDAR, Rig, config
@@ -50,6 +52,13 @@ def test_open_space_lets_the_robot_drive_at_full_speed():
 
 def test_without_a_shield_nothing_is_cut():
     assert Faced(ranges(0.3), shield=None).settles() == 1.0
+
+
+@pytest.mark.parametrize("wheelbase", [CAR.wheelbase, 0.0])
+def test_nothing_remains_to_be_compiled_after_a_rehearsal(wheelbase):
+    rehearse()
+    Faced(ranges(0.3), replace(CAR, wheelbase=wheelbase)).settles(0.1)
+    assert len(free.signatures) == 1
 
 
 @pytest.mark.parametrize("distance", [0.4, 0.6, 0.8])
