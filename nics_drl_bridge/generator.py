@@ -178,8 +178,7 @@ def generate(
         FitError: the drive does not hold enough to fit a model, or the model is of no use.
     """
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
-    unmoved = identified.fit.unmoved
-    reason = why_useless(identified.held_out, identified.recording, robot, unmoved)
+    reason = why_useless(identified, robot, order)
     if reason and not anyway:
         raise FitError(reason)
     shapes = (*shapes, footprint_shape(robot))

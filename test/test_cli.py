@@ -106,6 +106,7 @@ def test_a_recording_too_coarse_for_a_useful_model_is_one_sentence(tmp_path):
     assert wanted.returncode == 0, wanted.stderr
     assert "do not train with this model" in " ".join(wanted.stdout.split())
     assert names(tmp_path / "car") == MODEL_FILES
+    assert load_model(tmp_path / "car").robot == spec
 
 
 def test_replay_of_something_else_is_one_sentence(tmp_path):

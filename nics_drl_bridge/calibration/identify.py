@@ -114,6 +114,9 @@ def identify(
         refuse_unexcited(linear, spec)
     exact = calibration.is_exact
     model, calibration, notes = _refined(linear.model, calibration, training.recording, spec, until)
+    assumed: tuple[str, ...] = ()
+    if assume:
+        model, assumed = assume_textbook(model, spec, linear.unmoved)
     held_out, trial = _held_out(model, calibration, whole, spec, until, duration)
     calibration = replace(calibration, notes=sentences(calibration, findings, spec))
     notes = (
@@ -124,10 +127,8 @@ def identify(
         *unlearnt(linear, calibration, spec),
         *doubts(linear, held_out, exact),
         *trial,
+        *assumed,
     )
-    if assume:
-        model, assumed = assume_textbook(model, spec, linear.unmoved)
-        notes = (*notes, *assumed)
     unseen = unseen_samples(whole, calibration, spec, until)
     noise = measure_noise(whole, calibration, model, align(whole, calibration, spec), spec)
     as_fitted = model is linear.model

@@ -42,8 +42,8 @@ class OpenLoop:
         mean_position_error_m, median_position_error_m, max_position_error_m: at the end [m].
         mean_heading_error_rad: mean absolute error of the heading at the end [rad].
         mean_path_m: mean length of the measured path in the horizon [m].
-        mean_displacement_m: mean distance from its start to its end [m], the position error that
-            a robot which stands still would leave.
+        median_displacement_m: median distance from its start to its end [m], the position error
+            that a robot which stands still would leave.
     """
 
     horizon_s: float
@@ -53,7 +53,7 @@ class OpenLoop:
     max_position_error_m: float
     mean_heading_error_rad: float
     mean_path_m: float
-    mean_displacement_m: float
+    median_displacement_m: float
 
 
 @dataclass(frozen=True)
@@ -247,5 +247,5 @@ def open_loop_error(
         max_position_error_m=float(position.max()),
         mean_heading_error_rad=float(np.abs(geometry.wrap_angle(error[:, 2])).mean()),
         mean_path_m=float(chosen.path.mean()),
-        mean_displacement_m=float(np.hypot(moved[:, 0], moved[:, 1]).mean()),
+        median_displacement_m=float(np.median(np.hypot(moved[:, 0], moved[:, 1]))),
     )

@@ -33,6 +33,8 @@ OUTLYING = 10.0
 OUTLYING_SHARE = 0.25
 """if that is also more than this share of the longest path."""
 MOST_OUTLIERS = 0.3
+STEEPEST = 1e100
+"""Slopes of a model that runs away are cut here, so that what they are scaled by stays finite."""
 TURN_RAD = 1e-5
 """By so much the rotation is turned to see what that does."""
 
@@ -153,4 +155,5 @@ def prediction_slopes(
             slope = np.concatenate([slope, aside / (2.0 * TURN_RAD)], axis=2)
         slope[:, 2] *= HEADING_ARM_M
         parts.append(slope.reshape(-1, slope.shape[2]))
-    return np.nan_to_num(np.concatenate(parts), nan=0.0)
+    slopes = np.nan_to_num(np.concatenate(parts), nan=0.0)
+    return np.clip(slopes, -STEEPEST, STEEPEST)

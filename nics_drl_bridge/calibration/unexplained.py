@@ -38,6 +38,8 @@ STATE_HORIZON_S = 0.1
 MIN_WINDOWS = 20
 OUTLYING = 10.0
 """A window that errs this many times as much as usual holds a jump."""
+RUN_AWAY_M = 1e4
+"""No prediction over a second that is off by more is of a drift."""
 BLOCKS = 8
 TINY = 1e-9
 NEGLIGIBLE = 1e-4
@@ -123,7 +125,7 @@ def _pose_drift(
         return None
     error = geometry.between(_predicted(recording, calibration, model, spec, chosen), chosen.end)
     size = np.hypot(error[:, 0], error[:, 1])
-    if not np.isfinite(size).all():
+    if not (size < RUN_AWAY_M).all():
         return None
     inside = size <= OUTLYING * max(float(np.median(size)), TINY)
     position, _, heading = noise.pose

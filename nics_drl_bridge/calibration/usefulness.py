@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from nics_drl_bridge.calibration.open_loop import OpenLoop
+from nics_drl_bridge.calibration.identify import Identified
 from nics_drl_bridge.calibration.verdict import FAR_OFF
+from nics_drl_bridge.kinematics.fit import ORDER
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec
 
@@ -25,35 +26,32 @@ def is_useless(error: float, standing: float, path: float, radius: float) -> boo
     back where it was: there the path and the robot's size say what is little.
 
     Args:
-        error: mean position error of the predictions [m]; NaN or inf where they run away.
-        standing: mean position error on the same windows if the robot stood still [m].
+        error: median position error of the predictions [m]; NaN or inf where they run away.
+        standing: median position error on the same windows if the robot stood still [m].
         path: mean length of the measured path [m].
         radius: of the robot [m].
     """
     return not error <= max(MOST_LEFT * standing, FAR_OFF * path, radius)
 
 
-def why_useless(
-    held_out: OpenLoop | None, recording: Recording, spec: RobotSpec, unmoved: tuple[str, ...]
-) -> str:
-    """One sentence on a model of no use; empty if it is of some, or was not tried.
+def why_useless(identified: Identified, spec: RobotSpec, order: int = ORDER) -> str:
+    """One sentence on a model of no use, of some order; empty if it is of some, or was not tried.
 
-    Args:
-        held_out: errors of its predictions on unseen data.
-        recording: the drive.
-        spec: the robot.
-        unmoved: variables that did not move.
+    The median counts: a pose that jumps once, for good, spoils some of the predictions only.
     """
+    held_out, recording = identified.held_out, identified.recording
     if held_out is None:
         return ""
-    error, standing = held_out.mean_position_error_m, held_out.mean_displacement_m
+    error, standing = held_out.median_position_error_m, held_out.median_displacement_m
+    if not np.isfinite(held_out.mean_position_error_m):
+        error = np.inf
     if not is_useless(error, standing, held_out.mean_path_m, spec.footprint_radius):
         return ""
     return (
         f"{recording.source}: the fitted model is of no use: on unseen data its predictions "
         f"{_end(error)} after {held_out.horizon_s:g} s and a path of {held_out.mean_path_m:.2f} m, "
         f"where a robot that stood still would be {standing:.2f} m off; "
-        f"{_suspicion(recording, spec, unmoved)}."
+        f"{_suspicion(identified, spec, order)}."
     )
 
 
@@ -61,8 +59,9 @@ def _end(error: float) -> str:
     return f"end {error:.3g} m off" if np.isfinite(error) else "have run away"
 
 
-def _suspicion(recording: Recording, spec: RobotSpec, unmoved: tuple[str, ...]) -> str:
+def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
     """What may have spoilt the fit, and what to do."""
+    recording, unmoved = identified.recording, identified.fit.unmoved
     coarsest = max(_steps(recording, spec, unmoved), default=(0.0, ""))
     rows = recording.pose if recording.state is None else recording.state
     apart = f"{np.median(np.diff(rows.t)):.2g} s apart"
@@ -71,6 +70,13 @@ def _suspicion(recording: Recording, spec: RobotSpec, unmoved: tuple[str, ...]) 
             f"{coarsest[1]} changes by {coarsest[0]:.0%} of its range between rows that are "
             f"{apart}, so record at a higher rate"
         )
+    if unmoved:
+        return (
+            f"{', '.join(unmoved)} never moved in its first {identified.train_until_s:.0f} s, from "
+            "which it is learnt, so change it from the beginning on"
+        )
+    if identified.alpha != "auto" or order < ORDER:
+        return f"it may lack terms, so leave the order at {ORDER} and alpha at `auto`"
     return (
         "the recording does not show why, so make sure that nothing held the robot up, that it got "
         f"each command, that its pose did not jump and that rows {apart} show how it responds, and "

@@ -77,8 +77,9 @@ def generate(
             drive = read_recording(whole, spec, topic_roles(topics, topic or ()))
         drive = replace(drive, source=str(recording))
         model, identified = generate_model(
-            drive, spec, sensor, shapes, order, threshold, assume_textbook, strict, size, anyway
-        )
+            drive, spec, sensor, shapes, order, threshold,
+            assume=assume_textbook, strict=strict, budget=size, anyway=anyway,
+        )  # fmt: skip
         save_model(model, out)
         if pictures:
             from nics_drl_bridge.report.fit_pictures import write_pictures

@@ -139,7 +139,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._shape = (1, self.robots, self.task.observation_space.shape[0])
         self._each = (1, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
-        self._seed, self._episode = 0, -1
+        self._seed, self._episode, self._rehearsed = 0, -1, False
         self._picture: Any = None
         if isinstance(backend, str):
             options = dict(backend_options or {})
@@ -177,9 +177,10 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         starts = np.array(self.scene.starts)
         if options and "start" in options:
             give(starts[None], "start", options["start"])
+        episodes = Episodes(np.array([episode]), starts[None], self.scene.goals[None])
+        self._rehearse(episodes)
         self._view = self._lifted(self._backend.reset(Start(episode, self._row(starts))))
-        goals = self.scene.goals[None]
-        self.memory = self.task.reset(Episodes(np.array([episode]), starts[None], goals))
+        self.memory = self.task.reset(episodes)
         override(self.memory, options)
         self.ended, self._true_pose = np.zeros(self.robots, np.bool_), starts
         facts = {
@@ -192,6 +193,20 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if self.render_mode == "human":
             self.render()
         return observation.reshape(-1), self._info(self._view, facts)
+
+    def _rehearse(self, episodes: Episodes) -> None:
+        """Lets the task judge a step once that is never made, for a robot that may be a real one.
+
+        What a task compiles takes seconds; a robot that has a command would drive on meanwhile.
+        """
+        if self._rehearsed or isinstance(self._backend, SimBackend):
+            return
+        still = np.zeros((1, self.robots, 3))
+        free = np.full((1, self.robots, self.model.lidar.beams), np.inf, np.float32)
+        view = RobotView(episodes.starts.copy(), still, free, 0.0, 0.0, 0.0)
+        memory = self.task.reset(episodes)
+        self.task.step_into(np.empty(self._shape, np.float32), view, view, memory)
+        self._rehearsed = True
 
     def _scene_of(self, episode: int) -> Scene:
         if isinstance(self._backend, SimBackend):

@@ -9,6 +9,7 @@ from gymnasium.utils.env_checker import check_env
 from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registration import MAX_EPISODE_STEPS, NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -206,6 +207,26 @@ def test_any_object_with_reset_step_and_close_is_a_backend():
     env.close()
     assert np.array_equal(backend.commands, [[2.0, -2.0, 0.0]])
     assert backend.closed == 1
+
+
+def test_a_task_has_judged_a_step_before_a_robot_is_asked_for_anything():
+    """What it compiles then is not compiled while a robot drives."""
+    told = []
+
+    class Judging(Navigation):
+        def step_into(self, *given):
+            told.append("judged")
+            return super().step_into(*given)
+
+    class Robot(Recorder):
+        def reset(self, start):
+            told.append("reset")
+            return super().reset(start)
+
+    env = BridgeEnv(Robot(), model=direct_model(), world=field(), task=Judging)
+    env.reset(seed=0)
+    env.reset()
+    assert told == ["judged", "reset", "reset"]
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.kinematics.kernels import SERIES, rates, scratch, term_arrays
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.ekf import Estimator
+from nics_drl_bridge.middleware.measurement import Outcome
 from nics_drl_bridge.sim.simulator import FastSimulator
 
 ROBOTS = ("ackermann", "differential", "mecanum")
@@ -338,8 +339,11 @@ def test_what_is_foreseen_is_not_worked_out_again(monkeypatch):
     monkeypatch.setattr(kernels, "forecast", None)
     monkeypatch.setattr(kernels, "expect", None)
     estimator.predict(PERIOD)
-    estimator.update_twist(np.zeros(3))
+    monkeypatch.setattr(estimator._filter, "update", None)
+    assert estimator.update_twist(np.zeros(3)).outcome is Outcome.USED
     assert estimator.time_ns == PERIOD
+    with pytest.raises(TypeError):
+        estimator.update_twist(np.zeros(3))  # that was for one
 
 
 def test_the_same_data_give_the_same_bits():

@@ -27,6 +27,7 @@ pytestmark = pytest.mark.ros
 SOON_S = 0.5  # what the gate is made for, on a machine with time
 LATE_S = 5.0
 PERIOD_S = 0.1
+MOST_ARMINGS = 3
 PATIENT = {
     "scan_age": 1.0, "odom_age": 1.0, "command_age": 1.0, "rate_tolerance": 0.6,
     "e_stop_silence": 1.0,
@@ -101,17 +102,17 @@ class Robot:
     def drives(self, *wish):
         """Everything is well, the gate is armed, and the robot drives.
 
-        A busy machine may let the gate stop in between, and stay so.
+        A busy machine may let the gate stop in between, and stay so; once is enough.
         """
         self.silent, self.stamped = set(), None
         wish = wish or (0.5, 0.0, 0.0)
         deadline = time.monotonic() + DEADLINE_S
-        while True:
+        for _ in range(MOST_ARMINGS):
             self.is_armed(deadline)
             self.wish = wish
-            if self.comes(wish, LATE_S):
+            if self.comes(wish, DEADLINE_S / MOST_ARMINGS):
                 return
-            assert time.monotonic() < deadline, f"{wish} never came, but {self.passed[-1]}"
+        raise AssertionError(f"{wish} never came, but {self.passed[-1]}")
 
     def is_armed(self, deadline):
         """Arms the gate unless it is."""
@@ -158,9 +159,9 @@ def test_with_a_shield_it_does_not_listen_before_all_is_compiled(domain_id):
 from nics_drl_bridge.nodes.command_gate import CommandGate
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.safety.shield_kernels import free
+CommandGate._listen = lambda _: print(len(free.signatures))
 given = ["--ros-args", "-p", "shield:=true"]
 node = CommandGate(open_context(given, domain_id={domain_id}))
-print(len(free.signatures))
 node.destroy_node()
 node.context.try_shutdown()
 """

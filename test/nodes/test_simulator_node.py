@@ -216,6 +216,13 @@ def test_a_command_that_is_no_number_is_ignored(lockstep, period_ns, bad):
     assert np.isfinite(conversions.odometry_from_ros(lockstep.said["odom"][-1])[0]).all()
 
 
+def test_a_command_that_can_not_be_read_is_ignored_and_told(lockstep, period_ns):
+    now = lockstep.reset()["stamp_ns"]
+    lockstep.commands.publish(b"\0\7\0\0" + bytes(48))
+    assert lockstep.step(0.5) == {topic: [now + period_ns] for topic in TOPICS}
+    lockstep.peer.until(lambda: "can't be read" in lockstep.log.read_text(), "a warning")
+
+
 def test_a_command_beyond_what_its_model_was_fitted_to_is_said_in_its_log(lockstep):
     lockstep.reset()
     sentence = "speed_command is 9, but the model was fitted to"

@@ -11,13 +11,16 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.device_node import WATCH_S
 from nics_drl_bridge.nodes.sole import sole
 from nodes.peer import DEADLINE_S
 
@@ -69,6 +72,7 @@ def test_a_node_that_was_just_killed_does_not_keep_the_next_from_starting(launch
 def test_a_node_of_another_package_with_the_same_name_is_asked_and_found(domain_id, meet):
     peer, other = meet(domain_id), meet(domain_id)
     name = peer.node.get_name()
+    asked = other.node.create_client(GetParameters, f"{name}/get_parameters")
     alive = Node(name, context=peer.context)  # with the services of parameters
     peer._executor.add_node(alive)
     done = threading.Event()
@@ -77,7 +81,7 @@ def test_a_node_of_another_package_with_the_same_name_is_asked_and_found(domain_
     )
     spinning.start()
     try:
-        other.until(lambda: name in other.node.get_node_names(), "it in the graph")
+        other.until(lambda: asked.service_is_ready(), "it in the graph")
         with pytest.raises(BackendError, match="runs already"), sole(other.context, name):
             pass
     finally:
@@ -132,6 +136,8 @@ def test_two_simulators_that_tell_the_time_in_one_domain_name_each_other(launch,
         )
 
     peer.until(said, "the warnings")
+    diagnoses = peer.listen(DiagnosticArray, "/diagnostics")  # one a second of each
+    peer.until(lambda: len(diagnoses) > 6 * WATCH_S, "further looks at the graph")
     for process in both.values():
         assert process.log.read_text().count("/clock too") == 1
         process.check()
