@@ -102,7 +102,7 @@ setup(
     license=text_of("license"),
     python_requires=">=3.10,<3.15",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed"]},
+    package_data={PACKAGE: ["py.typed", "nodes/*.xml"]},
     data_files=data_files(),
     zip_safe=False,
     install_requires=REQUIRES,

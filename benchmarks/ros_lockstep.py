@@ -2,10 +2,10 @@
 
 The env is that of `gymnasium.make`: a command to a simulator node in a process of its own, its
 720-beam scan among ten obstacles and its odometry back, the estimator, observation and reward. The
-bare echo is what ROS 2 itself allows: two processes of rclpy's own executor that exchange the same
-messages, made once, and do nothing else; with `--executor standing` they are processes of this
-package's executor, whose wait set stands. Both are measured in turns, chunk by chunk, so that
-whatever else the machine does falls on both.
+bare echo is what ROS 2 itself allows: two processes of rclpy's own executor, by the transports that
+it chooses, that exchange the same messages, made once, and do nothing else; with
+`--executor standing` they are processes of this package's executor, whose wait set stands. Both are
+measured in turns, chunk by chunk, so that whatever else the machine does falls on both.
 """
 
 from __future__ import annotations
@@ -47,19 +47,20 @@ WORLD = {
 }
 DEPTH, PATIENCE_S = 10, 60.0
 EXECUTORS = {"rclpy": SingleThreadedExecutor, "standing": StandingExecutor}
+PLAIN = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"} | os.environ
+"""The environment before the env, which turns Fast DDS's shared memory off in it."""
 Exchange = Callable[[], Callable[[], object] | None]
+Chunk = Callable[[int], list[float]]
 
 
 class Bare:
-    """One node and an executor."""
+    """One node and an executor, in a process that has nothing else."""
 
     def __init__(self, name: str, namespace: str, executor: str) -> None:
-        self.context = Context()
-        self.context.init(None)
-        self.node = Node(
-            name, namespace=namespace, context=self.context, start_parameter_services=False
-        )
-        self._executor = EXECUTORS[executor](context=self.context)
+        context = Context()
+        context.init(None)
+        self.node = Node(name, namespace=namespace, context=context, start_parameter_services=False)
+        self._executor = EXECUTORS[executor](context=context)
         self._executor.add_node(self.node)
 
     def spin_until(self, done: Callable[[], bool]) -> None:
@@ -71,8 +72,8 @@ class Bare:
             self._executor.spin_once(timeout_sec=1.0)
 
 
-def answer(namespace: str, executor: str) -> None:
-    """The far end of the bare echo: answers each Twist by an Odometry and a LaserScan."""
+def far_end(namespace: str, executor: str) -> None:
+    """Answers each Twist by an Odometry and a LaserScan, until its parent is gone."""
     end, parent = Bare("far_end", namespace, executor), os.getppid()
     odometry, scan = Odometry(), LaserScan()
     scan.ranges = array.array("f", [1.0] * BEAMS)
@@ -88,46 +89,65 @@ def answer(namespace: str, executor: str) -> None:
         end._executor.spin_once(timeout_sec=1.0)
 
 
-@contextmanager
-def bare_echo(domain_id: int, executor: str) -> Iterator[Exchange]:
-    """A function that makes one round trip between two processes."""
-    os.environ["ROS_DOMAIN_ID"] = str(domain_id)
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    namespace = f"bare_{os.getpid()}"
-    order = [sys.executable, __file__, "--answer", namespace, "--executor", executor]
-    far = subprocess.Popen(order)
-    try:
-        end = Bare("near_end", namespace, executor)
-        received: list[object] = []
-        end.node.create_subscription(Odometry, "odom", received.append, DEPTH)
-        end.node.create_subscription(LaserScan, "scan", received.append, DEPTH)
-        commands = end.node.create_publisher(Twist, "cmd_vel", DEPTH)
-        names = [end.node.resolve_topic_name(topic) for topic in ("odom", "scan")]
-        end.spin_until(
-            lambda: (
-                commands.get_subscription_count() > 0
-                and all(end.node.count_publishers(name) > 0 for name in names)
-            )
+def near_end(namespace: str, executor: str) -> None:
+    """Makes as many round trips as each line on standard input says, and prints their seconds."""
+    end = Bare("near_end", namespace, executor)
+    received: list[object] = []
+    end.node.create_subscription(Odometry, "odom", received.append, DEPTH)
+    end.node.create_subscription(LaserScan, "scan", received.append, DEPTH)
+    commands = end.node.create_publisher(Twist, "cmd_vel", DEPTH)
+    names = [end.node.resolve_topic_name(topic) for topic in ("odom", "scan")]
+    end.spin_until(
+        lambda: (
+            commands.get_subscription_count() > 0
+            and all(end.node.count_publishers(name) > 0 for name in names)
         )
-        command = Twist()
+    )
+    command = Twist()
 
-        def exchange() -> None:
-            received.clear()
-            commands.publish(command)
-            end.spin_until(lambda: len(received) >= 2)
+    def exchange() -> None:
+        received.clear()
+        commands.publish(command)
+        end.spin_until(lambda: len(received) >= 2)
 
-        settle(exchange)
-        yield exchange
-        end.context.try_shutdown()
-    finally:
-        far.terminate()
-        far.wait()
+    time.sleep(1.0)  # the first answers may be lost, while the far end does not yet know of it
+    for line in sys.stdin:
+        sys.stdout.write(json.dumps(timed(exchange, int(line))) + "\n")
+        sys.stdout.flush()
 
 
-def settle(exchange: Exchange) -> None:
-    """The first answers may be lost, while the far end does not yet know of the near one."""
-    time.sleep(1.0)
-    exchange()
+ENDS = {"far": far_end, "near": near_end}
+
+
+@contextmanager
+def bare_echo(domain_id: int, executor: str) -> Iterator[Chunk]:
+    """A function that makes round trips between two processes, as ROS 2 makes them by itself."""
+    namespace = f"bare_{os.getpid()}"
+    order = [sys.executable, __file__, "--executor", executor, "--namespace", namespace, "--end"]
+    environment = PLAIN | {"ROS_DOMAIN_ID": str(domain_id)}
+    with (
+        subprocess.Popen([*order, "far"], env=environment) as far,
+        subprocess.Popen(
+            [*order, "near"],
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as near,
+    ):
+
+        def echo(count: int) -> list[float]:
+            near.stdin.write(f"{count}\n")
+            near.stdin.flush()
+            if not (answer := near.stdout.readline()):
+                raise TimeoutError("the bare pair does not answer")
+            return json.loads(answer)
+
+        try:
+            yield echo
+        finally:
+            near.terminate()
+            far.terminate()
 
 
 @contextmanager
@@ -155,7 +175,7 @@ def lockstep_env(domain_id: int, folder: Path) -> Iterator[Exchange]:
         env.close()
 
 
-def chunk(exchange: Exchange, count: int) -> list[float]:
+def timed(exchange: Exchange, count: int) -> list[float]:
     """Seconds of each of so many exchanges; what one gives to be called after it is not timed."""
     times = []
     for _ in range(count):
@@ -175,11 +195,11 @@ def measure(chunks: int, size: int, executor: str) -> dict[str, float]:
         lockstep_env(domain_id, Path(folder)) as step,
         bare_echo(domain_id, executor) as echo,
     ):
-        chunk(step, size), chunk(echo, size)  # as warm as they get
+        timed(step, size), echo(size)  # as warm as they get
         steps, echoes = [], []
         for _ in range(chunks):
-            steps += chunk(step, size)
-            echoes += chunk(echo, size)
+            steps += timed(step, size)
+            echoes += echo(size)
     rate, bare = len(steps) / sum(steps), len(echoes) / sum(echoes)
     p50, p99 = np.quantile(steps, [0.5, 0.99]) * 1e3
     return {
@@ -198,10 +218,11 @@ def main() -> None:
     parser.add_argument("--chunks", type=int, default=150)
     parser.add_argument("--size", type=int, default=100, help="steps in a chunk")
     parser.add_argument("--executor", choices=EXECUTORS, default="rclpy", help="of the bare pair")
-    parser.add_argument("--answer", metavar="NAMESPACE", help=argparse.SUPPRESS)
+    parser.add_argument("--end", choices=ENDS, help=argparse.SUPPRESS)
+    parser.add_argument("--namespace", help=argparse.SUPPRESS)
     given = parser.parse_args()
-    if given.answer:
-        answer(given.answer, given.executor)
+    if given.end:
+        ENDS[given.end](given.namespace, given.executor)
         return
     result = measure(given.chunks, given.size, given.executor)
     if given.json:

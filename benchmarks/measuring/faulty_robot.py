@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
@@ -19,7 +21,6 @@ from std_srvs.srv import Trigger
 
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.runner import open_context
 
 ROBOT, PERIOD_S, SPEED = "ackermann", 0.1, 0.5
 PATIENCE_S, MOTION_S = 60.0, 10.0
@@ -31,9 +32,17 @@ class NoMotionError(RuntimeError):
     """The gate was armed, but no command that moves the robot came."""
 
 
+def driver_context(domain_id: int) -> Context:
+    """A context as a driver of somebody else's has it: as ROS 2 makes it, with shared memory."""
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    context = Context()
+    context.init(None, domain_id=domain_id)
+    return context
+
+
 def hear(domain_id: int, out: Connection) -> None:
     """The base's end of `cmd_vel`: tells when each command came [s] and which; never ends."""
-    context = open_context(domain_id=domain_id)
+    context = driver_context(domain_id)
     node = Node("base", context=context, start_parameter_services=False)
 
     def tell(message: Twist) -> None:
@@ -64,7 +73,7 @@ class Robot:
 
     def __init__(self, domain_id: int, policy: bool) -> None:
         self._lidar = builtin_model(ROBOT).lidar
-        self._context = open_context(domain_id=domain_id)
+        self._context = driver_context(domain_id)
         self.node = Node("robot", context=self._context, start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)

@@ -23,6 +23,7 @@ from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.overrides import warn_of_unknown, widen
 from nics_drl_bridge.nodes.sole import sole
+from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
 
 SPIN_S = 0.1
 DELIVERY_S = 0.5
@@ -45,7 +46,8 @@ def open_context(args: Sequence[str] | None = None, domain_id: int | None = None
     """A context of one's own, with discovery on this machine unless the environment names a range.
 
     A robot that should be seen by others sets `ROS_AUTOMATIC_DISCOVERY_RANGE` (on Humble
-    `ROS_LOCALHOST_ONLY=0`); a simulator started in a lab does not move somebody's robot.
+    `ROS_LOCALHOST_ONLY=0`); a simulator started in a lab does not move somebody's robot. Fast DDS
+    sends by UDP, unless the environment chooses for itself (`transport`).
 
     Args:
         args: ROS arguments.
@@ -55,12 +57,16 @@ def open_context(args: Sequence[str] | None = None, domain_id: int | None = None
         BackendError: the arguments are wrong, or no ROS 2 middleware is there.
     """
     stay_on_this_machine(os.environ)
-    context = Context()
-    try:
+
+    def make() -> Context:
+        context = Context()
         context.init(None if args is None else list(args), domain_id=domain_id)
+        return context
+
+    try:
+        return OF_THIS_PROCESS.open(make)
     except RuntimeError as error:
         raise BackendError(f"ROS 2 does not start: {' '.join(str(error).split())}") from None
-    return context
 
 
 def last_word(publisher: Publisher, message: Any) -> None:

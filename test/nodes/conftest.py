@@ -12,6 +12,22 @@ from domains import claimed_domain
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.generator import SimulatorModel, builtin_model, save_model
 
+LOG_CHARACTERS = 2000
+LAUNCHED: list[Any] = []
+"""The processes of the test that runs, and of the others of its module."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Iterator[None]:
+    """Where a test fails, what the nodes around it said is told, too."""
+    report = yield
+    if report.failed:
+        for each in LAUNCHED:
+            said = each.log.read_text(encoding="utf-8", errors="replace")[-LOG_CHARACTERS:]
+            report.sections.append((f"{each.log}, ended with {each._process.poll()}", said))
+    return report
+
+
 # Modules below import rclpy, so the fixtures import them: without ROS 2 every test here skips.
 
 
@@ -69,9 +85,11 @@ def launch(
             folder: Path = tmp_path_factory.mktemp(f"{node}_{next(numbers)}")
             parameters = {"model": model_folder} | parameters
             process = NodeProcess(node, folder, parameters, domain_id, namespace, remap)
+            LAUNCHED.append(process)
             return started.enter_context(process)
 
         yield start
+        LAUNCHED.clear()
 
 
 @pytest.fixture(scope="module")
