@@ -13,7 +13,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.generator import open_model
+from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
@@ -67,14 +67,10 @@ class PolicyNode(ManagedNode):
     def configure(self) -> None:
         """Opens model and policy, and listens."""
         model = self._model = open_model(str(self.get_parameter("model").value))
-        name = str(self.get_parameter("policy").value)
-        self._policy, self._task = open_policy(name, model)
+        self._open_policy(model)
         self._goal: NDArray[np.float64] = self._declared_goal()
         self._pace, self._deadline = self._declared_pace(model.control_period)
         self._acted_ns = 0
-        view = rehearse(model)
-        self._task.judge(view, {"goal": np.zeros(2)})
-        self._command(view, np.zeros(2))
         self._raw = self.create_lifecycle_publisher(TwistStamped, "cmd_vel_raw", qos.COMMAND)
         self.undo.callback(self.destroy_lifecycle_publisher, self._raw)
         goals = self.create_subscription(PoseStamped, "goal_pose", self._on_goal, qos.COMMAND)
@@ -106,10 +102,17 @@ class PolicyNode(ManagedNode):
         period = control_period if np.isnan(rate) else 1.0 / rate if rate > 0.0 else 0.0
         return Pace(period), Deadline(0.5 * control_period if np.isnan(limit) else limit, patience)
 
+    def _open_policy(self, model: SimulatorModel) -> None:
+        """Opens the policy for a model, and uses it once: what it compiles is compiled now."""
+        name = str(self.get_parameter("policy").value)
+        self._policy, self._task = open_policy(name, model)
+        view = rehearse(model)
+        self._task.judge(view, {"goal": np.zeros(2)})
+        self._command(view, np.zeros(2))
+
     def _on_lidar(self, lidar: LidarSpec) -> None:
         """Looks through another lidar from now on. Raises ConfigError where that can't be done."""
-        name = str(self.get_parameter("policy").value)
-        self._policy, self._task = open_policy(name, replace(self._model, lidar=lidar))
+        self._open_policy(replace(self._model, lidar=lidar))
         begin, end = np.degrees([lidar.angles[0], lidar.angles[-1]])
         self.get_logger().info(
             f"scans of {lidar.beams} beams from {begin:.4g} to {end:.4g} deg are resampled"
