@@ -47,8 +47,6 @@ WORLD = {
 }
 DEPTH, PATIENCE_S = 10, 60.0
 EXECUTORS = {"rclpy": SingleThreadedExecutor, "standing": StandingExecutor}
-PLAIN = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"} | os.environ
-"""The environment before the env, which turns Fast DDS's shared memory off in it."""
 Exchange = Callable[[], Callable[[], object] | None]
 Chunk = Callable[[int], list[float]]
 
@@ -124,7 +122,8 @@ def bare_echo(domain_id: int, executor: str) -> Iterator[Chunk]:
     """A function that makes round trips between two processes, as ROS 2 makes them by itself."""
     namespace = f"bare_{os.getpid()}"
     order = [sys.executable, __file__, "--executor", executor, "--namespace", namespace, "--end"]
-    environment = PLAIN | {"ROS_DOMAIN_ID": str(domain_id)}
+    environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"} | os.environ
+    environment["ROS_DOMAIN_ID"] = str(domain_id)
     with (
         subprocess.Popen([*order, "far"], env=environment) as far,
         subprocess.Popen(

@@ -23,12 +23,17 @@ from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.overrides import warn_of_unknown, widen
 from nics_drl_bridge.nodes.sole import sole
-from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
+from nics_drl_bridge.nodes.transport import (
+    LOCAL,
+    OF_THIS_PROCESS,
+    OLDEST_DISTRIBUTION,
+    ONLY_LOCAL,
+    RANGE,
+)
 
 SPIN_S = 0.1
 DELIVERY_S = 0.5
 EXIT_BAD_INPUT = 2
-OLDEST_DISTRIBUTION = "humble"
 RANGES = {
     int: (IntegerRange, "integer_range"),
     float: (FloatingPointRange, "floating_point_range"),
@@ -37,9 +42,9 @@ RANGES = {
 
 def stay_on_this_machine(environment: MutableMapping[str, str]) -> None:
     """Limits discovery to this machine in an environment that does not say how far it goes."""
-    environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    if environment.get("ROS_DISTRO") == OLDEST_DISTRIBUTION:  # it knows no ranges
-        environment.setdefault("ROS_LOCALHOST_ONLY", "1")
+    environment.setdefault(RANGE, LOCAL)
+    if environment.get("ROS_DISTRO") == OLDEST_DISTRIBUTION:
+        environment.setdefault(ONLY_LOCAL, "1")
 
 
 def open_context(args: Sequence[str] | None = None, domain_id: int | None = None) -> Context:
@@ -54,7 +59,8 @@ def open_context(args: Sequence[str] | None = None, domain_id: int | None = None
         domain_id: DDS domain; the environment's by default.
 
     Raises:
-        BackendError: the arguments are wrong, or no ROS 2 middleware is there.
+        BackendError: the arguments are wrong, no ROS 2 middleware is there, or discovery should go
+            further than that of an earlier context of this process.
     """
     stay_on_this_machine(os.environ)
 

@@ -5,91 +5,127 @@ while it holds the lock holds up everybody who sends to it, for as long as it st
 that tells the base to stop, a base that sends its odometry to a policy. UDP has no such lock, and
 a step in lock-step takes a twentieth longer. A process of these nodes has no shared memory, neither
 to send through nor to be sent to, so that drivers that have it aren't held up by them either.
+
+Where discovery stays on this machine, rmw_fastrtps chooses the transports itself. A profile does
+what it does then, but for the shared memory; Fast DDS reads it once in a process, with its first
+node, and it rules the whole process. So it is looked at what came of it, and the environment is
+left as it was found.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import threading
-from collections.abc import Callable, MutableMapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from pathlib import Path
 
 from rclpy.context import Context
 from rclpy.logging import get_logger
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.utilities import get_rmw_implementation_identifier
 
-RANGE, LOCAL, SELF_MADE = "ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST", "SYSTEM_DEFAULT"
+from nics_drl_bridge.errors import BackendError
+
+RANGE, LOCAL, ONLY_LOCAL = "ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST", "ROS_LOCALHOST_ONLY"
+SELF_MADE = "SYSTEM_DEFAULT"
+OTHER_RANGES = ("SUBNET", "OFF", SELF_MADE, "")
+"""rcl takes every other word for LOCALHOST."""
+OLDEST_DISTRIBUTION = "humble"
+"""Knows no ranges."""
 TRANSPORTS, UDP = "FASTDDS_BUILTIN_TRANSPORTS", "UDPv4"
 PROFILE = Path(__file__).with_name("this_machine.xml")
 PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 """Names of the same variable, of Fast DDS 3 and of Fast DDS 2, which the library's name tells."""
-FAST_DDS_2 = "libfastrtps.so"
-FAST_DDS_2_DISTRIBUTIONS = ("humble", "iron", "jazzy")
-CHOICES = (*PROFILES, "ROS_DISCOVERY_SERVER", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY")
-"""Who sets one of these has chosen, as has who names other transports than UDP. `LOCALHOST_ONLY` is
-older than ranges and overrules them."""
-SEGMENTS = ("shm/fastdds_", "shm/fastrtps_")
-MAPS = Path("/proc/self/maps")
+PROFILES_HERE = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
+"""Fast DDS reads them in the working directory."""
+FAST_DDS_2, FAST_DDS_2_DISTRIBUTIONS = b"libfastrtps.so", (OLDEST_DISTRIBUTION, "iron", "jazzy")
+PEERS = ("ROS_DISCOVERY_SERVER", "ROS_STATIC_PEERS")
+"""Who sets one of these looks for others elsewhere, too, which the profile does not."""
+SEGMENTS = (b"shm/fastdds_", b"shm/fastrtps_")
+FIRST_PORT, PORTS_OF_A_DOMAIN = 7400, 250
+"""Of RTPS: the first port of a domain is that of multicast."""
 
 
-def prefer_udp(environment: MutableMapping[str, str], profiles: str = PROFILES[0]) -> None:
-    """Turns Fast DDS's shared memory off in an environment that does not choose for itself.
+def stays_here(environment: Mapping[str, str]) -> bool:
+    """Whether discovery stays on this machine, in an environment that says how far it goes."""
+    if environment.get(ONLY_LOCAL) == "1":
+        return True
+    ranges = environment.get("ROS_DISTRO") != OLDEST_DISTRIBUTION
+    return ranges and environment[RANGE] not in OTHER_RANGES
 
-    For LOCALHOST, rmw_fastrtps chooses the transports itself; so the range becomes SYSTEM_DEFAULT,
-    and a profile does what LOCALHOST does, but for the shared memory.
 
-    Args:
-        environment: of the process, whose range is set.
-        profiles: name of the variable of the profiles' file.
-    """
-    inherited = Path(environment.get(profiles, "")).parts[-3:] == PROFILE.parts[-3:]
-    if inherited:
-        del environment[profiles]
-    chosen = any(environment.get(name) for name in CHOICES)
-    if chosen or environment.get(TRANSPORTS, UDP) != UDP:
-        return
-    if environment[RANGE] == LOCAL or (inherited and environment[RANGE] == SELF_MADE):
-        environment[RANGE], environment[profiles] = SELF_MADE, str(PROFILE)
-    else:
-        environment[TRANSPORTS] = UDP
+def chosen(environment: Mapping[str, str]) -> bool:
+    """Whether somebody has chosen the transports: any but UDP, or by profiles of Fast DDS."""
+    named = environment.get(TRANSPORTS, "") not in ("", UDP)
+    return named or any(map(environment.get, PROFILES)) or any(map(os.path.exists, PROFILES_HERE))
 
 
 class Transport:
-    """How this process sends; profiles of Fast DDS are read once in it, with its first node."""
+    """How the nodes of this process send."""
 
     def __init__(self) -> None:
-        self._lock, self._tried, self._vain = threading.Lock(), False, False
+        self._lock = threading.Lock()
+        self._in_force: bool | None = None  # the profile; None: not tried yet
 
     def open(self, make: Callable[[], Context]) -> Context:
-        """A context over UDP; as rmw_fastrtps makes it where that can't be had.
-
-        It can't where a node of somebody else was started in this process before: that is warned
-        of, once.
+        """A context over UDP; as ROS 2 makes it where somebody has chosen or UDP can't be had.
 
         Args:
-            make: makes a context in the environment of this process.
+            make: makes a context in the environment of this process, which says how far discovery
+                goes.
+
+        Raises:
+            BackendError: discovery should go further than that of an earlier context.
         """
         with self._lock:
-            if self._vain or not _is_fast_dds():
+            if not _is_fast_dds() or chosen(os.environ):
                 return make()
-            profiles = _profiles_variable(os.environ.get("ROS_DISTRO"))
-            prefer_udp(os.environ, profiles)
-            context = make()
-            if self._tried or profiles not in os.environ or not _shares_memory(context):
-                self._tried = True
-                return context
-            self._vain = True
-            context.try_shutdown()
-            os.environ[RANGE] = LOCAL
-            del os.environ[profiles]
-            get_logger("nics_drl_bridge").warning(
-                "a node was started in this process before, with Fast DDS's shared memory: a "
-                "process that is frozen or killed can hold this one up. Make the bridge's node or "
-                "env first, or keep them in a process of their own."
-            )
+            if stays_here(os.environ):
+                elsewhere = any(map(os.environ.get, PEERS))
+                return make() if elsewhere or self._in_force is False else self._open_here(make)
+            if self._in_force:
+                raise BackendError(
+                    f"{RANGE} is {os.environ[RANGE]}, but an earlier node in this process keeps "
+                    "its discovery on this machine; set it before the first, or use another "
+                    "process."
+                )
+            os.environ[TRANSPORTS] = UDP
             return make()
+
+    def _open_here(self, make: Callable[[], Context]) -> Context:
+        with _profiled(os.environ):
+            context = make()
+            if self._in_force is None:
+                self._in_force = _is_in_force(context)
+        if self._in_force:
+            return context
+        context.try_shutdown()
+        get_logger("nics_drl_bridge").warning(
+            f"Fast DDS did not take on {PROFILE}, most likely since a node was started in this "
+            "process before: it sends through shared memory, and a process that is frozen or "
+            "killed can hold this one up. Make the bridge's node or env first, or keep them in a "
+            "process of their own."
+        )
+        return make()
+
+
+@contextlib.contextmanager
+def _profiled(environment: MutableMapping[str, str]) -> Iterator[None]:
+    """With the profile as the only word on discovery."""
+    name = _profiles_variable(environment.get("ROS_DISTRO"))
+    kept = {key: environment.get(key) for key in (RANGE, ONLY_LOCAL, name)}
+    environment.pop(ONLY_LOCAL, None)
+    environment.update({RANGE: SELF_MADE, name: str(PROFILE)})
+    try:
+        yield
+    finally:
+        for key, value in kept.items():
+            environment.pop(key, None)
+            if value is not None:
+                environment[key] = value
 
 
 def _is_fast_dds() -> bool:
@@ -100,24 +136,42 @@ def _is_fast_dds() -> bool:
 
 def _profiles_variable(distribution: str | None) -> str:
     """Name of the variable of the profiles' file in this process."""
-    old = distribution in FAST_DDS_2_DISTRIBUTIONS
-    return PROFILES[old or FAST_DDS_2 in MAPS.read_text(encoding="utf-8")]
+    return PROFILES[distribution in FAST_DDS_2_DISTRIBUTIONS or FAST_DDS_2 in _maps()]
 
 
-def _shares_memory(context: Context) -> bool:
-    """Whether a node in a context has shared memory of Fast DDS."""
-    node = Node(
-        "transport_probe",
-        context=context,
-        use_global_arguments=False,
-        start_parameter_services=False,
-        enable_rosout=False,
-    )
+def _maps() -> bytes:
+    return Path("/proc/self/maps").read_bytes()
+
+
+def _is_in_force(context: Context) -> bool:
+    """Whether a node in a context has neither shared memory nor the multicast of its domain."""
     try:
-        maps = MAPS.read_text(encoding="utf-8")
-        return any(segment in maps for segment in SEGMENTS)
+        node = Node(
+            "transport_probe",
+            context=context,
+            use_global_arguments=False,
+            start_parameter_services=False,
+            enable_rosout=False,
+            parameter_overrides=[Parameter("start_type_description_service", value=False)],
+        )
+    except BaseException:
+        context.try_shutdown()
+        raise
+    try:
+        port = FIRST_PORT + PORTS_OF_A_DOMAIN * context.get_domain_id()
+        return not any(segment in _maps() for segment in SEGMENTS) and port not in udp_ports()
     finally:
         node.destroy_node()
+
+
+def udp_ports(process: str = "self") -> set[int]:
+    """The ports of UDP over IPv4 that a process, this one or that of an id, has bound."""
+    sockets = set()
+    for file in Path(f"/proc/{process}/fd").iterdir():
+        with contextlib.suppress(OSError):  # of another thread, closed meanwhile
+            sockets.add(os.readlink(file))
+    rows = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
+    return {int(row[1].split(":")[1], 16) for row in rows if f"socket:[{row[9]}]" in sockets}
 
 
 OF_THIS_PROCESS = Transport()

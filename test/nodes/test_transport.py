@@ -9,78 +9,101 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
+from nics_drl_bridge.nodes.processes import NodeProcess
 from nics_drl_bridge.nodes.transport import (
-    CHOICES,
+    FIRST_PORT,
     LOCAL,
-    PROFILE,
+    ONLY_LOCAL,
+    PORTS_OF_A_DOMAIN,
     PROFILES,
     RANGE,
     SEGMENTS,
-    SELF_MADE,
     TRANSPORTS,
     UDP,
-    prefer_udp,
+    chosen,
+    stays_here,
+    udp_ports,
 )
 
 pytestmark = pytest.mark.ros
 
 NODES = ("simulator_node", "command_gate", "policy_node", "middleware_node")
-PROFILED = {RANGE: SELF_MADE, PROFILES[0]: str(PROFILE)}
-OF_ANOTHER_TREE = "/elsewhere/nics_drl_bridge/nodes/this_machine.xml"
+WARNING = "Fast DDS did not take on "
 
 
 @pytest.mark.parametrize(
-    ("given", "wanted"),
+    ("environment", "here"),
     [
-        ({RANGE: LOCAL}, PROFILED),
-        ({RANGE: LOCAL, TRANSPORTS: UDP}, PROFILED | {TRANSPORTS: UDP}),
-        ({RANGE: "SUBNET"}, {RANGE: "SUBNET", TRANSPORTS: UDP}),
-        ({RANGE: SELF_MADE}, {RANGE: SELF_MADE, TRANSPORTS: UDP}),
+        ({RANGE: LOCAL}, True),
+        ({RANGE: "localhost"}, True),  # rcl takes it for LOCALHOST
+        ({RANGE: "SUBNET"}, False),
+        ({RANGE: "OFF"}, False),
+        ({RANGE: "SUBNET", ONLY_LOCAL: "1"}, True),
+        ({RANGE: LOCAL, ONLY_LOCAL: "0"}, True),
+        ({RANGE: LOCAL, "ROS_DISTRO": "humble", ONLY_LOCAL: "1"}, True),
+        ({RANGE: LOCAL, "ROS_DISTRO": "humble", ONLY_LOCAL: "0"}, False),
     ],
 )
-def test_shared_memory_is_off_in_every_range_of_discovery(given, wanted):
-    environment = dict(given)
-    prefer_udp(environment)
-    assert environment == wanted
+def test_how_far_discovery_goes_is_read_as_rcl_reads_it(environment, here):
+    assert stays_here(environment) == here
 
 
 @pytest.mark.parametrize(
-    ("given", "wanted"),
+    ("environment", "expected"),
     [
-        (PROFILED, PROFILED),
-        (PROFILED | {RANGE: LOCAL}, PROFILED),
-        (PROFILED | {PROFILES[0]: OF_ANOTHER_TREE}, PROFILED),
-        (PROFILED | {RANGE: "SUBNET"}, {RANGE: "SUBNET", TRANSPORTS: UDP}),
+        ({}, False),
+        ({TRANSPORTS: UDP}, False),
+        ({TRANSPORTS: ""}, False),
+        ({TRANSPORTS: "DEFAULT"}, True),
+        ({PROFILES[0]: "mine.xml"}, True),
+        ({PROFILES[1]: "mine.xml"}, True),
+        ({ONLY_LOCAL: "1"}, False),
     ],
 )
-def test_what_a_process_inherits_from_another_does_not_bind_it(given, wanted):
-    environment = dict(given)
-    prefer_udp(environment)
-    assert environment == wanted
+def test_who_names_other_transports_or_profiles_has_chosen(environment, expected):
+    assert chosen(environment) == expected
 
 
-@pytest.mark.parametrize("name", [*CHOICES, TRANSPORTS])
-def test_who_chooses_for_himself_is_left_alone(name):
-    environment = given = {RANGE: LOCAL, name: "mine"}
-    prefer_udp(environment)
-    assert environment == given
+def test_profiles_in_the_working_directory_are_a_choice(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert not chosen({})
+    (tmp_path / "DEFAULT_FASTDDS_PROFILES.xml").write_text("<dds/>")
+    assert chosen({})
 
 
-def shared(pid: int) -> bool:
-    """Whether a process has shared memory of Fast DDS."""
-    maps = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8")
-    return any(segment in maps for segment in SEGMENTS)
+def is_apart(process: NodeProcess, domain_id: int) -> bool:
+    """Whether a node has neither shared memory of Fast DDS nor the multicast of its domain."""
+    maps, ports = Path(f"/proc/{process.pid}/maps").read_bytes(), udp_ports(str(process.pid))
+    assert ports
+    multicast = FIRST_PORT + PORTS_OF_A_DOMAIN * domain_id
+    return multicast not in ports and not any(segment in maps for segment in SEGMENTS)
 
 
 @pytest.mark.parametrize("node", NODES)
-def test_no_node_has_shared_memory_in_which_another_could_hold_it_up(launch, meet, domain_id, node):
+def test_nodes_have_udp_on_this_machine_alone(launch, meet, domain_id, node):
     process, peer = launch(node, domain_id), meet(domain_id)
     peer.be_known_to(f"/{node}")
-    assert not shared(process.pid)
+    assert is_apart(process, domain_id)
+
+
+def run(code: str, domain_id: int, folder: Path, **environment: str) -> str:
+    """What a Python process says that has nothing of this one's environment on DDS."""
+    ours = (RANGE, ONLY_LOCAL, TRANSPORTS, *PROFILES)
+    kept = {name: value for name, value in os.environ.items() if name not in ours}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=kept | {"ROS_DOMAIN_ID": str(domain_id)} | environment,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=120.0,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stderr
 
 
 DRIVER = """
-import os, sys, time
+import sys, time
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
@@ -98,57 +121,105 @@ while len(set(heard)) < 3:  # in lock-step the world moves by commands alone
     assert time.monotonic() < deadline, heard
     commands.publish(Twist())
     executor.spin_once(timeout_sec=0.01)
-with open("/proc/self/maps") as maps:
-    sys.exit(0 if "shm/fast" in maps.read() else "it has no shared memory")
+with open("/proc/self/maps", "rb") as maps:
+    sys.exit(0 if b"shm/fast" in maps.read() else "it has no shared memory")
 """
 
 
-def plain(domain_id: int) -> dict[str, str]:
-    """The environment of a process of somebody else's."""
-    ours = (RANGE, TRANSPORTS, *PROFILES)
-    kept = {name: value for name, value in os.environ.items() if name not in ours}
-    return kept | {"ROS_DOMAIN_ID": str(domain_id), RANGE: LOCAL}
-
-
-def test_a_driver_that_has_shared_memory_is_heard_and_hears(launch, domain_id):
+def test_a_driver_that_has_shared_memory_is_heard_and_hears(launch, domain_id, tmp_path):
     process = launch("simulator_node", domain_id, mode="lockstep")
-    done = subprocess.run(
-        [sys.executable, "-c", DRIVER],
-        env=plain(domain_id),
-        capture_output=True,
-        text=True,
-        timeout=120.0,
-    )
-    assert done.returncode == 0, done.stderr
-    assert not shared(process.pid)
+    run(DRIVER, domain_id, tmp_path, **{RANGE: LOCAL})
+    assert is_apart(process, domain_id)
 
 
-AFTER_ANOTHER = f"""
+IN_ORDER = f"""
 import os
+from pathlib import Path
 from rclpy.context import Context
 from rclpy.node import Node
+from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes.runner import open_context
-other = Context()
-other.init(None)
-node = Node("of_somebody_else", context=other)
-if {{forgotten}}:
+from nics_drl_bridge.nodes.transport import udp_ports
+
+PORT = {FIRST_PORT} + {PORTS_OF_A_DOMAIN} * int(os.environ["ROS_DOMAIN_ID"])
+
+def ours(where=None):
+    if where is not None:
+        os.environ["{RANGE}"] = where
+    return Node("ours", context=open_context())
+
+def plain():
+    context = Context()
+    context.init(None)
+    return Node("of_somebody_else", context=context)
+
+def end(node):
+    context = node.context
     node.destroy_node()
-    other.try_shutdown()
-for _ in range(2):
-    ours = Node("ours", context=open_context())
-    assert os.environ["{RANGE}"] == "{LOCAL}", os.environ
-    assert "{PROFILES[0]}" not in os.environ
+    context.try_shutdown()
+
+def shared():
+    return b"shm/fast" in Path("/proc/self/maps").read_bytes()
+
+def multicast():
+    return PORT in udp_ports()
 """
 
 
-@pytest.mark.parametrize("forgotten", [False, True])
-def test_after_a_node_of_somebody_else_the_range_is_kept_and_a_warning_given(domain_id, forgotten):
-    done = subprocess.run(
-        [sys.executable, "-c", AFTER_ANOTHER.format(forgotten=forgotten)],
-        env=plain(domain_id),
-        capture_output=True,
-        text=True,
-        timeout=60.0,
+def test_the_environment_is_left_as_it_was_found(domain_id, tmp_path):
+    code = "before = dict(os.environ)\nends = [ours(), ours()]\n"
+    code += f"assert os.environ == before | {{'{RANGE}': '{LOCAL}'}}\n"
+    code += "assert not shared() and not multicast()"
+    assert WARNING not in run(IN_ORDER + code, domain_id, tmp_path)
+
+
+@pytest.mark.parametrize("ended", ["", "end(other)"])
+@pytest.mark.parametrize("transports", ["", UDP])
+def test_after_a_node_of_somebody_else_discovery_stays_here_with_a_warning(
+    domain_id, tmp_path, ended, transports
+):
+    code = f"other = plain()\n{ended}\nends = [ours(), ours()]\nassert not multicast()"
+    said = run(IN_ORDER + code, domain_id, tmp_path, **{RANGE: LOCAL, TRANSPORTS: transports})
+    assert said.count(WARNING) == 1
+
+
+def test_after_a_subnet_discovery_stays_here_with_a_warning(domain_id, tmp_path):
+    code = "first = ours('SUBNET')\nassert multicast() and not shared()\n"
+    code += f"end(first)\nsecond = ours('{LOCAL}')\nassert not multicast()"
+    assert run(IN_ORDER + code, domain_id, tmp_path).count(WARNING) == 1
+
+
+def test_discovery_does_not_silently_stay_here_where_a_subnet_is_asked_for(domain_id, tmp_path):
+    code = "first = ours()\ntry:\n    ours('SUBNET')\nexcept BackendError as error:\n"
+    code += "    assert 'SUBNET, but an earlier node in this process keeps' in str(error)\n"
+    code += "else:\n    raise AssertionError('a subnet that nobody sees')"
+    run(IN_ORDER + code, domain_id, tmp_path)
+
+
+@pytest.mark.parametrize("distribution", ["", "humble"])
+def test_the_older_word_for_this_machine_is_heeded(domain_id, tmp_path, distribution):
+    code = "first = ours()\nassert not multicast() and not shared()"
+    words = {ONLY_LOCAL: "1", "ROS_DISTRO": distribution}
+    run(IN_ORDER + code, domain_id, tmp_path, **words)
+
+
+def test_who_chooses_shared_memory_gets_it(domain_id, tmp_path):
+    code = "first = ours()\nassert shared() and not multicast()"
+    run(IN_ORDER + code, domain_id, tmp_path, **{TRANSPORTS: "DEFAULT"})
+
+
+def test_the_probe_offers_nothing_that_rights_would_have_to_allow(domain_id, tmp_path):
+    code = (
+        "import nics_drl_bridge.nodes.transport as transport\n"
+        "seen = []\n"
+        "class Watched(transport.Node):\n"
+        "    def destroy_node(self):\n"
+        "        seen.append([self.get_name()] + [name for ends in (self.publishers,\n"
+        "            self.subscriptions) for name in sorted(each.topic_name for each in ends)]\n"
+        "            + [each.srv_name for each in self.services])\n"
+        "        super().destroy_node()\n"
+        "transport.Node = Watched\n"
+        "ours()\n"
+        "assert seen == [['transport_probe', '/parameter_events']], seen\n"
     )
-    assert done.returncode == 0, done.stderr
-    assert done.stderr.count("a node was started in this process before") == 1
+    run(IN_ORDER + code, domain_id, tmp_path)
