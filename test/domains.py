@@ -9,15 +9,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from nics_drl_bridge.nodes.udp import domains_in_use
+
 DOMAINS = range(1, 102)  # above, DDS ports may collide with those that Linux hands out
 
 
 @contextmanager
 def claimed_domain() -> Iterator[int]:
-    """A domain id that nobody else who asks here has; freed when the block or process ends."""
+    """A domain id that nobody uses or has asked for here; freed when the block or process ends."""
     folder = Path(tempfile.gettempdir()) / "nics_drl_bridge_test_domains"
     folder.mkdir(exist_ok=True)
-    for domain_id in random.sample(DOMAINS, len(DOMAINS)):
+    unused = sorted(set(DOMAINS) - domains_in_use())
+    for domain_id in random.sample(unused, len(unused)):
         with (folder / str(domain_id)).open("w") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -15,6 +15,7 @@ from typing import Any
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.nodes.udp import domains_in_use
 
 LAST_DOMAIN_ID, GREATEST_DOMAIN_ID = 101, 232
 """Above the first, DDS ports may collide with those that Linux hands out; above the other there
@@ -27,12 +28,16 @@ LOG_LINES = 5
 def free_domain_id() -> int:
     """The domain id of the environment, or one drawn at random so that runs keep apart.
 
+    Drawn is among those that nobody on this machine uses.
+
     Raises:
         ConfigError: the environment's is no domain id.
     """
     given = os.environ.get("ROS_DOMAIN_ID")
     if not given:
-        return random.SystemRandom().randint(1, LAST_DOMAIN_ID)
+        all_of_them = range(1, LAST_DOMAIN_ID + 1)
+        unused = sorted(set(all_of_them) - domains_in_use())
+        return random.SystemRandom().choice(unused or all_of_them)
     if not given.isdecimal() or int(given) > GREATEST_DOMAIN_ID:
         raise ConfigError(
             f"the environment variable ROS_DOMAIN_ID is {given!r}; it must be a number from 0 to "

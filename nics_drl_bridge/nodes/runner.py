@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, MutableMapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -23,13 +22,7 @@ from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.overrides import warn_of_unknown, widen
 from nics_drl_bridge.nodes.sole import sole
-from nics_drl_bridge.nodes.transport import (
-    LOCAL,
-    OF_THIS_PROCESS,
-    OLDEST_DISTRIBUTION,
-    ONLY_LOCAL,
-    RANGE,
-)
+from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
 
 SPIN_S = 0.1
 DELIVERY_S = 0.5
@@ -38,13 +31,6 @@ RANGES = {
     int: (IntegerRange, "integer_range"),
     float: (FloatingPointRange, "floating_point_range"),
 }
-
-
-def stay_on_this_machine(environment: MutableMapping[str, str]) -> None:
-    """Limits discovery to this machine in an environment that does not say how far it goes."""
-    environment.setdefault(RANGE, LOCAL)
-    if environment.get("ROS_DISTRO") == OLDEST_DISTRIBUTION:
-        environment.setdefault(ONLY_LOCAL, "1")
 
 
 def open_context(args: Sequence[str] | None = None, domain_id: int | None = None) -> Context:
@@ -62,7 +48,6 @@ def open_context(args: Sequence[str] | None = None, domain_id: int | None = None
         BackendError: the arguments are wrong, no ROS 2 middleware is there, or discovery should go
             further than that of an earlier context of this process.
     """
-    stay_on_this_machine(os.environ)
 
     def make() -> Context:
         context = Context()

@@ -3,13 +3,15 @@
 Fast DDS's shared memory has a lock for each process that listens. One that is frozen, or killed,
 while it holds the lock holds up everybody who sends to it, for as long as it stands still: a gate
 that tells the base to stop, a base that sends its odometry to a policy. UDP has no such lock, and
-a step in lock-step takes a twentieth longer. A process of these nodes has no shared memory, neither
-to send through nor to be sent to, so that drivers that have it aren't held up by them either.
+a step in lock-step takes a twentieth longer. These nodes have no shared memory, neither to send
+through nor to be sent to, so that drivers that have it aren't held up by them either.
 
 Where discovery stays on this machine, rmw_fastrtps chooses the transports itself. A profile does
-what it does then, but for the shared memory; Fast DDS reads it once in a process, with its first
-node, and it rules the whole process. So it is looked at what came of it, and the environment is
-left as it was found.
+what it does then, but for the shared memory. Fast DDS reads it once in a process, with its first
+node, so it is looked at what came of it; the environment is left as it was found. A node that
+somebody makes in the process afterwards does not listen to multicast, and may have shared memory.
+
+Where discovery goes further, a variable is enough. It is read with each node, and stays.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from rclpy.parameter import Parameter
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from nics_drl_bridge.errors import BackendError
+from nics_drl_bridge.nodes.udp import multicast_port, ports_of
 
 RANGE, LOCAL, ONLY_LOCAL = "ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST", "ROS_LOCALHOST_ONLY"
 SELF_MADE = "SYSTEM_DEFAULT"
@@ -45,8 +48,6 @@ FAST_DDS_2, FAST_DDS_2_DISTRIBUTIONS = b"libfastrtps.so", (OLDEST_DISTRIBUTION, 
 PEERS = ("ROS_DISCOVERY_SERVER", "ROS_STATIC_PEERS")
 """Who sets one of these looks for others elsewhere, too, which the profile does not."""
 SEGMENTS = (b"shm/fastdds_", b"shm/fastrtps_")
-FIRST_PORT, PORTS_OF_A_DOMAIN = 7400, 250
-"""Of RTPS: the first port of a domain is that of multicast."""
 
 
 def stays_here(environment: Mapping[str, str]) -> bool:
@@ -63,6 +64,13 @@ def chosen(environment: Mapping[str, str]) -> bool:
     return named or any(map(environment.get, PROFILES)) or any(map(os.path.exists, PROFILES_HERE))
 
 
+def stay_on_this_machine(environment: MutableMapping[str, str]) -> None:
+    """Limits discovery to this machine in an environment that does not say how far it goes."""
+    environment.setdefault(RANGE, LOCAL)
+    if environment.get("ROS_DISTRO") == OLDEST_DISTRIBUTION:
+        environment.setdefault(ONLY_LOCAL, "1")
+
+
 class Transport:
     """How the nodes of this process send."""
 
@@ -74,57 +82,63 @@ class Transport:
         """A context over UDP; as ROS 2 makes it where somebody has chosen or UDP can't be had.
 
         Args:
-            make: makes a context in the environment of this process, which says how far discovery
-                goes.
+            make: makes a context in the environment of this process.
 
         Raises:
             BackendError: discovery should go further than that of an earlier context.
         """
         with self._lock:
-            if not _is_fast_dds() or chosen(os.environ):
-                return make()
-            if stays_here(os.environ):
-                elsewhere = any(map(os.environ.get, PEERS))
-                return make() if elsewhere or self._in_force is False else self._open_here(make)
-            if self._in_force:
+            stay_on_this_machine(os.environ)
+            here = stays_here(os.environ)
+            if self._in_force and not here:
                 raise BackendError(
                     f"{RANGE} is {os.environ[RANGE]}, but an earlier node in this process keeps "
                     "its discovery on this machine; set it before the first, or use another "
                     "process."
                 )
-            os.environ[TRANSPORTS] = UDP
-            return make()
+            if not _is_fast_dds() or chosen(os.environ):
+                return make()
+            if not here:
+                os.environ[TRANSPORTS] = UDP
+                return make()
+            if self._in_force is False or any(map(os.environ.get, PEERS)):
+                return make()
+            return self._open_here(make)
 
     def _open_here(self, make: Callable[[], Context]) -> Context:
-        with _profiled(os.environ):
+        words = {RANGE: SELF_MADE}
+        if self._in_force is None:
+            words[_profiles_variable(os.environ.get("ROS_DISTRO"))] = str(PROFILE)
+        with _changed(os.environ, words):
             context = make()
             if self._in_force is None:
                 self._in_force = _is_in_force(context)
         if self._in_force:
             return context
         context.try_shutdown()
+        why = "since a node was started in this process before, or discovery went further"
         get_logger("nics_drl_bridge").warning(
-            f"Fast DDS did not take on {PROFILE}, most likely since a node was started in this "
-            "process before: it sends through shared memory, and a process that is frozen or "
-            "killed can hold this one up. Make the bridge's node or env first, or keep them in a "
-            "process of their own."
+            f"Fast DDS did not take on {PROFILE}, "
+            f"{why if PROFILE.is_file() else 'which is missing'}: it sends through shared memory, "
+            "and a process that is frozen or killed can hold this one up. Make the bridge's node "
+            "or env first, or keep them in a process of their own."
         )
         return make()
 
 
 @contextlib.contextmanager
-def _profiled(environment: MutableMapping[str, str]) -> Iterator[None]:
-    """With the profile as the only word on discovery."""
-    name = _profiles_variable(environment.get("ROS_DISTRO"))
-    kept = {key: environment.get(key) for key in (RANGE, ONLY_LOCAL, name)}
+def _changed(environment: MutableMapping[str, str], words: Mapping[str, str]) -> Iterator[None]:
+    """With these words, and without the older one on discovery, which overrules them."""
+    kept = {key: environment.get(key) for key in (ONLY_LOCAL, *words)}
     environment.pop(ONLY_LOCAL, None)
-    environment.update({RANGE: SELF_MADE, name: str(PROFILE)})
+    environment.update(words)
     try:
         yield
     finally:
         for key, value in kept.items():
-            environment.pop(key, None)
-            if value is not None:
+            if value is None:
+                environment.pop(key, None)
+            else:
                 environment[key] = value
 
 
@@ -158,20 +172,10 @@ def _is_in_force(context: Context) -> bool:
         context.try_shutdown()
         raise
     try:
-        port = FIRST_PORT + PORTS_OF_A_DOMAIN * context.get_domain_id()
-        return not any(segment in _maps() for segment in SEGMENTS) and port not in udp_ports()
+        shares = any(segment in _maps() for segment in SEGMENTS)
+        return not shares and multicast_port(context.get_domain_id()) not in ports_of()
     finally:
         node.destroy_node()
-
-
-def udp_ports(process: str = "self") -> set[int]:
-    """The ports of UDP over IPv4 that a process, this one or that of an id, has bound."""
-    sockets = set()
-    for file in Path(f"/proc/{process}/fd").iterdir():
-        with contextlib.suppress(OSError):  # of another thread, closed meanwhile
-            sockets.add(os.readlink(file))
-    rows = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
-    return {int(row[1].split(":")[1], 16) for row in rows if f"socket:[{row[9]}]" in sockets}
 
 
 OF_THIS_PROCESS = Transport()

@@ -11,24 +11,38 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from nics_drl_bridge.nodes.processes import NodeProcess
 from nics_drl_bridge.nodes.transport import (
-    FIRST_PORT,
     LOCAL,
     ONLY_LOCAL,
-    PORTS_OF_A_DOMAIN,
     PROFILES,
     RANGE,
     SEGMENTS,
     TRANSPORTS,
     UDP,
     chosen,
+    stay_on_this_machine,
     stays_here,
-    udp_ports,
 )
+from nics_drl_bridge.nodes.udp import multicast_port, ports_of
 
 pytestmark = pytest.mark.ros
 
 NODES = ("simulator_node", "command_gate", "policy_node", "middleware_node")
 WARNING = "Fast DDS did not take on "
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [
+        ({"ROS_DISTRO": "jazzy"}, {RANGE: LOCAL}),
+        ({"ROS_DISTRO": "jazzy", RANGE: "SUBNET"}, {RANGE: "SUBNET"}),
+        ({"ROS_DISTRO": "humble"}, {RANGE: LOCAL, ONLY_LOCAL: "1"}),
+        ({"ROS_DISTRO": "humble", ONLY_LOCAL: "0"}, {RANGE: LOCAL, ONLY_LOCAL: "0"}),
+    ],
+)
+def test_discovery_stays_on_this_machine_unless_the_environment_says_otherwise(given, wanted):
+    environment = dict(given)
+    stay_on_this_machine(environment)
+    assert environment == given | wanted
 
 
 @pytest.mark.parametrize(
@@ -73,10 +87,10 @@ def test_profiles_in_the_working_directory_are_a_choice(tmp_path, monkeypatch):
 
 def is_apart(process: NodeProcess, domain_id: int) -> bool:
     """Whether a node has neither shared memory of Fast DDS nor the multicast of its domain."""
-    maps, ports = Path(f"/proc/{process.pid}/maps").read_bytes(), udp_ports(str(process.pid))
+    maps, ports = Path(f"/proc/{process.pid}/maps").read_bytes(), ports_of(process.pid)
     assert ports
-    multicast = FIRST_PORT + PORTS_OF_A_DOMAIN * domain_id
-    return multicast not in ports and not any(segment in maps for segment in SEGMENTS)
+    shares = any(segment in maps for segment in SEGMENTS)
+    return not shares and multicast_port(domain_id) not in ports
 
 
 @pytest.mark.parametrize("node", NODES)
@@ -139,9 +153,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes.runner import open_context
-from nics_drl_bridge.nodes.transport import udp_ports
-
-PORT = {FIRST_PORT} + {PORTS_OF_A_DOMAIN} * int(os.environ["ROS_DOMAIN_ID"])
+from nics_drl_bridge.nodes.udp import multicast_port, ports_of
 
 def ours(where=None):
     if where is not None:
@@ -162,7 +174,7 @@ def shared():
     return b"shm/fast" in Path("/proc/self/maps").read_bytes()
 
 def multicast():
-    return PORT in udp_ports()
+    return multicast_port(int(os.environ["ROS_DOMAIN_ID"])) in ports_of()
 """
 
 
@@ -171,6 +183,13 @@ def test_the_environment_is_left_as_it_was_found(domain_id, tmp_path):
     code += f"assert os.environ == before | {{'{RANGE}': '{LOCAL}'}}\n"
     code += "assert not shared() and not multicast()"
     assert WARNING not in run(IN_ORDER + code, domain_id, tmp_path)
+
+
+def test_the_environment_is_left_as_it_was_found_by_arguments_that_are_wrong(domain_id, tmp_path):
+    code = "before = dict(os.environ)\ntry:\n    open_context(['node', '--ros-args', '-r', 'x'])\n"
+    code += "except BackendError:\n    assert os.environ == before\n"
+    code += "else:\n    raise AssertionError('x is no remapping')"
+    run(IN_ORDER + code, domain_id, tmp_path, **{RANGE: LOCAL})
 
 
 @pytest.mark.parametrize("ended", ["", "end(other)"])
@@ -189,8 +208,12 @@ def test_after_a_subnet_discovery_stays_here_with_a_warning(domain_id, tmp_path)
     assert run(IN_ORDER + code, domain_id, tmp_path).count(WARNING) == 1
 
 
-def test_discovery_does_not_silently_stay_here_where_a_subnet_is_asked_for(domain_id, tmp_path):
-    code = "first = ours()\ntry:\n    ours('SUBNET')\nexcept BackendError as error:\n"
+@pytest.mark.parametrize("transports", ["", UDP, "DEFAULT"])
+def test_discovery_does_not_silently_stay_here_where_a_subnet_is_asked_for(
+    domain_id, tmp_path, transports
+):
+    code = f"first = ours()\nos.environ['{TRANSPORTS}'] = '{transports}'\n"
+    code += "try:\n    ours('SUBNET')\nexcept BackendError as error:\n"
     code += "    assert 'SUBNET, but an earlier node in this process keeps' in str(error)\n"
     code += "else:\n    raise AssertionError('a subnet that nobody sees')"
     run(IN_ORDER + code, domain_id, tmp_path)
