@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+PATIENCE_S = 30.0
 RULES = """
 table netdev loss {{
     chain ingress {{
@@ -71,13 +73,25 @@ def link() -> Iterator[Link]:
             _run("ip", "-n", end, "address", "add", f"10.77.0.{number}/24", "dev", device)
             for name in ("lo", device):
                 _run("ip", "-n", end, "link", "set", name, "up")
+        for end, device in zip(ends, made.devices, strict=True):
+            _await_carrier(end, device)
         yield made
     finally:
         for end in ends:
             subprocess.run(["ip", "netns", "delete", end], check=False, capture_output=True)
 
 
-def _run(*words: str, text: str = "") -> None:
+def _await_carrier(end: str, device: str) -> None:
+    """Waits until an end of the cable is up: who starts before does not use it, ever."""
+    deadline = time.monotonic() + PATIENCE_S
+    while "state UP" not in _run("ip", "-n", end, "link", "show", device):
+        if time.monotonic() > deadline:
+            raise NoNamespacesError(f"{device} in {end} has no carrier.")
+        time.sleep(0.01)
+
+
+def _run(*words: str, text: str = "") -> str:
     done = subprocess.run(words, input=text, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise NoNamespacesError(f"{' '.join(words)}: {done.stderr.strip()}")
+    return done.stdout

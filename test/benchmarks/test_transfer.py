@@ -43,6 +43,7 @@ def test_it_prints_one_json_object_with_all_worlds():
         [sys.executable, str(SCRIPT), "--json", "--episodes", "1", "--robots", "differential"],
         capture_output=True, text=True, timeout=280,
     )  # fmt: skip
+    assert done.stdout, done.stderr
     told = json.loads(done.stdout)
     assert set(told) == {"robots", "without_randomisation"}
     for robots in told.values():
