@@ -116,8 +116,8 @@ class Robot(_End):
 
     def _ask(self) -> None:
         if not self.moves and self._arm.service_is_ready():
-            self._reset.call_async(Trigger.Request())
-            self._arm.call_async(Trigger.Request())
+            reset = self._reset.call_async(Trigger.Request())  # two at once may change places
+            reset.add_done_callback(lambda _: self._arm.call_async(Trigger.Request()))
 
     def _send(self) -> None:
         speed = self.heard[-1][1][0] if self.heard else 0.0
