@@ -73,5 +73,6 @@ def test_no_command_moves_a_robot_on_old_data_when_packets_are_lost():
     if done.returncode == 2:
         pytest.skip(done.stderr.strip())
     result = json.loads(done.stdout)
+    assert result["loss_20"]["moving_commands"] > 0
     assert result["loss_20"]["scans_arrived"] < result["loss_20"]["scans_sent"]
     assert result["unsafe_commands"] == 0
