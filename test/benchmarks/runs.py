@@ -1,0 +1,38 @@
+"""Runs a benchmark as a user would, in small."""
+
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+def asked(script: str, *options: str, timeout_s: float = 280.0) -> tuple[int, dict[str, Any]]:
+    """The exit code of a benchmark and the one JSON object that it prints."""
+    done = subprocess.run(
+        [sys.executable, str(BENCHMARKS / script), "--json", *options],
+        capture_output=True, text=True, check=False, timeout=timeout_s,
+    )  # fmt: skip
+    assert done.stdout.count("\n") == 1, done.stdout + done.stderr
+    return done.returncode, json.loads(done.stdout)
+
+
+def controls_of(script: str) -> list[str]:
+    """The names of a benchmark's controls, read from its source."""
+    for node in ast.parse((BENCHMARKS / script).read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "CONTROLS":
+            return list(ast.literal_eval(node.value))
+    return []
+
+
+def fails(script: str, control: str, *options: str) -> list[str]:
+    """The bars that a benchmark misses under a control, which has to be at least one."""
+    code, result = asked(script, "--control", control, *options)
+    assert (code, bool(result["failures"])) == (1, True), result
+    missed: list[str] = result["failures"]
+    return missed
