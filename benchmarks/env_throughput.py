@@ -3,103 +3,171 @@
 The navigation task of the differential robot: 10 kinematic substeps per step, a lidar of 720
 beams among ten circles, observation, reward, autoreset, random actions. Beside the vector env on
 one thread and on all, and the single env of `gymnasium.make` without and with the estimator, two
-other simulators do the same task in the same scenes in the same run, autoreset included.
+other simulators do the same task in the same scenes, all timed in turn in the same run.
 
-What they offer to users moves and scans in one step, so that ten kinematic substeps are ten of
-their steps: `peers`. `peers_with_one_scan` moves nine times past that, by their inner functions,
-and scans at the end only, as ours does. (irsim-x can also step many robots at once, but all in
-one scene, without a new one as each episode ends.)
+`times_as_fast_at_equal_work` is our vector env on one thread against them with one scan per
+control period, as ours has; `times_as_fast_with_ten_scans` against ten of their own steps, each
+of which scans: see measuring/peers.py. (irsim-x can also step many robots at once, but all in one
+scene, without a new one as each episode ends.) Bars are ratios within the run: to the peers, to
+writing as many bytes as the observations have, and to a step of Gymnasium's CartPole.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
-import sys
-import tempfile
-import time
 import tracemalloc
 from collections.abc import Callable
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
 import numpy as np
-from lidar_peers import PEERS
-from measuring.environments import NotInstalledError, python_with, run
-
-from nics_drl_bridge.env.navigation import Navigation
-from nics_drl_bridge.env.registration import MAX_EPISODE_STEPS, NAVIGATION, register_envs
-from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.sim.scenes import sample_scene
-from nics_drl_bridge.sim.world import World
-
-SCRIPT = Path(__file__).resolve().parent / "measuring" / "irsim_steps.py"
-MODEL = open_model("differential")
-RADIUS, CIRCLES = 0.15, 10
-WORLD = World.model_validate(
-    {
-        "name": "ten circles",
-        "size": [6.0, 6.0],
-        "obstacles": [
-            {"shapes": [{"kind": "circle", "radius": RADIUS}], "count": CIRCLES, "gap": 0.3}
-        ],
-        "clearance": 0.3,
-        "goal_distance": [2.0, 4.0],
-    }
+from measuring.peers import (
+    MODEL,
+    PEERS,
+    WORLD,
+    Measured,
+    block_of,
+    measure,
+    missed_by,
+    missed_by_robots,
+    scenes,
 )
-GOAL_RADIUS = Navigation(MODEL.robot, MODEL.lidar).goal_radius
-VECTOR_BAR, SINGLE_BAR, ESTIMATOR_BAR = 3e5, 2e4, 4e3
+from measuring.verdict import answer, parser_of
+from numpy.typing import NDArray
+
+from nics_drl_bridge.env.registration import NAVIGATION, register_envs
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.baking import bake
+
+CONTROLS = {
+    "slow": "the speed: each env step that counts is ten",
+    "standing": "the motion: the robots stand still",
+    "blind": "the scan: the lidar has 8 beams",
+}
+FEW_BEAMS, TIMES_SLOWER = 8, 10
+EQUAL_WORK_BARS = {"ir_sim": 900.0, "irsim_x": 70.0}
+"""How many times a peer's rate with one scan per control period ours is on one thread, at least."""
+WRITE_BAR = 0.01
+"""Of the rate at which the observations alone can be written, on one thread."""
+SINGLE_BAR, ESTIMATOR_BAR = 0.04, 0.007
+"""Of the rate of CartPole, a single env that calculates next to nothing."""
 SCENES = 50
 """That the peers go through, one for each episode."""
-ACTIONS, CHUNK, SINGLE_CHUNK = 64, 50, 500
+ACTIONS, CHUNK, SINGLE_CHUNK, WRITES = 64, 50, 500, 50
 
 
-def vector(worlds: int, threads: int) -> Callable[[], int]:
-    """Makes a vector env; the function takes a chunk of steps and says how many env-steps."""
-    further: dict[str, Any] = {} if threads == 1 else {"threads": threads}
-    env = BridgeVectorEnv(worlds, MODEL, WORLD, **further)
-    env.reset(seed=0)
-    size = (ACTIONS, *env.action_space.shape)
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, size).astype(np.float32)
+def actions_for(space: gymnasium.Space[Any], control: str | None) -> NDArray[np.float32]:
+    """(ACTIONS, ...) random actions, or those of no motion."""
+    size = (ACTIONS, *(space.shape or ()))
+    if control == "standing":
+        low, high = MODEL.robot.command_low, MODEL.robot.command_high
+        return np.broadcast_to(-(low + high) / (high - low), size).astype(np.float32)
+    return np.random.default_rng(0).uniform(-1.0, 1.0, size).astype(np.float32)
 
-    def chunk() -> int:
+
+def model_for(control: str | None) -> SimulatorModel:
+    """The robot, whose lidar may be next to blind."""
+    if control != "blind":
+        return MODEL
+    few = type(MODEL.lidar).model_validate({**MODEL.lidar.model_dump(), "beams": FEW_BEAMS})
+    return replace(MODEL, lidar=few, table=bake(few, MODEL.table.shapes))
+
+
+class Worlds:
+    """The vector env at work; `chunk` is a chunk of its steps, `steps` how many env steps."""
+
+    def __init__(self, worlds: int, threads: int, control: str | None = None) -> None:
+        further: dict[str, Any] = {} if threads == 1 else {"threads": threads}
+        self.model = model_for(control)
+        self.env = BridgeVectorEnv(worlds, self.model, WORLD, **further)
+        self.seen, _ = self.env.reset(seed=0)
+        self.actions = actions_for(self.env.action_space, control)
+        self.times, self.steps = TIMES_SLOWER if control == "slow" else 1, CHUNK * worlds
+
+    def chunk(self) -> None:
+        """Steps all worlds."""
         for k in range(CHUNK):
-            env.step(actions[k % ACTIONS])
-        return CHUNK * worlds
+            for _ in range(self.times):
+                self.env.step(self.actions[k % ACTIONS])
+
+    def drove(self) -> dict[str, float]:
+        """What shows that robots move and see, in one more chunk."""
+        beams, moved, changed, episodes = self.model.lidar.beams, 0.0, 0.0, 0
+        for k in range(CHUNK):
+            was_seen, was = self.seen, self.env.simulator.data.pose[:, 0, :2].copy()
+            self.seen, _, terminated, truncated, _ = self.env.step(self.actions[k % ACTIONS])
+            episodes += int((terminated | truncated).sum())
+            apart = self.env.simulator.data.pose[:, 0, :2] - was
+            moved += float(np.median(np.hypot(*apart.T)))  # not those whose episode began
+            changed += np.count_nonzero(self.seen[:, :beams] != was_seen[:, :beams])
+        return {
+            "moved_m_per_period": moved / CHUNK,
+            "beams_changed_per_period": changed / self.steps,
+            "episodes": episodes,
+        }
+
+
+class Alone:
+    """Likewise the env of `gymnasium.make`, with the wrappers that it adds, reset when it ends."""
+
+    def __init__(self, estimator: bool, control: str | None) -> None:
+        self.model = model_for(control)
+        self.env = gymnasium.make(NAVIGATION, model=self.model, world=WORLD, estimator=estimator)
+        self.seen, _ = self.env.reset(seed=0)
+        self.actions = actions_for(self.env.action_space, control)
+        self.times, self.steps = TIMES_SLOWER if control == "slow" else 1, SINGLE_CHUNK
+
+    def chunk(self) -> None:
+        """Steps the env."""
+        for k in range(SINGLE_CHUNK * self.times):
+            _, _, terminated, truncated, _ = self.env.step(self.actions[k % ACTIONS])
+            if terminated or truncated:
+                self.env.reset()
+
+    def drove(self) -> dict[str, float]:
+        """What shows that the robot moves and sees, in one more chunk."""
+        beams, moved, changed, episodes, was = self.model.lidar.beams, 0.0, 0, 0, None
+        for k in range(SINGLE_CHUNK):
+            was_seen = self.seen
+            self.seen, _, terminated, truncated, info = self.env.step(self.actions[k % ACTIONS])
+            moved += 0.0 if was is None else float(np.hypot(*(info["true_pose"] - was)[:2]))
+            changed += np.count_nonzero(self.seen[:beams] != was_seen[:beams])
+            was = info["true_pose"].copy()
+            if terminated or truncated:
+                (self.seen, _), was, episodes = self.env.reset(), None, episodes + 1
+        return {
+            "moved_m_per_period": moved / SINGLE_CHUNK,
+            "beams_changed_per_period": changed / SINGLE_CHUNK,
+            "episodes": episodes,
+        }
+
+
+def write_chunk(worlds: int) -> Callable[[], None]:
+    """Writes as many bytes as the observations of some steps have."""
+    seen = np.zeros((worlds, MODEL.lidar.beams + 6), np.float32)
+    out = np.ones_like(seen)
+
+    def chunk() -> None:
+        for _ in range(WRITES):
+            np.copyto(out, seen)
 
     return chunk
 
 
-def single(estimator: bool) -> Callable[[], int]:
-    """Likewise the env of `gymnasium.make`, with the wrappers that it adds, reset when it ends."""
-    env = gymnasium.make(NAVIGATION, model=MODEL, world=WORLD, estimator=estimator)
+def cartpole_chunk() -> Callable[[], None]:
+    """Steps of a single env that calculates next to nothing."""
+    env = gymnasium.make("CartPole-v1")
     env.reset(seed=0)
-    size = (ACTIONS, *env.action_space.shape)
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, size).astype(np.float32)
 
-    def chunk() -> int:
+    def chunk() -> None:
         for k in range(SINGLE_CHUNK):
-            _, _, terminated, truncated, _ = env.step(actions[k % ACTIONS])
+            _, _, terminated, truncated, _ = env.step(k % 2)
             if terminated or truncated:
                 env.reset()
-        return SINGLE_CHUNK
 
     return chunk
-
-
-def rates(calls: dict[str, Callable[[], int]], repeats: int) -> dict[str, float]:
-    """Env-steps per second of each: the median of chunks that are timed in turn."""
-    found: dict[str, list[float]] = {name: [] for name in calls}
-    for k in range(repeats + 1):
-        for name, call in calls.items():
-            begin = time.perf_counter()
-            steps = call()
-            if k:  # the first compiles, and fills caches
-                found[name].append(steps / (time.perf_counter() - begin))
-    return {name: float(np.median(each)) for name, each in found.items()}
 
 
 def memory_per_env(worlds: int) -> float:
@@ -107,106 +175,115 @@ def memory_per_env(worlds: int) -> float:
     taken = []
     for count in (worlds, 2 * worlds):
         tracemalloc.start()
-        chunk = vector(count, 1)
-        chunk()
+        env = Worlds(count, 1)
+        env.chunk()
         taken.append(tracemalloc.get_traced_memory()[0])
         tracemalloc.stop()
-        del chunk
+        del env
     return (taken[1] - taken[0]) / worlds
 
 
-def theirs(name: str, scenes: int, repeats: int) -> dict[str, float]:
-    """Steps per second of a peer, by how it scans. Raises NotInstalledError."""
-    footprint = MODEL.robot.footprint_radius
-    drawn = [sample_scene(WORLD, footprint, seed) for seed in range(scenes)]
-    fields = [
-        {
-            "circles": one.bodies[:, :2].tolist(),
-            "start": one.starts[0].tolist(),
-            "goal": one.goals[0].tolist(),
-        }
-        for one in drawn
-    ]
-    about = {
-        "beams": MODEL.lidar.beams,
-        "angle_range": float(MODEL.lidar.angles[-1] - MODEL.lidar.angles[0]),
-        "range_min": MODEL.lidar.range_min,
-        "range_max": MODEL.lidar.range_max,
-        "radius": RADIUS,
-        "half": (np.array(WORLD.size) / 2.0).tolist(),
-        "footprint": footprint,
-        "period": MODEL.control_period,
-        "substeps": MODEL.timing[1],
-        "goal_radius": GOAL_RADIUS,
-        "limit": MAX_EPISODE_STEPS,
-    }
-    python = python_with(name, PEERS[name])
-    with tempfile.TemporaryDirectory() as folder:
-        asked = Path(folder) / "task.json"
-        asked.write_text(json.dumps({"about": about, "scenes": fields, "repeats": repeats}))
-        printed = run(python, SCRIPT, str(asked))
-    return dict(json.loads(printed.strip().splitlines()[-1]))
-
-
-def run_all(worlds: int, threads: int, repeats: int, peers: tuple[str, ...]) -> dict[str, Any]:
+def run(
+    worlds: int, threads: int, repeats: int, peers: tuple[str, ...], control: str | None
+) -> tuple[dict[str, Any], Measured]:
     """All figures; `None` for a peer that can't be installed or was not asked for."""
     register_envs()
-    calls = {"one": vector(worlds, 1), "all": vector(worlds, threads)}
-    found = rates(calls, repeats)
-    alone = rates({"plain": single(False), "estimator": single(True)}, repeats)
+    ours = {
+        "one": Worlds(worlds, 1, control),
+        "all": Worlds(worlds, threads, control),
+        "plain": Alone(False, control),
+        "estimator": Alone(True, control),
+    }
+    yardsticks = {"write": write_chunk(worlds), "cartpole": cartpole_chunk()}
+    calls: dict[str, Callable[[], object]] = {name: one.chunk for name, one in ours.items()}
+    found = measure({**calls, **yardsticks}, peers, scenes(SCENES), repeats)
+    rate = {name: one.steps / found.seconds[name] for name, one in ours.items()}
+    rate["all"] = ours["all"].steps / found.wall["all"]
+    write = WRITES * worlds / found.seconds["write"]
+    cartpole = SINGLE_CHUNK / found.seconds["cartpole"]
+    whole = {name: 1.0 / one["period_with_ten_scans_s"] for name, one in found.peers.items()}
+    equal = {name: 1.0 / one["period_with_one_scan_s"] for name, one in found.peers.items()}
+    nobody = dict.fromkeys(PEERS)
     result: dict[str, Any] = {
-        "single_thread_env_steps_per_s": found["one"],
-        "all_threads_env_steps_per_s": found["all"],
+        "times_as_fast_at_equal_work": {name: rate["one"] / one for name, one in equal.items()},
+        "times_as_fast_with_ten_scans": {name: rate["one"] / one for name, one in whole.items()},
+        "single_thread_env_steps_per_s": rate["one"],
+        "all_threads_env_steps_per_s": rate["all"],
         "threads": threads,
-        "single_env_gym_steps_per_s": alone["plain"],
-        "single_env_with_estimator_steps_per_s": alone["estimator"],
-        "peers": dict.fromkeys(PEERS),
-        "peers_with_one_scan": dict.fromkeys(PEERS),
+        "single_env_gym_steps_per_s": rate["plain"],
+        "single_env_with_estimator_steps_per_s": rate["estimator"],
+        "peers_with_one_scan": {**nobody, **equal},
+        "peers": {**nobody, **whole},
+        **block_of(found),
+        "share_of_write_limit": rate["one"] / write,
+        "share_of_cartpole": rate["plain"] / cartpole,
+        "share_of_cartpole_with_estimator": rate["estimator"] / cartpole,
+        "write_limit_observations_per_s": write,
+        "cartpole_steps_per_s": cartpole,
+        "drove": {name: one.drove() for name, one in ours.items()},
         "memory_bytes_per_env": memory_per_env(worlds),
     }
-    for name in peers:
-        try:
-            rates_of = theirs(name, SCENES, repeats)
-            result["peers"][name] = rates_of["whole_steps"]
-            result["peers_with_one_scan"][name] = rates_of["one_scan"]
-        except NotInstalledError as error:
-            sys.stderr.write(f"{error}\n")
-    return result
+    return result, found
+
+
+def judge(result: dict[str, Any], found: Measured) -> list[str]:
+    """The bars that were missed."""
+    bars = [
+        ("share_of_write_limit", WRITE_BAR),
+        ("share_of_cartpole", SINGLE_BAR),
+        ("share_of_cartpole_with_estimator", ESTIMATOR_BAR),
+    ]
+    missed = [
+        f"{key}: {result[key]:.4f}, bar {bar}" for key, bar in bars if not result[key] >= bar
+    ]
+    for name, ratio in result["times_as_fast_at_equal_work"].items():
+        if not ratio >= EQUAL_WORK_BARS[name]:
+            missed.append(
+                f"times_as_fast_at_equal_work: {ratio:.0f} times {name}, "
+                f"bar {EQUAL_WORK_BARS[name]:.0f}"
+            )
+    missed += missed_by(found)
+    for name, drove in result["drove"].items():
+        missed += missed_by_robots(f"our env {name!r}", drove)
+    return missed
 
 
 def table_of(result: dict[str, Any]) -> str:
     """The figures for people."""
-    row, fast = "{:<44}{:>12}{:>12}\n", result["single_thread_env_steps_per_s"]
-    many = f"vector env, {result['threads']} threads"
-    lines = [
-        ("vector env, 1 thread", "single_thread_env_steps_per_s", VECTOR_BAR),
-        (many, "all_threads_env_steps_per_s", None),
-        ("gymnasium.make, odometry", "single_env_gym_steps_per_s", SINGLE_BAR),
-        ("gymnasium.make, estimator", "single_env_with_estimator_steps_per_s", ESTIMATOR_BAR),
-    ]
-    text = row.format("", "env-steps/s", "bar")
-    for title, key, bar in lines:
-        text += row.format(title, f"{result[key]:.3g}", "" if bar is None else f"{bar:.0e}")
-    for key, how in (("peers", ""), ("peers_with_one_scan", ", one scan")):
-        for name, rate in result[key].items():
-            shown = "-" if rate is None else f"{rate:.3g}"
-            ratio = "" if rate is None else f", {fast / rate:.0f} times slower than ours"
-            text += row.format(f"{name}{how}{ratio}", shown, "")
+    row = "{:<56}{:>12}\n"
+    equal, ten = "times as fast as {} at equal work", "times as fast as {} with ten of its steps"
+    text = ""
+    for title, key in ((equal, "equal_work"), (ten, "with_ten_scans")):
+        key = f"times_as_fast_{'at_' if key == 'equal_work' else ''}{key}"
+        for name, ratio in result[key].items():
+            text += row.format(title.format(name), f"{ratio:.3g}")
+    rates = {
+        "vector env, 1 thread": "single_thread_env_steps_per_s",
+        f"vector env, {result['threads']} threads": "all_threads_env_steps_per_s",
+        "gymnasium.make, odometry": "single_env_gym_steps_per_s",
+        "gymnasium.make, estimator": "single_env_with_estimator_steps_per_s",
+    }
+    for title, key in rates.items():
+        text += row.format(f"{title} [env-steps/s]", f"{result[key]:.3g}")
+    for name, one in result["peer_readings"].items():
+        for key, value in one.items():
+            text += row.format(f"{name}: {key}", f"{value:.3g}")
+    for name, reason in result["missing"].items():
+        text += f"{name}: {reason}\n"
     return text + f"memory: {result['memory_bytes_per_env'] / 1e3:.1f} kB per world\n"
 
 
 def main() -> None:
-    """Prints a table, or one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    """Prints a table, or one JSON object; ends with 1 when a bar is missed."""
+    parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--worlds", type=int, default=2048, help="of the vector env")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--repeats", type=int, default=10, help="timed chunks of steps")
     parser.add_argument("--without-peers", action="store_true", help="install nothing")
     given = parser.parse_args()
     peers = () if given.without_peers else tuple(PEERS)
-    result = run_all(given.worlds, given.threads, given.repeats, peers)
-    sys.stdout.write(json.dumps(result) + "\n" if given.json else table_of(result))
+    result, found = run(given.worlds, given.threads, given.repeats, peers, given.control)
+    answer(result, judge(result, found), table_of(result), given.json)
 
 
 if __name__ == "__main__":

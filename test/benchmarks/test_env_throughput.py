@@ -1,30 +1,190 @@
 from __future__ import annotations
 
-import json
-import subprocess
+import os
 import sys
-from pathlib import Path
 
 import pytest
 
-SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "env_throughput.py"
-FEW = ("--worlds", "4", "--threads", "1", "--repeats", "1", "--without-peers")
+from .runs import BENCHMARKS, asked, fails
+
+SCRIPT = "env_throughput.py"
+FEW = ("--worlds", "64", "--threads", "1", "--repeats", "1", "--without-peers")
+pytestmark = pytest.mark.timeout(300)  # a cold start compiles
 
 
-@pytest.mark.timeout(300)  # a cold start compiles
-def test_the_throughput_of_envs_is_one_json_object_with_every_figure():
-    command = [sys.executable, str(SCRIPT), *FEW, "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    found = json.loads(done.stdout)
-    assert set(found) == {
-        "single_thread_env_steps_per_s",
-        "all_threads_env_steps_per_s",
-        "threads",
-        "single_env_gym_steps_per_s",
-        "single_env_with_estimator_steps_per_s",
-        "peers",
-        "peers_with_one_scan",
-        "memory_bytes_per_env",
+@pytest.fixture(scope="module")
+def benchmark():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(BENCHMARKS))
+        import env_throughput
+
+        yield env_throughput
+
+
+@pytest.fixture(scope="module")
+def peers(benchmark):
+    return sys.modules["measuring.peers"]
+
+
+def test_the_throughput_is_told_with_the_ratio_at_equal_work_first():
+    _, found = asked(SCRIPT, *FEW)
+    assert list(found)[:2] == ["times_as_fast_at_equal_work", "times_as_fast_with_ten_scans"]
+    assert found["peers"] == found["peers_with_one_scan"] == {"ir_sim": None, "irsim_x": None}
+    for name in ("single_thread", "all_threads"):
+        assert found[f"{name}_env_steps_per_s"] > 0.0
+    assert found["single_env_gym_steps_per_s"] > 0.0
+    assert found["single_env_with_estimator_steps_per_s"] > 0.0
+    assert found["memory_bytes_per_env"] > 0.0
+    # Speed is judged where it is measured, not here; that all move, see and end is not speed.
+    assert not [line for line in found["failures"] if not line.startswith("share_of_")]
+
+
+def test_robots_that_stand_still_are_no_throughput():
+    missed = fails(SCRIPT, "standing", *FEW)
+    assert any(line.startswith("motion of our env 'one'") for line in missed)
+    assert any(line.startswith("scans of our env 'estimator'") for line in missed)
+
+
+def test_a_lidar_of_a_few_beams_is_no_throughput():
+    missed = fails(SCRIPT, "blind", *FEW)
+    assert any(line.startswith("scans of our env 'one'") for line in missed)
+    assert not any(line.startswith("motion") for line in missed)
+
+
+def test_an_env_that_is_ten_times_slower_misses_the_bars_of_speed():
+    missed = fails(SCRIPT, "slow", *FEW)
+    for bar in ("share_of_write_limit", "share_of_cartpole"):
+        assert any(line.startswith(f"{bar}: ") for line in missed), missed
+
+
+def measured(peers, **readings: float):
+    """A peer whose scan takes 1 ms, in its step and alone, unless told otherwise."""
+    one = {
+        "scan_s": 1e-3,
+        "agreement": 1.0,
+        "moved_m_per_period": 0.05,
+        "beams_changed_per_period": 400.0,
+        "episodes": 3,
     }
-    assert found["peers"] == {"ir_sim": None, "irsim_x": None}
-    assert all(value > 0 for name, value in found.items() if not name.startswith("peers"))
+    return peers.Measured({}, {}, {"ir_sim": {**one, **readings}}, {}, {}, {})
+
+
+@pytest.mark.parametrize(
+    ("reading", "value", "named"),
+    [
+        ("agreement", 1.21, "agreement of ir_sim"),
+        ("agreement", 0.79, "agreement of ir_sim"),
+        ("agreement", float("nan"), "agreement of ir_sim"),
+        ("moved_m_per_period", 0.0, "motion of ir_sim"),
+        ("moved_m_per_period", float("nan"), "motion of ir_sim"),
+        ("beams_changed_per_period", 0.0, "scans of ir_sim"),
+        ("episodes", 0, "episodes of ir_sim"),
+    ],
+)
+def test_a_peer_that_does_not_agree_with_itself_or_does_nothing_misses_a_bar(
+    peers, reading, value, named
+):
+    assert peers.missed_by(measured(peers)) == []
+    assert peers.missed_by(measured(peers, agreement=1.19)) == []
+    (missed,) = peers.missed_by(measured(peers, **{reading: value}))
+    assert missed.startswith(named)
+
+
+def test_a_peer_that_is_as_fast_as_ours_misses_no_bar_but_the_ratios(benchmark, peers):
+    shares = ("share_of_write_limit", "share_of_cartpole", "share_of_cartpole_with_estimator")
+    result = {**dict.fromkeys(shares, 1.0), "drove": {}}
+    result["times_as_fast_at_equal_work"] = {"ir_sim": 1.0, "irsim_x": float("nan")}
+    missed = benchmark.judge(result, measured(peers))
+    assert [line.split(":")[0] for line in missed] == ["times_as_fast_at_equal_work"] * 2
+
+
+def test_a_peer_that_crashes_is_a_missed_bar_and_no_hang(peers, monkeypatch, tmp_path):
+    broken = tmp_path / "irsim_peer.py"
+    broken.write_text("import sys\nsys.exit('no lidar')\n")
+    monkeypatch.setattr(peers, "SCRIPT", broken)
+    monkeypatch.setattr(peers, "python_with", lambda *_: sys.executable)
+    found = peers.measure({}, ["ir_sim"], peers.scenes(1), 1)
+    assert peers.missed_by(found) == ["ir_sim failed: no lidar"]
+
+
+def test_a_peer_that_ends_in_between_is_a_missed_bar(peers, monkeypatch, tmp_path):
+    broken = tmp_path / "irsim_peer.py"
+    broken.write_text("print('{\"ranges\": [[1.0]]}', flush=True)\n")
+    monkeypatch.setattr(peers, "SCRIPT", broken)
+    monkeypatch.setattr(peers, "python_with", lambda *_: sys.executable)
+    found = peers.measure({}, ["ir_sim"], peers.scenes(1), 1)
+    (missed,) = peers.missed_by(found)
+    assert missed.startswith("ir_sim failed")
+
+
+FAKE = '''
+import numpy as np
+
+
+class Thing:
+    """A robot or a circle: it is where it is put."""
+
+    def __init__(self):
+        self.state, self.velocity = np.zeros((3, 1)), np.zeros((2, 1))
+        self.collision_flag, self.lidar = False, None
+
+    def set_state(self, state, init):
+        self.state = np.array(state, float).reshape(3, 1)
+
+    def reset(self):
+        pass
+
+    def step(self, action, sensor_step):
+        self.state = self.state + 0.01 * np.array([[action[0, 0]], [0.0], [action[1, 0]]])
+
+    def check_status(self):
+        pass
+
+
+class Lidar:
+    def __init__(self):
+        self.range_data = np.ones(720)
+
+    def step(self, state):
+        self.range_data = np.full(720, 1.0 + abs(float(state[0, 0])))
+        for _ in range(3):
+            np.sort(np.arange(50_000.0)[::-1])
+
+
+class Env:
+    def __init__(self):
+        self.robot, self.obstacle_list = Thing(), [Thing() for _ in range(10)]
+        self.robot.lidar = Lidar()
+
+    def _objects_sensor_step(self):
+        self.robot.lidar.step(self.robot.state)
+
+    def step(self, action):
+        self.robot.step(action, False)
+        self._objects_sensor_step()
+
+    def refresh(self):
+        self._objects_sensor_step()
+
+
+def make(file, **options):
+    return Env()
+'''
+
+
+def fake_peer(peers, monkeypatch, folder) -> None:
+    """A peer that consists of next to nothing but has the functions that are measured."""
+    pytest.importorskip("yaml")
+    (folder / "irsim.py").write_text(FAKE)
+    monkeypatch.setattr(peers, "python_with", lambda *_: sys.executable)
+    monkeypatch.setattr(peers, "clean", lambda: {**os.environ, "PYTHONPATH": str(folder)})
+
+
+def test_the_readings_of_a_peer_come_from_one_process_and_its_own_steps(peers, monkeypatch, tmp_path):
+    fake_peer(peers, monkeypatch, tmp_path)
+    found = peers.measure({}, ["ir_sim"], peers.scenes(3), 2)
+    one = found.peers["ir_sim"]
+    assert found.failed == {}
+    assert set(f"{name}_s" for name in peers.READINGS) < set(one)
+    assert one["period_with_ten_scans_s"] > 3.0 * one["period_with_one_scan_s"]
+    assert found.ranges["ir_sim"].shape == (3, 720)

@@ -1,0 +1,287 @@
+"""Other simulators, measured one way for every benchmark: irsim_peer.py in a process of its own.
+
+ir-sim and irsim-x both install the module `irsim`, so each gets an environment of its own, made
+at first use from the package registry and kept in the user's cache folder. They go through the
+same scenes as ours, and their rounds are timed in turn with ours, so that a slow moment of the
+machine slows both.
+
+Readings of a peer, all from the same process and scenes:
+
+- `scan`, `step`, `step_without_scan`: what their step calls to scan, alone; their step, a motion
+  and a scan; the same step with the scan taken out. What a scan costs within a step is the
+  difference of the last two. It has to agree with the scan alone: `agreement`.
+- `period_with_one_scan`: a control period of our task, observation, reward and autoreset
+  included, of ten motions and one scan, as ours. That is equal work. It moves nine times by
+  their inner functions, past what they offer to users.
+- `period_with_ten_scans`: the same by ten of their steps, which is what their users get.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from measuring.environments import NotInstalledError, clean, python_with
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.registration import MAX_EPISODE_STEPS
+from nics_drl_bridge.generator import open_model
+from nics_drl_bridge.sim.scenes import Scene, sample_scene
+from nics_drl_bridge.sim.world import World
+
+WITH = ("numpy==2.4.6", "shapely==2.2.0", "matplotlib==3.11.2")
+PEERS = {"ir_sim": ("ir-sim==2.12.0", *WITH), "irsim_x": ("irsim-x==1.1.4", *WITH)}
+SCRIPT = Path(__file__).resolve().parent / "irsim_peer.py"
+READINGS = ("scan", "step", "step_without_scan", "period_with_one_scan", "period_with_ten_scans")
+MODEL = open_model("differential")
+RADIUS, CIRCLES = 0.15, 10
+WORLD = World.model_validate(
+    {
+        "name": "ten circles",
+        "size": [6.0, 6.0],
+        "obstacles": [
+            {"shapes": [{"kind": "circle", "radius": RADIUS}], "count": CIRCLES, "gap": 0.3}
+        ],
+        "clearance": 0.3,
+        "goal_distance": [2.0, 4.0],
+    }
+)
+GREATEST_DISAGREEMENT = 0.20
+"""Of the cost of a scan within a step with that of a scan alone, as a share of the latter."""
+LEAST_MOVED_M, LEAST_CHANGED = 0.01, 100
+"""Of a robot in a control period: how far it moves, and how many of its beams change."""
+
+
+class PeerFailedError(Exception):
+    """A peer that is installed did not answer; the text says which, and its last word."""
+
+
+@dataclass
+class Peer:
+    """A peer's process, and what it answered.
+
+    Attributes:
+        name: in `PEERS`.
+        process: that answers a line with a line.
+        log: its standard error.
+        ranges: (N, B) of a scan at the start of each scene [m].
+        times: of each reading, in all rounds but the first [s].
+        drove: what shows that the robots of its tasks moved and saw.
+    """
+
+    name: str
+    process: subprocess.Popen[str]
+    log: IO[str]
+    ranges: np.ndarray = field(default_factory=lambda: np.empty((0, 0), np.float32))
+    times: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in READINGS})
+    drove: dict[str, float] = field(default_factory=dict)
+
+    def answer(self) -> dict[str, Any]:
+        """The next line. Raises PeerFailedError if there is none."""
+        told = self.process.stdout.readline() if self.process.stdout else ""
+        if told:
+            return dict(json.loads(told))
+        self.log.seek(0)
+        last = self.log.read().strip().splitlines()[-1:] or ["no message"]
+        raise PeerFailedError(f"{self.name} failed: {last[0]}")
+
+    def round(self, counts: bool) -> None:
+        """Has it time every reading a little further. Raises PeerFailedError."""
+        if self.process.stdin is None or self.process.poll() is not None:
+            self.answer()
+            raise PeerFailedError(f"{self.name} ended")
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+        told = self.answer()
+        self.drove = {name: value for name, value in told.items() if name != "times"}
+        for name in READINGS if counts else ():
+            self.times[name] += told["times"][name]
+
+    def close(self) -> None:
+        """Ends the process."""
+        self.process.kill()
+        self.process.communicate()
+        self.log.close()
+
+    def readings(self) -> dict[str, float]:
+        """The median of each reading [s], and what is made of them."""
+        found = {f"{name}_s": float(np.median(each)) for name, each in self.times.items()}
+        within = np.subtract(self.times["step"], self.times["step_without_scan"])
+        found["scan_within_step_s"] = float(np.median(within))
+        found["agreement"] = found["scan_within_step_s"] / found["scan_s"]
+        return {**found, **self.drove}
+
+
+def scenes(count: int) -> list[Scene]:
+    """The scenes that everybody goes through, one for each episode."""
+    footprint = MODEL.robot.footprint_radius
+    return [sample_scene(WORLD, footprint, seed) for seed in range(count)]
+
+
+def task_of(drawn: Sequence[Scene], alone: str) -> dict[str, Any]:
+    """What a peer is told.
+
+    Args:
+        drawn: the scenes.
+        alone: the method of its `Simulator` that is timed as the scan alone.
+    """
+    lidar = MODEL.lidar
+    return {
+        "about": {
+            "beams": lidar.beams,
+            "angle_range": float(lidar.angles[-1] - lidar.angles[0]),
+            "range_min": lidar.range_min,
+            "range_max": lidar.range_max,
+            "radius": RADIUS,
+            "half": (np.array(WORLD.size) / 2.0).tolist(),
+            "footprint": MODEL.robot.footprint_radius,
+            "period": MODEL.control_period,
+            "substeps": MODEL.timing[1],
+            "goal_radius": Navigation(MODEL.robot, lidar).goal_radius,
+            "limit": MAX_EPISODE_STEPS,
+        },
+        "scenes": [
+            {
+                "circles": one.bodies[:, :2].tolist(),
+                "start": one.starts[0].tolist(),
+                "goal": one.goals[0].tolist(),
+            }
+            for one in drawn
+        ],
+        "alone": alone,
+    }
+
+
+def started(name: str, task: Mapping[str, Any]) -> Peer:
+    """A peer that has scanned each scene once.
+
+    Raises:
+        NotInstalledError: it can't be installed here.
+        PeerFailedError: it did not answer.
+    """
+    python = python_with(name, PEERS[name])
+    log = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")
+    with tempfile.TemporaryDirectory() as folder:
+        asked = Path(folder) / "task.json"
+        asked.write_text(json.dumps(task))
+        process = subprocess.Popen(
+            [str(python), str(SCRIPT), str(asked)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, env=clean(),
+        )  # fmt: skip
+        peer = Peer(name, process, log)
+        try:
+            peer.ranges = np.array(peer.answer()["ranges"], dtype=np.float32)
+        except PeerFailedError:
+            peer.close()
+            raise
+    return peer
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Ours and the peers, timed in turn.
+
+    Attributes:
+        seconds: of the processor that each of our calls takes, the median [s].
+        wall: likewise of the clock on the wall, for what runs on several threads [s].
+        peers: readings of each peer that answered.
+        ranges: (N, B) by each of them, of a scan at the start of each scene [m].
+        missing: why a peer can't be installed here.
+        failed: why a peer that is installed gave no readings.
+    """
+
+    seconds: dict[str, float]
+    wall: dict[str, float]
+    peers: dict[str, dict[str, float]]
+    ranges: dict[str, np.ndarray]
+    missing: dict[str, str]
+    failed: dict[str, str]
+
+
+def measure(
+    calls: Mapping[str, Callable[[], object]],
+    names: Sequence[str],
+    drawn: Sequence[Scene],
+    rounds: int,
+    alone: str = "scan",
+) -> Measured:
+    """Times our calls and the peers' readings, all in turn; the first round does not count."""
+    found = Measured({}, {}, {}, {}, {}, {})
+    peers: dict[str, Peer] = {}
+    times: dict[str, list[np.ndarray]] = {name: [] for name in calls}
+    try:
+        for name in names:
+            try:
+                peers[name] = started(name, task_of(drawn, alone))
+                found.ranges[name] = peers[name].ranges
+            except NotInstalledError as error:
+                found.missing[name] = str(error)
+            except PeerFailedError as error:
+                found.failed[name] = str(error)
+        for k in range(1 + rounds):
+            for name, call in calls.items():
+                begin = np.array([time.process_time(), time.perf_counter()])
+                call()
+                spent = np.array([time.process_time(), time.perf_counter()]) - begin
+                times[name] += [spent] if k else []
+            for name in [each for each in peers if each not in found.failed]:
+                try:
+                    peers[name].round(k > 0)
+                except PeerFailedError as error:
+                    found.failed[name] = str(error)
+        for name, each in times.items():
+            found.seconds[name], found.wall[name] = np.median(each, axis=0).tolist()
+        found.peers.update(
+            {name: one.readings() for name, one in peers.items() if name not in found.failed}
+        )
+    finally:
+        for peer in peers.values():
+            peer.close()
+    return found
+
+
+def block_of(found: Measured) -> dict[str, Any]:
+    """What every benchmark tells about the peers, under the same keys."""
+    return {
+        "agreement": {name: one["agreement"] for name, one in found.peers.items()},
+        "peer_readings": found.peers,
+        "missing": {**found.missing, **found.failed},
+    }
+
+
+def missed_by(found: Measured) -> list[str]:
+    """The bars of the peers that were missed."""
+    missed = list(found.failed.values())
+    for name, one in found.peers.items():
+        if not abs(one["agreement"] - 1.0) <= GREATEST_DISAGREEMENT:
+            missed.append(
+                f"agreement of {name}: a scan within its step costs {one['agreement']:.2f} times a "
+                f"scan alone, bar 1 +- {GREATEST_DISAGREEMENT}"
+            )
+        missed += missed_by_robots(name, one)
+    return missed
+
+
+def missed_by_robots(who: str, drove: Mapping[str, float]) -> list[str]:
+    """The bars that robots miss which stand still or see nothing."""
+    missed = []
+    if not drove["moved_m_per_period"] >= LEAST_MOVED_M:
+        missed.append(
+            f"motion of {who}: its robots moved {drove['moved_m_per_period']:.4f} m in a control "
+            f"period on average, bar {LEAST_MOVED_M} m"
+        )
+    if not drove["beams_changed_per_period"] >= LEAST_CHANGED:
+        missed.append(
+            f"scans of {who}: {drove['beams_changed_per_period']:.1f} beams changed in a control "
+            f"period on average, bar {LEAST_CHANGED}"
+        )
+    if not drove["episodes"] >= 1:
+        missed.append(f"episodes of {who}: none ended, bar 1")
+    return missed
