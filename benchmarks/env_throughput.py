@@ -233,9 +233,7 @@ def judge(result: dict[str, Any], found: Measured) -> list[str]:
         ("share_of_cartpole", SINGLE_BAR),
         ("share_of_cartpole_with_estimator", ESTIMATOR_BAR),
     ]
-    missed = [
-        f"{key}: {result[key]:.4f}, bar {bar}" for key, bar in bars if not result[key] >= bar
-    ]
+    missed = [f"{key}: {result[key]:.4f}, bar {bar}" for key, bar in bars if not result[key] >= bar]
     for name, ratio in result["times_as_fast_at_equal_work"].items():
         if not ratio >= EQUAL_WORK_BARS[name]:
             missed.append(

@@ -112,7 +112,9 @@ def judge(result: dict[str, Any], found: Measured) -> list[str]:
     """The bars that were missed."""
     missed = []
     if not result["share_of_write_limit"] >= WRITE_BAR:
-        missed.append(f"share_of_write_limit: {result['share_of_write_limit']:.4f}, bar {WRITE_BAR}")
+        missed.append(
+            f"share_of_write_limit: {result['share_of_write_limit']:.4f}, bar {WRITE_BAR}"
+        )
     for name, ratio in result["times_as_fast_at_equal_work"].items():
         if not ratio >= EQUAL_WORK_BARS[name]:
             missed.append(

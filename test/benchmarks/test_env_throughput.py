@@ -180,7 +180,9 @@ def fake_peer(peers, monkeypatch, folder) -> None:
     monkeypatch.setattr(peers, "clean", lambda: {**os.environ, "PYTHONPATH": str(folder)})
 
 
-def test_the_readings_of_a_peer_come_from_one_process_and_its_own_steps(peers, monkeypatch, tmp_path):
+def test_the_readings_of_a_peer_come_from_one_process_and_its_own_steps(
+    peers, monkeypatch, tmp_path
+):
     fake_peer(peers, monkeypatch, tmp_path)
     found = peers.measure({}, ["ir_sim"], peers.scenes(3), 2)
     one = found.peers["ir_sim"]

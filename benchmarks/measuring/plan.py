@@ -1,0 +1,81 @@
+"""Which benchmarks are run, and by which arguments.
+
+Every script in the folder is run, those that have no row here without arguments. A row is a run
+whose arguments are others than the script's own, or one of several runs of a script.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+TIMEOUT_S = 1800.0
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a script.
+
+    Attributes:
+        script: file in the folder of the benchmarks.
+        full: arguments for figures that are told.
+        quick: those of a short pass, whose figures say that all still works.
+        timeout_s: after which it is ended [s].
+    """
+
+    script: str
+    full: tuple[str, ...] = ()
+    quick: tuple[str, ...] = ()
+    timeout_s: float = TIMEOUT_S
+
+
+def row(script: str, full: str = "", quick: str = "", timeout_s: float = TIMEOUT_S) -> Run:
+    """Arguments as one would type them."""
+    return Run(f"{script}.py", tuple(full.split()), tuple(quick.split()), timeout_s)
+
+
+HOUR = 3600.0
+RUNS: dict[str, Run] = {
+    "baselines": row("baselines", "--episodes 200", "--episodes 20"),
+    "env_scaling": row("env_scaling", "", "--ends-only --repeats 5"),
+    "env_throughput": row("env_throughput", "", "--worlds 256 --repeats 2"),
+    "estimator": row("estimator", "", "--drives 5 --steps 20000"),
+    "fig4_pointcloud": row("fig4_pointcloud", "", "--scans 12 --without-slam"),
+    "files": row("files", "", "--kills 5 --flips 20 --cuts 10 --changes 20"),
+    "gate_envelope": row("gate_envelope", "--steps 1000000", "--steps 5000"),
+    "gate_faults": row("gate_faults", "--repeats 100", "--repeats 1", 3 * HOUR),
+    "gate_rules": row("gate_rules", timeout_s=2 * HOUR),
+    "generate_from_mujoco": row("generate_from_mujoco", "", "--drives 1 --train 30", HOUR),
+    "lidar_complexity": row("lidar_complexity", "", "--most 16 --scans 64 --repeats 5"),
+    "lidar_peers": row("lidar_peers", "", "--scans 128 --scenes 5 --repeats 2"),
+    "lidar_sensor_models": row("lidar_sensor_models", "", "--scans 128 --repeats 10"),
+    "packet_loss": row("packet_loss", "", "--seconds 5"),
+    "paper_fig7": row("paper_fig7", "", "--episodes 1"),
+    "parity": row("parity", "", "--steps 50"),
+    "ros_fleet": row("ros_fleet", "", "--seconds 2 --robots 2"),
+    "ros_lockstep": row("ros_lockstep", "", "--chunks 5 --size 20"),
+    "shield": row("shield", "--episodes 3000", "--episodes 30", 2 * HOUR),
+    "soak": row("soak", "", "--minutes 0.2 --warm-up 0.1"),
+    "soak_env": row("soak_env", "", "--steps 200000"),
+    "table2_lidar": row("table2_lidar", "", "--scans 512 --repeats 5"),
+    "table3_density": row("table3_density", "", "--scans 256"),
+    "training_differential": row(
+        "training", "--robot differential --seeds 0 1 2", "--robot differential --episodes 50"
+    ),
+    "training_ackermann": row(
+        "training", "--robot ackermann --seeds 0 1 2", "--robot ackermann --episodes 50"
+    ),
+    "training_mecanum": row(
+        "training", "--robot mecanum --seeds 0 1 2", "--robot mecanum --episodes 50"
+    ),
+    "transfer": row("transfer", "", "--episodes 5", HOUR),
+}
+
+
+def runs_of(folder: Path) -> dict[str, Run]:
+    """Every run of the scripts in a folder, by name."""
+    found: dict[str, Run] = {}
+    for path in sorted(folder.glob("*.py")):
+        rows = {name: run for name, run in RUNS.items() if run.script == path.name}
+        found.update(rows or {path.stem: Run(path.name)})
+    return found
