@@ -9,9 +9,6 @@ what then grows faster than their number is the search for them.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +17,7 @@ from typing import Any
 import numpy as np
 from measuring.fields import field, side_of
 from measuring.rates import interleaved, medians
+from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -27,6 +25,11 @@ from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.sim.world import World
 
+CONTROLS = {
+    "quadratic": "the search for what is near: each step looks once at each pair of robots or "
+    "obstacles of a world, in Python",
+    "slow": "the batch: each world is stepped by a call of its own",
+}
 MODEL = open_model("differential")
 WORLDS, OBSTACLES, SIDE, BEAMS = 256, 10, 8.0, 720
 SWEEPS: dict[str, tuple[int, ...]] = {

@@ -76,7 +76,7 @@ class Scans:
     def ranges(self, renderer: Renderer, turned: float = 0.0) -> NDArray[np.float32]:
         """(N, B) of the batch, with every lidar turned [m, rad]."""
         scanner = Scanner(SPEC, self.table, renderer)
-        return scanner.scan(self.starts + [0.0, 0.0, turned], *self.scene)
+        return scanner.scan(self.starts + np.array([0.0, 0.0, turned]), *self.scene)
 
 
 def run(

@@ -167,7 +167,7 @@ def started(name: str, task: Mapping[str, Any]) -> Peer:
         PeerFailedError: it did not answer.
     """
     python = python_with(name, PEERS[name])
-    log = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")
+    log = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115
     with tempfile.TemporaryDirectory() as folder:
         asked = Path(folder) / "task.json"
         asked.write_text(json.dumps(task))

@@ -1,0 +1,373 @@
+"""Every table of figures in README.md and docs/: a row for each figure. See tables.py."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of figures.
+
+    Attributes:
+        head: its columns.
+        rows: the run that a row is of, and its cells, with placeholders.
+    """
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+def told(*rows: tuple[str, str, str]) -> Table:
+    """Figures in words: run, what, figure."""
+    of = {"training_differential": "training", "training_ackermann": "training"}
+    return Table(
+        ("what", "script", "figure"),
+        tuple((run, what, f"`{of.get(run, run)}.py`", text) for run, what, text in rows),
+    )
+
+
+ROBOTS = {"ackermann": "Ackermann", "differential": "differential", "mecanum": "mecanum"}
+SHAPES = {
+    "circle": "circle, r 0.15 m",
+    "square": "square, 0.3 m",
+    "strip": "strip, 0.6 x 0.06 m",
+    "mixture": "mixture",
+}
+README = told(
+    (
+        "table1_kinematics",
+        "kinematics, robot-steps per second on one thread",
+        "{min robots.*.steps_per_s_batched|.0e} to {max robots.*.steps_per_s_batched|.0e} batched, "
+        "{min robots.*.steps_per_s_single|.0e} to {max robots.*.steps_per_s_single|.0e} one robot; "
+        "errors below the paper's Table I (`docs/kinematics.md`)",
+    ),
+    (
+        "real_robot",
+        "a real car, 5 s open-loop on the unseen last third of a 45 s drive",
+        "{mean_position_error_m|.3f} m over a path of {mean_path_m|.2f} m",
+    ),
+    (
+        "generate_from_mujoco",
+        "robots in MuJoCo, real wheels on contact, 5 s open-loop on unseen drives",
+        "off by {min robots.*.position_error_over_path x100|.1f} to "
+        "{max robots.*.position_error_over_path|.1%} of the path; "
+        "{min robots.*.speed_up_batched|,.0f} times MuJoCo's speed or more, batched",
+    ),
+    (
+        "env_throughput",
+        "whole env steps on one thread beside other simulators at equal work: one scan of 720 "
+        "beams per control period, 10 circles, observation, reward, autoreset",
+        "{times_as_fast_at_equal_work.irsim_x|.0f} times irsim-x and "
+        "{times_as_fast_at_equal_work.ir_sim|,.0f} times ir-sim; with ten of their own steps per "
+        "control period, each with a scan, {times_as_fast_with_ten_scans.irsim_x|,.0f} and "
+        "{times_as_fast_with_ten_scans.ir_sim|,.0f} times",
+    ),
+    (
+        "env_throughput",
+        "the same per second",
+        "{single_thread_env_steps_per_s|.1e} on one thread, {all_threads_env_steps_per_s|.1e} on "
+        "{threads}; {single_env_gym_steps_per_s|.1e} by `gymnasium.make`, "
+        "{single_env_with_estimator_steps_per_s|.1e} with the estimator",
+    ),
+    (
+        "table2_lidar",
+        "scans per second among ten obstacles on one thread, RMSE",
+        "{min scenes.*.baked_scans_per_s|.0e} to {max scenes.*.baked_scans_per_s|.0e}, "
+        "{min scenes.*.rmse_m x1000|.1f} to {max scenes.*.rmse_m x1000|.1f} mm (`docs/lidar.md`)",
+    ),
+    (
+        "estimator",
+        "estimate with motion capture at 10 Hz, 100 ms late, 5 % lost, against raw odometry",
+        "RMSE {ekf_rmse_m|.3f} m against {raw_rmse_m|.2f} m; NEES {nees_mean|.1f}, 95 % band "
+        "{nees_95_band.0|.1f} to {nees_95_band.1|.1f} (`docs/middleware.md`)",
+    ),
+    (
+        "gate_faults",
+        "zero on `cmd_vel` after the last scan, policy dead, frozen or hung, e-stop; real "
+        "processes over DDS",
+        "{scan_silent.max_s|.2f} s, {policy_killed.max_s|.2f}, {policy_frozen.max_s|.2f} and "
+        "{policy_hung.max_s|.2f} s, {e_stop.max_s|.2f} s at worst of {scan_silent.n} each; "
+        "{sum *.unsafe_commands} unsafe commands",
+    ),
+    (
+        "gate_envelope",
+        "the gate's limits of speed, rate and jerk under random commands at random intervals",
+        "{violations} violations in {steps|,} commands",
+    ),
+    (
+        "shield",
+        "contacts of three robots with the shield in episodes of adversaries; without it",
+        "{contacts} in {episodes|,}; {contacts_without} in {tried_without}",
+    ),
+    (
+        "transfer",
+        "one policy file in process, over DDS, in MuJoCo over DDS: success",
+        "; ".join(
+            f"{title} {{robots.{robot}.fast x100|.0f}}, {{robots.{robot}.dds x100|.0f}}, "
+            f"{{robots.{robot}.mujoco_dds|.0%}}"
+            for robot, title in (("differential", "differential"), ("ackermann", "car"),
+                                 ("mecanum", "mecanum"))
+        ) + " (`docs/evaluation.md`)",
+    ),
+    (
+        "parity",
+        "in process against DDS lock-step, three robots, and four in namespaces",
+        "difference {max_abs_observation_difference|.2g}, {late_observations} late observations in "
+        "{steps|,} steps",
+    ),
+    (
+        "ros_lockstep",
+        "env steps over DDS in lock-step, 720 beams, estimator included",
+        "{steps_per_s|,.0f} per second, {p50_ms|.2f} ms; a bare pair of rclpy nodes exchanges the "
+        "same messages {bare_echo_per_s|,.0f} times",
+    ),
+    (
+        "training_differential",
+        "navigation learnt from nothing, 500 unseen episodes, the worst of three seeds",
+        "; ".join(
+            f"{title} {{training_{robot}:success_rate|.1%}} in {{training_{robot}:wall_s|.0f}} s"
+            for robot, title in (("differential", "differential"), ("mecanum", "mecanum"),
+                                 ("ackermann", "car"))
+        ) + " with the evaluation",
+    ),
+)  # fmt: skip
+SAFETY = told(
+    (
+        "gate_faults",
+        "faults around real processes over DDS at 10 Hz: policy killed, frozen, hung, scan and "
+        "odom silent, NaN in scans, clocks that jump, e-stop, and more",
+        "zero within {scan_silent.max_s|.2f} s of the last scan, {command_silent.max_s|.2f} s of "
+        "the last command ({command_frozen.max_s|.2f} s if it is repeated), "
+        "{policy_killed.max_s|.2f}, {policy_frozen.max_s|.2f} and {policy_hung.max_s|.2f} s of the "
+        "policy's death, freeze or hang ({scan_silent.n} times each), {e_stop.max_s|.2f} s of the "
+        "e-stop, {e_stop_silent.max_s|.2f} s of its last heartbeat; {sum *.unsafe_commands} unsafe "
+        "commands",
+    ),
+    (
+        "gate_envelope",
+        "random commands at intervals of 1 to 220 ms, three robots",
+        "{violations} violations of value, rate, jerk or zero in {steps|,} commands, in motion at "
+        "{in_motion|,} of them",
+    ),
+    (
+        "shield",
+        "episodes of adversaries, three robots",
+        "{contacts} contacts in {episodes|,} and {path_m x0.001|.1f} km; without the shield "
+        "{contacts_without} in {tried_without}",
+    ),
+    ("gate_rules", "the gate's rules, each taken out in turn", "a test misses each of {rules}"),
+)
+PEERS = Table(
+    ("", "scans/s", "baked is faster", "RMSE against our exact scan", "its cost in a step / alone"),
+    (
+        ("lidar_peers", "baked", "{baked|.1e}", "", "{rmse_m.baked x1000|.1f} mm", ""),
+        ("lidar_peers", "exact", "{exact|.1e}", "", "", ""),
+        *(
+            (
+                "lidar_peers",
+                title,
+                f"{{{name}|,.0f}}",
+                f"{{times_as_fast_at_equal_work.{name}|,.0f}} times",
+                f"{{rmse_m.{name}|.1g}} m{further}",
+                f"{{agreement.{name}|.2f}}",
+            )
+            for name, title, further in (
+                ("ir_sim", "ir-sim 2.12.0", " (its circles are polygons)"),
+                ("irsim_x", "irsim-x 1.1.4", ""),
+            )
+        ),
+    ),
+)
+THROUGHPUT = Table(
+    ("", "ir-sim 2.12.0", "irsim-x 1.1.4"),
+    tuple(
+        ("env_throughput", title, *(f"{{{path.format(name)}}}" for name in ("ir_sim", "irsim_x")))
+        for title, path in (
+            ("one thread is as fast, at equal work: one scan per control period",
+             "times_as_fast_at_equal_work.{}|,.0f"),
+            ("one thread is as fast, with ten of their own steps per control period",
+             "times_as_fast_with_ten_scans.{}|,.0f"),
+            ("a scan alone [ms]", "peer_readings.{}.scan_s x1000|.3g"),
+            ("a scan within their step [ms]", "peer_readings.{}.scan_within_step_s x1000|.3g"),
+            ("their step, a motion and a scan [ms]", "peer_readings.{}.step_s x1000|.3g"),
+            ("control period with one scan [ms]",
+             "peer_readings.{}.period_with_one_scan_s x1000|.3g"),
+            ("control period with ten scans [ms]",
+             "peer_readings.{}.period_with_ten_scans_s x1000|.3g"),
+        )
+    ),
+)  # fmt: skip
+SCALING = Table(
+    ("",) * 6,
+    tuple(
+        ("env_scaling", title, *(f"{{{key}.{k}{how}}}" for k in indices))
+        for sizes, name, key, indices in (
+            ("worlds", "µs per env step", "worlds_us", (0, 2, 4, 5, 7)),
+            ("robots in each world", "µs per robot and step", "robots_us_per_robot",
+             (0, 2, 4, 5, 6)),
+            ("obstacles", "µs per env step", "obstacles_us", (0, 1, 2, 3, 4)),
+            ("beams", "µs per env step", "beams_us", (0, 2, 4, 5, 6)),
+        )
+        for title, key, how in ((sizes, sizes.split()[0], ""), (name, key, "|.1f"))
+    ),
+)  # fmt: skip
+PAPER_SCANS = {
+    "circle": ("57", "330", "0.085", "0.0056"),
+    "square": ("3.6", "332", "0.089", "0.0067"),
+    "strip": ("4.2", "324", "0.105", "0.0099"),
+    "mixture": ("5.7", "339", "0.091", "0.0072"),
+}
+TABLE2 = Table(
+    ("scene", "", "scan mode [1/s]", "baked [1/s]", "RMSE [m]", "RMSE of the area [m²]", "table"),
+    tuple(
+        row
+        for name, title in SHAPES.items()
+        for row in (
+            ("table2_lidar", title, "here", f"{{scenes.{name}.exact_scans_per_s|.1e}}",
+             f"{{scenes.{name}.baked_scans_per_s|.1e}}", f"{{scenes.{name}.rmse_m|.4f}}",
+             f"{{scenes.{name}.area_rmse_m2|.4f}}", f"{{table_bytes.{name} x1e-6|.2g}} MB"),
+            ("table2_lidar", "", "nearest row", "", "",
+             f"{{scenes.{name}.nearest_row_rmse_m|.3f}}",
+             f"{{scenes.{name}.nearest_row_area_rmse_m2|.3f}}", ""),
+            ("table2_lidar", "", "paper", *PAPER_SCANS[name], ""),
+        )
+    ),
+)  # fmt: skip
+DENSITIES = ("100x240", "50x240", "100x120")
+TABLE3 = Table(
+    ("look-up", "distances x rotations", *SHAPES, "worse, on average"),
+    (
+        *(
+            ("table3_density", title if not k else "", density.replace("x", " x "),
+             *(f"{{{path}{density}.{name}|{how}}}" for name in SHAPES),
+             f"{{times_worse.{key}.{density}|.2f}} times" if k else "")
+            for key, title, path, how in (
+                ("ours", "here", "", ".4f"),
+                ("nearest_row", "nearest row", "nearest_row.", ".3f"),
+            )
+            for k, density in enumerate(DENSITIES)
+        ),
+        ("table3_density", "paper", "50 x 240", "", "", "", "", "3.47 times"),
+        ("table3_density", "", "100 x 120", "", "", "", "", "little"),
+    ),
+)  # fmt: skip
+COMPLEXITY = Table(
+    ("vertices", *(str(2**power) for power in range(2, 13))),
+    tuple(
+        ("lidar_complexity", name, *(f"{{{name}_us.{k}|.2g}}" for k in range(11)))
+        for name in ("exact", "baked")
+    ),
+)
+MODELS = Table(
+    ("table", "scans/s", "times as long, shortest", "median", "size"),
+    tuple(
+        ("lidar_sensor_models", title, f"{{scans_per_s.{key}|.1e}}", f"{{times_as_long.{key}|.2f}}",
+         f"{{times_as_long_median.{key}|.2f}}", size)
+        for key, title, size in (
+            *((each, each, f"{{table_bytes.{each} x1e-6|.1f}} MB")
+              for each in ("no model", "incidence dropout", "intensity", "both")),
+            ("both, with intensities", "both, and intensities of every scan", ""),
+        )
+    ),
+)  # fmt: skip
+MAPS = Table(
+    ("720 beams, map of 20 m x 20 m at 0.05 m", "range [m]", "exact [scans/s]", "baked [scans/s]",
+     "ratio", "RMSE [mm]"),
+    tuple(
+        ("map_lidar", title, f"{{rows.{k}.range_max_m|.0f}}",
+         f"{{rows.{k}.exact_scans_per_s|,}}", f"{{rows.{k}.baked_scans_per_s|,}}",
+         f"{{rows.{k}.ratio|.1f}}", f"{{rows.{k}.rmse_m x1000|.1g}}")
+        for k, title in enumerate((*("office",) * 2, *("as SLAM leaves it",) * 2))
+    ),
+)  # fmt: skip
+ESTIMATOR = Table(
+    ("robot", "odometry, RMSE [m]", "estimate, RMSE [m]", "mean NEES", "95 % band"),
+    tuple(
+        ("estimator", title, f"{{{path}raw_rmse_m|.3f}}", f"{{{path}ekf_rmse_m|.3f}}",
+         f"{{{path}nees_mean|.2f}}",
+         f"{{{path}nees_95_band.0|.2f}} to {{{path}nees_95_band.1|.2f}}")
+        for title, path in (*((each, f"robots.{each}.") for each in ROBOTS), ("all", ""))
+    ),
+)  # fmt: skip
+TRANSFER = Table(
+    ("robot", "in process", "over DDS", "MuJoCo over DDS", "without randomisation, the same"),
+    tuple(
+        ("transfer", ROBOTS[robot], *(f"{{robots.{robot}.{place}|.0%}}" for place in
+                                      ("fast", "dds", "mujoco_dds")),
+         f"{{without_randomisation.{robot}.fast x100|.0f}}, "
+         f"{{without_randomisation.{robot}.dds x100|.0f}}, "
+         f"{{without_randomisation.{robot}.mujoco_dds|.0%}}")
+        for robot in ("differential", "ackermann", "mecanum")
+    ),
+)  # fmt: skip
+BASELINES = Table(
+    ("`circles`, success", "differential", "ackermann", "mecanum"),
+    tuple(
+        ("baselines", f"`{policy}`", *(
+            f"{{{at}.success.value|.1%}} ({{{at}.success.low x100|.1f}} to "
+            f"{{{at}.success.high x100|.1f}}), collision {{{at}.collision.value|.1%}}"
+            for at in (f"circles/{robot}/{policy}"
+                       for robot in ("differential", "ackermann", "mecanum"))
+        ))
+        for policy in ("dynamic_window", "go_to_goal", "straight", "random")
+    ),
+)  # fmt: skip
+TRAINING = Table(
+    ("robot", "success", "collision", "environment steps", "time", "of that in the simulator"),
+    tuple(
+        (f"training_{robot}", robot,
+         "{success_rate|.1%} ({success_95ci.0 x100|.1f} to {success_95ci.1 x100|.1f})",
+         "{collision_rate|.1%}", "{env_steps|,}", "{wall_s|.0f} s", "{env_share_of_wall|.0%}")
+        for robot in ("differential", "mecanum", "ackermann")
+    ),
+)  # fmt: skip
+MUJOCO = Table(
+    ("robot", "error / path, mean", "worst unseen drive", "speed-up, batched", "alone"),
+    tuple(
+        ("generate_from_mujoco", title, f"{{robots.{robot}.position_error_over_path|.3f}}",
+         f"{{robots.{robot}.worst_drive_error_over_path|.3f}}",
+         f"{{robots.{robot}.speed_up_batched|.1e}}", f"{{robots.{robot}.speed_up_single|.1e}}")
+        for robot, title in ROBOTS.items()
+    ),
+)  # fmt: skip
+PAPER_STEPS = {
+    "ackermann": ("3.1e-9", "9.7e-6", "9.9e-5", "", "9.0e4", ""),
+    "differential": ("2.6e-7", "5.1e-9", "1.6e-16", "", "5.7e4", ""),
+    "mecanum": ("1.2e-17", "9.4e-18", "3.8e-17", "", "4.7e4", ""),
+}
+TABLE1 = Table(
+    ("robot", "", "x [m]", "y [m]", "heading [rad]", "terms", "steps/s, one robot",
+     "steps/s, batched"),
+    tuple(
+        row
+        for robot, title in ROBOTS.items()
+        for row in (
+            ("table1_kinematics", title, "here",
+             *(f"{{robots.{robot}.rmse_{each}|.1e}}" for each in ("x_m", "y_m", "heading_rad")),
+             f"{{robots.{robot}.terms_kept}} of {{robots.{robot}.terms_total}}",
+             f"{{robots.{robot}.steps_per_s_single|.1e}}",
+             f"{{robots.{robot}.steps_per_s_batched|.1e}}"),
+            ("table1_kinematics", "", "paper", *PAPER_STEPS[robot]),
+        )
+    ),
+)  # fmt: skip
+TABLES: Mapping[str, Table] = {
+    "figures": README,
+    "safety": SAFETY,
+    "lidar_peers": PEERS,
+    "env_throughput": THROUGHPUT,
+    "env_scaling": SCALING,
+    "table1": TABLE1,
+    "table2": TABLE2,
+    "table3": TABLE3,
+    "lidar_complexity": COMPLEXITY,
+    "sensor_models": MODELS,
+    "maps": MAPS,
+    "estimator": ESTIMATOR,
+    "transfer": TRANSFER,
+    "baselines": BASELINES,
+    "training": TRAINING,
+    "mujoco": MUJOCO,
+}

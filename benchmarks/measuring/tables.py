@@ -1,0 +1,184 @@
+"""Makes the tables of figures in README.md and docs/ from results.json: `make tables`.
+
+What stands between `<!-- results:NAME -->` and `<!-- /results -->` is the table `NAME` of
+`figures.py`. A cell is text with placeholders, `{[max|min|sum ][RUN:]PATH[ xFACTOR][|FORMAT]}`:
+the path goes into the result of the row's run, or of `RUN`, with dots between keys and `*` for each;
+the format is Python's. A cell whose placeholders lead nowhere reads `not measured`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from measuring.figures import TABLES, Table
+from measuring.run_all import MET, RESULTS
+
+ROOT = RESULTS.parents[1]
+REGION = re.compile(r"<!-- results:([a-z0-9_]+) -->\n(.*?)<!-- /results -->", re.DOTALL)
+PLACEHOLDER = re.compile(
+    r"\{(?:(?P<how>max|min|sum) )?(?:(?P<run>[a-z0-9_]+):)?(?P<path>[^{}|]+?)"
+    r"(?: x(?P<factor>[0-9.e+-]+))?(?:\|(?P<format>[^{}]*))?\}"
+)
+HOW = {"max": max, "min": min, "sum": sum}
+NOT_MEASURED, OF_MISSED, OF_QUICK = "not measured", "†", "‡"
+MACHINE = "machine"
+"""The name of the region that says on what was measured."""
+
+
+class UnknownFigureError(Exception):
+    """A path leads nowhere in what was measured."""
+
+
+def found_at(value: Any, keys: Sequence[str]) -> Iterator[Any]:
+    """What a path leads to; nothing when it leads nowhere."""
+    if not keys:
+        yield value
+        return
+    key, rest = keys[0], keys[1:]
+    if key == "*":
+        values = value.values() if isinstance(value, Mapping) else value
+        for each in values if isinstance(value, Mapping | list) else ():
+            yield from found_at(each, rest)
+    elif isinstance(value, Mapping) and key in value:
+        yield from found_at(value[key], rest)
+    elif isinstance(value, list) and key.isdigit() and int(key) < len(value):
+        yield from found_at(value[int(key)], rest)
+
+
+def written(value: Any, how: str) -> str:
+    """A value by a Python format, its exponent and per cent sign as in our texts."""
+    text = format(value, how)
+    if isinstance(value, str | bool):
+        return text
+    text = re.sub(r"e([+-])0*(\d+)$", lambda m: "e" + m[1].replace("+", "") + m[2], text)
+    return re.sub(r"%$", " %", text)
+
+
+def line_of(cells: Sequence[str]) -> str:
+    """A line of a table."""
+    return "|".join(["", *(f" {cell} " if cell else " " for cell in cells), ""])
+
+
+class Page:
+    """The tables of one set of results."""
+
+    def __init__(self, results: Mapping[str, Any]) -> None:
+        self.runs: Mapping[str, Any] = results.get("runs", {})
+        self.machine: Mapping[str, Any] = results.get("machine", {})
+
+    def figure(self, match: re.Match[str], run: str) -> str:
+        """One placeholder. Raises UnknownFigureError."""
+        result = self.runs.get(match["run"] or run, {}).get("result")
+        values = list(found_at(result, match["path"].split(".")))
+        if not values or any(value is None or isinstance(value, dict | list) for value in values):
+            raise UnknownFigureError
+        value = HOW[match["how"]](values) if match["how"] else values[0]
+        if match["factor"]:
+            value = float(value) * float(match["factor"])
+        return written(value, match["format"] or "")
+
+    def cell(self, template: str, run: str) -> tuple[str, set[str]]:
+        """The text of a cell, and the runs that it is from."""
+        runs = {match["run"] or run for match in PLACEHOLDER.finditer(template)}
+        try:
+            text = PLACEHOLDER.sub(lambda match: self.figure(match, run), template)
+        except (UnknownFigureError, ValueError, TypeError):
+            return NOT_MEASURED, runs
+        return "".join([text, *(f" {mark}" for mark in self.marks(runs))]), runs
+
+    def marks(self, runs: set[str]) -> list[str]:
+        """Signs for a cell whose runs missed a bar or were short."""
+        entries = [self.runs[name] for name in runs if name in self.runs]
+        missed = any(entry["state"] != MET for entry in entries)
+        return [OF_MISSED] * missed + [OF_QUICK] * any(entry["quick"] for entry in entries)
+
+    def table(self, table: Table) -> str:
+        """A table, and below it what is not as it should be with its runs."""
+        lines = [line_of(table.head), f"|{'---|' * len(table.head)}"]
+        used: set[str] = set()
+        for run, *cells in table.rows:
+            told = [self.cell(each, run) for each in cells]
+            lines.append(line_of([text for text, _ in told]))
+            used |= {name for _, runs in told for name in runs}
+        return "\n".join([*lines, *self.notes(used)]) + "\n"
+
+    def notes(self, runs: set[str]) -> list[str]:
+        """A sentence for each run that missed a bar, broke or was short."""
+        notes = []
+        for name in sorted(runs & set(self.runs)):
+            entry = self.runs[name]
+            if entry["state"] != MET:
+                wrong = " ".join("; ".join(entry["failures"] or [entry["error"] or ""]).split())
+                notes.append(f"{OF_MISSED} `{entry['script']}` {entry['state']}: {wrong[:300]}")
+            if entry["quick"]:
+                notes.append(f"{OF_QUICK} `{entry['script']}`: a short run")
+        return [line for note in notes for line in ("", note)]
+
+    def about(self) -> str:
+        """On what was measured."""
+        if not self.runs:
+            return "Nothing is measured yet.\n"
+        commits = sorted({
+            f"{entry['commit']}{' and changes' if entry['dirty'] else ''}"
+            for entry in self.runs.values()
+        })  # fmt: skip
+        loads = [entry["load_before"][0] for entry in self.runs.values()]
+        libraries = self.machine.get("libraries", {})
+        versions = [f"Python {self.machine['python']}"]
+        versions += [f"{name} {libraries[name]}" for name in ("numba", "numpy") if name in libraries]
+        return (
+            f"On {self.machine['cores']} shared cores ({self.machine['cpu']}, "
+            f"{self.machine['memory_gb']:.0f} GB), "
+            f"{', '.join(versions)}; load average before "
+            f" each run {min(loads):.1f} to {max(loads):.1f}; commit {', '.join(commits)}:\n"
+        )
+
+    def text(self, name: str) -> str:
+        """What stands in a region. Raises KeyError for a name that there is not."""
+        return self.about() if name == MACHINE else self.table(TABLES[name])
+
+
+def rendered(text: str, page: Page) -> str:
+    """A document with all its regions made anew."""
+    return REGION.sub(
+        lambda match: f"<!-- results:{match[1]} -->\n{page.text(match[1])}<!-- /results -->", text
+    )
+
+
+def documents() -> list[Path]:
+    """The files that may have regions."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def open_page(file: Path = RESULTS) -> Page:
+    """The tables of a file of results; of nothing when there is none."""
+    return Page(json.loads(file.read_text(encoding="utf-8")) if file.exists() else {})
+
+
+def main() -> None:
+    """Writes the tables, or says which are not as they should be."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="write nothing, end with 1 if unlike")
+    given = parser.parse_args()
+    page, stale = open_page(), []
+    for path in documents():
+        before = path.read_text(encoding="utf-8")
+        after = rendered(before, page)
+        if after != before:
+            stale.append(path)
+            if not given.check:
+                path.write_text(after, encoding="utf-8")
+    for path in stale:
+        said = "is not what results.json gives; run `make tables`" if given.check else "written"
+        sys.stdout.write(f"{path.relative_to(ROOT)}: {said}\n")
+    raise SystemExit(1 if given.check and stale else 0)
+
+
+if __name__ == "__main__":
+    main()
