@@ -8,6 +8,8 @@ SHELL := /bin/bash
 PYTHON ?= python3
 RECORDING ?=
 PYTEST_ARGS ?=
+BENCHMARKS ?=
+QUICK ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -41,7 +43,7 @@ DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Ma
 
 OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
 
-.PHONY: help setup demo test test-jazzy test-ray test-messages test-clients ros-status lint format types pytest benchmark clean distclean
+.PHONY: help setup demo test test-jazzy test-ray test-messages test-clients ros-status lint format types pytest benchmark tables clean distclean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 12
@@ -180,8 +182,13 @@ $(CLIENTS)/.ready: Makefile
 		$(CLIENTS)/bin/python -m pip install -qq $(CLIENT_LIBRARIES)
 	@touch $@
 
-benchmark: setup ## run every benchmark and print its table
-	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python "$$script"; done
+# To its end whatever one of them says; each is told with machine, commit and load.
+benchmark: setup ## run every benchmark, write benchmarks/results.json: make benchmark [BENCHMARKS="parity files"] [QUICK=1]
+	@cd benchmarks && ../$(BIN)/python -m measuring.run_all \
+		$(if $(BENCHMARKS),--only $(BENCHMARKS)) $(if $(QUICK),--quick)
+
+tables: setup ## make the tables of README and docs from benchmarks/results.json
+	@cd benchmarks && ../$(BIN)/python -m measuring.tables
 
 clean: ## remove what building and testing left behind
 	rm -rf build dist install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

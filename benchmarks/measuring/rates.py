@@ -13,11 +13,15 @@ Name = TypeVar("Name", bound=Hashable)
 
 
 def interleaved(
-    calls: Mapping[Name, Callable[[], object]], repeats: int, warm: bool = False
+    calls: Mapping[Name, Callable[[], object]],
+    repeats: int,
+    warm: bool = False,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> dict[Name, list[float]]:
     """Times of each call [s], all in turn, so that a slow moment slows all of them.
 
-    With `warm`, each is called once more just before, so that what it reads is in the caches.
+    With `warm`, each is called once more just before, so that what it reads is in the caches. With
+    `time.process_time` as the `clock`, other work on the machine does not count, all threads do.
     """
     for _ in range(WARM_UP):
         for call in calls.values():
@@ -27,9 +31,9 @@ def interleaved(
         for name, call in calls.items():
             if warm:
                 call()
-            begin = time.perf_counter()
+            begin = clock()
             call()
-            times[name].append(time.perf_counter() - begin)
+            times[name].append(clock() - begin)
     return times
 
 

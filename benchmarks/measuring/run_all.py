@@ -3,9 +3,9 @@
     python -m measuring.run_all [--quick] [--only NAME ...]
 
 A run ends with its bars met, with some missed, or broken: crashed, hung, killed, or without one
-JSON object on standard output. All that is kept, with what was measured, the machine, the commit and
-the load. The file is written anew after each run, so what was measured before an interruption stays.
-Ends with 1 if any run missed a bar or broke, 130 when it was interrupted.
+JSON object on standard output. All that is kept, with what was measured, the machine, the commit
+and the load. The file is written anew after each run, so what was measured before an interruption
+stays. Ends with 1 if any run missed a bar or broke, 130 when it was interrupted.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 What stands between `<!-- results:NAME -->` and `<!-- /results -->` is the table `NAME` of
 `figures.py`. A cell is text with placeholders, `{[max|min|sum ][RUN:]PATH[ xFACTOR][|FORMAT]}`:
-the path goes into the result of the row's run, or of `RUN`, with dots between keys and `*` for each;
-the format is Python's. A cell whose placeholders lead nowhere reads `not measured`.
+the path goes into the result of the row's run, or of `RUN`, with dots between keys and `*` for
+each; the format is Python's. A cell whose placeholders lead nowhere reads `not measured`.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ PLACEHOLDER = re.compile(
 )
 HOW = {"max": max, "min": min, "sum": sum}
 NOT_MEASURED, OF_MISSED, OF_QUICK = "not measured", "†", "‡"
+VERSIONS = ("numba", "numpy")
 MACHINE = "machine"
 """The name of the region that says on what was measured."""
 
@@ -131,7 +132,7 @@ class Page:
         loads = [entry["load_before"][0] for entry in self.runs.values()]
         libraries = self.machine.get("libraries", {})
         versions = [f"Python {self.machine['python']}"]
-        versions += [f"{name} {libraries[name]}" for name in ("numba", "numpy") if name in libraries]
+        versions += [f"{name} {libraries[name]}" for name in VERSIONS if name in libraries]
         return (
             f"On {self.machine['cores']} shared cores ({self.machine['cpu']}, "
             f"{self.machine['memory_gb']:.0f} GB), "

@@ -187,6 +187,6 @@ def test_the_readings_of_a_peer_come_from_one_process_and_its_own_steps(
     found = peers.measure({}, ["ir_sim"], peers.scenes(3), 2)
     one = found.peers["ir_sim"]
     assert found.failed == {}
-    assert set(f"{name}_s" for name in peers.READINGS) < set(one)
+    assert {f"{name}_s" for name in peers.READINGS} < set(one)
     assert one["period_with_ten_scans_s"] > 3.0 * one["period_with_one_scan_s"]
     assert found.ranges["ir_sim"].shape == (3, 720)

@@ -14,8 +14,12 @@ import pytest
 
 from nics_drl_bridge.lidar.baking import bake
 
+from .runs import fails
+
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 SCENES = ["circle", "square", "strip", "mixture"]
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nics_drl_bridge"
+PEERS = ("ir_sim", "irsim_x")
 
 
 def result_of(script: str, *options: str, **variables: str) -> dict:
@@ -82,13 +86,69 @@ def test_peers_are_null_with_a_reason_where_they_cant_be_installed(tmp_path):
     options = ("--scans", "32", "--scenes", "1", "--repeats", "2")
     nowhere = {"PIP_NO_INDEX": "1", "PIP_CONFIG_FILE": os.devnull}
     cache = {"XDG_CACHE_HOME": str(tmp_path), "PIP_FIND_LINKS": str(tmp_path)}
-    result = result_of("lidar_peers.py", *options, **nowhere, **cache)
+    done = subprocess.run(
+        [sys.executable, str(BENCHMARKS / "lidar_peers.py"), "--json", *options],
+        capture_output=True, text=True, timeout=280, env={**os.environ, **nowhere, **cache},
+    )  # fmt: skip
+    result = json.loads(done.stdout)
     assert result["baked"] > 0.0
     assert result["exact"] > 0.0
+    assert result["rmse_m"]["baked"] < 0.01
     for peer in ("ir_sim", "irsim_x"):
         assert result[peer] is None
         assert "can't be installed" in result["missing"][peer]
+    assert result["agreement"] == result["times_as_fast_at_equal_work"] == {}
+    assert not [line for line in result["failures"] if not line.startswith("share_of_")]
     assert not any(path.name == ".ready" for path in tmp_path.rglob("*"))
+
+
+WITHOUT_PEERS = ("--scans", "64", "--scenes", "4", "--repeats", "2", "--without-peers")
+
+
+def test_a_scan_that_is_turned_by_one_beam_is_not_the_same_scan():
+    missed = fails("lidar_peers.py", "shifted", *WITHOUT_PEERS)
+    assert any(line.startswith("rmse_m of baked: ") for line in missed)
+
+
+def test_a_scanner_that_is_ten_times_slower_misses_its_bar():
+    missed = fails("lidar_peers.py", "slow", *WITHOUT_PEERS)
+    assert any(line.startswith("share_of_write_limit: ") for line in missed)
+
+
+@pytest.mark.timeout(400)
+def test_a_scan_that_is_not_that_of_a_step_does_not_agree_with_it():
+    ready = [next(CACHE.glob(f"{name}-py3.{sys.version_info[1]}/.ready"), None) for name in PEERS]
+    if not all(ready):
+        pytest.skip(f"needs the other simulators, which lidar_peers.py installs below {CACHE}")
+    few = ("--scans", "32", "--scenes", "4", "--repeats", "2")
+    missed = fails("lidar_peers.py", "other_way", *few)
+    assert any(line.startswith("agreement of irsim_x: ") for line in missed)
+    assert not any("rmse_m" in line for line in missed)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"share_of_write_limit": float("nan")}, "share_of_write_limit"),
+        ({"times_as_fast_at_equal_work": {"ir_sim": 600.0}}, "times_as_fast_at_equal_work"),
+        ({"times_as_fast_at_equal_work": {"irsim_x": 5.0}}, "times_as_fast_at_equal_work"),
+        ({"rmse_m": {"irsim_x": 0.13}}, "rmse_m of irsim_x"),
+        ({"rmse_m": {"ir_sim": float("nan")}}, "rmse_m of ir_sim"),
+    ],
+)
+def test_a_figure_of_the_peers_beyond_its_bar_is_missed(scenes, changes, named):
+    import lidar_peers
+    from measuring.peers import Measured
+
+    good = {
+        "share_of_write_limit": 0.05,
+        "times_as_fast_at_equal_work": {"ir_sim": 9000.0, "irsim_x": 60.0},
+        "rmse_m": {"baked": 0.001, "ir_sim": 0.006, "irsim_x": 1e-6},
+    }
+    nobody = Measured({}, {}, {}, {}, {}, {})
+    assert lidar_peers.judge(good, nobody) == []
+    (missed,) = lidar_peers.judge({**good, **changes}, nobody)
+    assert missed.startswith(named)
 
 
 def test_the_point_clouds_of_scan_mode_baked_and_mujoco_lie_on_each_other(tmp_path):
