@@ -100,19 +100,20 @@ def stepper(env: BridgeVectorEnv, times: int, in_pairs: bool) -> Callable[[], No
     Args:
         env: which.
         times: steps of a call.
-        in_pairs: whether each robot of a world looks at each other, one by one.
+        in_pairs: whether each robot of a world looks at each other in each substep, one by one.
     """
     env.reset(seed=0)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(16)]
-    count = [0]
+    count, looks = [0], env.model.timing[1] if in_pairs and env.robots > 1 else 0
 
     def step() -> None:
         for _ in range(times):
             env.step(actions[count[0] % len(actions)])
             count[0] += 1
-            for world in env.simulator.data.pose[:, :, :2].tolist() if in_pairs else ():
-                min(math.dist(one, other) for one in world for other in world)
+            for _ in range(looks):
+                for world in env.simulator.data.pose[:, :, :2].tolist():
+                    min(math.dist(one, other) for one in world for other in world)
 
     return step
 
