@@ -16,8 +16,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from measuring.figures import TABLES, Table
+from measuring.figures import TABLES
 from measuring.run_all import MET, RESULTS
+from measuring.table import Table
 
 ROOT = RESULTS.parents[1]
 REGION = re.compile(r"<!-- results:([a-z0-9_]+) -->\n(.*?)<!-- /results -->", re.DOTALL)

@@ -1,0 +1,18 @@
+"""A table of figures, before they are filled in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of figures.
+
+    Attributes:
+        head: its columns.
+        rows: the run that a row is of, and its cells, with placeholders.
+    """
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
