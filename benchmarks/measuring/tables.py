@@ -138,7 +138,7 @@ class Page:
             f"On {self.machine['cores']} shared cores ({self.machine['cpu']}, "
             f"{self.machine['memory_gb']:.0f} GB), "
             f"{', '.join(versions)}; load average before "
-            f" each run {min(loads):.1f} to {max(loads):.1f}; commit {', '.join(commits)}:\n"
+            f"each run {min(loads):.1f} to {max(loads):.1f}; commit {', '.join(commits)}:\n"
         )
 
     def text(self, name: str) -> str:
