@@ -21,9 +21,9 @@ def take_time(config: GateConfig, state: GateState, given: Input, now: float) ->
     if still >= FROZEN_INPUTS:
         fault = f"the steady clock stands still at {now} s"
     ticked = state.tick_s
+    if ticked is not None and now - ticked > config.gap_s:  # whatever wakes it up first
+        fault = f"no decision for {now - ticked:.3f} s, the limit is {config.gap_s} s"
     if isinstance(given, Tick):
-        if ticked is not None and now - ticked > config.gap_s:
-            fault = f"no decision for {now - ticked:.3f} s, the limit is {config.gap_s} s"
         ticked = now
     return replace(state, now_s=now, tick_s=ticked, still_ticks=still, clock_fault=fault)
 
