@@ -62,9 +62,7 @@ def look(
     path = max(float(np.hypot(moved[0], moved[1])), abs(float(moved[2])))
     if path <= config.frozen_distance:
         return (*others, known), ""
-    telling = pictures.must_differ(config, known.ranges, moved)
-    enough = np.count_nonzero(telling) >= pictures.LEAST_BEAMS
-    if enough and pictures.same(known.ranges, ranges, telling):
+    if pictures.shown_again(config, known.ranges, ranges, moved):
         return (*others, known), (
             f"{known.count} scans are the same over a motion of {path:.2f} m or rad"
         )

@@ -169,19 +169,20 @@ def _take_odometry(
     if fault:
         jumped = ODOM if fault == "jumped" else ""
         return replace(state, odometries=arrivals, jumped=jumped), f"odom: its stamp {fault}"
-    leap = _leap(config, state.odometry, odometry)
+    leap = _leap(config, state, odometry, now)
     if leap:  # what comes after it is judged from there
         return replace(state, odometry=odometry, leap=leap, push=None, seen=()), f"odom: {leap}"
     restless = state.restless_s if frozen.stands_still(config, odometry.twist) else now
     return replace(state, odometries=arrivals, odometry=odometry, restless_s=restless), ""
 
 
-def _leap(config: GateConfig, before: Odometry | None, odometry: Odometry) -> str:
+def _leap(config: GateConfig, state: GateState, odometry: Odometry, now: float) -> str:
     """What is wrong with a pose that the robot can't have come to; nothing is with most."""
-    if before is None or config.limits is None:
+    before, limits = state.odometry, config.limits
+    if before is None or limits is None:
         return ""
-    limits = config.limits
-    passed = max(0.0, (odometry.stamp_ns - before.stamp_ns) * NANO)
+    stamped = (odometry.stamp_ns - before.stamp_ns) * NANO
+    passed = max(stamped, now - state.odometries.times[-1])  # what little jitter there is in either
     slip, turned = (NOISE * std * passed for std in config.odom_std)
     turn = CAR_TURN if not limits.turn.any() else greatest(limits, limits.turn)
     speed = float(np.hypot.reduce(np.maximum(-limits.low, limits.high)[limits.linear]))

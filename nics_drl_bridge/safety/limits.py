@@ -23,7 +23,8 @@ PERIOD_S = 0.02
 """Between two ticks of the gate. What crosses its whole range within one is no limit but a typo."""
 SNAP = 1e-12
 """A value this near to its target is there, as a share of the greatest one."""
-GREATEST_STEP = 1e300
+GREATEST = 1e300
+"""What is 0 after a multiplication by 0."""
 STILL = 1e-9
 LEAST_MOTION = 0.01
 """A robot none of whose speeds may be greater can't be driven [m/s or rad/s]."""
@@ -143,15 +144,15 @@ def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
             f"{key}.max': {limit.max:g} {unit} is beyond the robot's own limit; "
             f"give at most {high:g}."
         )
-    span, far = limit.max - limit.min, max(-limit.min, limit.max)
+    span, far = high - low, max(-limit.min, limit.max)
     for name, slope, share, value in (
         ("rate", f"{unit}/s", PERIOD_S, limit.rate),
         ("jerk", f"{unit}/s^2", PERIOD_S**2, limit.jerk),
     ):
         if value > span / share:
             raise ConfigError(
-                f"{key}.{name}': {value:g} {slope} crosses the whole range within a period of the "
-                f"gate, {PERIOD_S:g} s, and limits nothing; give at most {span / share:g}."
+                f"{key}.{name}': {value:g} {slope} crosses the robot's whole range within a period "
+                f"of the gate, {PERIOD_S:g} s, and limits nothing; give at most {span / share:g}."
             )
     for name, reach in (
         ("rate", limit.rate * LONGEST_START_S),
@@ -186,8 +187,8 @@ def saturate(command: Array, limits: Limits) -> Array:
     direction of the motion stay. What a robot can't do at all (a limit of 0) is dropped.
     """
     speeds, factor = limits.linear | limits.turn, 1.0
-    out = command.copy()
-    for i, value in enumerate(command):
+    out = np.clip(command, -GREATEST, GREATEST)  # 0 times inf is no number
+    for i, value in enumerate(out):
         bound = limits.high[i] if value > 0.0 else limits.low[i]
         if bound == 0.0:
             out[i] = 0.0
@@ -257,7 +258,7 @@ def _follow_one(
     scale = max(-bounds[0], bounds[1])
     low, high = bounds[0] / scale, bounds[1] / scale
     here, there = value / scale, target / scale
-    step = min(dt / scale, GREATEST_STEP)  # of a slope; times 0 it is to be 0
+    step = min(dt / scale, GREATEST)  # of a slope
     least, most = -(high - low), high - low
     rate_step, before = min(rate * step, most), min(max(slope * step, least), most)
     jerk_step = min(jerk * dt * step, 2.0 * most)

@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
 SAME_SHARE = 0.99
 """Of the beams, from which on two scans are the same picture: one beam may flicker."""
+TELLING_SHARE = 0.9
+"""Of those that must have changed, from which on it is none of now; a lidar that lives has none."""
 CHANGE = 0.02
 """A beam that must have changed did so by more than this [m],"""
 HEADINGS = (-0.03, 0.0, 0.03)
@@ -26,20 +28,23 @@ NEIGHBOURS = 1.5
 LEAST_BEAMS = 3
 
 
-def same(one: Ranges, other: Ranges, beams: NDArray[np.bool_] | None = None) -> bool:
+def same(one: Ranges, other: Ranges) -> bool:
     """Whether two scans (B,) show the same picture bit for bit, but for a few beams.
 
-    Args:
-        one: (B,) ranges [m]; only beams that return in one of the two count.
-        other: (B,) ranges [m].
-        beams: (B,) which of them are looked at; all by default.
+    Only beams that return in one of them count.
     """
     returned = np.isfinite(one) | np.isfinite(other)
-    if beams is not None:
-        returned &= beams
     count = int(np.count_nonzero(returned))
     equal = int(np.count_nonzero((one == other) & returned))
     return count > 0 and equal >= SAME_SHARE * count
+
+
+def shown_again(config: GateConfig, old: Ranges, ranges: Ranges, moved: Array) -> bool:
+    """Whether a scan (B,) is an old one (B,), although the robot has moved (3,) [m, m, rad]."""
+    telling = must_differ(config, old, moved)
+    count = int(np.count_nonzero(telling))
+    equal = int(np.count_nonzero((old == ranges) & telling))
+    return count >= LEAST_BEAMS and equal >= TELLING_SHARE * count
 
 
 def must_differ(config: GateConfig, ranges: Ranges, moved: Array) -> NDArray[np.bool_]:
@@ -54,7 +59,7 @@ def must_differ(config: GateConfig, ranges: Ranges, moved: Array) -> NDArray[np.
     moved = between(mount, compose(moved, mount))
     open_ = np.isposinf(ranges)
     known = np.isfinite(ranges) | open_
-    far = float(ranges[np.isfinite(ranges)].max())
+    far = config.range_max or float(ranges[np.isfinite(ranges)].max())
     length = np.where(open_, far, ranges)[known].astype(np.float64)
     angles = config.beam_angles[known]
     ends = np.stack([length * np.cos(angles), length * np.sin(angles), 0.0 * length], axis=1)

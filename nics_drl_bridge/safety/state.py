@@ -49,6 +49,7 @@ class GateConfig:
         mount: (3,) x [m], y [m], heading [rad] of the lidar in `base_link`.
         range_min: of the lidar [m].
         scan_rate, odom_rate: as declared [Hz].
+        range_max: of the lidar [m]; 0 when it is not known.
         scan_age_s: of the newest scan, and of the scan behind a command, at most [s].
         odom_age_s: of the newest odometry, at most [s].
         command_age_s: of the newest command, at most [s].
@@ -80,6 +81,7 @@ class GateConfig:
     range_min: float
     scan_rate: float
     odom_rate: float
+    range_max: float = 0.0
     scan_age_s: float = 0.35
     odom_age_s: float = 0.35
     command_age_s: float = 0.30

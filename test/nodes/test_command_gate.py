@@ -328,7 +328,10 @@ def test_limits_of_another_robot_end_it_with_one_sentence(launch, meet, domain_i
 def test_a_policy_that_dies_or_hangs_stops_the_robot(launch, meet, domain_id, how, tmp_path):
     launch("simulator_node", domain_id, world="empty")
     launch("middleware_node", domain_id)
-    launch("command_gate", domain_id, limits="ackermann", black_box=str(tmp_path))
+    launch(
+        "command_gate", domain_id, limits="ackermann", black_box=str(tmp_path),
+        use_sim_time=True, e_stop_required=False,
+    )  # fmt: skip
     peer = meet(domain_id)
     passed = peer.listen(Twist, "cmd_vel", qos.COMMAND)
     # As far as the field goes, so that it does not arrive in between.
