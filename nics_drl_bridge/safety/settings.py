@@ -33,7 +33,7 @@ def require_possible(config: GateConfig) -> None:
 
 
 def doubtful(config: GateConfig, control_period_s: float) -> str:
-    """A sentence about a setting with which the robot moves for an unusual policy alone, or nothing.
+    """A sentence about a setting with which only an unusual policy moves the robot, or nothing.
 
     Args:
         config: of the gate.
