@@ -19,6 +19,8 @@ from nics_drl_bridge.safety.limits import load_limits
 from nics_drl_bridge.safety.settings import doubtful, require_possible
 from nics_drl_bridge.safety.state import GateConfig, ShieldConfig
 
+SCAN_PERIODS = 1.75
+"""A command's scan is no older by default than so many of the lidar's periods, if it is slow."""
 DEFAULTS = GateConfig((), None, np.zeros(0), (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
 
 
@@ -59,6 +61,7 @@ def declare_gate(node: Node) -> GateParameters:
     needs_e_stop = "Whether e_stop must have been heard before arming; false in simulations alone."
     needs_estimate = "Whether arming needs odometry/filtered."
     folder = "Where a stop's last 30 s are written; ~/.ros/black_box if empty."
+    scan_age = max(DEFAULTS.scan_age_s, SCAN_PERIODS / lidar.rate)
     config = GateConfig(
         fields=tuple(int(i) for i in np.flatnonzero(robot.to_cmd_vel(np.ones(len(robot.command))))),
         limits=load_limits(limits, robot) if limits else None,
@@ -68,7 +71,7 @@ def declare_gate(node: Node) -> GateParameters:
         range_max=lidar.range_max,
         scan_rate=lidar.rate,
         odom_rate=get("odom_rate", 1.0 / model.control_period, "Of odom [Hz].", low=0.1, high=1e4),
-        scan_age_s=seconds("scan_age", DEFAULTS.scan_age_s, "Oldest scan, and behind a command"),
+        scan_age_s=seconds("scan_age", scan_age, "Oldest scan, and behind a command"),
         odom_age_s=seconds("odom_age", DEFAULTS.odom_age_s, "Oldest odometry"),
         command_age_s=seconds("command_age", DEFAULTS.command_age_s, "Oldest command"),
         rate_tolerance=share(
