@@ -44,7 +44,7 @@ MEDIAN_S = 0.30
 LOG_CHARACTERS, MOST_IDLE = 500, 3
 GATE, POLICY = "command_gate", "policy_node"
 PATIENCE_S, SHORT_PATIENCE_S = 60.0, 8.0
-AGES = {"scan_age": 3.2, "odom_age": 3.2, "command_age": 3.0, "e_stop_silence": 2.5}
+AGES = {"scan_age": 3.0, "odom_age": 3.0, "command_age": 3.0, "e_stop_silence": 2.5}
 """Ten times the gate's own [s]."""
 
 

@@ -82,8 +82,8 @@ class GateConfig:
     scan_rate: float
     odom_rate: float
     range_max: float = 0.0
-    scan_age_s: float = 0.32
-    odom_age_s: float = 0.32
+    scan_age_s: float = 0.30
+    odom_age_s: float = 0.30
     command_age_s: float = 0.30
     race_s: float = 0.05
     settle_s: float = 1.0
