@@ -139,7 +139,8 @@ class Robot:
             if self.republished:
                 self._topics["cmd_vel_raw"].publish(self.last["cmd_vel_raw"])
             return
-        command = TwistStamped(twist=conversions.twist_to_ros([self._speed, 0.0, 0.1]))
+        turn = 0.1 if self._speed else 0.0
+        command = TwistStamped(twist=conversions.twist_to_ros([self._speed, 0.0, turn]))
         if "scan" in self.last:  # what a policy acts on is the scan that it got
             command.header.stamp = self.last["scan"].header.stamp
         self._say("cmd_vel_raw", command)
