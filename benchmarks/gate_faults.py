@@ -135,7 +135,7 @@ class Bench:
         self.robot = Robot(self.domain_id, policy, speed, relayed=control == "no_gate")
         stack.callback(self.robot.close)
         self.goal = [0.0, 0.0] if control == "standing" else [1e6, 0.0]
-        self.patience_s = SHORT_PATIENCE_S if control else PATIENCE_S
+        self.patience_s = SHORT_PATIENCE_S if control == "standing" else PATIENCE_S
 
 
 def measure(
