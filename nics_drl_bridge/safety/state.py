@@ -61,7 +61,7 @@ class GateConfig:
         clock_rate: seconds of the stamps' clock per second of the steady one; not 1 only in a
             simulation that does not run in real time.
         simulated: whether the stamps are those of a simulator, which may fall behind real time.
-        gap_s: the longest time between two ticks [s].
+        gap_s: the longest time between two ticks, and how long it stops after a longer one [s].
         e_stop_required: whether an emergency stop that was never heard counts as pressed; one that
             was heard and falls silent always does.
         e_stop_silence_s: such a silence [s].
@@ -220,6 +220,7 @@ class GateState:
         moved_s: when it was published [s].
         now_s: greatest time seen [s].
         tick_s: time of the last tick [s].
+        awake_s: when it last went on after it had been asleep [s].
         still_ticks: inputs in a row at which the clock stood still.
         clock_fault: what is wrong with the clock at this input.
         armed: whether commands pass.
@@ -247,6 +248,7 @@ class GateState:
     moved_s: float = float("-inf")
     now_s: float = float("-inf")
     tick_s: float | None = None
+    awake_s: float = float("-inf")
     still_ticks: int = 0
     clock_fault: str = ""
     armed: bool = False

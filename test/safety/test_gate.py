@@ -262,6 +262,11 @@ def test_the_first_word_of_a_gate_that_was_asleep_is_a_zero_whatever_wakes_it(fi
     assert inputs[first]().cause.rule == "own_clock"
     assert len(rig.published) == known + 1
     assert not rig.published[-1][1].any()
+    rig.speed = 0.0
+    rig.run(0.18)  # for one zero may be lost
+    assert not rig.moves
+    rig.run(0.5)
+    assert rig.moves
 
 
 def test_the_e_stop_stops_at_once_and_stays():
