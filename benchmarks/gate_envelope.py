@@ -37,7 +37,7 @@ TOLERANCE = 1e-6
 """Of a finite difference: rounding of the published values, divided by the interval."""
 ODD = np.array([np.nan, np.inf, -np.inf, 1e300, -1e300, 1e3])
 LEAST_MOTION = 0.8
-"""The share of steps within shipped limits that are to be in motion; late ticks stop it for 0.2 s."""
+"""Of the steps within shipped limits are to be in motion; a late tick stops it for 0.2 s."""
 RANDOM_SHARE, WITH_ONE = 4, 200
 """One in so many steps has random limits, which are drawn anew after so many steps."""
 FASTEST = 50.0

@@ -61,9 +61,9 @@ def add_untested() -> None:
     rules.STOPS = (*rules.STOPS, rules.Rule(_covers_nothing))
 
 
-def tests_fail_without(name: str | None, control: str) -> bool:
+def tests_fail_without(name: str | None, control: str, tests: str) -> bool:
     """Whether some test fails without a rule; or, without a name, at all."""
-    words = [sys.executable, __file__, "--inside", name or ""]
+    words = [sys.executable, __file__, "--tests", tests, "--inside", name or ""]
     words += ["--control", control] if control else []
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=600)
     if done.returncode not in (0, 1):
@@ -71,7 +71,7 @@ def tests_fail_without(name: str | None, control: str) -> bool:
     return done.returncode == 1
 
 
-def _inside(name: str, control: str) -> int:
+def _inside(name: str, control: str, tests: str) -> int:
     """Runs the tests without a rule, in this process; the exit code of pytest."""
     import pytest
 
@@ -79,7 +79,7 @@ def _inside(name: str, control: str) -> int:
         add_untested()
     if name:
         take_out(name)
-    tests = OTHER_TEST if control == "no_tests" else TESTS
+    tests = OTHER_TEST if control == "no_tests" else tests
     return int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", tests]))
 
 
@@ -87,22 +87,23 @@ def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a rule is not tested."""
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--rule", action="append", help="only this one; else all")
+    parser.add_argument("--tests", default=TESTS, help="that have to fail")
     parser.add_argument("--inside", help=argparse.SUPPRESS)
     given = parser.parse_args()
     control = given.control or ""
     if given.inside is not None:
-        raise SystemExit(_inside(given.inside, control))
+        raise SystemExit(_inside(given.inside, control, given.tests))
     if control == "untested_rule":
         add_untested()
-    if tests_fail_without(None, control):
-        raise SystemExit(f"{TESTS} fails as it is; repair that first.")
+    if tests_fail_without(None, control, given.tests):
+        raise SystemExit(f"{given.tests} fails as it is; repair that first.")
     known = names()
     asked = known if given.rule is None else given.rule
     if control == "untested_rule":
         asked = [name for name in known if name.endswith(_covers_nothing.__name__)]
     untested, table = [], ""
     for name in asked:
-        found = tests_fail_without(name, control)
+        found = tests_fail_without(name, control, given.tests)
         untested += [] if found else [name]
         table += f"{name:<34}{'found' if found else 'NOT FOUND'}\n"
     missed = [f"no test misses the rule {name}, bar: one does" for name in untested]
