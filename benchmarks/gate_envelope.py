@@ -4,31 +4,44 @@ The whole gate decides, on an injected clock. What it publishes is judged by fin
 against the limits of the YAML file, by code that shares nothing with the gate: value (speed and
 steering), its rate (acceleration and steering rate), the rate's rate (jerk). A stop has to be
 exactly zero. Among the commands are NaN, inf and absurd ones, after which nothing may move; some
-ticks come late, and now and then somebody presses the emergency stop.
+ticks come late, and now and then somebody presses the emergency stop. A part of the steps is driven
+with limits drawn at random, from plausible ones to 1e-308 and 1e308; there what is published has to
+be numbers within them.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
+from dataclasses import replace
 
 import numpy as np
 from measuring.gates import Gate, gate_config
+from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 
 from nics_drl_bridge.config import find_config, parse_yaml, read_text
-from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.safety.inputs import Press
+from nics_drl_bridge.safety.limits import Limits
 from nics_drl_bridge.safety.state import Decision
 
+CONTROLS = {
+    "no_limits": "the limits of the gate are a hundred times as wide",
+    "nan": "one in a thousand decisions is no number",
+    "standing": "the commands are zero",
+}
 ROBOTS = ("ackermann", "differential", "mecanum")
 LIDAR = LidarSpec(beams=8, angle_min=-3.0, angle_max=3.0, range_min=0.05, range_max=3.0, rate=10.0)
 SHORTEST_S, LONGEST_S = 1e-3, 0.22
 TOLERANCE = 1e-6
 """Of a finite difference: rounding of the published values, divided by the interval."""
 ODD = np.array([np.nan, np.inf, -np.inf, 1e300, -1e300, 1e3])
+LEAST_MOTION = 0.8
+"""Of the steps within shipped limits are to be in motion; a late tick stops it for 0.2 s."""
+RANDOM_SHARE, WITH_ONE = 4, 200
+"""One in so many steps has random limits, which are drawn anew after so many steps."""
+FASTEST = 50.0
+"""What odometry shows at most [m/s, rad/s]."""
 Array = NDArray[np.float64]
 
 
@@ -38,15 +51,19 @@ class Judge:
     Attributes:
         violations: how often a limit was exceeded, by its name.
         sane: whether the newest command is one.
+        low, high: (C,) limits of the value.
     """
 
-    def __init__(self, robot: str) -> None:
-        spec, path = load_robot(robot), find_config(robot, "limits")
+    def __init__(self, spec: RobotSpec, limits: Limits | None = None) -> None:
+        path = find_config(spec.name, "limits")
         rows = parse_yaml(read_text(path), str(path))["commands"]
         each = [rows[variable.name] for variable in spec.command]
-        self._low, self._high, self._rate, self._jerk = (
+        self.low, self.high, self._rate, self._jerk = (
             np.array([row[key] for row in each]) for key in ("min", "max", "rate", "jerk")
         )
+        self._slopes = limits is None  # of others, rounding may be all there is
+        if limits is not None:
+            self.low, self.high = limits.low, limits.high
         self._spec = spec
         self._value, self._slope = np.zeros(len(each)), np.zeros(len(each))
         self._time, self.sane = -np.inf, True
@@ -64,10 +81,12 @@ class Judge:
             self._count("stop", decision.twist.any())
             self._value, self._slope, self._time = value, np.zeros_like(value), now
             return
+        inside = (value >= self.low) & (value <= self.high)  # False for NaN
+        self._count("value", not inside.all())
+        if not self._slopes:
+            return
         passed = now - self._time
         slope = (value - self._value) / passed
-        inside = (value >= self._low) & (value <= self._high)  # False for NaN
-        self._count("value", not inside.all())
         self._count("rate", not (np.abs(slope) <= self._rate * (1 + TOLERANCE)).all())
         change = np.abs(slope - self._slope) / passed
         self._count("jerk", not (change <= self._jerk * (1 + TOLERANCE)).all())
@@ -77,12 +96,33 @@ class Judge:
         self.violations[name] += bool(violated)
 
 
-def drive(robot: str, steps: int, rng: np.random.Generator) -> tuple[dict[str, int], int]:
+def random_limits(spec: RobotSpec, shipped: Limits, rng: np.random.Generator) -> Limits:
+    """Limits of a robot: plausible ones, or of any size that a float has."""
+    widest = 1.0 if rng.random() < 0.5 else 308.0
+    low, high, rate, jerk = 10.0 ** rng.uniform(-widest, widest, (4, len(spec.command)))
+    return replace(shipped, low=-low, high=high, rate=rate, jerk=jerk)
+
+
+def drive(
+    spec: RobotSpec, steps: int, rng: np.random.Generator, control: str, random: bool
+) -> tuple[dict[str, int], int]:
     """Violations by name of so many steps, and at how many of them the robot moved."""
-    spec, judge = load_robot(robot), Judge(robot)
-    gate = Gate(gate_config(spec, LIDAR), LIDAR)
+    config = gate_config(spec, LIDAR)
+    assert config.limits is not None
+    drawn = random_limits(spec, config.limits, rng) if random else None
+    limits, judge = drawn or config.limits, Judge(spec, drawn)
+    if control == "no_limits":
+        wide = {key: 100.0 * getattr(limits, key) for key in ("low", "high", "rate", "jerk")}
+        limits = replace(limits, **wide)
+    gate = Gate(replace(config, limits=limits), LIDAR)
     ranges, pose, twist = np.ones(LIDAR.beams, np.float32), np.zeros(3), np.zeros(3)
-    gate.witness = judge.see
+
+    def see(decision: Decision, now: float) -> None:
+        if control == "nan" and rng.random() < 1e-3:
+            decision = replace(decision, twist=np.full(3, np.nan))
+        judge.see(decision, now)
+
+    gate.witness = see
     sensed, moving = -np.inf, 0
     gaps = np.exp(rng.uniform(np.log(SHORTEST_S), np.log(LONGEST_S), steps))
     whims = rng.random(steps)
@@ -98,21 +138,25 @@ def drive(robot: str, steps: int, rng: np.random.Generator) -> tuple[dict[str, i
             sensed = gate.now
         if whim < 0.6:
             wish = spec.to_cmd_vel(_wish(judge, whim, rng))
-            judge.sane = bool((np.abs(np.nan_to_num(wish, nan=np.inf)) < 1e2).all())
+            wish = np.zeros(3) if control == "standing" else wish
+            reach = 50.0 * np.maximum(-judge.low, judge.high)
+            asked = np.abs(spec.from_cmd_vel(wish)) < reach
+            judge.sane = bool(np.isfinite(wish).all() and asked.all())
             gate.command(wish)
         elif whim > 1.0 - 1e-4:
             gate.give(Press())
         decision = gate.tick()
         if decision.publish:
-            twist = decision.twist
-        moving += bool(twist.any())
+            twist = np.clip(np.nan_to_num(decision.twist), -FASTEST, FASTEST)
+        moving += bool(decision.twist.any())
     return judge.violations, moving
 
 
 def _wish(judge: Judge, whim: float, rng: np.random.Generator) -> Array:
     """A command (C,): within the limits, at them, beyond them, or nonsense."""
-    low, high = judge._low, judge._high
-    wish = rng.uniform(low, high)
+    low, high = judge.low, judge.high
+    share = rng.random(len(low))
+    wish = low * share + high * (1.0 - share)
     if whim < 0.2:
         wish = np.where(rng.random(len(low)) < 0.5, low, high)
     elif whim < 0.3:
@@ -122,29 +166,64 @@ def _wish(judge: Judge, whim: float, rng: np.random.Generator) -> Array:
     return np.asarray(wish)
 
 
+def _within_random_limits(
+    spec: RobotSpec, steps: int, rng: np.random.Generator, control: str
+) -> tuple[dict[str, int], int]:
+    """As `drive`, with other limits now and then."""
+    total: dict[str, int] = {}
+    moving = 0
+    for begin in range(0, steps, WITH_ONE):
+        with np.errstate(over="ignore", invalid="ignore"):
+            some, moved = drive(spec, min(WITH_ONE, steps - begin), rng, control, random=True)
+        total = {name: total.get(name, 0) + count for name, count in some.items()}
+        moving += moved
+    return total, moving
+
+
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 after a violation."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     total: dict[str, int] = {}
-    moving = 0
+    table, moving, shipped_steps, moved_random, control = "", 0, 0, 0, given.control or ""
     for index, robot in enumerate(ROBOTS):
-        rng = np.random.default_rng([given.seed, index])
+        rng, spec = np.random.default_rng([given.seed, index]), load_robot(robot)
         steps = given.steps // len(ROBOTS) + (index < given.steps % len(ROBOTS))
-        violations, moved = drive(robot, steps, rng)
-        moving += moved
-        total = {name: total.get(name, 0) + count for name, count in violations.items()}
-        if not given.json:
-            counts = ", ".join(f"{name} {count}" for name, count in violations.items())
-            sys.stdout.write(f"{robot:<14}{steps} steps, {moved} in motion; violations: {counts}\n")
-    violated = sum(total.values())
-    if given.json:
-        result = {"steps": given.steps, "violations": violated, "in_motion": moving, "by": total}
-        sys.stdout.write(json.dumps(result) + "\n")
-    raise SystemExit(1 if violated else 0)
+        others = steps // RANDOM_SHARE
+        within, moved = drive(spec, steps - others, rng, control, random=False)
+        beyond, more = _within_random_limits(spec, others, rng, control)
+        moving, shipped_steps, moved_random = (
+            moving + moved, shipped_steps + steps - others, moved_random + more,
+        )  # fmt: skip
+        both = {name: count + beyond.get(name, 0) for name, count in within.items()}
+        total = {name: total.get(name, 0) + count for name, count in both.items()}
+        counts = ", ".join(f"{name} {count}" for name, count in both.items())
+        table += f"{robot:<14}{steps} steps, {moved + more} in motion; violations: {counts}\n"
+    result = {
+        "steps": given.steps,
+        "violations": sum(total.values()),
+        "in_motion": moving + moved_random,
+        "steps_within_shipped_limits": shipped_steps,
+        "in_motion_within_shipped_limits": moving,
+        "in_motion_with_random_limits": moved_random,
+        "by": total,
+    }
+    answer(result, missed_by(result), table, given.json)
+
+
+def missed_by(result: dict[str, object]) -> list[str]:
+    """A sentence for each bar that was missed."""
+    missed, by = [], result["by"]
+    steps, moving = result["steps_within_shipped_limits"], result["in_motion_within_shipped_limits"]
+    if result["violations"] != 0:
+        missed.append(f"{result['violations']} violations, bar 0: {by}")
+    if not steps or not moving / steps >= LEAST_MOTION:  # type: ignore[operator]
+        missed.append(f"in motion at {moving} of {steps} steps, bar {LEAST_MOTION:.0%}")
+    if not result["in_motion_with_random_limits"]:
+        missed.append("with random limits the robot never moved: nothing was measured")
+    return missed
 
 
 if __name__ == "__main__":

@@ -1,16 +1,19 @@
 """Faults around a gate of real processes: how long until the robot is told to stop, and stays so?
 
 The gate, and for some faults the policy, are processes of their own, as on a vehicle; this one
-publishes what a robot publishes, over DDS and at 10 Hz, and breaks it. A time counts from the last
-good datum before the fault (or from the fault itself, where it is an event) to the arrival of a
-zero on `cmd_vel`. A command is unsafe when it moves the robot after the fault's limit, holds NaN
-or inf, or lies outside the limits of the robot.
+publishes what a robot publishes, over DDS and at 10 Hz, and breaks it while the robot is being told
+to move, at any phase. The worst time counts from the last good datum before the fault (or from the
+fault itself, where it is an event) to the arrival of a zero on `cmd_vel`; the median, from the
+fault. A command is unsafe when it moves the robot after the fault's limit, holds NaN or inf, or
+lies outside the limits of the robot. After a freeze of the gate itself its first word must be a
+zero.
+
+`end_after_stops` is another thing: good and NaN commands in turn, and then SIGINT.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
+import multiprocessing
 import os
 import signal
 import sys
@@ -23,204 +26,149 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import TwistStamped
-from measuring.faulty_robot import ALL, NANO, ROBOT, NoMotionError, Robot
-from sensor_msgs.msg import LaserScan
+from measuring.faults import FAULTS, LATE_S, Around
+from measuring.faulty_robot import ROBOT, SPEED, NoMotionError, Robot
+from measuring.gate_end import END, Ended, end_after_stops
+from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
+CONTROLS = {
+    "slow_gate": "a gate that lets data get ten times as old",
+    "no_gate": "commands are relayed past the gate",
+    "standing": "the robot is never told to move",
+}
 WATCHED_S = 0.8
+MEDIAN_S = 0.30
 LOG_CHARACTERS, MOST_IDLE = 500, 3
 GATE, POLICY = "command_gate", "policy_node"
-
-Injection = Callable[[Robot, NodeProcess | None], object]
-
-
-@dataclass(frozen=True)
-class Fault:
-    """A way in which something breaks.
-
-    Attributes:
-        limit_s: by when the robot must have been told to stop [s].
-        inject: breaks it; gets the robot and the policy's process. Of several, each in turn.
-        since: the topic whose last good datum the time counts from; empty for the fault itself.
-        policy: whether it needs the policy's process.
-    """
-
-    limit_s: float
-    inject: Injection | Sequence[Injection]
-    since: str = ""
-    policy: bool = False
-
-
-def _silence(*topics: str) -> Injection:
-    return lambda robot, _: robot.silent.update(topics)
-
-
-def _twist(x: float, turn: float) -> Injection:
-    def change(message: TwistStamped) -> TwistStamped:
-        message.twist = conversions.twist_to_ros([x, 0.0, turn])
-        return message
-
-    return lambda robot, _: robot.change.update({"cmd_vel_raw": change})
-
-
-def _stamp(topic: str, off_s: float) -> Injection:
-    def change(message: LaserScan) -> LaserScan:
-        stamp = conversions.stamp_from_ros(message.header.stamp) + round(off_s * NANO)
-        message.header.stamp = conversions.stamp_to_ros(stamp)
-        return message
-
-    return lambda robot, _: robot.change.update({topic: change})
-
-
-def _freeze(topic: str, stamped: bool = False) -> Injection:
-    """Repeats the last good message, as a frozen driver does; with the stamp of now if wanted."""
-
-    def inject(robot: Robot, _: NodeProcess | None) -> None:
-        held = robot.last[topic]
-
-        def change(message: Any) -> Any:
-            if stamped:
-                held.header.stamp = message.header.stamp
-            return held
-
-        robot.change[topic] = change
-
-    return inject
-
-
-def _few_beams(robot: Robot, _: NodeProcess | None) -> None:
-    def change(message: LaserScan) -> LaserScan:
-        message.ranges = message.ranges[:100]
-        return message
-
-    robot.change["scan"] = change
-
-
-def _nan_scan(robot: Robot, _: NodeProcess | None) -> None:
-    def change(message: LaserScan) -> LaserScan:
-        message.ranges = [float("nan")] * len(message.ranges)
-        return message
-
-    robot.change["scan"] = change
-
-
-def _jump(seconds: int) -> Injection:
-    return lambda robot, _: setattr(robot, "jump_ns", seconds * NANO)
-
-
-def _signal(how: signal.Signals, republished: bool = False) -> Injection:
-    """Ends or stops the policy; somebody may go on with its last command."""
-
-    def inject(robot: Robot, policy: NodeProcess | None) -> None:
-        if policy is not None:
-            os.kill(policy.pid, how)
-            robot.republished = republished
-
-    return inject
-
-
-FAULTS: dict[str, Fault] = {
-    "policy_killed": Fault(0.40, _signal(signal.SIGKILL), policy=True),
-    "policy_frozen": Fault(0.40, _signal(signal.SIGSTOP), policy=True),
-    "policy_hung": Fault(0.40, _signal(signal.SIGSTOP, republished=True), policy=True),
-    "scan_silent": Fault(0.40, _silence("scan"), "scan"),
-    "odom_silent": Fault(0.40, _silence("odom"), "odom"),
-    "nan_scan": Fault(0.40, _nan_scan, "scan"),
-    "clock_jump": Fault(0.40, (_jump(10), _jump(-10), _jump(1), _jump(-1)), "scan"),
-    "e_stop": Fault(0.10, (lambda robot, _: robot.press(), lambda robot, _: robot.call("e_stop"))),
-    "e_stop_silent": Fault(0.40, _silence("e_stop"), "e_stop"),
-    "all_silent": Fault(0.40, _silence(*ALL), "scan"),
-    "command_silent": Fault(0.40, _silence("cmd_vel_raw"), "cmd_vel_raw"),
-    "command_frozen": Fault(0.40, _freeze("cmd_vel_raw"), "cmd_vel_raw"),
-    "command_nan": Fault(0.40, _twist(float("nan"), 0.0), "cmd_vel_raw"),
-    "command_inf": Fault(0.40, _twist(float("inf"), 0.0), "cmd_vel_raw"),
-    "command_absurd": Fault(0.40, _twist(1e9, 0.0), "cmd_vel_raw"),
-    "command_from_the_future": Fault(0.40, _stamp("cmd_vel_raw", 3600.0), "cmd_vel_raw"),
-    "scan_of_another_lidar": Fault(0.40, _few_beams, "scan"),
-    "scan_stamps_frozen": Fault(0.40, _freeze("scan"), "scan"),
-    "scan_from_the_future": Fault(0.40, _stamp("scan", 3600.0), "scan"),
-    "scan_frozen": Fault(1.50, _freeze("scan", stamped=True), "scan"),
-    "no_motion": Fault(2.50, lambda robot, _: setattr(robot, "stuck", True)),
-}
+PATIENCE_S, SHORT_PATIENCE_S = 60.0, 8.0
+AGES = {"scan_age": 3.0, "odom_age": 3.0, "command_age": 3.0, "e_stop_silence": 2.5}
+"""Ten times the gate's own [s]."""
 
 
 @dataclass
 class Result:
-    """What one fault led to: times to zero [s], and commands that must not have been."""
+    """What one fault led to.
+
+    Attributes:
+        unsafe: commands that must not have been.
+        times: from the last good datum to zero [s].
+        after: from the fault to zero [s].
+    """
 
     unsafe: int = 0
     times: list[float] = field(default_factory=list)
+    after: list[float] = field(default_factory=list)
 
     def summary(self, limit_s: float) -> dict[str, Any]:
-        """For the JSON object."""
+        """For the JSON object; NaN where nothing was measured."""
         return {
             "n": len(self.times),
-            "p50_s": round(float(np.median(self.times)), 4),
-            "max_s": round(max(self.times), 4),
+            "p50_s": round(float(np.median(self.after)), 4) if self.after else float("nan"),
+            "max_s": round(max(self.times), 4) if self.times else float("nan"),
             "limit_s": limit_s,
             "unsafe_commands": self.unsafe,
         }
 
 
-def inject(robot: Robot, policy: NodeProcess | None, name: str, result: Result) -> None:
+def missed_by(name: str, one: dict[str, Any], wanted: int) -> list[str]:
+    """A sentence for each bar that a fault's summary misses."""
+    missed = []
+    if one["n"] < wanted:
+        missed.append(f"{name}: {one['n']} of {wanted} were measured: the robot did not move")
+    if not one["max_s"] <= one["limit_s"]:
+        missed.append(f"{name}: zero after {one['max_s']} s at worst, limit {one['limit_s']} s")
+    if one["limit_s"] == LATE_S and not one["p50_s"] <= MEDIAN_S:
+        missed.append(f"{name}: zero after {one['p50_s']} s in the median, bar {MEDIAN_S} s")
+    if one["unsafe_commands"] != 0:
+        missed.append(f"{name}: {one['unsafe_commands']} unsafe commands, bar 0")
+    return missed
+
+
+def inject(around: Around, name: str, result: Result, patience_s: float) -> None:
     """Drives, breaks something, and watches what the gate says."""
-    fault = FAULTS[name]
+    fault, robot = FAULTS[name], around.robot
     ways = [fault.inject] if callable(fault.inject) else fault.inject
-    robot.drive()
+    robot.drive(patience_s)
     robot.heard.clear()
-    began = time.monotonic()
-    ways[len(result.times) % len(ways)](robot, policy)
+    broken = time.monotonic()
+    ways[len(result.times) % len(ways)](around)
     robot.until(lambda: False, fault.limit_s + WATCHED_S)
-    began = robot.sent_s[fault.since] if fault.since else began
-    after = [(when - began, twist) for when, twist in robot.heard]
-    moving = [when for when, twist in after if twist.any()]
-    last = max(moving, default=0.0)
-    result.times.append(min((when for when, _ in after if when > last), default=float("inf")))
+    good = robot.sent_s[fault.since] if fault.since else broken
+    moving = [when for when, twist in robot.heard if twist.any()]
+    zeros = [when for when, twist in robot.heard if not twist.any()]
+    if fault.first_word:  # it may drive on
+        moving = [when for when in moving if when < min(zeros, default=float("inf"))]
+    last = max(moving, default=broken)
+    stopped = min((when for when in zeros if when > last), default=float("inf"))
+    result.times.append(stopped - good)
+    result.after.append(stopped - broken)
     low, high = np.array([0.0, 0.0, -0.5]), np.array([1.0, 0.0, 0.5])
-    wild = sum(not ((twist >= low) & (twist <= high)).all() for _, twist in after)
-    result.unsafe += int(wild) + sum(when > fault.limit_s for when in moving)
+    wild = sum(not ((twist >= low) & (twist <= high)).all() for _, twist in robot.heard)
+    late = len(moving) if fault.first_word else sum(w - good > fault.limit_s for w in moving)
+    result.unsafe += int(wild) + int(late)
 
 
-def measure(names: Sequence[str], repeats: int, told: Callable[[str], None]) -> dict[str, Result]:
+class Bench:
+    """A gate, or what stands for it under a control, and a robot around it.
+
+    Args:
+        name: of the fault.
+        control: what is taken out; empty for nothing.
+        stack: ends it all.
+    """
+
+    def __init__(self, name: str, control: str, stack: ExitStack) -> None:
+        self.domain_id = free_domain_id()
+        self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        given: dict[str, Any] = {"model": ROBOT, "limits": ROBOT, "e_stop_required": True}
+        given["black_box"] = str(self.folder / "black_box")
+        given |= AGES if control == "slow_gate" else {}
+        self.gate = None
+        if control != "no_gate":
+            process = NodeProcess(GATE, self.folder, given, self.domain_id)
+            self.gate = stack.enter_context(process)
+        policy = FAULTS[name].policy if name in FAULTS else False
+        speed = 0.0 if control == "standing" else SPEED
+        self.robot = Robot(self.domain_id, policy, speed, relayed=control == "no_gate")
+        stack.callback(self.robot.close)
+        self.goal = [0.0, 0.0] if control == "standing" else [1e6, 0.0]
+        self.patience_s = SHORT_PATIENCE_S if control == "standing" else PATIENCE_S
+
+
+def measure(
+    names: Sequence[str], repeats: int, told: Callable[[str], None], control: str = ""
+) -> dict[str, Result]:
     """Injects each fault so often; a gate of its own for each fault."""
     results = {name: Result() for name in names}
     for name in names:
-        domain_id = free_domain_id()
         with ExitStack() as stack:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-            gate = {"model": ROBOT, "limits": ROBOT, "e_stop_required": True}
-            gate["black_box"] = str(folder / "black_box")
-            stack.enter_context(NodeProcess(GATE, folder, gate, domain_id))
-            robot = Robot(domain_id, FAULTS[name].policy)
-            stack.callback(robot.close)
-            idle = 0
-            while (known := len(results[name].times)) < repeats:
-                _some(robot, folder, domain_id, name, repeats, results[name])
+            bench, idle = Bench(name, control, stack), 0
+            while (known := len(results[name].times)) < repeats and idle < MOST_IDLE:
+                _some(bench, name, repeats, results[name])
                 told(f"{name}: {len(results[name].times)} of {repeats}")
                 idle = idle + 1 if known == len(results[name].times) else 0
-                if idle == MOST_IDLE:
-                    raise NoMotionError(f"{name}: {MOST_IDLE} policies in turn did not drive")
     return results
 
 
-def _some(
-    robot: Robot, folder: Path, domain_id: int, name: str, repeats: int, result: Result
-) -> None:
+def _some(bench: Bench, name: str, repeats: int, result: Result) -> None:
     """One injection; or, if the policy outlives it, all of them with one policy."""
     if not FAULTS[name].policy:
-        inject(robot, None, name, result)
+        try:
+            inject(Around(bench.robot, None, bench.gate), name, result, bench.patience_s)
+        except NoMotionError as error:
+            sys.stderr.write(f"{name}: {error}\n")
         return
-    with NodeProcess(POLICY, folder, {"model": ROBOT, "goal": [1e6, 0.0]}, domain_id) as policy:
+    given = {"model": ROBOT, "goal": bench.goal}
+    with NodeProcess(POLICY, bench.folder, given, bench.domain_id) as policy:
         while len(result.times) < repeats:
             try:
-                inject(robot, policy, name, result)
-            except (
-                NoMotionError
-            ) as error:  # nothing was injected yet; who was killed may leave DDS ill
+                around = Around(bench.robot, policy, bench.gate)
+                inject(around, name, result, bench.patience_s)
+            except NoMotionError as error:
+                # Nothing was injected yet; who was killed may leave DDS ill.
                 told = policy.log.read_text(encoding="utf-8", errors="replace")[-LOG_CHARACTERS:]
                 sys.stderr.write(f"{name}: {error}; another policy is started. {told}\n")
                 return
@@ -231,28 +179,61 @@ def _some(
                 return
 
 
+def _spin_for_ever() -> None:
+    while True:
+        pass
+
+
+def load(stack: ExitStack, count: int) -> None:
+    """Keeps so many cores busy until the stack ends."""
+    for _ in range(count):
+        process = multiprocessing.get_context("spawn").Process(target=_spin_for_ever, daemon=True)
+        process.start()
+        stack.callback(process.kill)
+
+
+def _ends(given: Any, control: str, told: Callable[[str], None]) -> Ended:
+    """The end of a gate after many stops."""
+    with ExitStack() as stack:
+        bench = Bench(END, control, stack)
+        try:
+            return end_after_stops(bench.robot, bench.gate, bench.folder, given.seconds, told)
+        except NoMotionError as error:
+            told(f"{END}: {error}")
+            return Ended()
+
+
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a stop came late."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--repeats", type=int, default=30)
-    parser.add_argument("--fault", action="append", choices=sorted(FAULTS), help="only this one")
+    known = sorted([*FAULTS, END])
+    parser.add_argument("--fault", action="append", choices=known, help="only this one")
+    parser.add_argument("--load", type=int, default=0, help="keep so many cores busy besides")
+    parser.add_argument("--seconds", type=float, default=15.0, help=f"of commands for {END}")
     given = parser.parse_args()
-    results = measure(
-        given.fault or list(FAULTS), given.repeats, lambda line: sys.stderr.write(f"{line}\n")
+    control, names = given.control or "", given.fault or [*FAULTS, END]
+
+    def told(line: str) -> None:
+        sys.stderr.write(f"{line}\n")
+
+    with ExitStack() as stack:
+        load(stack, given.load)
+        faults = [name for name in names if name != END]
+        results = measure(faults, given.repeats, told, control)
+        ended = _ends(given, control, told) if END in names else None
+    summary = {name: one.summary(FAULTS[name].limit_s) for name, one in results.items()}
+    missed = [line for name in faults for line in missed_by(name, summary[name], given.repeats)]
+    table = "".join(
+        f"{name:<26}{one['n']:>3} times, zero after {one['p50_s']:.3f} s, "
+        f"{one['max_s']:.3f} s at worst, limit {one['limit_s']:.2f} s, "
+        f"unsafe commands {one['unsafe_commands']}\n"
+        for name, one in summary.items()
     )
-    summary = {name: result.summary(FAULTS[name].limit_s) for name, result in results.items()}
-    if given.json:
-        sys.stdout.write(json.dumps(summary) + "\n")
-    else:
-        for name, one in summary.items():
-            sys.stdout.write(
-                f"{name:<26}{one['n']:>3} times, zero after {one['p50_s']:.3f} s, "
-                f"{one['max_s']:.3f} s at worst, limit {one['limit_s']:.2f} s, "
-                f"unsafe commands {one['unsafe_commands']}\n"
-            )
-    bad = [one for one in summary.values() if one["max_s"] > one["limit_s"]]
-    raise SystemExit(1 if bad or any(one["unsafe_commands"] for one in summary.values()) else 0)
+    if ended is not None:
+        summary[END], table = ended.summary(), table + ended.line
+        missed += ended.missed()
+    answer(summary, missed, table, given.json)
 
 
 if __name__ == "__main__":

@@ -7,13 +7,21 @@ motion, and what the shield takes for an obstacle. Each run is a process of its 
 from __future__ import annotations
 
 import argparse
-import json
 import subprocess
 import sys
 from pathlib import Path
 
+from measuring.verdict import answer, parser_of
+
 from nics_drl_bridge.safety import arming, intake, rules, shield
 
+CONTROLS = {
+    "no_tests": "no test that looks at the gate's rules is run",
+    "untested_rule": "a rule is looked for that no test covers",
+}
+LEAST_RULES = 30
+"""There are more; a run that found fewer has lost a table."""
+TESTS, OTHER_TEST = "test/safety", "test/safety/test_settings.py"
 ROOT = Path(__file__).resolve().parents[1]
 TABLES = {
     "stop": (rules, "STOPS", lambda rule: rule.judge.__name__),
@@ -44,39 +52,65 @@ def take_out(name: str) -> None:
     setattr(module, table, kept)
 
 
-def tests_fail_without(name: str | None) -> bool:
+def _covers_nothing(config: object, state: object, now: float) -> None:
+    """A rule that stops nothing: nobody can miss it."""
+
+
+def add_untested() -> None:
+    """Puts a rule that no test covers into the table of stops, in this process."""
+    rules.STOPS = (*rules.STOPS, rules.Rule(_covers_nothing))
+
+
+def tests_fail_without(name: str | None, control: str, tests: str) -> bool:
     """Whether some test fails without a rule; or, without a name, at all."""
-    words = [sys.executable, __file__, "--inside", name or ""]
+    words = [sys.executable, __file__, "--tests", tests, "--inside", name or ""]
+    words += ["--control", control] if control else []
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=600)
     if done.returncode not in (0, 1):
         raise SystemExit(f"pytest ended with {done.returncode}:\n{done.stdout}{done.stderr}")
     return done.returncode == 1
 
 
+def _inside(name: str, control: str, tests: str) -> int:
+    """Runs the tests without a rule, in this process; the exit code of pytest."""
+    import pytest
+
+    if control == "untested_rule":
+        add_untested()
+    if name:
+        take_out(name)
+    tests = OTHER_TEST if control == "no_tests" else tests
+    return int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", tests]))
+
+
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a rule is not tested."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser = parser_of(__doc__, CONTROLS)
+    parser.add_argument("--rule", action="append", help="only this one; else all")
+    parser.add_argument("--tests", default=TESTS, help="that have to fail")
     parser.add_argument("--inside", help=argparse.SUPPRESS)
     given = parser.parse_args()
+    control = given.control or ""
     if given.inside is not None:
-        import pytest
-
-        if given.inside:
-            take_out(given.inside)
-        raise SystemExit(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "test/safety"]))
-    if tests_fail_without(None):
-        raise SystemExit("test/safety fails as it is; repair that first.")
-    untested = []
-    for name in names():
-        fails = tests_fail_without(name)
-        untested += [] if fails else [name]
-        if not given.json:
-            sys.stdout.write(f"{name:<34}{'found' if fails else 'NOT FOUND'}\n")
-            sys.stdout.flush()
-    if given.json:
-        sys.stdout.write(json.dumps({"rules": len(names()), "untested": untested}) + "\n")
-    raise SystemExit(1 if untested else 0)
+        raise SystemExit(_inside(given.inside, control, given.tests))
+    if control == "untested_rule":
+        add_untested()
+    if tests_fail_without(None, control, given.tests):
+        raise SystemExit(f"{given.tests} fails as it is; repair that first.")
+    known = names()
+    asked = known if given.rule is None else given.rule
+    if control == "untested_rule":
+        asked = [name for name in known if name.endswith(_covers_nothing.__name__)]
+    untested, table = [], ""
+    for name in asked:
+        found = tests_fail_without(name, control, given.tests)
+        untested += [] if found else [name]
+        table += f"{name:<34}{'found' if found else 'NOT FOUND'}\n"
+    missed = [f"no test misses the rule {name}, bar: one does" for name in untested]
+    if len(known) < LEAST_RULES or not asked:
+        missed.append(f"{len(known)} rules are known, {len(asked)} were looked at")
+    result = {"rules": len(known), "looked_at": len(asked), "untested": untested}
+    answer(result, missed, table, given.json)
 
 
 if __name__ == "__main__":

@@ -147,6 +147,7 @@ def begin(stack: ExitStack) -> Soak:
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
     field, track = free_domain_id(), free_domain_id()
     gate = {"model": ROBOT, "limits": ROBOT, "black_box": str(folder / "black_box")}
+    gate |= {"use_sim_time": True, "e_stop_required": False}
     parts: dict[str, tuple[str, dict[str, Any], int]] = {
         "simulator_node": ("simulator_node", {"model": ROBOT, "world": WORLD}, field),
         "middleware_node": ("middleware_node", {"model": ROBOT}, field),

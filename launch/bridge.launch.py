@@ -18,6 +18,7 @@ DEFAULT = PathJoinSubstitution([FindPackageShare(PACKAGE), "config", "nodes", "b
 def generate_launch_description():
     use_sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
     autostart = ParameterValue(LaunchConfiguration("autostart"), value_type=bool)
+    e_stop_required = ParameterValue(LaunchConfiguration("e_stop_required"), value_type=bool)
 
     def node(name, **more):
         return Node(
@@ -37,7 +38,12 @@ def generate_launch_description():
             DeclareLaunchArgument("use_sim_time", default_value="false", description="Use /clock"),
             DeclareLaunchArgument("autostart", default_value="true", description="Lead lifecycles"),
             DeclareLaunchArgument("log_level", default_value="info", description="Of all nodes"),
-            node("command_gate"),
+            DeclareLaunchArgument(
+                "e_stop_required",
+                default_value="true",
+                description="An e_stop that was never heard counts as pressed",
+            ),
+            node("command_gate", e_stop_required=e_stop_required),
             node("middleware_node", autostart=autostart),
             node("policy_node", autostart=autostart),
         ]

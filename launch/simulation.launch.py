@@ -35,6 +35,11 @@ def generate_launch_description():
             DeclareLaunchArgument("use_rviz", default_value="false", description="Start RViz"),
             DeclareLaunchArgument("log_level", default_value="info", description="Of all nodes"),
             DeclareLaunchArgument(
+                "e_stop_required",
+                default_value="false",
+                description="An e_stop that was never heard counts as pressed",
+            ),
+            DeclareLaunchArgument(
                 "simulator",
                 default_value="simulator",
                 choices=["simulator", "mujoco"],
@@ -50,7 +55,7 @@ def generate_launch_description():
                 arguments=["--ros-args", "--log-level", value("log_level")],
                 output="screen",
             ),
-            include("bridge.launch.py", "params_file", "autostart"),
+            include("bridge.launch.py", "params_file", "autostart", "e_stop_required"),
             include("description.launch.py", "use_rviz"),
         ]
     )

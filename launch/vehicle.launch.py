@@ -1,6 +1,7 @@
 """All that runs on a vehicle, beside the drivers of its lidar and its base.
 
-Give it a file of parameters of your own: model, limits, latency and e-stop are those of the robot.
+Give it a file of parameters of your own: model, limits and latency are those of the robot. An
+emergency stop that was never heard counts as pressed, whatever the file says.
 
 ros2 launch nics_drl_bridge vehicle.launch.py params_file:=car.yaml
 """
@@ -17,10 +18,10 @@ DEFAULT = PathJoinSubstitution([SHARE, "config", "nodes", "bridge.yaml"])
 
 
 def generate_launch_description():
-    def include(file, *names):
+    def include(file, *names, **given):
         source = PythonLaunchDescriptionSource(PathJoinSubstitution([SHARE, "launch", file]))
         names = ("namespace", "use_sim_time", "log_level", *names)
-        given = {name: LaunchConfiguration(name) for name in names}
+        given |= {name: LaunchConfiguration(name) for name in names}
         return IncludeLaunchDescription(source, launch_arguments=given.items())
 
     return LaunchDescription(
@@ -31,7 +32,7 @@ def generate_launch_description():
             DeclareLaunchArgument("autostart", default_value="true", description="Lead lifecycles"),
             DeclareLaunchArgument("use_rviz", default_value="false", description="Start RViz"),
             DeclareLaunchArgument("log_level", default_value="info", description="Of all nodes"),
-            include("bridge.launch.py", "params_file", "autostart"),
+            include("bridge.launch.py", "params_file", "autostart", e_stop_required="true"),
             include("description.launch.py", "use_rviz"),
         ]
     )

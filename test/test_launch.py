@@ -41,6 +41,17 @@ def test_a_simulation_is_a_vehicle_and_a_simulator_on_simulated_time() -> None:
         assert vehicle[name]["parameters"]["use_sim_time"] is False
 
 
+@pytest.mark.parametrize(
+    ("file", "required"),
+    [("simulation.launch.py", False), ("vehicle.launch.py", True), ("bridge.launch.py", True)],
+)
+def test_only_a_simulation_does_without_an_emergency_stop(file: str, required: bool) -> None:
+    gate = Launched().run(file).nodes["command_gate"]
+    assert gate["parameters"]["e_stop_required"] is required
+    told = yaml.safe_load(Path(gate["files"][0]).read_text(encoding="utf-8"))
+    assert told["/**/command_gate"]["ros__parameters"]["e_stop_required"] is True
+
+
 def test_arguments_reach_every_node() -> None:
     given = {
         "namespace": "car", "params_file": "own.yaml", "use_sim_time": "False",

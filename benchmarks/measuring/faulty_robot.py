@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import random
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -24,6 +25,8 @@ from nics_drl_bridge.nodes import conversions, qos
 
 ROBOT, PERIOD_S, SPEED = "ackermann", 0.1, 0.5
 PATIENCE_S, MOTION_S = 60.0, 10.0
+RECENT_S = 0.15
+"""The newest command must be younger, for the robot to be told to move now [s]."""
 NANO = conversions.NANO
 ALL = frozenset({"scan", "odom", "odometry/filtered", "cmd_vel_raw", "e_stop"})
 
@@ -71,7 +74,9 @@ class Robot:
         sent_s: when each topic sent a good one last [s].
     """
 
-    def __init__(self, domain_id: int, policy: bool) -> None:
+    def __init__(
+        self, domain_id: int, policy: bool, speed: float = SPEED, relayed: bool = False
+    ) -> None:
         self._lidar = builtin_model(ROBOT).lidar
         self._context = driver_context(domain_id)
         self.node = Node("robot", context=self._context, start_parameter_services=False)
@@ -86,7 +91,8 @@ class Robot:
             for name, kind in kinds.items()
         }
         self.heard: list[tuple[float, np.ndarray]] = []
-        self._policy = policy
+        self._policy, self._speed, self._relayed = policy, speed, relayed
+        self._past = self.node.create_publisher(Twist, "cmd_vel", qos.COMMAND) if relayed else None
         spawning = multiprocessing.get_context("spawn")
         self._ear, out = spawning.Pipe(duplex=False)
         self._base = spawning.Process(target=hear, args=(domain_id, out), daemon=True)
@@ -97,7 +103,8 @@ class Robot:
             for service in ("arm", "reset", "e_stop")
         }
         self.node.create_timer(PERIOD_S, self._send)
-        self._now_ns, self._x, self.sent_s = time.time_ns(), 0.0, dict.fromkeys(ALL, 0.0)
+        self._offset_ns = time.time_ns() - time.monotonic_ns()
+        self._now_ns, self._x, self.sent_s = 0, 0.0, dict.fromkeys(ALL, 0.0)
         self.last: dict[str, Any] = {}
         self.mend()
 
@@ -117,8 +124,8 @@ class Robot:
 
     def _send(self) -> None:
         speed = self.heard[-1][1][0] if self.heard and not self.stuck else 0.0
-        self._now_ns += round(PERIOD_S * NANO)
-        self._x += speed * PERIOD_S
+        before, self._now_ns = self._now_ns, time.monotonic_ns() + self._offset_ns
+        self._x += speed * min(self._now_ns - before, NANO) / NANO
         stamp = self._now_ns + self.jump_ns
         odometry = conversions.odometry_to_ros(
             [self._x, 0.0, 0.0], [speed, 0.0, 0.0], stamp, ("odom", "base_link"), (1e-4,) * 4
@@ -132,10 +139,13 @@ class Robot:
             if self.republished:
                 self._topics["cmd_vel_raw"].publish(self.last["cmd_vel_raw"])
             return
-        command = TwistStamped(twist=conversions.twist_to_ros([SPEED, 0.0, 0.1]))
+        turn = 0.1 if self._speed else 0.0
+        command = TwistStamped(twist=conversions.twist_to_ros([self._speed, 0.0, turn]))
         if "scan" in self.last:  # what a policy acts on is the scan that it got
             command.header.stamp = self.last["scan"].header.stamp
         self._say("cmd_vel_raw", command)
+        if self._past is not None and "cmd_vel_raw" in self.last:
+            self._past.publish(self.last["cmd_vel_raw"].twist)
 
     def _say(self, name: str, message: Any) -> None:
         if name in self.silent or name not in self._topics:
@@ -176,20 +186,26 @@ class Robot:
         """Whether the newest command moves it."""
         return bool(self.heard) and bool(self.heard[-1][1].any())
 
-    def drive(self) -> None:
-        """Arms the gate and drives, so that a fault finds the robot in motion.
+    def drive(self, patience_s: float = PATIENCE_S) -> None:
+        """Arms the gate and drives, so that a fault finds the robot in motion, at any phase.
 
         A busy machine may hold up this process itself, which the gate takes for a fault.
+
+        Raises:
+            NoMotionError: the robot is not told to move, or not any more.
         """
         self.mend()
         self.until(lambda: False, 3 * PERIOD_S)  # of good data
-        end = time.monotonic() + PATIENCE_S
+        end = time.monotonic() + patience_s
         while not self.moves:
             if time.monotonic() > end:
-                raise NoMotionError(f"not within {PATIENCE_S} s: motion")
-            self._arm()
-            self.until(lambda: self.moves, MOTION_S)
-        self.until(lambda: False, 0.5)
+                raise NoMotionError(f"not within {patience_s} s: motion")
+            if not self._relayed:
+                self._arm()
+            self.until(lambda: self.moves, min(MOTION_S, patience_s))
+        self.until(lambda: False, 0.5 + random.uniform(0.0, PERIOD_S))
+        if not self.moves or time.monotonic() - self.heard[-1][0] > RECENT_S:
+            raise NoMotionError("the robot was not being told to move when it was to be broken")
 
     def _arm(self) -> None:
         self.call("reset")

@@ -29,6 +29,7 @@ def gate_config(robot: RobotSpec, lidar: LidarSpec, **changes: object) -> GateCo
         beam_angles=lidar.angles,
         mount=lidar.mount,
         range_min=lidar.range_min,
+        range_max=lidar.range_max,
         scan_rate=lidar.rate,
         odom_rate=lidar.rate,
         e_stop_required=False,

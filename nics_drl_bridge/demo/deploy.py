@@ -67,6 +67,8 @@ def _nodes(
         "middleware_node": {"model": folder},
         "command_gate": {
             "model": folder,
+            "use_sim_time": True,
+            "e_stop_required": False,
             "limits": str(_write_limits(robot, plan.out / "limits.yaml")),
             "black_box": str(plan.out / "black_box"),
         },

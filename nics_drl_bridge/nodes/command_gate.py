@@ -9,6 +9,7 @@ from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
@@ -34,9 +35,11 @@ from nics_drl_bridge.safety.inputs import (
     Scan,
     Tick,
 )
+from nics_drl_bridge.safety.limits import PERIOD_S
 from nics_drl_bridge.safety.state import Decision, begin
 
-PERIOD_S = 0.02
+STALE_S = 0.05
+"""A motion that was decided on longer ago is decided on anew [s]."""
 
 
 class CommandGate(QosWatch):
@@ -125,10 +128,25 @@ class CommandGate(QosWatch):
     def _decide(self, given: Input) -> Decision:
         now, before = time.monotonic(), self._state
         self._state, decision = decide(self._config, before, given, now)
+        published = True
         if decision.publish:  # first of all: what follows may take its time
-            self._out.publish(conversions.twist_to_ros(decision.twist))
+            published = self._say(decision, now)
         self._log.note(Entry(now, given, before, decision))
+        if not published:
+            self._decide(Tick())
         return decision
+
+    def _say(self, decision: Decision, now: float) -> bool:
+        """Publishes a decision, unless it is a motion that was decided on too long ago.
+
+        A process that is frozen goes on where it was; so the last thing before the publication is a
+        look at the clock. Bytes, since little but the sending is then left to do.
+        """
+        message = serialize_message(conversions.twist_to_ros(decision.twist))
+        if decision.cause is None and time.monotonic() - now > STALE_S:
+            return False
+        self._out.publish(message)
+        return True
 
     def _look(self) -> Finding:
         """What `/diagnostics` tells; also who else moves the robot, which no gate can prevent."""

@@ -16,8 +16,11 @@ from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes.runner import declare, declare_model
 from nics_drl_bridge.safety.limits import load_limits
+from nics_drl_bridge.safety.settings import doubtful, require_possible
 from nics_drl_bridge.safety.state import GateConfig, ShieldConfig
 
+SCAN_PERIODS = 1.75
+"""A command's scan is no older by default than so many of the lidar's periods, if it is slow."""
 DEFAULTS = GateConfig((), None, np.zeros(0), (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
 
 
@@ -42,9 +45,12 @@ def declare_gate(node: Node) -> GateParameters:
     """Declares the parameters of a gate, and reads them.
 
     Raises:
-        ConfigError: a value can't be used.
+        ConfigError: a value can't be used, or would never let the robot move.
     """
     get = partial(declare, node, read_only=True)
+
+    def share(name: str, default: float, description: str, low: float, high: float) -> float:
+        return float(get(name, default, description, low=low, high=high))
 
     def seconds(name: str, default: float, description: str) -> float:
         return float(get(name, default, f"{description} [s].", low=0.01, high=10.0))
@@ -52,32 +58,40 @@ def declare_gate(node: Node) -> GateParameters:
     model = declare_model(node)
     lidar, robot = model.lidar, model.robot
     limits = get("limits", "", "Limits of the robot: a shipped file, or a YAML file; no default.")
-    needs_e_stop = "Whether e_stop must have been heard before arming; set it on every vehicle."
+    needs_e_stop = "Whether e_stop must have been heard before arming; false in simulations alone."
     needs_estimate = "Whether arming needs odometry/filtered."
     folder = "Where a stop's last 30 s are written; ~/.ros/black_box if empty."
+    scan_age = max(DEFAULTS.scan_age_s, SCAN_PERIODS / lidar.rate)
     config = GateConfig(
         fields=tuple(int(i) for i in np.flatnonzero(robot.to_cmd_vel(np.ones(len(robot.command))))),
         limits=load_limits(limits, robot) if limits else None,
         beam_angles=lidar.angles,
         mount=lidar.mount,
         range_min=lidar.range_min,
+        range_max=lidar.range_max,
         scan_rate=lidar.rate,
         odom_rate=get("odom_rate", 1.0 / model.control_period, "Of odom [Hz].", low=0.1, high=1e4),
-        scan_age_s=seconds("scan_age", DEFAULTS.scan_age_s, "Oldest scan, and behind a command"),
+        scan_age_s=seconds("scan_age", scan_age, "Oldest scan, and behind a command"),
         odom_age_s=seconds("odom_age", DEFAULTS.odom_age_s, "Oldest odometry"),
         command_age_s=seconds("command_age", DEFAULTS.command_age_s, "Oldest command"),
-        rate_tolerance=get(
-            "rate_tolerance", DEFAULTS.rate_tolerance, "Of both rates.", low=0.01, high=0.9
+        rate_tolerance=share(
+            "rate_tolerance", DEFAULTS.rate_tolerance, "Of both rates.", 0.01, 0.9
         ),
-        e_stop_required=get("e_stop_required", False, needs_e_stop),
+        clock_rate=share(
+            "clock_rate", 1.0, "Of stamps: simulated seconds per second.", 0.01, 100.0
+        ),
+        simulated=bool(node.get_parameter("use_sim_time").value),
+        e_stop_required=get("e_stop_required", DEFAULTS.e_stop_required, needs_e_stop),
         e_stop_silence_s=seconds("e_stop_silence", DEFAULTS.e_stop_silence_s, "Silence of e_stop"),
         estimate_required=get("estimate_required", True, needs_estimate),
-        estimate_std=get(
-            "estimate_std", DEFAULTS.estimate_std, "Of the estimate [m, rad].", low=1e-3, high=1e3
-        ),
+        estimate_std=share("estimate_std", DEFAULTS.estimate_std, "Greatest [m, rad].", 1e-3, 1e3),
         odom_std=model.noise.odometry,
         shield=_declare_shield(node, model),
     )
+    require_possible(config)
+    doubt = doubtful(config, model.control_period)
+    if doubt:
+        node.get_logger().warning(doubt)
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     return GateParameters(
         config, robot.name, lidar, Path(get("black_box", "", folder) or home / "black_box")

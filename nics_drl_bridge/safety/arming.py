@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from nics_drl_bridge.safety.e_stop import e_stop_pressed, e_stop_silent
-from nics_drl_bridge.safety.freshness import NANO, gap_free, rate
+from nics_drl_bridge.safety.freshness import AHEAD_S, NANO, creep, gap_free, rate
 from nics_drl_bridge.safety.frozen import stands_still
 from nics_drl_bridge.safety.inputs import Arm
 from nics_drl_bridge.safety.state import Arrivals, GateConfig, GateState
 
+BEHIND_S = 0.2
+"""Stamps may fall behind by so much while the gate settles, for want of regularity [s]."""
 Check = Callable[[GateConfig, GateState, Arm, float], str]
 
 
@@ -53,15 +55,23 @@ def odom_rate(config: GateConfig, state: GateState, request: Arm, now: float) ->
 
 
 def clocks_agree(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
-    """Scan and odometry are stamped by clocks that tell the same time."""
+    """Scan and odometry are stamped by clocks that tell the same time, and run as this one does."""
     scans, odometries = state.scans, state.odometries
     if not (scans.times and odometries.times):
         return "scan and odom have not both come"
-    stamped = (scans.stamps_ns[-1] - odometries.stamps_ns[-1]) * NANO
+    stamped = (scans.stamps_ns[-1] - odometries.stamps_ns[-1]) * NANO / config.clock_rate
     apart = stamped - (scans.times[-1] - odometries.times[-1])
-    if abs(apart) <= config.clock_jump_s:
-        return ""
-    return f"the stamps of scan are {apart:.3f} s ahead of those of odom"
+    if abs(apart) > config.clock_jump_s:
+        return f"the stamps of scan are {apart:.3f} s ahead of those of odom"
+    for topic, arrivals in (("scan", scans), ("odom", odometries)):
+        ahead = creep(arrivals)
+        behind = 0.0 if config.simulated else -ahead
+        if ahead > AHEAD_S or behind > BEHIND_S:
+            return (
+                f"the stamps of {topic} run away from this machine's clock, by {ahead:+.3f} s in a "
+                "moment; a simulation that is not in real time needs the parameter 'clock_rate'"
+            )
+    return ""
 
 
 def estimator_converged(config: GateConfig, state: GateState, request: Arm, now: float) -> str:

@@ -20,12 +20,16 @@ def take_time(config: GateConfig, state: GateState, given: Input, now: float) ->
     fault = ""
     if still >= FROZEN_INPUTS:
         fault = f"the steady clock stands still at {now} s"
-    ticked = state.tick_s
+    ticked, awake = state.tick_s, state.awake_s
+    if ticked is not None and now - ticked > config.gap_s:  # whatever wakes it up first
+        fault, awake = f"no decision for {now - ticked:.3f} s, the limit is {config.gap_s} s", now
+    elif now - awake <= config.gap_s:  # one zero alone may be lost, the newest command counts
+        fault = f"awake again for only {now - awake:.3f} s"
     if isinstance(given, Tick):
-        if ticked is not None and now - ticked > config.gap_s:
-            fault = f"no decision for {now - ticked:.3f} s, the limit is {config.gap_s} s"
         ticked = now
-    return replace(state, now_s=now, tick_s=ticked, still_ticks=still, clock_fault=fault)
+    return replace(
+        state, now_s=now, tick_s=ticked, awake_s=awake, still_ticks=still, clock_fault=fault
+    )
 
 
 def own_clock(config: GateConfig, state: GateState, now: float) -> Cause | None:

@@ -13,11 +13,12 @@ import numpy as np
 from nics_drl_bridge.safety import arming, motion, rules
 from nics_drl_bridge.safety.clocks import take_time
 from nics_drl_bridge.safety.e_stop import reset
+from nics_drl_bridge.safety.freshness import settled
 from nics_drl_bridge.safety.frozen import watch_motion
 from nics_drl_bridge.safety.inputs import Arm, Input, Reset, Tick
 from nics_drl_bridge.safety.intake import take
 from nics_drl_bridge.safety.limits import LEAST_STEP_S
-from nics_drl_bridge.safety.state import Cause, Decision, GateConfig, GateState, Sameness
+from nics_drl_bridge.safety.state import Cause, Decision, GateConfig, GateState
 
 
 def decide(
@@ -52,8 +53,14 @@ def decide(
         return state, _decision(config, state, publish, cause, refused, answer)
     if not isinstance(given, Tick) or now - state.moved_s < LEAST_STEP_S:
         return state, _decision(config, state, False, None, refused, answer)
-    state, shielded = _move(config, state, now)
-    return state, replace(_decision(config, state, True, None, refused, answer), shielded=shielded)
+    moved = _shaped(config, state, now)
+    if moved.fault:
+        cause = Cause("motion_unfit", "", moved.fault)
+        state = _stopped(replace(state, latched=cause), now, disarm=True)
+        return state, _decision(config, state, True, cause, refused, answer)
+    state = _move(config, state, moved, now)
+    decision = _decision(config, state, True, None, refused, answer)
+    return state, replace(decision, shielded=moved.shielded)
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,10 @@ def _serve(
         failed = arming.failures(config, state, given, now)
         if failed:
             return state, _Answer("; ".join(failed))
-        state = replace(state, armed=True, same=Sameness(), push=None)
+        scans, odometries = settled(state.scans), settled(state.odometries)
+        state = replace(
+            state, armed=True, scans=scans, odometries=odometries, seen=(), frozen="", push=None
+        )
         return state, _Answer("armed", granted=True)
     if isinstance(given, Reset):
         stop = reset(state.e_stop)
@@ -89,18 +99,23 @@ def _stopped(state: GateState, moved_s: float, disarm: bool) -> GateState:
     )  # fmt: skip
 
 
-def _move(config: GateConfig, state: GateState, now: float) -> tuple[GateState, bool]:
+def _shaped(config: GateConfig, state: GateState, now: float) -> motion.Motion:
     """The next motion towards the newest command."""
     moved = motion.asked(config, state)
     for shape in rules.SHAPERS:
         moved = shape(config, state, moved, now)
+    return moved
+
+
+def _move(config: GateConfig, state: GateState, moved: motion.Motion, now: float) -> GateState:
+    """The state after a motion is published."""
     past = 0.0 if config.shield is None else config.shield.latency_s
     recent = tuple(each for each in state.recent if each[0] >= now - past)
     state = replace(
         state, value=moved.value, slope=moved.slope, moved_s=now,
         recent=(*recent, (now, moved.value)) if past > 0.0 else (),
     )  # fmt: skip
-    return watch_motion(config, state, now), moved.shielded
+    return watch_motion(config, state, now)
 
 
 def _decision(

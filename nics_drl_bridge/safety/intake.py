@@ -7,14 +7,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from nics_drl_bridge.geometry import between
 from nics_drl_bridge.safety import e_stop, frozen, shield
-from nics_drl_bridge.safety.freshness import ODOM, SCAN, arrived
+from nics_drl_bridge.safety.freshness import NANO, ODOM, SCAN, arrived
+from nics_drl_bridge.safety.frozen import NOISE
 from nics_drl_bridge.safety.inputs import Command, Estimate, EStop, Input, Odometry, Press, Scan
-from nics_drl_bridge.safety.limits import implausible
+from nics_drl_bridge.safety.limits import greatest, implausible
 from nics_drl_bridge.safety.state import GateConfig, GateState
 
 GREATEST_SPEED = 100.0
 """No odometry of a mobile robot shows more [m/s, rad/s]."""
+SLIP = 2.0
+"""A robot may be faster than its limits by this factor, downhill or pushed,"""
+SLIP_SPEED, SLIP_TURN = 0.5, 1.0
+"""and by so much more [m/s, rad/s]."""
+CAR_TURN = 4.0
+"""How fast a robot may turn that is told a steering angle [rad/s]."""
+LEAP, LEAP_TURN = 0.1, 0.2
+"""A pose by odometry may jump by so much, for want of precision [m, rad]."""
 ANGLE_TOLERANCE = 1e-3
 """By which the last beam may point elsewhere than declared [rad]."""
 
@@ -97,7 +107,7 @@ REFUSALS: tuple[Refusal, ...] = (
 
 def take(config: GateConfig, state: GateState, given: Input, now: float) -> tuple[GateState, str]:
     """Takes an input into the state, or says why not."""
-    state = replace(state, jumped="")
+    state = replace(state, jumped="", leap="")
     for refusal in REFUSALS:
         reason = refusal.judge(config, state, given) if isinstance(given, refusal.kind) else ""
         if reason:
@@ -121,23 +131,30 @@ def take(config: GateConfig, state: GateState, given: Input, now: float) -> tupl
 
 def _take_command(state: GateState, command: Command, now: float) -> GateState:
     """A command counts once the scan behind it is here, too; the one before holds until then."""
-    if command.stamp_ns not in state.scans.stamps_ns:
+    scans = state.scans
+    if command.stamp_ns not in scans.stamps_ns:
         since = now if state.pending_s is None else state.pending_s
         return replace(state, pending=command, pending_s=since)
+    behind = scans.stamps_ns.index(command.stamp_ns)
     return replace(
-        state, command=command, command_s=now, malformed="", pending=None, pending_s=None
-    )
+        state, command=command, command_s=now, behind_s=scans.times[behind] - scans.late[behind],
+        malformed="", pending=None, pending_s=None,
+    )  # fmt: skip
 
 
 def _take_scan(
     config: GateConfig, state: GateState, scan: Scan, now: float
 ) -> tuple[GateState, str]:
-    arrivals, fault = arrived(state.scans, scan.stamp_ns, now, config.clock_jump_s)
+    arrivals, fault = arrived(
+        config, state.scans, scan.stamp_ns, now, config.scan_age_s, state.armed
+    )
     if fault:
         jumped = SCAN if fault == "jumped" else ""
         return replace(state, scans=arrivals, jumped=jumped), f"scan: its stamp {fault}"
-    same, obstacles = frozen.compare(state, scan), shield.obstacles(config, scan.ranges)
-    state = replace(state, scans=arrivals, scan=scan, same=same, obstacles=obstacles)
+    pose = None if state.odometry is None else state.odometry.pose
+    seen, why = frozen.look(config, state.seen, scan.ranges, pose)
+    obstacles = shield.obstacles(config, scan.ranges)
+    state = replace(state, scans=arrivals, scan=scan, seen=seen, frozen=why, obstacles=obstacles)
     if state.pending is not None and state.pending.stamp_ns == scan.stamp_ns:
         state = _take_command(state, state.pending, now)
     return state, ""
@@ -146,9 +163,33 @@ def _take_scan(
 def _take_odometry(
     config: GateConfig, state: GateState, odometry: Odometry, now: float
 ) -> tuple[GateState, str]:
-    arrivals, fault = arrived(state.odometries, odometry.stamp_ns, now, config.clock_jump_s)
+    arrivals, fault = arrived(
+        config, state.odometries, odometry.stamp_ns, now, config.odom_age_s, state.armed
+    )
     if fault:
         jumped = ODOM if fault == "jumped" else ""
         return replace(state, odometries=arrivals, jumped=jumped), f"odom: its stamp {fault}"
+    leap = _leap(config, state, odometry, now)
+    if leap:  # what comes after it is judged from there
+        return replace(state, odometry=odometry, leap=leap, push=None, seen=()), f"odom: {leap}"
     restless = state.restless_s if frozen.stands_still(config, odometry.twist) else now
     return replace(state, odometries=arrivals, odometry=odometry, restless_s=restless), ""
+
+
+def _leap(config: GateConfig, state: GateState, odometry: Odometry, now: float) -> str:
+    """What is wrong with a pose that the robot can't have come to; nothing is with most."""
+    before, limits = state.odometry, config.limits
+    if before is None or limits is None:
+        return ""
+    stamped = (odometry.stamp_ns - before.stamp_ns) * NANO
+    passed = max(stamped, now - state.odometries.times[-1])  # what little jitter there is in either
+    slip, turned = (NOISE * std * passed for std in config.odom_std)
+    turn = CAR_TURN if not limits.turn.any() else greatest(limits, limits.turn)
+    speed = float(np.hypot.reduce(np.maximum(-limits.low, limits.high)[limits.linear]))
+    far = LEAP + (SLIP * speed + SLIP_SPEED) * passed + slip
+    round_ = LEAP_TURN + (SLIP * turn + SLIP_TURN) * passed + turned
+    x, y, heading = between(before.pose, odometry.pose)
+    path = float(np.hypot(x, y))
+    if path <= far and abs(heading) <= round_:
+        return ""
+    return f"its pose jumped by {path:.2f} m and {abs(heading):.2f} rad in {passed:.3f} s"

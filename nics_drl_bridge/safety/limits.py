@@ -12,16 +12,24 @@ from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError, nearest
-from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.kinematics.spec import CommandVariable, RobotSpec
 
 Array = NDArray[np.float64]
 IMPLAUSIBLE = 10.0
 """A command beyond this many times its limit is no wish but a fault, and refused."""
 LEAST_STEP_S = 1e-3
 """Motions closer in time than this are not published: their derivatives would be noise."""
+PERIOD_S = 0.02
+"""Between two ticks of the gate. What crosses its whole range within one is no limit but a typo."""
 SNAP = 1e-12
-"""A value this near to its target is there."""
+"""A value this near to its target is there, as a share of the greatest one."""
+GREATEST = 1e300
+"""What is 0 after a multiplication by 0."""
 STILL = 1e-9
+LEAST_MOTION = 0.01
+"""A robot none of whose speeds may be greater can't be driven [m/s or rad/s]."""
+LONGEST_START_S, STARTED = 10.0, 0.01
+"""A command has to come to this share of its greatest value within that time."""
 SPEED, TURN = "m/s", "rad/s"
 
 
@@ -86,7 +94,8 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
         robot: whose commands they limit.
 
     Raises:
-        ConfigError: a key is missing, unknown, or belongs to another robot.
+        ConfigError: a key is missing, unknown, or belongs to another robot; a limit is beyond what
+            the robot or a period of the gate can do, or would never let the robot move.
     """
     path = find_config(name, "limits")
     file = load_yaml(path, LimitsFile)
@@ -102,9 +111,11 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     for wanted in names:
         if wanted not in file.commands:
             raise ConfigError(f"{path}: the key 'commands.{wanted}' is missing; add it.")
+    for variable in robot.command:
+        _check(f"{path}: key 'commands.{variable.name}", file.commands[variable.name], variable)
     each = [file.commands[wanted] for wanted in names]
     units = np.array([variable.unit for variable in robot.command])
-    return Limits(
+    limits = Limits(
         low=np.array([limit.min for limit in each]),
         high=np.array([limit.max for limit in each]),
         rate=np.array([limit.rate for limit in each]),
@@ -112,12 +123,61 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
         linear=units == SPEED,
         turn=units == TURN,
     )
+    if greatest(limits, limits.linear | limits.turn) < LEAST_MOTION:
+        raise ConfigError(
+            f"{path}: the robot could never move: none of its speeds and turn rates may reach "
+            f"{LEAST_MOTION:g}; raise a `max`."
+        )
+    return limits
+
+
+def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
+    """Raises ConfigError for limits beyond what the robot or a period can do, or that hold it."""
+    unit, low, high = variable.unit, min(variable.min, 0.0), max(variable.max, 0.0)
+    if limit.min < low:
+        raise ConfigError(
+            f"{key}.min': {limit.min:g} {unit} is beyond the robot's own limit; "
+            f"give at least {low:g}."
+        )
+    if limit.max > high:
+        raise ConfigError(
+            f"{key}.max': {limit.max:g} {unit} is beyond the robot's own limit; "
+            f"give at most {high:g}."
+        )
+    span, far = high - low, max(-limit.min, limit.max)
+    for name, slope, share, value in (
+        ("rate", f"{unit}/s", PERIOD_S, limit.rate),
+        ("jerk", f"{unit}/s^2", PERIOD_S**2, limit.jerk),
+    ):
+        if value > span / share:
+            raise ConfigError(
+                f"{key}.{name}': {value:g} {slope} crosses the robot's whole range within a period "
+                f"of the gate, {PERIOD_S:g} s, and limits nothing; give at most {span / share:g}."
+            )
+    for name, reach in (
+        ("rate", limit.rate * LONGEST_START_S),
+        ("jerk", limit.jerk * LONGEST_START_S**2 / 2.0),
+    ):
+        if reach < STARTED * far:
+            raise ConfigError(
+                f"{key}.{name}': {getattr(limit, name):g} would never let it move: after "
+                f"{LONGEST_START_S:g} s it has come to {reach:.2g} of {far:g} {unit}; raise it."
+            )
+
+
+def greatest(limits: Limits, which: NDArray[np.bool_]) -> float:
+    """The greatest value, in either direction, of some commands (C,); 0 when there are none."""
+    return float(np.maximum(-limits.low, limits.high)[which].max(initial=0.0))
 
 
 def implausible(command: Array, limits: Limits) -> bool:
     """Whether a command (C,) is so far out of range that it must be a fault."""
-    reach = IMPLAUSIBLE * np.maximum(-limits.low, limits.high)
-    return bool((np.abs(command) > reach).any())
+    return bool((np.abs(command) / IMPLAUSIBLE > np.maximum(-limits.low, limits.high)).any())
+
+
+def within(value: Array, limits: Limits) -> bool:
+    """Whether each value (C,) is a number between its limits."""
+    return bool(((value >= limits.low) & (value <= limits.high)).all())  # False for NaN
 
 
 def saturate(command: Array, limits: Limits) -> Array:
@@ -127,8 +187,8 @@ def saturate(command: Array, limits: Limits) -> Array:
     direction of the motion stay. What a robot can't do at all (a limit of 0) is dropped.
     """
     speeds, factor = limits.linear | limits.turn, 1.0
-    out = command.copy()
-    for i, value in enumerate(command):
+    out = np.clip(command, -GREATEST, GREATEST)  # 0 times inf is no number
+    for i, value in enumerate(out):
         bound = limits.high[i] if value > 0.0 else limits.low[i]
         if bound == 0.0:
             out[i] = 0.0
@@ -160,9 +220,9 @@ def follow(
         if turning:
             wanted[limits.turn] *= _progress(after[limits.linear], target[limits.linear])
         for i in np.flatnonzero(limits.turn == turning):
+            low, high = float(limits.low[i]), float(limits.high[i])
             after[i], change[i] = _follow_one(
-                float(value[i]), float(slope[i]), float(wanted[i]), dt,
-                (float(limits.low[i]), float(limits.high[i])),
+                float(value[i]), float(slope[i]), float(wanted[i]), dt, (low, high),
                 float(limits.rate[i]), float(limits.jerk[i]),
             )  # fmt: skip
     return after, change
@@ -170,10 +230,11 @@ def follow(
 
 def _progress(speed: Array, wanted: Array) -> float:
     """Which part of the wanted speed is reached, along its direction, in [0, 1]."""
-    length2 = float(wanted @ wanted)
-    if length2 < STILL**2:
+    most = float(np.abs(wanted).max(initial=0.0))
+    if most < STILL:
         return 1.0
-    return min(1.0, max(0.0, float(speed @ wanted) / length2))
+    along = wanted / most  # so that no square is too great for a float
+    return min(1.0, max(0.0, float((speed / most) @ along) / float(along @ along)))
 
 
 def _follow_one(
@@ -190,17 +251,32 @@ def _follow_one(
     A slope a can be taken back within a change of a^2 / (2 jerk), whatever the intervals to come:
     the sum over them lies below the integral. So a value with value + a^2 / (2 jerk) within the
     bounds stays within them for ever.
+
+    It is reckoned in shares of the greatest value and in steps of this interval. There no slope is
+    greater than what one interval can do, the whole range, and no limit makes a number overflow.
     """
-    wanted = _slope_towards(target - value, dt, jerk)
-    wanted = min(max(wanted, slope - jerk * dt, -rate), slope + jerk * dt, rate)
-    wanted = min(wanted, _slope_towards(bounds[1] - value, dt, jerk))
-    wanted = max(wanted, _slope_towards(bounds[0] - value, dt, jerk))
-    after = min(max(value + wanted * dt, bounds[0]), bounds[1])
-    return (target if abs(target - after) < SNAP else after), wanted
+    scale = max(-bounds[0], bounds[1])
+    low, high = bounds[0] / scale, bounds[1] / scale
+    here, there = value / scale, target / scale
+    step = min(dt / scale, GREATEST)  # of a slope
+    least, most = -(high - low), high - low
+    rate_step, before = min(rate * step, most), min(max(slope * step, least), most)
+    jerk_step = min(jerk * dt * step, 2.0 * most)
+    wanted = _step_towards(there - here, jerk_step)
+    wanted = min(max(wanted, before - jerk_step, -rate_step), before + jerk_step, rate_step)
+    wanted = min(wanted, _step_towards(high - here, jerk_step))
+    wanted = max(wanted, _step_towards(low - here, jerk_step))
+    after = here + wanted
+    change = min(max(wanted / step if step > 0.0 else 0.0, -rate), rate)
+    if abs(there - after) < SNAP:
+        return target, change
+    return min(max(after * scale, bounds[0]), bounds[1]), change
 
 
-def _slope_towards(gap: float, dt: float, jerk: float) -> float:
-    """The greatest slope a over dt that can still end at a gap: a dt + a^2 / (2 jerk) = gap."""
-    step, reach = jerk * dt, 2.0 * jerk * abs(gap)
-    # Not the difference of root and step, which for small gaps would be mere rounding.
-    return math.copysign(reach / (math.sqrt(step * step + reach) + step), gap)
+def _step_towards(gap: float, jerk: float) -> float:
+    """The greatest step a that can still end at a gap: a + a^2 / (2 jerk) = gap."""
+    reach = 2.0 * jerk * abs(gap)
+    if reach == 0.0:
+        return 0.0
+    # Not the difference of root and jerk, which for small gaps would be mere rounding.
+    return math.copysign(reach / (math.sqrt(jerk * jerk + reach) + jerk), gap)

@@ -22,11 +22,13 @@ class Motion:
         value: (C,) of the command.
         slope: (C,) its change per second.
         shielded: whether the shield cut it down.
+        fault: why it must not be published; empty for most.
     """
 
     value: Array
     slope: Array
     shielded: bool = False
+    fault: str = ""
 
 
 def asked(config: GateConfig, state: GateState) -> Motion:
@@ -50,3 +52,14 @@ def follow(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     since = now - state.moved_s if math.isfinite(state.moved_s) else config.gap_s
     value, slope = limits.follow(state.value, state.slope, motion.value, since, config.limits)
     return replace(motion, value=value, slope=slope)
+
+
+def bounded(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
+    """Lets nothing pass that is no number or beyond its limits, whatever came before."""
+    good = config.limits is None or limits.within(motion.value, config.limits)
+    if good and np.isfinite(motion.value).all() and np.isfinite(motion.slope).all():
+        return motion
+    zero = np.zeros_like(motion.value)
+    return replace(
+        motion, value=zero, slope=zero, fault=f"a motion of {motion.value.tolist()} came out"
+    )

@@ -41,6 +41,7 @@ STOPS: tuple[Rule, ...] = (
     Rule(clocks.own_clock),
     Rule(e_stop.e_stop_silent, latches=True),
     Rule(freshness.stamps_jumped, latches=True),
+    Rule(frozen.odom_jumped, latches=True),
     Rule(frozen.scan_frozen, latches=True),
     Rule(frozen.no_motion, latches=True),
     Rule(freshness.scan_silent),
@@ -54,7 +55,7 @@ STOPS: tuple[Rule, ...] = (
 """In the order in which they are asked; the first that speaks names the stop."""
 
 Shaper = Callable[[GateConfig, GateState, Motion, float], Motion]
-SHAPERS: tuple[Shaper, ...] = (motion.saturate, motion.follow, shield)
+SHAPERS: tuple[Shaper, ...] = (motion.saturate, motion.follow, shield, motion.bounded)
 """What a command that passes goes through."""
 
 

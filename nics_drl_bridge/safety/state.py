@@ -49,14 +49,19 @@ class GateConfig:
         mount: (3,) x [m], y [m], heading [rad] of the lidar in `base_link`.
         range_min: of the lidar [m].
         scan_rate, odom_rate: as declared [Hz].
+        range_max: of the lidar [m]; 0 when it is not known.
         scan_age_s: of the newest scan, and of the scan behind a command, at most [s].
         odom_age_s: of the newest odometry, at most [s].
         command_age_s: of the newest command, at most [s].
         race_s: by how much a command may overtake its scan on the way here [s].
         settle_s: how long data must be fresh and the robot stand still before it is armed [s].
         rate_tolerance: share by which a rate may differ from the declared one.
-        clock_jump_s: a stamp this far ahead of the steady clock, or back, is a jump [s].
-        gap_s: the longest time between two ticks [s].
+        clock_jump_s: a stamp this far back, or before arming this far ahead, is a jump [s]; for
+            one armed see `freshness`.
+        clock_rate: seconds of the stamps' clock per second of the steady one; not 1 only in a
+            simulation that does not run in real time.
+        simulated: whether the stamps are those of a simulator, which may fall behind real time.
+        gap_s: the longest time between two ticks, and how long it stops after a longer one [s].
         e_stop_required: whether an emergency stop that was never heard counts as pressed; one that
             was heard and falls silent always does.
         e_stop_silence_s: such a silence [s].
@@ -76,13 +81,16 @@ class GateConfig:
     range_min: float
     scan_rate: float
     odom_rate: float
-    scan_age_s: float = 0.35
-    odom_age_s: float = 0.35
+    range_max: float = 0.0
+    scan_age_s: float = 0.30
+    odom_age_s: float = 0.30
     command_age_s: float = 0.30
     race_s: float = 0.05
     settle_s: float = 1.0
     rate_tolerance: float = 0.3
     clock_jump_s: float = 0.5
+    clock_rate: float = 1.0
+    simulated: bool = False
     gap_s: float = 0.2
     e_stop_required: bool = True
     e_stop_silence_s: float = 0.25
@@ -121,51 +129,70 @@ class Cause:
         return f"{self.rule}:{topic}{age} {self.detail}"
 
 
+Mark = tuple[float, int, int, float]
+"""Arrival [s], stamp [ns] and number of a datum, and the greatest lead until the next mark [s]."""
+
+
 @dataclass(frozen=True)
 class Arrivals:
     """When the data of a topic arrived, oldest first.
 
+    The lead of a datum is how far its stamp is ahead of the steady clock, counted from the first
+    datum: the offset of two clocks, less the time that it took to get here.
+
     Attributes:
-        stamps_ns: of their headers [ns].
-        times: on the steady clock [s].
-        late: by how much each came later than the fastest of those before it [s].
+        stamps_ns: of the headers of the last ones [ns].
+        times: of those on the steady clock [s].
+        late: by how much each of those came later than it could have [s].
+        origin: stamp [ns] and arrival [s] of the first.
+        count: of all since the first.
+        envelope: the lead of data that come as fast as they can [s].
+        unbroken_s: since when there was no gap that is too long [s].
+        marks: one in a while, as far back as arming asks.
     """
 
     stamps_ns: tuple[int, ...] = ()
     times: tuple[float, ...] = ()
     late: tuple[float, ...] = ()
+    origin: tuple[int, float] = (0, 0.0)
+    count: int = 0
+    envelope: float = 0.0
+    unbroken_s: float = float("inf")
+    marks: tuple[Mark, ...] = ()
 
 
 @dataclass(frozen=True)
 class Sameness:
-    """How far the robot moved while its scans stayed identical.
+    """A picture that the lidar has shown, and how far the robot moved while it stayed the same.
 
     Attributes:
-        count: of identical scans.
-        first, last: (3,) poses by odometry when the first and the last of them arrived; None
-            when there was no odometry yet.
+        ranges: (B,) of the scan that showed it first [m].
+        count: of scans that showed it.
+        first: (3,) pose by odometry when it was seen first; None when there was no odometry yet.
     """
 
-    count: int = 0
-    first: Array | None = None
-    last: Array | None = None
+    ranges: NDArray[np.float32]
+    count: int
+    first: Array | None
 
 
 @dataclass(frozen=True)
 class Push:
-    """What the robot was told over some time.
+    """What the robot was told without a pause.
 
     Attributes:
-        since_s, last_s: from when to when [s].
-        pose: (3,) by odometry at the beginning.
+        since_s, last_s, moving_s: when it began, when it was summed up last, and when the robot
+            was last told to move [s].
         told: (3,) the way that it was told, the sum of its body twists x time [m, m, rad]; what
             goes there and back again adds up to nothing.
+        marks: times [s], `told` then, and poses (3,) by odometry, oldest first.
     """
 
     since_s: float
     last_s: float
-    pose: Array
+    moving_s: float
     told: Array
+    marks: tuple[tuple[float, Array, Array], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -193,19 +220,23 @@ class GateState:
         moved_s: when it was published [s].
         now_s: greatest time seen [s].
         tick_s: time of the last tick [s].
+        awake_s: when it last went on after it had been asleep [s].
         still_ticks: inputs in a row at which the clock stood still.
         clock_fault: what is wrong with the clock at this input.
         armed: whether commands pass.
         latched: the stop that only a reset clears.
         scans, odometries: arrivals of accepted data.
-        jumped: the topic whose stamps have just jumped.
+        jumped: the topic whose stamps have just jumped, or ran ahead.
+        leap: what is wrong with the newest pose by odometry; empty when nothing is.
         scan, odometry, estimate, command: the newest accepted of each.
         estimate_s, command_s: when those arrived [s].
         pending: a command whose scan has not arrived here yet.
         pending_s: since when commands have named such scans [s]; None when the newest does not.
         obstacles: (P, 2) what the newest scan shows, in `base_link` [m].
+        behind_s: when the scan behind the newest command was as new as can be [s].
         malformed: what is wrong with the newest command; empty when nothing is.
-        same: see there.
+        seen: what the lidar has shown last, the newest last.
+        frozen: why the newest scan is no new one; empty when it is.
         restless_s: when odometry last showed motion [s].
         push: what the robot was told lately; None when it was stopped.
         recent: times and values of the commands published within the latency.
@@ -217,6 +248,7 @@ class GateState:
     moved_s: float = float("-inf")
     now_s: float = float("-inf")
     tick_s: float | None = None
+    awake_s: float = float("-inf")
     still_ticks: int = 0
     clock_fault: str = ""
     armed: bool = False
@@ -224,6 +256,7 @@ class GateState:
     scans: Arrivals = Arrivals()
     odometries: Arrivals = Arrivals()
     jumped: str = ""
+    leap: str = ""
     scan: Scan | None = None
     odometry: Odometry | None = None
     estimate: Estimate | None = None
@@ -233,8 +266,10 @@ class GateState:
     pending: Command | None = None
     pending_s: float | None = None
     obstacles: Array | None = None
+    behind_s: float = float("-inf")
     malformed: str = ""
-    same: Sameness = Sameness()
+    seen: tuple[Sameness, ...] = ()
+    frozen: str = ""
     restless_s: float = float("-inf")
     push: Push | None = None
     recent: tuple[tuple[float, Array], ...] = ()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from nics_drl_bridge.safety.freshness import SCAN, age
+from nics_drl_bridge.safety.freshness import SCAN
 from nics_drl_bridge.safety.state import Cause, GateConfig, GateState
 
 RAW = "cmd_vel_raw"
@@ -30,24 +30,20 @@ def command_silent(config: GateConfig, state: GateState, now: float) -> Cause | 
 
 def scan_behind_unknown(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """Commands name scans that do not arrive; from the future, perhaps. One may be on its way."""
-    command, known = state.command, state.scans.stamps_ns
-    if state.pending is not None and state.pending_s is not None:
-        if now - state.pending_s <= config.race_s and command is not None:
-            return None
-        command = state.pending
-    if command is None or command.stamp_ns in known:
+    if state.pending is None or state.pending_s is None:
+        return None
+    if now - state.pending_s <= config.race_s and state.command is not None:
         return None
     return Cause(
-        "scan_behind_unknown", RAW, f"the scan behind it ({command.stamp_ns}) never arrived"
+        "scan_behind_unknown", RAW, f"the scan behind it ({state.pending.stamp_ns}) never arrived"
     )
 
 
 def scan_behind_old(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The scan behind the command is old, however fresh the command: a republisher, or a hang."""
-    if state.command is None or state.command.stamp_ns not in state.scans.stamps_ns:
+    if state.command is None:
         return None
-    index = state.scans.stamps_ns.index(state.command.stamp_ns)
-    old, limit = age(state.scans, now, index), config.scan_age_s
+    old, limit = now - state.behind_s, config.scan_age_s
     if old <= limit:
         return None
     return Cause("scan_behind_old", SCAN, f"the scan behind {RAW} is old", old, limit)

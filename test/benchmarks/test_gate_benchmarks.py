@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+from .runs import BENCHMARKS, asked, fails
 
 
 def result_of(script: str, *options: str) -> dict:
@@ -22,12 +21,6 @@ def result_of(script: str, *options: str) -> dict:
     return json.loads(done.stdout)
 
 
-def test_no_random_command_at_any_interval_leaves_the_envelope():
-    result = result_of("gate_envelope.py", "--steps", "9000")
-    assert (result["steps"], result["violations"]) == (9000, 0)
-    assert result["in_motion"] > 8000
-
-
 @pytest.mark.timeout(300)  # a cold start compiles
 def test_no_adversary_makes_a_shielded_robot_touch_anything():
     result = result_of("shield.py", "--episodes", "48")
@@ -36,18 +29,84 @@ def test_no_adversary_makes_a_shielded_robot_touch_anything():
     assert result["path_m"] > 0.5 * result["episodes"]
 
 
-@pytest.mark.timeout(300)
-@pytest.mark.parametrize("fault", ["scan_silent", "e_stop", "policy_hung"])
-def test_a_fault_around_a_real_gate_leads_to_zero(fault):
+def test_no_random_command_at_any_interval_leaves_the_envelope():
+    code, result = asked("gate_envelope.py", "--steps", "6000")
+    assert (code, result["failures"]) == (0, [])
+    assert (result["steps"], result["violations"]) == (6000, 0)
+    assert result["in_motion_with_random_limits"] > 0
+
+
+@pytest.mark.parametrize(
+    ("control", "bar"),
+    [("no_limits", "violations, bar 0"), ("nan", "violations"), ("standing", "in motion at 0 of")],
+)
+def test_an_envelope_that_is_none_is_noticed(control, bar):
+    assert bar in fails("gate_envelope.py", control, "--steps", "6000")[0]
+
+
+def best_of_three(fault):
+    """A fault's summary; this machine may be busy with other tests, and then it is tried again."""
+    for _ in range(3):
+        code, result = asked("gate_faults.py", "--repeats", "2", "--fault", fault)
+        assert result[fault]["unsafe_commands"] == 0, result
+        if code == 0:
+            break
+    assert (code, result["failures"]) == (0, [])
+    return result[fault]
+
+
+@pytest.mark.ros
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(
+    ("fault", "limit_s"),
+    [
+        ("scan_silent", 0.40), ("e_stop", 0.10), ("policy_hung", 0.40), ("odom_teleports", 0.40),
+        ("stamps_run_ahead", 0.40), ("scan_alternates", 1.50), ("gate_frozen", 0.90),
+        ("no_motion", 1.10),
+    ],
+)  # fmt: skip
+def test_a_fault_around_a_real_gate_leads_to_zero_in_time(fault, limit_s):
     pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-    done = subprocess.run(
-        [sys.executable, str(BENCHMARKS / "gate_faults.py"), "--json", "--repeats", "1",
-         "--fault", fault],
-        capture_output=True, text=True, check=False, timeout=250,
-    )  # fmt: skip
-    result = json.loads(done.stdout)[fault]
-    assert result["n"] == 1
-    assert 0.0 < result["max_s"] < 5.0  # a busy machine may be late; the benchmark says how late
+    result = best_of_three(fault)
+    assert (result["n"], result["limit_s"]) == (2, limit_s)
+    assert 0.0 < result["max_s"] <= limit_s
+
+
+@pytest.mark.ros
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize(
+    ("control", "bar"),
+    [("slow_gate", "scan_silent: zero after"), ("no_gate", "scan_silent: zero after inf s"),
+     ("standing", "scan_silent: 0 of 1 were measured: the robot did not move")],
+)  # fmt: skip
+def test_a_gate_that_does_not_stop_the_robot_is_noticed(control, bar):
+    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+    missed = fails("gate_faults.py", control, "--repeats", "1", "--fault", "scan_silent")
+    assert missed[0].startswith(bar)
+
+
+@pytest.mark.ros
+@pytest.mark.timeout(300)
+def test_a_gate_that_stopped_many_times_ends_at_once_and_keeps_the_first_stop():
+    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+    words = ("--fault", "end_after_stops", "--seconds", "5")
+    code, result = asked("gate_faults.py", *words)
+    assert (code, result["failures"]) == (0, [])
+    assert result["end_after_stops"]["exit_s"] <= 2.0
+
+
+def test_bars_of_a_fault_are_missed_by_what_is_no_number_late_unsafe_or_not_measured(monkeypatch):
+    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import gate_faults
+
+    good = {"n": 2, "p50_s": 0.2, "max_s": 0.3, "limit_s": 0.4, "unsafe_commands": 0}
+    assert gate_faults.missed_by("x", good, 2) == []
+    worse = [{"n": 1}, {"unsafe_commands": 1}]
+    worse += [{"p50_s": value} for value in (0.31, float("nan"))]
+    worse += [{"max_s": value} for value in (0.41, float("nan"), float("inf"))]
+    for change in worse:
+        assert len(gate_faults.missed_by("x", good | change, 2)) == 1, change
 
 
 def test_a_rule_that_is_taken_out_is_missed_by_a_test(monkeypatch):
@@ -56,10 +115,27 @@ def test_a_rule_that_is_taken_out_is_missed_by_a_test(monkeypatch):
 
     names = gate_rules.names()
     assert len(names) == len(set(names)) > 30
-    assert {"stop/disarmed", "refusal/command_not_finite", "shaping/follow"} <= set(names)
-    assert gate_rules.tests_fail_without("stop/e_stop_pressed")
+    assert {"stop/disarmed", "refusal/command_not_finite", "shaping/bounded"} <= set(names)
     with pytest.raises(SystemExit, match="there is no rule 'stop/nothing'"):
         gate_rules.take_out("stop/nothing")
+
+
+ONE_RULE = ("--tests", "test/safety/test_arming.py", "--rule", "arming/one_publisher")
+
+
+@pytest.mark.timeout(300)
+def test_a_rule_that_a_test_misses_is_found():
+    code, result = asked("gate_rules.py", *ONE_RULE)
+    assert (code, result["failures"], result["looked_at"]) == (0, [], 1)
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize(
+    ("control", "bar"),
+    [("no_tests", "rule arming/one_publisher"), ("untested_rule", "rule stop/_covers_nothing")],
+)
+def test_a_rule_that_no_test_misses_is_reported(control, bar):
+    assert bar in fails("gate_rules.py", control, *ONE_RULE)[0]
 
 
 @pytest.mark.timeout(300)

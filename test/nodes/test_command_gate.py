@@ -5,6 +5,8 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,12 +16,15 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes import command_gate, conversions, qos
+from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.safety.black_box import replay
+from nics_drl_bridge.safety.inputs import Tick
 from nodes.peer import DEADLINE_S
 
 pytestmark = pytest.mark.ros
@@ -167,6 +172,32 @@ node.context.try_shutdown()
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["1"]
+
+
+def test_a_motion_that_was_decided_on_before_a_freeze_is_never_published(
+    domain_id, tmp_path, monkeypatch
+):
+    given = ["node", "--ros-args", "-p", f"black_box:={tmp_path}"]
+    node = command_gate.CommandGate(open_context(given, domain_id))
+    said, clock = [], [100.0]
+    decide = command_gate.decide
+
+    def frozen(config, state, event, now):
+        """Moves the robot, and is frozen for half a second the first time."""
+        state, decision = decide(config, state, event, now)
+        if now > 100.0:
+            return state, decision
+        clock[0] += 0.5
+        return state, replace(decision, publish=True, cause=None, twist=np.ones(3))
+
+    monkeypatch.setattr(command_gate, "decide", frozen)
+    monkeypatch.setattr(command_gate.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(node, "_out", SimpleNamespace(publish=said.append))
+    node._decide(Tick())
+    monkeypatch.undo()
+    node.destroy_node()
+    node.context.try_shutdown()
+    assert [deserialize_message(one, Twist) for one in said] == [Twist()]
 
 
 def test_it_starts_disarmed_and_refuses_by_name_to_be_armed(robot):
@@ -328,7 +359,10 @@ def test_limits_of_another_robot_end_it_with_one_sentence(launch, meet, domain_i
 def test_a_policy_that_dies_or_hangs_stops_the_robot(launch, meet, domain_id, how, tmp_path):
     launch("simulator_node", domain_id, world="empty")
     launch("middleware_node", domain_id)
-    launch("command_gate", domain_id, limits="ackermann", black_box=str(tmp_path))
+    launch(
+        "command_gate", domain_id, limits="ackermann", black_box=str(tmp_path),
+        use_sim_time=True, e_stop_required=False,
+    )  # fmt: skip
     peer = meet(domain_id)
     passed = peer.listen(Twist, "cmd_vel", qos.COMMAND)
     # As far as the field goes, so that it does not arrive in between.

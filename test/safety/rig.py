@@ -28,6 +28,7 @@ def config(robot: str = "ackermann", **changes) -> GateConfig:
             beam_angles=LIDAR.angles,
             mount=LIDAR.mount,
             range_min=LIDAR.range_min,
+            range_max=LIDAR.range_max,
             scan_rate=10.0,
             odom_rate=10.0,
         ),

@@ -249,6 +249,26 @@ def test_a_gate_that_was_asleep_starts_with_a_stop():
     assert not rig.moves
 
 
+@pytest.mark.parametrize("first", ["scan", "odom", "command", "e_stop", "tick"])
+def test_the_first_word_of_a_gate_that_was_asleep_is_a_zero_whatever_wakes_it(first):
+    rig = driving()
+    rig.now += 0.25
+    rig.stamp += round(0.05 * NANO)
+    known = len(rig.published)
+    inputs = {
+        "scan": rig.scan, "odom": rig.odom, "command": rig.command, "tick": rig.tick,
+        "e_stop": lambda: rig.give(EStop(False)),
+    }  # fmt: skip
+    assert inputs[first]().cause.rule == "own_clock"
+    assert len(rig.published) == known + 1
+    assert not rig.published[-1][1].any()
+    rig.speed = 0.0
+    rig.run(0.18)  # for one zero may be lost
+    assert not rig.moves
+    rig.run(0.5)
+    assert rig.moves
+
+
 def test_the_e_stop_stops_at_once_and_stays():
     rig = driving()
     decision = rig.give(EStop(True))

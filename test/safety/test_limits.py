@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from hypothesis import strategies as st
 from nics_drl_bridge.config import find_config
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.kinematics.spec import load_robot
-from nics_drl_bridge.safety.limits import follow, implausible, load_limits, saturate
-from safety.rig import Rig, config, driving
+from nics_drl_bridge.safety import rules
+from nics_drl_bridge.safety.inputs import Command
+from nics_drl_bridge.safety.limits import Limits, follow, implausible, load_limits, saturate, within
+from safety.rig import TICK_S, Rig, config, driving
 
 ROBOTS = ("ackermann", "differential", "mecanum")
 LIMITS = {robot: load_limits(robot, load_robot(robot)) for robot in ROBOTS}
@@ -123,6 +126,18 @@ def test_a_motion_too_soon_after_the_last_is_not_published():
         (("min: 0.0, max: 1.0", "min: 0.0, max: 0.0"), "min must be less than max"),
         (("min: 0.0, max: 1.0", "min: 0.2, max: 1.0"), "less than or equal to 0"),
         (("jerk: 40.0}", "jerk: 40.0, snap: 1.0}"), "unknown key 'commands.speed_command.snap'"),
+        (
+            ("max: 1.0", "max: 10.0"),
+            "'commands.speed_command.max': 10 m/s is beyond the robot's own",
+        ),
+        (("min: 0.0", "min: -0.1"), "'commands.speed_command.min': -0.1 m/s is beyond the robot's"),
+        (("max: 0.5", "max: 0.51"), "give at most 0.5"),
+        (("rate: 2.0", "rate: 1e308"), "within a period of the gate, 0.02 s, and limits nothing"),
+        (("rate: 2.0", "rate: 51.0"), "give at most 50"),
+        (("jerk: 40.0", "jerk: 1e308"), "'commands.speed_command.jerk': 1e+308 m/s/s^2 crosses"),
+        (("rate: 2.0", "rate: 1e-4"), "'commands.speed_command.rate': 0.0001 would never let it"),
+        (("jerk: 80.0", "jerk: 1e-300"), "'commands.steering_command.jerk': 1e-300 would never"),
+        (("max: 1.0", "max: 0.001"), "the robot could never move: none of its speeds"),
     ],
 )
 def test_a_wrong_file_of_limits_is_one_sentence(tmp_path, change, sentence):
@@ -164,3 +179,94 @@ def test_the_gate_cuts_what_is_too_much_and_keeps_the_curve(wish, speed, turn):
     rig.speed = speed
     rig.run(1.0)
     assert rig.decision.twist == pytest.approx([speed, 0.0, turn])
+
+
+ABSURD = st.floats(1e-308, 1e308)
+TWIST = st.floats(-1.8e308, 1.8e308)
+
+
+@st.composite
+def absurd_limits(draw):
+    """Limits of two commands that no file would be let through with."""
+    pairs = [[draw(ABSURD) for _ in range(2)] for _ in range(4)]
+    low, high, rate, jerk = (np.array(pair) for pair in pairs)
+    kinds = np.array([True, False]), np.array([False, draw(st.booleans())])
+    return Limits(-low, high, rate, jerk, *kinds)
+
+
+@settings(max_examples=400, deadline=None)
+@given(
+    limits=absurd_limits(),
+    steps=st.lists(st.tuples(TWIST, TWIST, ABSURD | st.floats(1e-3, 0.2)), min_size=1, max_size=8),
+)
+def test_whatever_the_limits_the_wish_and_the_interval_what_follows_is_a_number_within(
+    limits, steps
+):
+    value, slope = np.zeros(2), np.zeros(2)
+    with np.errstate(all="ignore"):
+        for *wish, dt in steps:
+            value, slope = follow(value, slope, saturate(np.array(wish), limits), dt, limits)
+            assert within(value, limits)
+            assert np.isfinite(slope).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(limits=absurd_limits(), wish=st.tuples(TWIST, TWIST), dt=st.floats(1e-3, 0.2))
+def test_a_gate_with_absurd_limits_publishes_numbers_within_them(limits, wish, dt):
+    rig = Rig(config("differential", limits=limits))
+    rig.run(1.5)
+    assert rig.arm().granted
+    with np.errstate(all="ignore"):
+        for _ in range(4):
+            rig.give(Command(rig.state.scans.stamps_ns[-1], np.array([wish[0], 0.0, wish[1]])))
+            rig.now += dt
+            value = rig.tick().twist[[0, 2]]
+            assert within(value, limits)
+
+
+@pytest.mark.parametrize("jerk", [1e308, 1e300, 1e16])
+def test_a_jerk_beyond_all_bounds_lets_a_command_pass_within_its_rate(jerk):
+    shipped = LIMITS["ackermann"]
+    rig = Rig(config(limits=replace(shipped, jerk=np.full(2, jerk))))
+    rig.drive(0.1)
+    assert rig.decision.twist[0] > 0.0
+    assert all(np.isfinite(twist).all() for _, twist in rig.published)
+
+
+def test_limits_of_a_period_are_let_through_and_those_of_the_robot_itself(tmp_path):
+    text = find_config("ackermann", "limits").read_text(encoding="utf-8")
+    path = tmp_path / "limits.yaml"
+    path.write_text(text.replace("rate: 2.0, jerk: 40.0", "rate: 50.0, jerk: 2500.0"))
+    assert load_limits(str(path), load_robot("ackermann")).jerk[0] == 2500.0
+
+
+def test_a_motion_that_is_no_number_after_all_is_a_zero_that_stays(monkeypatch):
+    rig = driving()
+
+    def broken(config, state, motion, now):
+        return replace(motion, value=np.array([np.nan, 0.0]))
+
+    shapers = rules.SHAPERS
+    monkeypatch.setattr(rules, "SHAPERS", (*shapers[:-1], broken, shapers[-1]))
+    decision = rig.run(TICK_S)
+    assert (rig.rule, decision.publish, decision.twist.tolist()) == (
+        "motion_unfit",
+        True,
+        [0.0] * 3,
+    )
+    monkeypatch.setattr(rules, "SHAPERS", shapers)
+    rig.run(1.0)
+    assert rig.rule == "motion_unfit"
+    assert not rig.moves
+
+
+@pytest.mark.parametrize("far", [1.1, -0.1, np.inf])
+def test_a_motion_beyond_its_limits_after_all_is_a_zero(monkeypatch, far):
+    rig = driving()
+
+    def broken(config, state, motion, now):
+        return replace(motion, value=np.array([far, 0.0]))
+
+    monkeypatch.setattr(rules, "SHAPERS", (broken, rules.SHAPERS[-1]))
+    assert not rig.run(TICK_S).twist.any()
+    assert rig.rule == "motion_unfit"

@@ -1,0 +1,106 @@
+"""What the parameters of `command_gate` come to: its defaults, and what is refused at the start."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from dataclasses import replace
+
+from launch_stub import ROOT, Launched
+from rclpy.node import Node
+
+from nics_drl_bridge.config import dump_yaml, find_config
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.nodes import gate_parameters
+from nics_drl_bridge.nodes.runner import open_context
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture
+def declared(domain_id, tmp_path):
+    """Declares the gate's parameters as given, over those of files."""
+
+    def declare(given=(), files=()):
+        path = tmp_path / "given.yaml"
+        # By the node's full name, as launch_ros writes what a launch file gives a node.
+        own = {"/command_gate": {"ros__parameters": dict(given)}}
+        path.write_text(dump_yaml(own), encoding="utf-8")
+        arguments = ["node", "--ros-args", "-r", "__node:=command_gate"]
+        for file in (*files, path) if given else files:
+            arguments += ["--params-file", str(file)]
+        context = open_context(arguments, domain_id)
+        try:
+            node = Node("command_gate", context=context)
+            try:
+                return gate_parameters.declare_gate(node).config
+            finally:
+                node.destroy_node()
+        finally:
+            context.try_shutdown()
+
+    return declare
+
+
+def launched(file, declared, **values):
+    """What the gate is told when a launch file starts it."""
+    gate = Launched(values=values).run(file).nodes["command_gate"]
+    return declared(gate["parameters"], gate["files"])
+
+
+def test_a_gate_that_is_told_nothing_requires_an_emergency_stop(declared):
+    config = declared()
+    assert config.e_stop_required
+    assert not config.simulated
+
+
+def test_a_launched_vehicle_requires_an_emergency_stop_whatever_its_file_says(declared, tmp_path):
+    assert launched("vehicle.launch.py", declared).e_stop_required
+    file = tmp_path / "own.yaml"
+    text = (ROOT / "config" / "nodes" / "bridge.yaml").read_text(encoding="utf-8")
+    own = text.replace("e_stop_required: true", "e_stop_required: false")
+    assert own != text
+    file.write_text(own, encoding="utf-8")
+    assert launched("vehicle.launch.py", declared, params_file=str(file)).e_stop_required
+    assert launched("bridge.launch.py", declared).e_stop_required
+
+
+def test_a_launched_simulation_requires_none_unless_it_is_asked_to(declared):
+    config = launched("simulation.launch.py", declared)
+    assert (config.e_stop_required, config.simulated) == (False, True)
+    assert launched("simulation.launch.py", declared, e_stop_required="true").e_stop_required
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"scan_age": 0.05}, "parameter 'scan_age': 0.05 s: scan comes every 0.1 s"),
+        ({"odom_age": 0.02}, "parameter 'odom_age'"),
+        ({"odom_rate": 50.0, "odom_age": 0.01}, "give more than 0.02"),
+        ({"odom_rate": 0.5, "odom_age": 5.0}, "too seldom"),
+    ],
+)
+def test_a_parameter_with_which_the_robot_could_never_move_is_one_sentence(
+    declared, given, sentence
+):
+    with pytest.raises(ConfigError, match=sentence):
+        declared(given)
+
+
+def test_a_typo_in_the_limits_is_one_sentence(declared, tmp_path):
+    file = tmp_path / "limits.yaml"
+    text = find_config("ackermann", "limits").read_text(encoding="utf-8")
+    file.write_text(text.replace("max: 1.0", "max: 10.0"), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"speed_command\.max': 10 m/s is beyond the robot's own"):
+        declared({"limits": str(file)})
+
+
+@pytest.mark.parametrize(("rate", "age"), [(10.0, 0.3), (5.0, 0.35), (4.0, 0.4375), (40.0, 0.3)])
+def test_scans_of_a_slow_lidar_may_get_older(declared, monkeypatch, rate, age):
+    model = builtin_model("ackermann")
+    slow = replace(model, lidar=model.lidar.model_copy(update={"rate": rate}))
+    monkeypatch.setattr(gate_parameters, "declare_model", lambda _: slow)
+    assert declared({"odom_rate": 10.0}).scan_age_s == pytest.approx(age)
