@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env.actions import check_action, still, team_space
+from nics_drl_bridge.env.actions import check_action, check_command, still, team_space
 from nics_drl_bridge.env.backends import halting, make_backend
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.env.reset_arguments import check_options, check_reset
@@ -138,6 +138,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._shape = (1, self.robots, self.task.observation_space.shape[0])
         self._each = (1, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
+        self._rest = np.tile(self._still, (self.robots, 1))
         self._seed, self._episode, self._rehearsed = 0, -1, False
         self._picture: Any = None
         if isinstance(backend, str):
@@ -145,8 +146,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             options |= self._backend_arguments(backend, estimator, randomisation)
             self._backend = make_backend(backend, self.model, self.world, **options)
         else:
-            rest = np.tile(self._still, (self.robots, 1))
-            self._backend = halting(backend, self._row(rest))
+            self._backend = halting(backend, self._row(self._rest))
 
     def _backend_arguments(
         self, backend: str, estimator: bool | None, randomisation: str | Randomisation | None
@@ -265,7 +265,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if before is None:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         given = check_action(action, self.action_space, "action")
-        command = self._row(self.task.command(given.reshape(self._each))[0])
+        made = self.task.command(given.reshape(self._each))[0]
+        command = self._row(check_command(made, self._rest))
         waiting = self.robots > 1 and bool(self.ended.any())
         if waiting:
             command = np.where(self.ended[:, None], self._still, command)

@@ -202,9 +202,9 @@ def _spin(context: Context, node: Node, timeout: CommandTimeout) -> None:
     finally:
         if context.ok():  # an error ends it, and with it whoever would notice that data are old
             timeout.end()
+            context.try_shutdown()
         executor.shutdown(timeout_sec=1.0)
         node.destroy_node()
-        context.try_shutdown()
 
 
 def _shut_down(context: Context, commands: Publisher, kind: Any, thread: threading.Thread) -> None:

@@ -6,6 +6,7 @@ import pytest
 from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.pettingzoo_env import BridgeParallelEnv
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
@@ -75,3 +76,42 @@ def test_a_list_of_seeds_is_checked_one_by_one(bad):
 def test_reset_mask_is_an_option_of_the_vector_env_alone():
     with pytest.raises(ConfigError, match="unknown reset option 'reset_mask'"):
         single().reset(options={"reset_mask": np.array([True])})
+
+
+@pytest.mark.parametrize(
+    "goal", [5.0, (1.0,), [[1.0], [1.0, 2.0]], None, object(), "12", (1j, 2.0), np.ones((1, 1, 1))]
+)
+def test_an_option_of_another_shape_is_refused_rather_than_spread(goal):
+    with pytest.raises(ConfigError, match=r"reset option 'goal'.*must be numbers of shape"):
+        single().reset(options={"goal": goal})
+
+
+@pytest.mark.parametrize(
+    "action", [np.array(["a", "b", "c"]), np.ones(3) * 1j, np.array([None] * 3), [[1.0], 2.0]]
+)
+def test_an_action_of_no_numbers_is_refused_by_its_type(action):
+    env = single()
+    env.reset(seed=0)
+    with pytest.raises(gymnasium.error.InvalidAction):
+        env.step(action)
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.int8, np.uint64, np.bool_, list])
+def test_an_action_of_any_real_numbers_is_an_action(kind):
+    env, ones = single(), [1, 0, 1]
+    env.reset(seed=0)
+    told = env.step(ones if kind is list else np.array(ones, kind))
+    env.reset(seed=0)
+    assert np.array_equal(told[0], env.step(np.array(ones, np.float32))[0])
+
+
+@pytest.mark.parametrize("command", [lambda c: c[..., :1], lambda c: c * np.nan, lambda c: c[0]])
+def test_a_task_whose_command_no_robot_can_be_told_is_named(command):
+    class Senseless(Navigation):
+        def command(self, action):
+            return command(super().command(action))
+
+    env = BridgeEnv(model=direct_model(), world=field(), task=Senseless)
+    env.reset(seed=0)
+    with pytest.raises(ConfigError, match=r"^the task's command .*must be finite, of shape \(1, 3"):
+        env.step(np.ones(3, np.float32))
