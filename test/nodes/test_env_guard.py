@@ -190,6 +190,7 @@ def test_the_death_of_the_thread_that_listens_leaves_a_zero_behind(driving, monk
     env.step(AHEAD)
     monkeypatch.setattr(link.StandingExecutor, "spin_once", dies)
     peer.until(lambda: heard[-1] == Twist(), "a zero command")
+    peer.until(lambda: not env.unwrapped._backend._link._context.ok(), "the thread's end")
     with pytest.raises(BackendError, match="closed"):
         env.step(AHEAD)
 
