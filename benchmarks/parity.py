@@ -19,6 +19,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from measuring.standing import standing_action
 from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.env.registration import COOPERATIVE_REACHING, NAVIGATION, register_envs
@@ -90,7 +91,7 @@ def measure(
         if control is not None:
             there = Spoilt(there, control)
         try:
-            return compare(here, there, steps, seed, share=0.0 if control == "standing" else 1.0)
+            return compare(here, there, steps, seed, stands=control == "standing")
         finally:
             here.close()
             there.close()
@@ -116,7 +117,7 @@ def told_differently(one: dict[str, Any], other: dict[str, Any]) -> float:
 
 
 def compare(
-    here: gymnasium.Env, there: gymnasium.Env, steps: int, seed: int, share: float = 1.0
+    here: gymnasium.Env, there: gymnasium.Env, steps: int, seed: int, stands: bool = False
 ) -> dict[str, float]:
     """Steps two envs side by side, beginning a new episode in both whenever one ends.
 
@@ -125,7 +126,7 @@ def compare(
         there: over DDS.
         steps: how many.
         seed: of actions and first episode.
-        share: of the random actions that is driven.
+        stands: whether the robots are told to stand.
     """
     rng = np.random.default_rng(seed)
     worst, late, spent, episodes, driven = 0.0, 0, 0.0, 0, 0.0
@@ -136,8 +137,9 @@ def compare(
             episodes += 1
             worst = max(worst, difference(a, b), told_differently(info_a, info_b))
         before = info_b["pose"]
-        action = share * rng.uniform(-1.0, 1.0, here.action_space.shape)
-        action = action.astype(np.float32)
+        action = rng.uniform(-1.0, 1.0, here.action_space.shape).astype(np.float32)
+        if stands:
+            action = standing_action(here)
         a, reward_a, end_a, cut_a, info_a = here.step(action)
         begin = time.perf_counter()
         b, reward_b, end_b, cut_b, info_b = there.step(action)

@@ -28,6 +28,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 from geometry_msgs.msg import Twist
+from measuring.standing import standing_action
 from measuring.verdict import answer, parser_of
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
@@ -170,14 +171,16 @@ class Driving:
 
     def __init__(self, env: gymnasium.Env, control: str | None) -> None:
         self._env, self._actions = env, np.random.default_rng(0)
-        self._share = 0.0 if control == "standing" else 1.0
+        self._stands = control == "standing"
         self._rest_s = REST_S if control == "slow" else 0.0
         self.driven_m, self._pose = 0.0, None
 
     def step(self) -> Callable[[], object] | None:
         """One step; gives what begins a new episode where one has ended."""
-        action = self._share * self._actions.uniform(-1.0, 1.0, self._env.action_space.shape)
-        _, _, ended, cut, info = self._env.step(action.astype(np.float32))
+        action = self._actions.uniform(-1.0, 1.0, self._env.action_space.shape).astype(np.float32)
+        if self._stands:
+            action = standing_action(self._env)
+        _, _, ended, cut, info = self._env.step(action)
         before, self._pose = self._pose, info["pose"]
         if before is not None:
             self.driven_m += float(np.hypot(*(self._pose - before)[:2]))

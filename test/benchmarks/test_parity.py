@@ -50,7 +50,9 @@ def test_an_observation_that_is_told_twice_is_late_and_different():
 
 
 def test_robots_that_stand_have_shown_nothing():
-    assert fails(SCRIPT, "standing", *SHORT) == ["driven_m 0.0: must be 0.2 at least in every run"]
+    (missed,) = fails(SCRIPT, "standing", *SHORT)
+    assert missed.startswith("driven_m 0.0")
+    assert missed.endswith("must be 0.2 at least in every run")
 
 
 @pytest.mark.parametrize(

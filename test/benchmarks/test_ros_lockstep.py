@@ -31,4 +31,4 @@ def test_an_env_that_rests_in_each_step_is_too_slow():
 
 def test_a_robot_that_stands_has_measured_nothing():
     missed = fails(SCRIPT, "standing", *SHORT)
-    assert "driven_m 0.0: must be 0.1 at least" in missed
+    assert any(line.startswith("driven_m 0.0") for line in missed)
