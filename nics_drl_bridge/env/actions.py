@@ -98,7 +98,7 @@ def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray
             f"{name} of shape {given.shape}: must be of shape {space.shape}."
         )
     if isinstance(space, gymnasium.spaces.Box) and space.dtype == np.float32:
-        if given.dtype not in (np.float32, np.float64):
+        if given.dtype.char not in "fd":
             given = given.astype(np.float64)  # the kernels are compiled for these two
         if not kernels.finite(given.reshape(1, -1)):
             raise gymnasium.error.InvalidAction(f"{name} {given!r}: holds NaN or inf.")
