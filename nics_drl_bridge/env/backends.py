@@ -31,6 +31,7 @@ class HaltedByStep:
 
     def __init__(self, backend: Any, still: NDArray[np.float64]) -> None:
         self._backend, self._still = backend, still
+        self._told = False
 
     def reset(self, start: Start) -> RobotView:
         """That of the backend."""
@@ -39,16 +40,20 @@ class HaltedByStep:
 
     def step(self, command: NDArray[np.float64]) -> tuple[RobotView, dict[str, Any]]:
         """That of the backend."""
+        self._told = True
         told: tuple[RobotView, dict[str, Any]] = self._backend.step(command)
         return told
 
     def halt(self) -> None:
-        """Steps once with the command nearest to zero."""
-        self._backend.step(self._still.copy())
+        """Steps once with the command nearest to zero, where another one came before."""
+        if self._told:
+            self._backend.step(self._still.copy())
+            self._told = False
 
     def close(self) -> None:
-        """That of the backend."""
+        """That of the backend, which leaves a zero behind by itself."""
         self._backend.close()
+        self._told = False
 
 
 def halting(backend: Any, still: NDArray[np.float64]) -> Backend:

@@ -21,6 +21,7 @@ from nics_drl_bridge.env.pettingzoo_env import BridgeParallelEnv
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.policy.evaluation import drive
 
 MODEL, FIELD = direct_model(), field()
 AHEAD = np.array([1.0, 0.5, -0.5], np.float32)
@@ -197,6 +198,32 @@ def test_the_last_word_to_a_robot_is_zero_whatever_is_thrown_from_wherever(
     before = robot.driven
     env.step(action_of(env, AHEAD))
     assert robot.driven > before
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 30), st.sampled_from(ERRORS), st.sampled_from([Robot, RobotWithoutHalt]))
+def test_a_policy_or_callback_that_raises_amid_an_episode_stops_the_robot(when, error, make_robot):
+    robot = make_robot()
+    FAULT.now = Fault()
+    env = gymnasium.wrappers.TimeLimit(single(robot, True, None), 20)
+
+    def act(_):
+        FAULT.now.at("policy")
+        return AHEAD
+
+    FAULT.now = Fault(when, error)
+    with pytest.raises(error):  # noqa: PT012
+        for seed in range(20):
+            drive(env, SimpleNamespace(act=act), seed, None, lambda: FAULT.now.at("on_start"))
+    assert not robot.last.any()
+
+
+def test_a_backend_that_was_told_nothing_is_not_stepped_to_halt_it():
+    """It may never have been reset, and would say something else than what is wrong."""
+    env = BridgeEnv(RobotWithoutHalt(), MODEL, FIELD)
+    FAULT.now = Fault()
+    with pytest.raises(gymnasium.error.Error, match="Seed must be greater"):
+        env.reset(seed=-1)
 
 
 def test_everything_that_an_env_calls_was_thrown_from():

@@ -17,7 +17,11 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registration import COOPERATIVE_REACHING, NAVIGATION
 from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import link, qos
+from nics_drl_bridge.nodes.dds_backend import DdsBackend
+from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
+from nics_drl_bridge.sim.world import load_world
 
 pytestmark = pytest.mark.ros
 
@@ -261,3 +265,24 @@ def test_what_a_user_is_told_by_may_raise(simulators, listeners, monkeypatch):
         peer.until(lambda: heard[-1] == Twist(), "a zero command")
     finally:
         env.close()
+
+
+@pytest.mark.parametrize("kind", [DdsBackend, RealtimeBackend])
+@pytest.mark.parametrize("command", [[np.nan, 0.0], [0.5, np.inf], [-np.inf, np.nan]])
+def test_a_backend_publishes_nothing_that_is_not_finite(
+    simulators, listeners, model, kind, command
+):
+    mode = "lockstep" if kind is DdsBackend else "realtime"
+    peer, heard = listeners[mode]
+    backend = kind(model, load_world("empty"), domain_id=simulators[mode])
+    try:
+        backend.reset(Start(seed=3, pose=np.zeros(3)))
+        heard.clear()
+        moves = lambda: heard and heard[-1].linear.x > 0.0  # noqa: E731
+        peer.until(lambda: backend.step(np.array([0.5, 0.1])) and moves(), "that it drives")
+        with pytest.raises(BackendError, match="must be finite, a zero was sent instead"):
+            backend.step(np.array(command))
+        peer.until(lambda: heard[-1] == Twist(), "a zero command")
+        assert all(np.isfinite([each.linear.x, each.angular.z]).all() for each in heard)
+    finally:
+        backend.close()
