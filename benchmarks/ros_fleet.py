@@ -2,9 +2,9 @@
 
 A simulator node runs a fleet: each robot with 720-beam scans at 10 Hz and odometry at 50 Hz. A
 process of its own commands every robot at 10 Hz, and another one subscribes to all topics, counts
-what arrives of each robot, and looks how far from its start its odometry says that it drove. A fleet is held
-when every topic of every robot arrives at 99 % of its rate at least. Sizes are tried one after the
-other, each for some seconds after the first message of the last topic.
+what arrives of each robot, and looks how far from its start its odometry says that it came. A
+fleet is held when every topic of every robot arrives at 99 % of its rate at least. Sizes are tried
+one after the other, each for some seconds after the first message of the last topic.
 
 Bars: a fleet is held, and every robot of it drove. The controls let nobody command, or the listener
 miss one robot.
