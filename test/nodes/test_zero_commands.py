@@ -157,6 +157,7 @@ main([sys.argv[0], "--ros-args", "-p", "goal:=[8.0, 5.0]"])
 """
 
 
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize("error", ["ValueError('of the policy')", "SystemExit(3)", "MemoryError()"])
 def test_a_policy_that_raises_leaves_a_zero_command_behind(robot, domain_id, error):
     peer, _, tell = robot
@@ -166,7 +167,7 @@ def test_a_policy_that_raises_leaves_a_zero_command_behind(robot, domain_id, err
         env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)}, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:
-        peer.until(lambda: tell() or process.poll() is not None, "the end of the policy")
+        peer.until(lambda: tell() or process.poll() is not None, "its end", 200.0)
         peer.until(lambda: raw and raw[-1].twist == Twist(), "a zero command")
         assert process.returncode != 0
         assert any(each.twist.linear.x > 0.0 for each in raw)
