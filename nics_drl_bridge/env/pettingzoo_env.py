@@ -20,6 +20,8 @@ from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world import World
 
 Observations = dict[str, NDArray[np.float32]]
+OF_CHECKER = "options"
+"""PettingZoo's checker resets with an option of this name, which means nothing."""
 
 
 class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
@@ -96,6 +98,8 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, dict[str, Any]]]:
         """Begins an episode with all agents; see PettingZoo."""
+        if isinstance(options, dict):
+            options = {name: value for name, value in options.items() if name != OF_CHECKER}
         observation, info = self.env.reset(seed=seed, options=options)
         self.agents, self._steps = list(self.possible_agents), 0
         seen = dict(zip(self.agents, observation.reshape(len(self.agents), -1), strict=True))
