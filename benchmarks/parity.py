@@ -1,16 +1,17 @@
 """The same seed and commands in process and over DDS: how much do the observations differ?
 
 A simulator node runs in lock-step as a process of its own. Both envs are reset to the same
-seeds and get the same random actions. A late observation is one that holds a scan or an
-odometry older than the step that it answers. By default each robot drives alone, and then a team
-of four cars drives with each in its own namespace.
+seeds and get the same random actions. Observations, rewards, ends and what `info` holds in both are
+compared; NaN, another shape and another end differ by infinity. A late observation is one that
+holds a scan or an odometry older than the step that it answers. By default each robot drives
+alone, and then a team of four cars drives with each in its own namespace.
+
+Bars: no difference, no late observation, and every run drove. The controls spoil one observation of
+the env over DDS, or let the robots stand.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -18,15 +19,56 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from measuring.standing import standing_action
+from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.env.registration import COOPERATIVE_REACHING, NAVIGATION, register_envs
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
+CONTROLS = {
+    "nan": "a number of one observation",
+    "noise": "the last bit of one number",
+    "late": "one observation, of which the one before is told again",
+    "standing": "the commands: no robot drives",
+}
+SPOILT_STEP = 3
+DRIVEN_M = 0.2
+"""Less is no drive."""
+OF_SIMULATOR = {"true_pose", "true_collision", "randomisation"}
+"""What only the simulator in process tells."""
+OF_CLOCKS = {"stamp_ns"}
+"""What counts from another beginning in each."""
+DIFFERENCE, LATE, DRIVEN = "max_abs_observation_difference", "late_observations", "driven_m"
 ROBOTS = ("ackermann", "differential", "mecanum")
 FLEET = 4
 
 
-def measure(robot: str, world: str, steps: int, seed: int, robots: int = 1) -> dict[str, float]:
+class Spoilt(gymnasium.Wrapper):
+    """An env one of whose observations a control spoils."""
+
+    def __init__(self, env: gymnasium.Env, control: str) -> None:
+        super().__init__(env)
+        self._control, self._steps, self._last = control, 0, None
+
+    def step(self, action: Any) -> Any:
+        """That of the env, but for one."""
+        observation, reward, ended, cut, info = self.env.step(action)
+        self._steps += 1
+        seen = observation.copy()
+        if self._steps == SPOILT_STEP:
+            if self._control == "nan":
+                seen[-1] = np.nan
+            if self._control == "noise":
+                seen[-1] = np.nextafter(seen[-1], np.float32(np.inf))
+            if self._control == "late" and self._last is not None:
+                seen, info = self._last, {**info, "scan_age_s": 0.1}
+        self._last = observation
+        return seen, reward, ended, cut, info
+
+
+def measure(
+    robot: str, world: str, steps: int, seed: int, robots: int = 1, control: str | None = None
+) -> dict[str, float]:
     """Drives both envs for `steps` steps and compares every observation."""
     register_envs()
     domain_id = free_domain_id()
@@ -46,70 +88,119 @@ def measure(robot: str, world: str, steps: int, seed: int, robots: int = 1) -> d
             world=world,
             backend_options={"domain_id": domain_id},
         )
+        if control is not None:
+            there = Spoilt(there, control)
         try:
-            return compare(here, there, steps, seed)
+            return compare(here, there, steps, seed, stands=control == "standing")
         finally:
             here.close()
             there.close()
 
 
-def compare(here: gymnasium.Env, there: gymnasium.Env, steps: int, seed: int) -> dict[str, float]:
-    """Steps two envs side by side, beginning a new episode in both whenever one ends."""
+def difference(one: Any, other: Any) -> float:
+    """Greatest difference of two arrays, or numbers; inf of another shape, and where NaN is."""
+    a, b = np.asarray(one, np.float64), np.asarray(other, np.float64)
+    if a.shape != b.shape or not (np.isfinite(a).all() and np.isfinite(b).all()):
+        return float("inf")
+    return float(np.abs(a - b).max(initial=0.0))
+
+
+def told_differently(one: dict[str, Any], other: dict[str, Any]) -> float:
+    """Greatest difference of what both `info` hold; inf where one lacks what the task tells."""
+    worst = 0.0 if set(one) - set(other) <= OF_SIMULATOR else float("inf")
+    for name in set(one) & set(other):
+        a, b = one[name], other[name]
+        pairs = [(a[term], b.get(term, np.nan)) for term in a] if isinstance(a, dict) else [(a, b)]
+        if name not in OF_CLOCKS:
+            worst = max([worst, *(difference(*pair) for pair in pairs)])
+    return worst
+
+
+def compare(
+    here: gymnasium.Env, there: gymnasium.Env, steps: int, seed: int, stands: bool = False
+) -> dict[str, float]:
+    """Steps two envs side by side, beginning a new episode in both whenever one ends.
+
+    Args:
+        here: in process.
+        there: over DDS.
+        steps: how many.
+        seed: of actions and first episode.
+        stands: whether the robots are told to stand.
+    """
     rng = np.random.default_rng(seed)
-    worst, late, spent, episodes = 0.0, 0, 0.0, 0
+    worst, late, spent, episodes, driven = 0.0, 0, 0.0, 0, 0.0
     ended = True
     for _ in range(steps):
         if ended:
-            a, _ = here.reset(seed=seed + episodes)
-            b, _ = there.reset(seed=seed + episodes)
+            (a, info_a), (b, info_b) = (env.reset(seed=seed + episodes) for env in (here, there))
             episodes += 1
-            worst = max(worst, float(np.abs(a - b).max()))
+            worst = max(worst, difference(a, b), told_differently(info_a, info_b))
+        before = info_b["pose"]
         action = rng.uniform(-1.0, 1.0, here.action_space.shape).astype(np.float32)
-        a, reward_a, end_a, cut_a, _ = here.step(action)
+        if stands:
+            action = standing_action(here)
+        a, reward_a, end_a, cut_a, info_a = here.step(action)
         begin = time.perf_counter()
-        b, reward_b, end_b, cut_b, info = there.step(action)
+        b, reward_b, end_b, cut_b, info_b = there.step(action)
         spent += time.perf_counter() - begin
-        worst = max(worst, float(np.abs(a - b).max()), abs(reward_a - reward_b))
-        late += info["scan_age_s"] > 0.0 or info["odom_age_s"] > 0.0
-        if (end_a, cut_a) != (end_b, cut_b):
-            worst = float("inf")
+        ends = difference((end_a, cut_a), (end_b, cut_b)) and float("inf")
+        told = told_differently(info_a, info_b)
+        worst = max(worst, difference(a, b), difference(reward_a, reward_b), ends, told)
+        late += not (info_b["scan_age_s"] <= 0.0 and info_b["odom_age_s"] <= 0.0)
+        # Of a team, the one that moved least.
+        moved = np.atleast_2d(info_b["pose"] - before)[:, :2]
+        driven += float(np.hypot(*moved.T).min())
         ended = end_a or cut_a or end_b or cut_b
     return {
         "steps": steps,
-        "max_abs_observation_difference": worst,
-        "late_observations": int(late),
+        DIFFERENCE: worst,
+        LATE: int(late),
         "episodes": episodes,
-        "dds_steps_per_s": round(steps / spent, 1),
+        DRIVEN: round(driven, 3),
+        "dds_steps_per_s": round(steps / spent, 1) if spent else 0.0,
     }
 
 
-def measure_all(world: str, steps: int, seed: int) -> dict[str, Any]:
+def measure_all(world: str, steps: int, seed: int, control: str | None) -> dict[str, Any]:
     """Each robot alone, then the fleet; with the worst of all on top."""
-    runs = {robot: measure(robot, world, steps, seed) for robot in ROBOTS}
-    runs[f"{FLEET} robots in namespaces"] = measure(ROBOTS[0], world, steps, seed, FLEET)
-    name = "max_abs_observation_difference"
+    runs = {robot: measure(robot, world, steps, seed, control=control) for robot in ROBOTS}
+    fleet = measure(ROBOTS[0], world, steps, seed, FLEET, control)
+    runs[f"{FLEET} robots in namespaces"] = fleet
     return {
         "steps": sum(int(run["steps"]) for run in runs.values()),
-        name: max(run[name] for run in runs.values()),
-        "late_observations": sum(int(run["late_observations"]) for run in runs.values()),
+        DIFFERENCE: max(run[DIFFERENCE] for run in runs.values()),
+        LATE: sum(int(run[LATE]) for run in runs.values()),
+        DRIVEN: min(run[DRIVEN] for run in runs.values()),
         "runs": runs,
     }
 
 
-def show(result: dict[str, Any], indent: str = "") -> None:
-    """Prints a table."""
-    for key, value in result.items():
-        if isinstance(value, dict):
-            sys.stdout.write(f"{indent}{key}\n")
-            show(value, indent + "  ")
-        else:
-            sys.stdout.write(f"{indent}{key:<34}{value}\n")
+def bars(result: dict[str, Any]) -> list[str]:
+    """A sentence for each bar that was missed."""
+    missed = []
+    if not result[DIFFERENCE] <= 0.0:
+        missed.append(f"{DIFFERENCE} {result[DIFFERENCE]:g}: must be 0")
+    if not result[LATE] <= 0:
+        missed.append(f"{LATE} {result[LATE]}: must be 0")
+    if not result[DRIVEN] >= DRIVEN_M:
+        missed.append(f"{DRIVEN} {result[DRIVEN]}: must be {DRIVEN_M} at least in every run")
+    return missed
+
+
+def table(result: dict[str, Any], indent: str = "") -> str:
+    """For people."""
+    return "".join(
+        f"{indent}{key}\n" + table(value, indent + "  ")
+        if isinstance(value, dict)
+        else f"{indent}{key:<34}{value}\n"
+        for key, value in result.items()
+    )
 
 
 def main() -> None:
-    """Prints a table, or one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    """Prints a table, or one JSON object, and ends with 1 where a bar was missed."""
+    parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--steps", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--robot", help="one kind of robot alone, as ackermann")
@@ -117,14 +208,12 @@ def main() -> None:
     parser.add_argument("--world", default="arena")
     given = parser.parse_args()
     if given.robot is None and given.robots is None:
-        result = measure_all(given.world, given.steps, given.seed)
+        result = measure_all(given.world, given.steps, given.seed, given.control)
     else:
         robot = given.robot or ROBOTS[0]
-        result = measure(robot, given.world, given.steps, given.seed, given.robots or 1)
-    if given.json:
-        sys.stdout.write(json.dumps(result) + "\n")
-    else:
-        show(result)
+        alone = given.robots or 1
+        result = measure(robot, given.world, given.steps, given.seed, alone, given.control)
+    answer(result, bars(result), table(result), given.json)
 
 
 if __name__ == "__main__":

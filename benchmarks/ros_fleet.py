@@ -1,9 +1,13 @@
 """How many robots does one simulator process hold in real time?
 
 A simulator node runs a fleet: each robot with 720-beam scans at 10 Hz and odometry at 50 Hz. A
-process of its own subscribes to all of it and counts what arrives. A fleet is held when every
-topic of every robot arrives at 99 % of its rate at least. Sizes are tried one after the other,
-each for some seconds after the first message of the last topic.
+process of its own commands every robot at 10 Hz, and another one subscribes to all topics, counts
+what arrives of each robot, and looks how far from its start its odometry says that it came. A
+fleet is held when every topic of every robot arrives at 99 % of its rate at least. Sizes are tried
+one after the other, each for some seconds after the first message of the last topic.
+
+Bars: a fleet is held, and every robot of it drove. The controls let nobody command, or the listener
+miss one robot.
 """
 
 from __future__ import annotations
@@ -15,57 +19,114 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from nics_drl_bridge.config import dump_yaml
-from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
-
-SCAN_HZ, ODOM_HZ, SHARE = 10.0, 50.0, 0.99
-SIZES = (20, 24, 28, 32, 40, 48, 56, 64)
-SIDE_PER_ROBOT_M = 3.0
-PATIENCE_S = 90.0
-LISTENER = """
-import json, sys, time
+import numpy as np
+from geometry_msgs.msg import Twist
+from measuring.verdict import answer, parser_of
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
-from nics_drl_bridge.nodes import qos
+
+from nics_drl_bridge.config import dump_yaml
+from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.executor import StandingExecutor
+from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 from nics_drl_bridge.nodes.runner import open_context
 
-robots, seconds, patience = int(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])
-context = open_context()
-node = Node("listener", context=context, start_parameter_services=False)
-counts = {}
+CONTROLS = {
+    "standing": "the commands: no robot drives",
+    "deaf": "the topics of one robot, which nobody receives",
+}
+SCAN_HZ, ODOM_HZ, SHARE = 10.0, 50.0, 0.99
+COMMAND_HZ, COMMAND = 10.0, (0.3, 0.0, 0.3)
+DRIVEN_M = 0.1
+"""Less is no drive: odometry drifts, and some are placed where they soon touch another one."""
+SIZES = (20, 24, 28, 32, 40, 48, 56, 64)
+SIDE_PER_ROBOT_M = 3.0
+SETTLE_S = 2.0
 
-def counter(topic):
-    def count(_):
-        counts[topic] += 1
-    counts[topic] = 0
-    return count
 
-for k in range(robots):
-    for kind, name in ((LaserScan, "scan"), (Odometry, "odom")):
-        topic = f"robot{k + 1}/{name}"
-        node.create_subscription(kind, topic, counter(topic), qos.SENSOR, raw=True)
-executor = StandingExecutor(context)
-executor.add_node(node)
-deadline = time.monotonic() + patience
-while not all(counts.values()) and time.monotonic() < deadline:
-    executor.spin_once(timeout_sec=0.1)
-settled = time.monotonic() + 2.0
-while time.monotonic() < settled:
-    executor.spin_once(timeout_sec=0.1)
-known, began = dict(counts), time.monotonic()
-sys.stdout.write("counting\\n")
-sys.stdout.flush()
-while time.monotonic() < began + seconds:
-    executor.spin_once(timeout_sec=0.1)
-spent = time.monotonic() - began
-print(json.dumps({topic: (count - known[topic]) / spent for topic, count in counts.items()}))
-"""
+class Listener:
+    """Counts what arrives of each robot.
+
+    Args:
+        robots: how many there are.
+        heard: how many are listened to, from the first on.
+    """
+
+    def __init__(self, robots: int, heard: int) -> None:
+        context = open_context()
+        self._node = Node("listener", context=context, start_parameter_services=False)
+        self.counts = {f"robot{k + 1}": {"scan": 0, "odom": 0} for k in range(robots)}
+        self.driven = dict.fromkeys(self.counts, 0.0)
+        self._starts: dict[str, np.ndarray] = {}
+        for name in list(self.counts)[:heard]:
+            self._listen(name)
+        self._executor = StandingExecutor(context)
+        self._executor.add_node(self._node)
+
+    def _listen(self, name: str) -> None:
+        counts = self.counts[name]
+
+        def scan(_: bytes) -> None:
+            counts["scan"] += 1
+
+        def odom(message: bytes) -> None:
+            counts["odom"] += 1
+            if counts["odom"] % int(ODOM_HZ / COMMAND_HZ) == 0:
+                place = wire.odometry_of(message)[0][:2]
+                gone = float(np.hypot(*(place - self._starts.setdefault(name, place))))
+                self.driven[name] = max(self.driven[name], gone)
+
+        for kind, topic, take in ((LaserScan, "scan", scan), (Odometry, "odom", odom)):
+            self._node.create_subscription(kind, f"{name}/{topic}", take, qos.SENSOR, raw=True)
+
+    def spin(self, seconds: float, until_all: bool = False) -> None:
+        """Listens for a time, or until every robot was heard."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self._executor.spin_once(timeout_sec=0.1)
+            if until_all and all(all(each.values()) for each in self.counts.values()):
+                return
+
+
+def listen(robots: int, heard: int, seconds: float, patience_s: float) -> None:
+    """Says when it begins to count, and then by robot: rates [1/s] and how far it drove [m]."""
+    listener = Listener(robots, heard)
+    listener.spin(patience_s, until_all=True)
+    listener.spin(SETTLE_S)
+    known = {name: dict(counts) for name, counts in listener.counts.items()}
+    began = time.monotonic()
+    sys.stdout.write("counting\n")
+    sys.stdout.flush()
+    listener.spin(seconds)
+    spent = time.monotonic() - began
+    told = {
+        name: {
+            **{topic: (counts[topic] - known[name][topic]) / spent for topic in counts},
+            "driven_m": listener.driven[name],
+        }
+        for name, counts in listener.counts.items()
+    }
+    sys.stdout.write(json.dumps(told) + "\n")
+
+
+def command(robots: int) -> None:
+    """Commands every robot, until its parent is gone."""
+    node = Node("commander", context=open_context(), start_parameter_services=False)
+    topics = [
+        node.create_publisher(Twist, f"robot{k + 1}/cmd_vel", qos.COMMAND) for k in range(robots)
+    ]
+    message, parent = wire.TwistWriter().write(np.array(COMMAND)), os.getppid()
+    while os.getppid() == parent:
+        for topic in topics:
+            topic.publish(message)
+        time.sleep(1.0 / COMMAND_HZ)
 
 
 @dataclass(frozen=True)
@@ -75,15 +136,19 @@ class Run:
     Attributes:
         robots: M.
         scan_hz, odom_hz: of the robot that was heard least.
+        driven_m: of the robot that drove least [m].
         cpu_cores: that the simulator's process used.
         rss_mb: its memory.
+        each: of each robot: `scan` and `odom` [1/s], and `driven_m`.
     """
 
     robots: int
     scan_hz: float
     odom_hz: float
+    driven_m: float
     cpu_cores: float
     rss_mb: float
+    each: dict[str, dict[str, float]]
 
     @property
     def held(self) -> bool:
@@ -112,8 +177,22 @@ def rss_mb(pid: int) -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def measure(robots: int, seconds: float) -> Run:
-    """Runs a fleet of `robots` and listens to it for `seconds`."""
+@contextmanager
+def part(domain_id: int, *options: str) -> Iterator[subprocess.Popen[str]]:
+    """This script in a process of its own, as listener or commander."""
+    environment = {"ROS_DOMAIN_ID": str(domain_id), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    with subprocess.Popen(
+        [sys.executable, __file__, *options],
+        env=os.environ | environment, stdout=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        try:
+            yield process
+        finally:
+            process.terminate()
+
+
+def measure(robots: int, seconds: float, patience_s: float, control: str | None) -> Run:
+    """Runs a fleet of `robots`, drives it, and listens to it for `seconds`."""
     domain_id = free_domain_id()
     with tempfile.TemporaryDirectory() as name:
         parameters: dict[str, Any] = {
@@ -123,68 +202,83 @@ def measure(robots: int, seconds: float) -> Run:
             "scan_rate": SCAN_HZ,
             "odom_rate": ODOM_HZ,
         }
-        with NodeProcess("simulator_node", Path(name), parameters, domain_id) as simulator:
-            listener = subprocess.Popen(
-                [sys.executable, "-c", LISTENER, str(robots), str(seconds), str(PATIENCE_S)],
-                env=os.environ
-                | {
-                    "ROS_DOMAIN_ID": str(domain_id),
-                    "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-                },
-                stdout=subprocess.PIPE,
-                text=True,
-            )
+        fleet, driven = str(robots), str(0 if control == "standing" else robots)
+        heard = str(robots - 1 if control == "deaf" else robots)
+        options = ("--seconds", str(seconds), "--patience", str(patience_s), "--heard", heard)
+        with (
+            NodeProcess("simulator_node", Path(name), parameters, domain_id) as simulator,
+            part(domain_id, "--part", "command", "--robots", driven),
+            part(domain_id, "--part", "listen", "--robots", fleet, *options) as listener,
+        ):
             if listener.stdout is None or listener.stdout.readline().strip() != "counting":
                 simulator.check()
                 raise RuntimeError("the listener ended without a result")
             simulator.check()
             before, began = cpu_seconds(simulator.pid), time.monotonic()
-            line = listener.stdout.readline()
+            each = json.loads(listener.stdout.readline())
             cores = (cpu_seconds(simulator.pid) - before) / (time.monotonic() - began)
             memory = rss_mb(simulator.pid)
-            listener.wait()
-    rates = json.loads(line)
-    scan, odom = (
-        min(rate for topic, rate in rates.items() if topic.endswith(end))
-        for end in ("scan", "odom")
+    each = {name: {key: round(v, 3) for key, v in told.items()} for name, told in each.items()}
+    scan, odom, driven_m = (
+        min(told[key] for told in each.values()) for key in ("scan", "odom", "driven_m")
     )
-    return Run(robots, round(scan, 2), round(odom, 2), round(cores, 2), round(memory, 1))
+    rates = round(scan, 2), round(odom, 2)
+    return Run(robots, *rates, driven_m, round(cores, 2), round(memory, 1), each)
 
 
-def largest(seconds: float) -> Run:
-    """The largest fleet that is held, or the smallest that was tried."""
-    best = measure(SIZES[0], seconds)
+def largest(seconds: float, patience_s: float) -> Run:
+    """The largest fleet that is held; the smallest that was tried, where none is."""
+    best = measure(SIZES[0], seconds, patience_s, None)
     for robots in SIZES[1:] if best.held else ():
-        run = measure(robots, seconds)
+        run = measure(robots, seconds, patience_s, None)
         if not run.held:
             break
         best = run
-    return best if best.held else smaller(best, seconds)
+    return best if best.held else smaller(best, seconds, patience_s)
 
 
-def smaller(failed: Run, seconds: float) -> Run:
+def smaller(failed: Run, seconds: float, patience_s: float) -> Run:
     """The largest fleet below one that was not held."""
     for robots in range(failed.robots - 4, 0, -4):
-        run = measure(robots, seconds)
+        run = measure(robots, seconds, patience_s, None)
         if run.held:
             return run
     return failed
 
 
+def bars(run: Run) -> list[str]:
+    """A sentence for each bar that was missed, with the robot that misses it most."""
+    missed, least = [], {"scan": SHARE * SCAN_HZ, "odom": SHARE * ODOM_HZ, "driven_m": DRIVEN_M}
+    for key, bar in least.items():
+        figure, worst = min((told[key], name) for name, told in run.each.items())
+        if not figure >= bar:
+            missed.append(f"{worst} of {run.robots}: {key} {figure:g}, must be {bar:g} at least")
+    return missed
+
+
 def main() -> None:
-    """Prints a table, or one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    """Prints a table, or one JSON object, and ends with 1 where a bar was missed."""
+    parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--seconds", type=float, default=10.0, help="to listen to each fleet")
     parser.add_argument("--robots", type=int, help="this size alone")
+    parser.add_argument("--patience", type=float, default=90.0, help="for the first messages [s]")
+    parser.add_argument("--part", choices=("command", "listen"), help=argparse.SUPPRESS)
+    parser.add_argument("--heard", type=int, help=argparse.SUPPRESS)
     given = parser.parse_args()
-    run = largest(given.seconds) if given.robots is None else measure(given.robots, given.seconds)
-    result = vars(run)
-    if given.json:
-        sys.stdout.write(json.dumps(result) + "\n")
+    if given.part == "command":
+        command(given.robots)
+    elif given.part == "listen":
+        listen(given.robots, given.heard, given.seconds, given.patience)
     else:
-        for key, value in result.items():
-            sys.stdout.write(f"{key:<12}{value}\n")
+        robots = SIZES[0] if given.control and given.robots is None else given.robots
+        run = (
+            largest(given.seconds, given.patience)
+            if robots is None
+            else measure(robots, given.seconds, given.patience, given.control)
+        )
+        result = asdict(run)
+        table = "".join(f"{key:<12}{value}\n" for key, value in result.items() if key != "each")
+        answer(result, bars(run), table, given.json)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,9 @@ bare echo is what ROS 2 itself allows: two processes of rclpy's own executor, by
 it chooses, that exchange the same messages, made once, and do nothing else; with
 `--executor standing` they are processes of this package's executor, whose wait set stands. Both are
 measured in turns, chunk by chunk, so that whatever else the machine does falls on both.
+
+Bars: 0.7 env steps for each exchange of the bare pair of rclpy's executor (of standing ones 0.5),
+and the robot drives. The controls let the env rest in each step, or let it command nothing.
 """
 
 from __future__ import annotations
@@ -25,6 +28,8 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 from geometry_msgs.msg import Twist
+from measuring.standing import standing_action
+from measuring.verdict import answer, parser_of
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -46,6 +51,10 @@ WORLD = {
     "goal_distance": [2.0, 4.0],
 }
 DEPTH, PATIENCE_S = 10, 60.0
+CONTROLS = {"slow": "speed: a step rests", "standing": "the commands: the robot does not drive"}
+REST_S, DRIVEN_M = 0.003, 0.1
+RATIOS = {"rclpy": 0.7, "standing": 0.5}
+"""The least, by the executor of the bare pair."""
 EXECUTORS = {"rclpy": SingleThreadedExecutor, "standing": StandingExecutor}
 Exchange = Callable[[], Callable[[], object] | None]
 Chunk = Callable[[int], list[float]]
@@ -149,9 +158,44 @@ def bare_echo(domain_id: int, executor: str) -> Iterator[Chunk]:
             far.terminate()
 
 
+class Driving:
+    """Steps an env by random actions, and adds up how far its robot drives.
+
+    Args:
+        env: that has been reset.
+        control: of `CONTROLS`.
+
+    Attributes:
+        driven_m: by the robot's own estimate [m].
+    """
+
+    def __init__(self, env: gymnasium.Env, control: str | None) -> None:
+        self._env, self._actions = env, np.random.default_rng(0)
+        self._stands = control == "standing"
+        self._rest_s = REST_S if control == "slow" else 0.0
+        self.driven_m, self._pose = 0.0, None
+
+    def step(self) -> Callable[[], object] | None:
+        """One step; gives what begins a new episode where one has ended."""
+        action = self._actions.uniform(-1.0, 1.0, self._env.action_space.shape).astype(np.float32)
+        if self._stands:
+            action = standing_action(self._env)
+        _, _, ended, cut, info = self._env.step(action)
+        before, self._pose = self._pose, info["pose"]
+        if before is not None:
+            self.driven_m += float(np.hypot(*(self._pose - before)[:2]))
+        if self._rest_s:
+            time.sleep(self._rest_s)
+        return self._begin if ended or cut else None
+
+    def _begin(self) -> None:
+        self._env.reset()
+        self._pose = None
+
+
 @contextmanager
-def lockstep_env(domain_id: int, folder: Path) -> Iterator[Exchange]:
-    """A function that makes one step of the env, and gives its `reset` at an episode's end."""
+def lockstep_env(domain_id: int, folder: Path, control: str | None) -> Iterator[Driving]:
+    """An env that drives in lock-step with a simulator in a process of its own."""
     register_envs()
     file = folder / "world.yaml"
     file.write_text(dump_yaml(World.model_validate(WORLD).model_dump(mode="json")))
@@ -163,14 +207,7 @@ def lockstep_env(domain_id: int, folder: Path) -> Iterator[Exchange]:
             NAVIGATION, backend="dds", model=ROBOT, world=str(file), backend_options=options
         )
         env.reset(seed=0)
-        actions = np.random.default_rng(0)
-
-        def step() -> Callable[[], object] | None:
-            action = actions.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
-            _, _, ended, cut, _ = env.step(action)
-            return env.reset if ended or cut else None
-
-        yield step
+        yield Driving(env, control)
         env.close()
 
 
@@ -186,18 +223,18 @@ def timed(exchange: Exchange, count: int) -> list[float]:
     return times
 
 
-def measure(chunks: int, size: int, executor: str) -> dict[str, float]:
+def measure(chunks: int, size: int, executor: str, control: str | None) -> dict[str, float]:
     """Steps and echoes per second over all chunks, and how long a step takes."""
     domain_id = free_domain_id()
     with (
         tempfile.TemporaryDirectory() as folder,
-        lockstep_env(domain_id, Path(folder)) as step,
+        lockstep_env(domain_id, Path(folder), control) as driving,
         bare_echo(domain_id, executor) as echo,
     ):
-        timed(step, size), echo(size)  # as warm as they get
+        timed(driving.step, size), echo(size)  # as warm as they get
         steps, echoes = [], []
         for _ in range(chunks):
-            steps += timed(step, size)
+            steps += timed(driving.step, size)
             echoes += echo(size)
     rate, bare = len(steps) / sum(steps), len(echoes) / sum(echoes)
     p50, p99 = np.quantile(steps, [0.5, 0.99]) * 1e3
@@ -207,13 +244,23 @@ def measure(chunks: int, size: int, executor: str) -> dict[str, float]:
         "ratio": round(rate / bare, 3),
         "p50_ms": round(float(p50), 3),
         "p99_ms": round(float(p99), 3),
+        "driven_m": round(driving.driven_m, 3),
     }
 
 
+def bars(result: dict[str, float], executor: str) -> list[str]:
+    """A sentence for each bar that was missed."""
+    missed, least = [], RATIOS[executor]
+    if not result["ratio"] >= least:
+        missed.append(f"ratio {result['ratio']}: must be {least} at least")
+    if not result["driven_m"] >= DRIVEN_M:
+        missed.append(f"driven_m {result['driven_m']}: must be {DRIVEN_M} at least")
+    return missed
+
+
 def main() -> None:
-    """Prints a table, or one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    """Prints a table, or one JSON object, and ends with 1 where a bar was missed."""
+    parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--chunks", type=int, default=150)
     parser.add_argument("--size", type=int, default=100, help="steps in a chunk")
     parser.add_argument("--executor", choices=EXECUTORS, default="rclpy", help="of the bare pair")
@@ -223,12 +270,9 @@ def main() -> None:
     if given.end:
         ENDS[given.end](given.namespace, given.executor)
         return
-    result = measure(given.chunks, given.size, given.executor)
-    if given.json:
-        sys.stdout.write(json.dumps(result) + "\n")
-    else:
-        for key, value in result.items():
-            sys.stdout.write(f"{key:<20}{value}\n")
+    result = measure(given.chunks, given.size, given.executor, given.control)
+    table = "".join(f"{key:<20}{value}\n" for key, value in result.items())
+    answer(result, bars(result, given.executor), table, given.json)
 
 
 if __name__ == "__main__":

@@ -5,13 +5,13 @@ field, in real time, each part a process: `simulator_node`, `middleware_node`, `
 `command_gate`. In another, a Gymnasium env begins and drives episodes over lock-step topics as
 fast as it can. Memory (resident), threads and file descriptors of each process, and of this one,
 are taken after a warm-up and until the end. A stop is explained if this script asked for it.
+
+Bars: no unexplained stop, nothing grows, and both robots drove: goals and metres for each minute,
+episodes and their steps. The controls never arm the gate, or open a file in each episode.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -25,6 +25,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from measuring.processes import Use, use_of
+from measuring.verdict import answer, parser_of
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -40,23 +41,38 @@ ROBOT, WORLD = "differential", "empty"
 GOALS = np.array([[1.5, 0.0], [1.5, 1.5], [0.0, 1.5], [-1.5, 0.0], [0.0, -1.5]])
 NEAR_M, STEPS_PER_EPISODE = 0.35, 20
 SAMPLE_S, PATIENCE_S, GOAL_AGAIN_S = 5.0, 90.0, 1.0
+CONTROLS = {
+    "standing": "the gate's consent: the robot in real time never moves",
+    "leak": "order: each episode leaves a file open",
+}
+MOST = {"unexplained_stops": 0, "rss_growth_mb": 10.0, "fds_growth": 0, "threads_growth": 0}
+LEAST = {"resets": 1, "steps": 1}
+LEAST_PER_MINUTE = {"driven_m": 2.0, "goals_reached": 1}
+DRIVEN_M = 0.2
+"""Least of the robot of the episodes, over all."""
 
 
 class Drive:
     """Arms the gate, sends goals one after the other, and counts the stops that the gate tells of.
 
+    Args:
+        domain_id: of the robot.
+        armed: whether the gate is taken for armed, so that nobody asks it.
+
     Attributes:
         goals: how many were reached.
         stops: rule -> how often it stopped the robot since it was armed.
+        driven_m: how far the robot truly drove [m].
     """
 
-    def __init__(self, domain_id: int) -> None:
+    def __init__(self, domain_id: int, armed: bool) -> None:
+        self.driven_m, self._place = 0.0, None
         self._context = open_context(domain_id=domain_id)
         self._node = Node("soak", context=self._context, start_parameter_services=False)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self.goals, self.stops, self._sent_s = 0, {}, 0.0
-        self.armed, self._asked_s, self._answer = False, 0.0, None
+        self.armed, self._asked_s, self._answer = armed, 0.0, None
         self._goal = self._node.create_publisher(PoseStamped, "goal_pose", qos.COMMAND)
         self._arm = self._node.create_client(Trigger, "command_gate/arm")
         self._node.create_subscription(Odometry, "ground_truth", self._look, qos.SENSOR)
@@ -64,6 +80,8 @@ class Drive:
 
     def _look(self, message: Odometry) -> None:
         pose = conversions.odometry_from_ros(message)[0]
+        before, self._place = self._place, pose[:2]
+        self.driven_m += 0.0 if before is None else float(np.hypot(*(pose[:2] - before)))
         goal, now = GOALS[self.goals % len(GOALS)], time.monotonic()
         if np.hypot(*(pose[:2] - goal)) < NEAR_M:
             self.goals += 1
@@ -103,9 +121,17 @@ class Drive:
 
 
 class Episodes:
-    """Short episodes of an env over lock-step topics, one after the other."""
+    """Short episodes of an env over lock-step topics, one after the other.
 
-    def __init__(self, domain_id: int) -> None:
+    Attributes:
+        env: that drives.
+        resets, steps: how many.
+        driven_m: how far its robot drove, by its own estimate [m].
+    """
+
+    def __init__(self, domain_id: int, leaks: bool) -> None:
+        self._opened: list[Any] | None = [] if leaks else None
+        self.driven_m, self._place = 0.0, np.zeros(2)
         register_envs()
         options = {"domain_id": domain_id, "timeout_s": PATIENCE_S}
         self.env = gymnasium.make(
@@ -117,13 +143,17 @@ class Episodes:
     def go_on(self) -> None:
         """A reset or a step."""
         if self._left == 0:
-            self.env.reset(seed=self.resets)
+            self._place = self.env.reset(seed=self.resets)[1]["pose"][:2]
             self.resets += 1
+            if self._opened is not None:
+                self._opened.append(open("/dev/null"))  # noqa: SIM115  (it is to leak)
             self._left = STEPS_PER_EPISODE
             return
         action = self._rng.uniform(-1.0, 1.0, self.env.action_space.shape).astype(np.float32)
-        _, _, ended, cut, _ = self.env.step(action)
+        _, _, ended, cut, info = self.env.step(action)
         self.steps += 1
+        before, self._place = self._place, info["pose"][:2]
+        self.driven_m += float(np.hypot(*(self._place - before)))
         self._left = 0 if ended or cut else self._left - 1
 
 
@@ -142,7 +172,7 @@ class Soak:
     uses: Callable[[], dict[str, Use]]
 
 
-def begin(stack: ExitStack) -> Soak:
+def begin(stack: ExitStack, control: str | None) -> Soak:
     """Starts everything; it ends with the stack."""
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
     field, track = free_domain_id(), free_domain_id()
@@ -161,9 +191,9 @@ def begin(stack: ExitStack) -> Soak:
         name: stack.enter_context(NodeProcess(node, folder / name, given, domain))
         for name, (node, given, domain) in parts.items()
     }
-    drive = Drive(field)
+    drive = Drive(field, armed=control == "standing")
     try:
-        episodes = Episodes(track)
+        episodes = Episodes(track, leaks=control == "leak")
     except BackendError:
         for process in processes.values():
             process.check()  # raises with the log of the one that is to blame
@@ -205,16 +235,17 @@ def growth(samples: list[dict[str, Use]], of: Callable[[Use], float]) -> dict[st
     }
 
 
-def measure(minutes: float, warm_up: float) -> dict[str, Any]:
+def measure(minutes: float, warm_up: float, control: str | None) -> dict[str, Any]:
     """Runs everything and tells what grew."""
     with ExitStack() as stack:
-        soak = begin(stack)
+        soak = begin(stack, control)
         deadline = time.monotonic() + PATIENCE_S
-        while not (soak.drive.armed and soak.drive.goals) and time.monotonic() < deadline:
+        while not (soak.drive.armed and (soak.drive.goals or control == "standing")):
             run(soak, 1.0)
+            if time.monotonic() > deadline:
+                break
         run(soak, 60.0 * warm_up)
-        before = dict(soak.drive.stops)
-        goals, resets, steps = soak.drive.goals, soak.episodes.resets, soak.episodes.steps
+        before, known = dict(soak.drive.stops), counts(soak)
         samples = run(soak, 60.0 * minutes)
         stops = {
             rule: count - before.get(rule, 0)
@@ -229,26 +260,45 @@ def measure(minutes: float, warm_up: float) -> dict[str, Any]:
             "unexplained_stops": sum(stops.values()),
             "stops": stops,
             "rss_growth_mb_by_process": {name: round(v, 2) for name, v in memory.items()},
-            "goals_reached": soak.drive.goals - goals,
-            "resets": soak.episodes.resets - resets,
-            "steps": soak.episodes.steps - steps,
+            **{name: round(now - known[name], 3) for name, now in counts(soak).items()},
             "minutes": minutes,
         }
 
 
+def counts(soak: Soak) -> dict[str, float]:
+    """What was done until now."""
+    return {
+        "goals_reached": soak.drive.goals,
+        "driven_m": soak.drive.driven_m,
+        "resets": soak.episodes.resets,
+        "steps": soak.episodes.steps,
+        "driven_in_episodes_m": soak.episodes.driven_m,
+    }
+
+
+def bars(result: dict[str, Any]) -> list[str]:
+    """A sentence for each bar that was missed."""
+    minutes = result["minutes"]
+    least = LEAST | {name: rate * minutes for name, rate in LEAST_PER_MINUTE.items()}
+    least["goals_reached"] = int(least["goals_reached"])  # of whole minutes
+    least["driven_in_episodes_m"] = DRIVEN_M
+    return [
+        *(f"{name} {result[name]}: must be {bar} at most"
+          for name, bar in MOST.items() if not result[name] <= bar),
+        *(f"{name} {result[name]}: must be {bar:g} at least"
+          for name, bar in least.items() if not result[name] >= bar),
+    ]  # fmt: skip
+
+
 def main() -> None:
-    """Prints a table, or one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    """Prints a table, or one JSON object, and ends with 1 where a bar was missed."""
+    parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--warm-up", type=float, default=1.0, help="minutes before it counts")
     given = parser.parse_args()
-    result = measure(given.minutes, given.warm_up)
-    if given.json:
-        sys.stdout.write(json.dumps(result) + "\n")
-    else:
-        for key, value in result.items():
-            sys.stdout.write(f"{key:<28}{value}\n")
+    result = measure(given.minutes, given.warm_up, given.control)
+    table = "".join(f"{key:<28}{value}\n" for key, value in result.items())
+    answer(result, bars(result), table, given.json)
 
 
 if __name__ == "__main__":

@@ -79,6 +79,13 @@ class Backend(Protocol):
         """
         ...
 
+    def halt(self) -> None:
+        """Leaves the robot with a zero command; the episode is over.
+
+        It may be called at any time: after an error of its own, twice, and after `close`.
+        """
+        ...
+
     def close(self) -> None:
         """Leaves the robot with a zero command and frees everything."""
         ...

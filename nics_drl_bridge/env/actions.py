@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.env import kernels
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.kinematics.spec import RobotSpec
 
 Array = NDArray[np.float64]
@@ -83,16 +84,39 @@ def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray
     """An action as an array of its space's shape.
 
     Raises:
-        gymnasium.error.InvalidAction: of another shape, NaN, inf, or no action of that number.
+        gymnasium.error.InvalidAction: no numbers, of another shape, NaN, inf, or no action of that
+            number.
     """
-    given = np.asarray(action)
+    try:
+        given = np.asarray(action)
+    except ValueError as error:  # a ragged list
+        raise gymnasium.error.InvalidAction(f"{name}: {error}") from None
+    if given.dtype.kind not in "fiub":
+        raise gymnasium.error.InvalidAction(f"{name} of {given.dtype}: must be real numbers.")
     if given.shape != space.shape:
         raise gymnasium.error.InvalidAction(
             f"{name} of shape {given.shape}: must be of shape {space.shape}."
         )
     if isinstance(space, gymnasium.spaces.Box) and space.dtype == np.float32:
+        if given.dtype.char not in "fd":
+            given = given.astype(np.float64)  # the kernels are compiled for these two
         if not kernels.finite(given.reshape(1, -1)):
             raise gymnasium.error.InvalidAction(f"{name} {given!r}: holds NaN or inf.")
     elif not space.contains(given):
         raise gymnasium.error.InvalidAction(f"{name} {given!r}: is not in {space}.")
     return given
+
+
+def check_command(command: Any, like: Array) -> Array:
+    """A command as a task made it, which has to be of the shape of another one.
+
+    Raises:
+        ConfigError: it is of another shape, or holds NaN or inf.
+    """
+    made = np.asarray(command, np.float64)
+    if made.shape != like.shape or not kernels.finite(made.reshape(1, -1)):
+        raise ConfigError(
+            f"the task's command {made}: must be finite, of shape {like.shape}; look at its "
+            "`command`."
+        )
+    return made

@@ -9,11 +9,14 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env.actions import check_action, still, team_space
+from nics_drl_bridge.env.actions import check_action, check_command, still, team_space
+from nics_drl_bridge.env.backends import halting, make_backend
+from nics_drl_bridge.env.guard import halts_on_error
+from nics_drl_bridge.env.reset_arguments import check_options, check_reset
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.env.task import Episodes, Memory, Task, give, override
 from nics_drl_bridge.env.tasks import make_task
-from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
+from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend, RobotView, Start
 from nics_drl_bridge.random_kernels import episode_seed
@@ -23,11 +26,6 @@ from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]
 
-BACKENDS = {
-    "sim": "nics_drl_bridge.env.sim_backend:SimBackend",
-    "dds": "nics_drl_bridge.nodes.backends:dds_backend",
-}
-"""Where each backend lives. Named as text, so that an env in process never imports ROS 2."""
 RENDER_FPS = 10
 
 
@@ -88,7 +86,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     ## Arguments
 
     Args:
-        backend: `sim`, `dds`, or an object of your own with `reset`, `step` and `close`.
+        backend: `sim`, `dds`, or an object of your own, see `interface.Backend`; one without
+            `halt` is halted by a step with the command nearest to zero.
         model: a SimulatorModel, its folder, or the name of a shipped robot.
         world: a World, its YAML file, or the name of a shipped one.
         task: a name, `path/to/file.py:ClassName`, a class, or a Task; see `env.tasks.make_task`.
@@ -139,6 +138,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._shape = (1, self.robots, self.task.observation_space.shape[0])
         self._each = (1, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
+        self._rest = np.tile(self._still, (self.robots, 1))
         self._seed, self._episode, self._rehearsed = 0, -1, False
         self._picture: Any = None
         if isinstance(backend, str):
@@ -146,7 +146,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             options |= self._backend_arguments(backend, estimator, randomisation)
             self._backend = make_backend(backend, self.model, self.world, **options)
         else:
-            self._backend = backend
+            self._backend = halting(backend, self._row(self._rest))
 
     def _backend_arguments(
         self, backend: str, estimator: bool | None, randomisation: str | Randomisation | None
@@ -162,10 +162,16 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         chosen = {"estimator": bool(estimator), "robots": self.robots}
         return chosen if randomisation is None else {**chosen, "randomisation": randomisation}
 
+    @halts_on_error
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begins an episode; see Gymnasium."""
+        """Begins an episode; see Gymnasium.
+
+        Raises:
+            ConfigError: a seed of 2**63 or more, or options that the task does not have.
+        """
+        check_reset(seed, options)
         super().reset(seed=seed)
         if seed is not None or self._episode < 0:
             self._seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
@@ -179,9 +185,11 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             give(starts[None], "start", options["start"])
         episodes = Episodes(np.array([episode]), starts[None], self.scene.goals[None])
         self._rehearse(episodes)
+        memory = self.task.reset(episodes)
+        check_options(options, memory)
+        override(memory, options)
         self._view = self._lifted(self._backend.reset(Start(episode, self._row(starts))))
-        self.memory = self.task.reset(episodes)
-        override(self.memory, options)
+        self.memory = memory
         self.ended, self._true_pose = np.zeros(self.robots, np.bool_), starts
         facts = {
             "episode_seed": episode,
@@ -220,11 +228,12 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         named = {name: self._fact(value) if value.ndim else value for name, value in values.items()}
         return {"randomisation": named} if named else {}
 
+    @halts_on_error
     def step(
         self, action: NDArray[Any]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Applies an action for one control period; see Gymnasium."""
-        observation, terms, info = self.advance(action)
+        observation, terms, info = self._advance(action)
         values = {name: term.tolist() for name, term in terms.items()}
         each = [0.0] * self.robots
         for term in values.values():  # one after the other, as the vector env adds them
@@ -238,6 +247,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             self.render()
         return observation.reshape(-1), reward, bool(self.ended.all()), False, info
 
+    @halts_on_error
     def advance(
         self, action: NDArray[Any]
     ) -> tuple[NDArray[np.float32], dict[str, Array], dict[str, Any]]:
@@ -246,26 +256,20 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         `ended` (M,) says for which robots the episode is over; they get a zero command and no
         further reward.
         """
-        if self._view is None:
+        return self._advance(action)
+
+    def _advance(
+        self, action: NDArray[Any]
+    ) -> tuple[NDArray[np.float32], dict[str, Array], dict[str, Any]]:
+        before = self._view
+        if before is None:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         given = check_action(action, self.action_space, "action")
-        command = self._row(self.task.command(given.reshape(self._each))[0])
+        made = self.task.command(given.reshape(self._each))[0]
+        command = self._row(check_command(made, self._rest))
         waiting = self.robots > 1 and bool(self.ended.any())
         if waiting:
             command = np.where(self.ended[:, None], self._still, command)
-        # After an error from here on, only a reset leads back.
-        before, self._view = self._view, None
-        try:
-            return self._apply(command, before, waiting)
-        except BaseException:
-            # Of the task, too: whoever catches it shall not be left with a moving robot.
-            getattr(self._backend, "halt", lambda: None)()
-            raise
-
-    def _apply(
-        self, command: Array, before: RobotView, waiting: bool
-    ) -> tuple[NDArray[np.float32], dict[str, Array], dict[str, Any]]:
-        """What `advance` does with a command that is allowed."""
         seen, facts = self._backend.step(command)
         view, out = self._lifted(seen), np.empty(self._shape, np.float32)
         outcome = self.task.step_into(out, before, view, self.memory)
@@ -277,6 +281,14 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         for name, values in outcome.info.items():
             facts[name] = self._fact(values[0])
         return out[0], terms, self._info(view, facts)
+
+    def halt(self) -> None:
+        """Leaves the robot with a zero command; only a reset leads back.
+
+        Any exception that leaves `reset`, `step`, `render` or `close` has done so.
+        """
+        self._view = None
+        self._backend.halt()
 
     def _lifted(self, view: RobotView) -> RobotView:
         """A view as the batch of one that the task expects: leading (1, M)."""
@@ -303,6 +315,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         info.update(facts)
         return info
 
+    @halts_on_error
     def render(self) -> Any:
         """The world as it is, drawn from above; see Gymnasium."""
         if self.render_mode is None:
@@ -318,12 +331,15 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             bodies = self._backend.simulator.obstacles[0]
         return self._picture.draw(poses, self._view.ranges[0], bodies, self.memory)
 
+    @halts_on_error
     def close(self) -> None:
         """Leaves the robot with a zero command."""
-        self._backend.close()
-        if self._picture is not None:
-            self._picture.close()
-            self._picture = None
+        picture, self._picture = self._picture, None
+        try:
+            self._backend.close()
+        finally:
+            if picture is not None:
+                picture.close()
 
 
 def check_render_mode(mode: str | None, metadata: dict[str, Any]) -> None:
@@ -331,19 +347,3 @@ def check_render_mode(mode: str | None, metadata: dict[str, Any]) -> None:
     known = metadata["render_modes"]
     if mode is not None and mode not in known:
         raise ConfigError(f"unknown render_mode {mode!r}; {nearest(mode, known)}")
-
-
-def make_backend(name: str, model: SimulatorModel, world: World, **options: Any) -> Backend:
-    """A backend by name.
-
-    Raises:
-        ConfigError: unknown name, or its library is missing.
-    """
-    if name not in BACKENDS:
-        raise ConfigError(f"unknown backend {name!r}; {nearest(name, BACKENDS)}")
-    module, _, factory = BACKENDS[name].partition(":")
-    try:
-        made: Backend = getattr(import_module(module), factory)(model, world, **options)
-    except ModuleNotFoundError as error:
-        raise ConfigError(f"backend {name!r} {MISSING_ROS.format(module=error.name)}") from None
-    return made

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, BridgeEnv
+from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.env.registration import MAX_EPISODE_STEPS
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError
@@ -19,6 +20,8 @@ from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world import World
 
 Observations = dict[str, NDArray[np.float32]]
+OF_CHECKER = "options"
+"""PettingZoo's checker resets with an option of this name, which means nothing."""
 
 
 class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
@@ -90,15 +93,19 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         """Of an agent, always the same object."""
         return self.action_spaces[agent]
 
+    @halts_on_error
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, dict[str, Any]]]:
         """Begins an episode with all agents; see PettingZoo."""
+        if isinstance(options, dict):
+            options = {name: value for name, value in options.items() if name != OF_CHECKER}
         observation, info = self.env.reset(seed=seed, options=options)
         self.agents, self._steps = list(self.possible_agents), 0
         seen = dict(zip(self.agents, observation.reshape(len(self.agents), -1), strict=True))
         return seen, {name: self._told(info, m) for m, name in enumerate(self.agents)}
 
+    @halts_on_error
     def step(
         self, actions: dict[str, NDArray[Any]]
     ) -> tuple[
@@ -134,6 +141,10 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         self.agents = [] if late else [name for name in self.agents if not ended[name]]
         return seen, rewards, ended, cut, told
 
+    def halt(self) -> None:
+        """Lets every robot stand still; only a reset leads back. Any exception has done so."""
+        self.env.halt()
+
     def _told(self, info: dict[str, Any], m: int) -> dict[str, Any]:
         """What concerns robot m of the env's `info`."""
         return {
@@ -148,10 +159,12 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         each = self.env.robots > 1 and isinstance(value, np.ndarray)
         return value[m] if each else value
 
+    @halts_on_error
     def render(self) -> Any:
         """The world as it is, drawn from above."""
         return self.env.render()
 
+    @halts_on_error
     def close(self) -> None:
         """Closes the window."""
         self.env.close()

@@ -94,5 +94,8 @@ class SimBackend:
         middleware.scan(now, now, data.ranges[0, robot].copy())
         return middleware.view(now)
 
+    def halt(self) -> None:
+        """Nothing moves but in `step`."""
+
     def close(self) -> None:
         """Nothing has to be freed."""

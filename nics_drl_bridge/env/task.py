@@ -297,11 +297,15 @@ def give(rows: NDArray[Any], name: str, value: Any) -> None:
         ConfigError: it has another shape, or holds NaN or inf.
     """
     try:
-        rows[...] = value
-    except (TypeError, ValueError):
+        given = np.asarray(value)
+    except ValueError:  # a ragged list
+        given = np.asarray(None)
+    fits = given.shape in [rows.shape[k:] for k in range(max(2, rows.ndim))]
+    if not fits or given.dtype.kind not in "fiub":
         raise ConfigError(
             f"reset option {name!r}, {value!r}: must be numbers of shape {rows.shape[1:]}, or of "
             "its last dimensions."
-        ) from None
+        )
+    rows[...] = given
     if not np.isfinite(rows).all():
         raise ConfigError(f"reset option {name!r}, {value!r}: must be finite.")

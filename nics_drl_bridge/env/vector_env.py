@@ -16,6 +16,7 @@ from nics_drl_bridge.env import vector_info
 from nics_drl_bridge.env.actions import check_action, still, team_space
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
 from nics_drl_bridge.env.kernels import episode_seeds
+from nics_drl_bridge.env.reset_arguments import check_options, check_reset
 from nics_drl_bridge.env.sim_backend import NANO
 from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, give, override
 from nics_drl_bridge.env.tasks import make_task
@@ -134,6 +135,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._starts: Array = np.zeros((count, robots, 3))
         self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
         self.memory: Memory = {}
+        self.ready = False  # not after an exception either, which leaves worlds between two steps
 
     @property
     def changing(self) -> dict[str, NDArray[Any]]:
@@ -154,19 +156,26 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """Begins an episode in every world; world i takes its seeds from `seed + i`.
 
         Raises:
-            ConfigError: wrong number of seeds, or a wrong mask.
+            ConfigError: wrong number of seeds, one that is negative or too great, a wrong mask, or
+                an option that the task does not have.
+            ResetNeeded: some worlds alone, where all need it: at first and after an exception.
         """
+        check_reset(seed, options, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = chosen_worlds(options, self.num_envs)
+        if not (self.ready or chosen.all()):
+            raise gymnasium.error.ResetNeeded("call reset() of all worlds before one of some.")
         seeds, fresh = named_seeds(seed, chosen, self._episode < 0, self.np_random)
+        self.ready = False
         self._first[fresh], self._episode[fresh] = seeds[fresh], -1
-        if self.memory and not chosen.all():  # the others see what they saw
+        if not chosen.all():  # the others see what they saw
             self.task.observe_into(self._out, self._view(slice(None)), self.memory)
         rows = np.flatnonzero(chosen)
         self._begin(rows, self._out, options)
         infos: dict[str, Any] = {}
         facts = self._known(rows) | self._facts.beginnings(self._starts, self._bodies, rows)
         vector_info.put_rows(infos, facts, rows, self.num_envs)
+        self.ready = True
         return flat(self._out.copy() if self.copy else self._out), infos
 
     def _begin(
@@ -186,6 +195,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._bodies[worlds] = scenes.bodies
         self._starts[worlds] = self.simulator.data.pose[worlds]
         fresh = self.task.reset(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))
+        check_options(options, fresh, more=("reset_mask",))
         override(fresh, options)
         for name, rows in fresh.items():
             if name not in self.memory:
@@ -203,9 +213,10 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self, actions: NDArray[Any]
     ) -> tuple[Observation, Array, Flags, Flags, dict[str, Any]]:
         """One control period in every world; see Gymnasium."""
-        if not self.memory:
+        if not self.ready:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         given = check_action(actions, self.action_space, "actions").reshape(self._each)
+        self.ready = False
         out = np.empty_like(self._out) if self.copy else self._out
         begun = self._over.copy()  # these ignore their action and begin anew
         outcome = joined(
@@ -222,6 +233,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         else:
             self._over = over
             self._tell(infos, facts, begun)
+        self.ready = True
         return flat(out), reward, terminated, truncated, infos
 
     def _advance(

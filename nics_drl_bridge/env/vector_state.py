@@ -47,6 +47,7 @@ def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
         target[...] = state[name]  # in place: the compiled steps hold these arrays
     env.memory = _below(MEMORY, state)
     env.simulator.drawn = _below(DRAWN, state)
+    env.ready = bool((targets["episode"] >= 0).all())
 
 
 _SAME = "make the env with the arguments that it had."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import numpy as np
@@ -81,14 +81,16 @@ class FleetBackend:
             raise
 
     def halt(self) -> None:
-        """Publishes a zero command for each robot; the episode is over."""
-        for robot in self._robots:
-            robot.halt()
+        """Publishes a zero command for each robot, whatever one of them raises."""
+        with ExitStack() as each:
+            for robot in self._robots:
+                each.callback(robot.halt)
 
     def close(self) -> None:
-        """Publishes a zero command for each robot and ends the nodes."""
-        for robot in self._robots:
-            robot.close()
+        """Publishes a zero command for each robot and ends the nodes, whatever one raises."""
+        with ExitStack() as each:
+            for robot in self._robots:
+                each.callback(robot.close)
 
 
 def together(facts: Sequence[dict[str, Any]]) -> dict[str, Any]:

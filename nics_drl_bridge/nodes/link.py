@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import signal
 import threading
 import time
@@ -10,16 +11,19 @@ import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 
+from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.command_timeout import CommandTimeout
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.graph import owner
 from nics_drl_bridge.nodes.qos_watch import QosWatch
@@ -43,6 +47,8 @@ class Link:
         command_topic: where commands go.
         stamped: whether they are TwistStamped.
         parameters: of the node.
+        command_timeout_s: a command that no other one follows for so long is followed by a zero
+            [s]; inf never.
     """
 
     def __init__(
@@ -52,6 +58,7 @@ class Link:
         command_topic: str = "cmd_vel",
         stamped: bool = False,
         parameters: Mapping[str, Any] | None = None,
+        command_timeout_s: float = math.inf,
     ) -> None:
         _end_orderly_on_sigterm()
         self._context = open_context(domain_id=domain_id)
@@ -63,20 +70,33 @@ class Link:
         self._kind = TwistStamped if stamped else Twist
         self._twists = TwistWriter()
         self.commands = self.node.create_publisher(self._kind, command_topic, qos.COMMAND)
+        self._timeout = CommandTimeout(self.commands, self._kind, command_timeout_s)
         self._closing: weakref.finalize[Any, Any] | None = None
 
     def begin(self) -> None:
         """Starts the executor's thread; to be called when all subscriptions are there."""
         thread = threading.Thread(
-            target=_spin, args=(self._context, self.node), daemon=True, name="dds_backend"
-        )
+            target=_spin, args=(self._context, self.node, self._timeout), daemon=True,
+            name="dds_backend",
+        )  # fmt: skip
         thread.start()
         self._closing = weakref.finalize(
             self, _shut_down, self._context, self.commands, self._kind, thread
         )
 
-    def send(self, twist: ArrayLike, stamp_ns: int = 0) -> None:
-        """Publishes linear.x, linear.y, angular.z (3,), stamped if the topic is."""
+    def send(self, twist: NDArray[np.float64], stamp_ns: int = 0) -> None:
+        """Publishes linear.x, linear.y, angular.z (3,), stamped if the topic is.
+
+        Raises:
+            BackendError: they are not finite; a zero is published instead.
+        """
+        if not all(map(math.isfinite, twist)):
+            self.halt()
+            raise BackendError(
+                f"command {twist} for {self.commands.topic_name}: must be finite, a zero was sent "
+                "instead; look at what the task's `command` returns."
+            )
+        self._timeout.begin(moving=True)
         if self._kind is Twist:
             self.commands.publish(self._twists.write(twist))
             return
@@ -88,6 +108,7 @@ class Link:
     def halt(self) -> None:
         """Publishes a zero command."""
         if self._context.ok():
+            self._timeout.begin(moving=False)
             self.commands.publish(self._kind())
 
     @contextlib.contextmanager
@@ -101,7 +122,7 @@ class Link:
 
     def check_open(self) -> None:
         """Raises BackendError when it is closed."""
-        if self._closing is None or not self._closing.alive:
+        if self._closing is None or not self._closing.alive or not self._context.ok():
             raise BackendError("this backend is closed; make another one.")
 
     def call(self, client: Any, request: Any, timeout_s: float) -> Any:
@@ -169,45 +190,32 @@ class Link:
             self._closing()
 
 
-def _spin(context: Context, node: Node) -> None:
+def _spin(context: Context, node: Node, timeout: CommandTimeout) -> None:
     executor = StandingExecutor(context)
     executor.add_node(node)
     try:
         while context.ok():
             executor.spin_once(timeout_sec=SPIN_S)
+            timeout.look()
     except ExternalShutdownException:
         pass
     finally:
+        if context.ok():  # an error ends it, and with it whoever would notice that data are old
+            timeout.end()
+            context.try_shutdown()
         executor.shutdown(timeout_sec=1.0)
         node.destroy_node()
 
 
 def _shut_down(context: Context, commands: Publisher, kind: Any, thread: threading.Thread) -> None:
     """Leaves a zero command behind and ends the thread; knows nothing of the link."""
-    with _deaf_to_interrupts():
+    with uninterrupted():  # the interpreter would end beside a thread in the middleware's library
         if context.ok():
             last_word(commands, kind())
             context.try_shutdown()
         # Garbage may be collected in any thread, also in that one.
         if thread is not threading.current_thread():
             thread.join(timeout=2.0)
-
-
-@contextlib.contextmanager
-def _deaf_to_interrupts() -> Iterator[None]:
-    """Lets no second Ctrl-C cut a shutdown short.
-
-    The interpreter would end beside a thread inside the middleware's library, which aborts.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        if before is not None:
-            signal.signal(signal.SIGINT, before)
 
 
 def _end_orderly_on_sigterm() -> None:

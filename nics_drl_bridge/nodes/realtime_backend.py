@@ -28,6 +28,8 @@ POLL_S = 0.01
 SAY_EVERY_S = 2.0
 SERVICES_S = 0.5
 """What has shown no services so long after its topics is a vehicle."""
+COMMAND_S, PERIODS = 0.5, 2
+"""A command holds so long, and for so many periods at least; then a zero follows by itself."""
 STILL = (0.02, 0.05)
 """A robot that is slower stands [m/s, rad/s]."""
 ADVICE = (
@@ -69,6 +71,8 @@ class RealtimeBackend:
                 "use_imu": chosen.use_imu,
                 "enable_stamped_cmd_vel": chosen.stamped,
             },
+            # A gate looks after it by itself.
+            command_timeout_s=math.inf if chosen.gated else self._command_timeout_s(),
         )  # fmt: skip
         try:
             declare_sensors(self._link.node)
@@ -84,6 +88,9 @@ class RealtimeBackend:
         except BaseException:
             self.close()
             raise
+
+    def _command_timeout_s(self) -> float:
+        return max(COMMAND_S, PERIODS * self._period_ns / NANO)
 
     def reset(self, start: Start) -> RobotView:
         """Begins an episode: a simulator's service does, or a vehicle has to stand there.

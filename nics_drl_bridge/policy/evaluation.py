@@ -10,6 +10,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.policy.policies import Policy
 
 Array = NDArray[np.float64]
@@ -55,7 +57,7 @@ def drive(
     options: dict[str, Any] | None = None,
     on_start: Callable[[], None] = lambda: None,
 ) -> Episode:
-    """Drives one episode to its end.
+    """Drives one episode to its end; the robot is halted where the policy or a callback raises.
 
     Args:
         env: to drive in.
@@ -64,6 +66,22 @@ def drive(
         options: of `env.reset`.
         on_start: is called when the robot stands at its start.
     """
+    try:
+        return _drive(env, policy, seed, options, on_start)
+    except BaseException:
+        if isinstance(env.unwrapped, BridgeEnv):  # which never sees what a policy raises
+            with uninterrupted():
+                env.unwrapped.halt()
+        raise
+
+
+def _drive(
+    env: gymnasium.Env[Any, Any],
+    policy: Policy,
+    seed: int,
+    options: dict[str, Any] | None,
+    on_start: Callable[[], None],
+) -> Episode:
     observation, info = env.reset(seed=seed, options=options)
     on_start()
     goal, bodies = info["goal"], info["bodies"]

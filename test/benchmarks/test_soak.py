@@ -2,26 +2,43 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
-SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "soak.py"
+from .runs import BENCHMARKS, asked, fails
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(300)]
+SCRIPT = "soak.py"
 
 
-@pytest.mark.ros
-@pytest.mark.timeout(300)
 def test_the_whole_stack_drives_and_begins_episodes_and_keeps_its_files_and_threads():
-    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-    done = subprocess.run(
-        [sys.executable, str(SCRIPT), "--json", "--minutes", "0.2", "--warm-up", "0.1"],
-        capture_output=True, text=True, check=True, timeout=280,
-    )  # fmt: skip
-    result = json.loads(done.stdout)
+    code, result = asked(SCRIPT, "--minutes", "0.2", "--warm-up", "0.1")
     assert result["resets"] > 0
     assert result["steps"] > result["resets"]
-    assert set(result) >= {"rss_growth_mb", "unexplained_stops"}
+    assert result["driven_m"] > 0.4
+    assert result["driven_in_episodes_m"] > 0.2
+    assert set(result) >= {"rss_growth_mb", "unexplained_stops", "goals_reached"}
     assert (result["fds_growth"], result["threads_growth"]) == (0, 0)
+    # On a busy machine data come late, which stops a robot.
+    assert all(line.startswith("unexplained_stops") for line in result["failures"])
+    assert code == bool(result["failures"])
+
+
+def test_a_robot_that_never_moves_has_shown_nothing():
+    missed = fails(SCRIPT, "standing", "--minutes", "0.05", "--warm-up", "0.0")
+    assert any(line.startswith("driven_m 0.0: must be 0.1 at least") for line in missed)
+
+
+def test_a_file_that_each_episode_leaves_open_is_found():
+    missed = fails(SCRIPT, "leak", "--minutes", "0.2", "--warm-up", "0.0")
+    assert any(line.startswith("fds_growth ") for line in missed)
+
+
+def test_a_figure_that_is_nan_misses_its_bar(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import soak
+
+    names = [*soak.MOST, *soak.LEAST, *soak.LEAST_PER_MINUTE, "driven_in_episodes_m"]
+    result = dict.fromkeys(names, float("nan")) | {"minutes": 1.0}
+    assert len(soak.bars(result)) == len(names)

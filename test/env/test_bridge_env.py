@@ -198,15 +198,36 @@ class Recorder:
         self.closed += 1
 
 
-def test_any_object_with_reset_step_and_close_is_a_backend():
+def test_any_object_with_reset_step_and_close_is_a_backend_that_a_still_command_halts():
     backend = Recorder()
-    assert isinstance(backend, Backend)
     env = BridgeEnv(backend, model=direct_model(), world=field())
     env.reset(seed=0)
     env.step(np.array([1.0, -1.0, 0.0], np.float32))
+    env.halt()
     env.close()
-    assert np.array_equal(backend.commands, [[2.0, -2.0, 0.0]])
+    assert np.array_equal(backend.commands, [[2.0, -2.0, 0.0], [0.0, 0.0, 0.0]])
     assert backend.closed == 1
+
+
+def test_a_backend_with_a_halt_of_its_own_is_halted_by_it():
+    class Halting(Recorder):
+        halts = 0
+
+        def halt(self):
+            self.halts += 1
+
+    backend = Halting()
+    assert isinstance(backend, Backend)
+    assert isinstance(SimBackend(direct_model(), field()), Backend)
+    env = BridgeEnv(backend, model=direct_model(), world=field())
+    env.reset(seed=0)
+    env.halt()
+    assert (backend.halts, backend.commands) == (1, [])
+
+
+def test_what_is_no_backend_is_refused_with_what_it_lacks():
+    with pytest.raises(ConfigError, match=r"backend of type object: has no reset, no step, no clo"):
+        BridgeEnv(object())
 
 
 def test_a_task_has_judged_a_step_before_a_robot_is_asked_for_anything():

@@ -14,6 +14,7 @@ from gymnasium.wrappers import TimeLimit
 from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registration import ENVIRONMENTS, NAVIGATION
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
@@ -267,6 +268,55 @@ def test_gymnasiums_wrappers_take_it():
 def test_a_wrong_argument_gives_one_sentence(arguments, sentence):
     with pytest.raises(ConfigError, match=sentence[:40].replace("?", ".")):
         vector(1, **arguments)
+
+
+class Fragile(Navigation):
+    """Raises in one world of the batch, after the simulator has moved all."""
+
+    broken = False
+
+    def step_into(self, *given):
+        if Fragile.broken:
+            raise KeyboardInterrupt
+        return super().step_into(*given)
+
+
+def test_an_exception_amid_a_step_wants_a_reset_of_all_worlds_which_sets_all_right():
+    env = vector(3, task=Fragile)
+    fresh = vector(3, task=Fragile)
+    actions = np.full((3, 3), 0.5, np.float32)
+    env.reset(seed=1)
+    env.step(actions)
+    Fragile.broken = True
+    with pytest.raises(KeyboardInterrupt):
+        env.step(actions)
+    Fragile.broken = False
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(actions)
+    with pytest.raises(gymnasium.error.ResetNeeded, match="all worlds"):
+        env.reset(options={"reset_mask": np.array([True, False, True])})
+    assert np.array_equal(env.reset(seed=7)[0], fresh.reset(seed=7)[0])
+    for _ in range(3):
+        assert np.array_equal(env.step(actions)[0], fresh.step(actions)[0])
+
+
+class Forgetful(Navigation):
+    shown = ()
+
+    def reset(self, episodes):
+        return {}
+
+    def step_into(self, out, before, after, memory):
+        return super().step_into(out, before, after, {"goal": np.zeros((*after.pose.shape[:2], 2))})
+
+    def observation(self, view, memory):
+        return super().observation(view, {"goal": np.zeros((*view.pose.shape[:2], 2))})
+
+
+def test_a_task_that_remembers_nothing_can_be_stepped():
+    env = vector(2, task=Forgetful)
+    env.reset(seed=0)
+    env.step(np.zeros((2, 3), np.float32))
 
 
 def test_actions_that_hold_nan_are_refused():

@@ -311,9 +311,15 @@ def test_an_error_in_a_step_leaves_a_zero_command_and_wants_a_reset(
     env = BridgeEnv(connect(), model, arena)
     action = np.ones(2, np.float32)
     env.reset(seed=0)
-    with pytest.raises(gymnasium.error.InvalidAction, match="NaN"):
-        env.step(action * np.nan)
-    env.step(action)  # nothing was sent, so nothing is lost
+
+    def refused():
+        with pytest.raises(gymnasium.error.InvalidAction, match="NaN"):
+            env.step(action * np.nan)
+
+    zero_follows(commands_heard, lambda: env.step(action), refused)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(action)
+    env.reset(seed=0)
 
     def interrupted():
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):  # noqa: PT012

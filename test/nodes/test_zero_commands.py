@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
-from geometry_msgs.msg import Twist
+from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 
@@ -137,3 +137,40 @@ def test_the_last_command_of_a_process_is_zero(robot, drive, what, until, signal
     if until == "stepped":
         assert any(command.linear.x > 0.0 for command in heard)
     peer.until(lambda: heard and heard[-1] == Twist(), "a zero command")
+
+
+POLICY = """
+import sys
+from nics_drl_bridge.nodes.policy_node import PolicyNode, main
+
+inner, acted = PolicyNode._command, []
+
+def command(self, view, goal):
+    if self.state == "active":
+        acted.append(view)
+    if len(acted) > 5:
+        raise eval(sys.argv[1])
+    return inner(self, view, goal)
+
+PolicyNode._command = command
+main([sys.argv[0], "--ros-args", "-p", "goal:=[8.0, 5.0]"])
+"""
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("error", ["ValueError('of the policy')", "SystemExit(3)", "MemoryError()"])
+def test_a_policy_that_raises_leaves_a_zero_command_behind(robot, domain_id, error):
+    peer, _, tell = robot
+    raw = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
+    process = subprocess.Popen(
+        [sys.executable, "-c", POLICY, error],
+        env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)}, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        peer.until(lambda: tell() or process.poll() is not None, "its end", 200.0)
+        peer.until(lambda: raw and raw[-1].twist == Twist(), "a zero command")
+        assert process.returncode != 0
+        assert any(each.twist.linear.x > 0.0 for each in raw)
+    finally:
+        process.kill()
+        process.wait()

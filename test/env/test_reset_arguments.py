@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from robots import direct_model, field
+
+from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.pettingzoo_env import BridgeParallelEnv
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.errors import ConfigError
+
+
+def single():
+    return BridgeEnv(model=direct_model(), world=field())
+
+
+def vector(count=3):
+    return BridgeVectorEnv(count, model=direct_model(), world=field())
+
+
+def agents():
+    return BridgeParallelEnv(model=direct_model(), world=field())
+
+
+ENVS = {"single": single, "vector": vector, "agents": agents}
+
+
+@pytest.mark.parametrize("kind", sorted(ENVS))
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"seed": 2**63}, "^seed 9223372036854775808: must be at most"),
+        ({"seed": 2**200}, "^seed of 201 bits: must be at most"),
+        ({"seed": 10**6000}, "^seed of 19932 bits: must be at most"),
+        ({"seed": "three"}, "^seed of type str: must be an integer, or None"),
+        ({"seed": 3.0}, "^seed of type float: must be an integer, or None"),
+        ({"options": [1]}, "^reset options of type list: must be a dict"),
+        ({"options": "start"}, "^reset options of type str: must be a dict"),
+        ({"options": {"gaol": (1.0, 1.0)}}, "^unknown reset option 'gaol'; did you mean 'goal'?"),
+        ({"options": {3: 1}}, "^unknown reset option 3; "),
+    ],
+)
+def test_what_a_reset_cant_use_is_one_sentence_and_the_next_reset_works(kind, arguments, sentence):
+    env = ENVS[kind]()
+    with pytest.raises(ConfigError, match=sentence.replace("?", r"\?")):
+        env.reset(**arguments)
+    first = env.reset(seed=3)[0]
+    again = ENVS[kind]().reset(seed=3)[0]
+    np.testing.assert_equal(first, again)
+
+
+@pytest.mark.parametrize("kind", sorted(ENVS))
+def test_a_negative_seed_is_one_sentence(kind):
+    with pytest.raises(gymnasium.error.Error, match="must be greater or equal to zero"):
+        ENVS[kind]().reset(seed=-1)
+
+
+def test_the_greatest_seed_works():
+    assert single().reset(seed=2**63 - 1)[0].dtype == np.float32
+    assert vector(3).reset(seed=2**63 - 3)[0].shape[0] == 3
+
+
+def test_the_last_world_counts_on_from_the_seed_of_the_first():
+    with pytest.raises(ConfigError, match=r"must be at most 2\*\*63 - 3\.$"):
+        vector(3).reset(seed=2**63 - 2)
+
+
+@pytest.mark.parametrize("bad", [2**63, "x", 1.5])
+def test_a_list_of_seeds_is_checked_one_by_one(bad):
+    with pytest.raises(ConfigError, match=r"^seed "):
+        vector(3).reset(seed=[1, bad, None])
+
+
+def test_reset_mask_is_an_option_of_the_vector_env_alone():
+    with pytest.raises(ConfigError, match="unknown reset option 'reset_mask'"):
+        single().reset(options={"reset_mask": np.array([True])})
+
+
+@pytest.mark.parametrize(
+    "goal", [5.0, (1.0,), [[1.0], [1.0, 2.0]], None, object(), "12", (1j, 2.0), np.ones((1, 1, 1))]
+)
+def test_an_option_of_another_shape_is_refused_rather_than_spread(goal):
+    with pytest.raises(ConfigError, match=r"reset option 'goal'.*must be numbers of shape"):
+        single().reset(options={"goal": goal})
+
+
+@pytest.mark.parametrize(
+    "action", [np.array(["a", "b", "c"]), np.ones(3) * 1j, np.array([None] * 3), [[1.0], 2.0]]
+)
+def test_an_action_of_no_numbers_is_refused_by_its_type(action):
+    env = single()
+    env.reset(seed=0)
+    with pytest.raises(gymnasium.error.InvalidAction):
+        env.step(action)
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.int8, np.uint64, np.bool_, list])
+def test_an_action_of_any_real_numbers_is_an_action(kind):
+    env, ones = single(), [1, 0, 1]
+    env.reset(seed=0)
+    told = env.step(ones if kind is list else np.array(ones, kind))
+    env.reset(seed=0)
+    assert np.array_equal(told[0], env.step(np.array(ones, np.float32))[0])
+
+
+@pytest.mark.parametrize("command", [lambda c: c[..., :1], lambda c: c * np.nan, lambda c: c[0]])
+def test_a_task_whose_command_no_robot_can_be_told_is_named(command):
+    class Senseless(Navigation):
+        def command(self, action):
+            return command(super().command(action))
+
+    env = BridgeEnv(model=direct_model(), world=field(), task=Senseless)
+    env.reset(seed=0)
+    with pytest.raises(ConfigError, match=r"^the task's command .*must be finite, of shape \(1, 3"):
+        env.step(np.ones(3, np.float32))

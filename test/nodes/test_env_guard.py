@@ -1,0 +1,288 @@
+"""An env over DDS leaves a zero on `cmd_vel` whatever leaves one of its methods by an exception."""
+
+from __future__ import annotations
+
+import threading
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from geometry_msgs.msg import Twist
+
+from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.registration import COOPERATIVE_REACHING, NAVIGATION
+from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.interface import Start
+from nics_drl_bridge.nodes import link, qos
+from nics_drl_bridge.nodes.dds_backend import DdsBackend
+from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
+from nics_drl_bridge.sim.world import load_world
+
+pytestmark = pytest.mark.ros
+
+AHEAD = np.array([1.0, 0.0], np.float32)
+PATIENCE_S = 60.0
+
+
+class Thrower(Navigation):
+    """Drives as told until `error` is set, which then leaves whatever is called next."""
+
+    thrown = SimpleNamespace(error=None, value=None)
+
+    def command(self, action):
+        if self.thrown.error is not None:
+            raise self.thrown.error
+        command = super().command(action)
+        return command if self.thrown.value is None else command * self.thrown.value
+
+    def reset(self, episodes):
+        if self.thrown.error is not None:
+            raise self.thrown.error
+        return super().reset(episodes)
+
+
+@pytest.fixture(scope="module")
+def simulators(launch, domains):
+    """The domain of a simulator for each mode."""
+    from domains import claimed_domain
+
+    found = {}
+    for mode in ("realtime", "lockstep"):
+        found[mode] = domains.enter_context(claimed_domain())
+        # A command holds for an hour: what stops the robot is the env.
+        launch("simulator_node", found[mode], mode=mode, world="empty", command_timeout=3600.0)
+    return found
+
+
+@pytest.fixture(scope="module")
+def listeners(simulators, meet):
+    """What is heard on `cmd_vel` of each mode."""
+    peers = {mode: meet(domain_id) for mode, domain_id in simulators.items()}
+    return {mode: (peer, peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND))
+            for mode, peer in peers.items()}  # fmt: skip
+
+
+@pytest.fixture
+def driving(simulators, listeners):
+    """Makes an env whose robot drives ahead, `driving(mode)`; it is known to who listens."""
+    made = []
+    Thrower.thrown.error = Thrower.thrown.value = None
+
+    def start(mode, **arguments):
+        peer, heard = listeners[mode]
+        options = {"mode": mode, "domain_id": simulators[mode]}
+        options |= {"stale_after_s": PATIENCE_S} if mode == "realtime" else {}
+        env = gymnasium.make(
+            NAVIGATION, backend="dds", world="empty", task=Thrower, max_episode_steps=100_000,
+            backend_options=options, **arguments,
+        )  # fmt: skip
+        made.append(env)
+        env.reset(seed=1)
+        heard.clear()
+        peer.until(lambda: step(env) and heard and heard[-1].linear.x > 0.0, "that it drives")
+        return env, peer, heard
+
+    yield start
+    Thrower.thrown.error = Thrower.thrown.value = None
+    for env in made:
+        env.close()
+
+
+def step(env):
+    ended = env.step(AHEAD)[2]
+    if ended:
+        env.reset()
+    return True
+
+
+def throw(error=None, value=None):
+    Thrower.thrown.error, Thrower.thrown.value = error, value
+
+
+def task_raises(env):
+    throw(ZeroDivisionError("of the task"))
+    env.step(AHEAD)
+
+
+def task_says_nan(env):
+    throw(value=np.nan)
+    env.step(AHEAD)
+
+
+def interrupted(env):
+    throw(KeyboardInterrupt())
+    env.step(AHEAD)
+
+
+def task_raises_in_reset(env):
+    throw(ZeroDivisionError("of the task"))
+    env.reset(seed=2)
+
+
+def picture_fails(env):
+    def draw(*_):
+        raise OSError("no screen")
+
+    env.unwrapped._picture = SimpleNamespace(draw=draw, close=lambda: None)
+    env.render()
+
+
+def close_fails(env):
+    env.unwrapped._picture = SimpleNamespace(close=lambda: 1 / 0)
+    env.close()
+
+
+CASES = {
+    "step with NaN": (lambda env: env.step(AHEAD * np.nan), gymnasium.error.InvalidAction),
+    "step with a wrong shape": (lambda env: env.step(AHEAD[:1]), gymnasium.error.InvalidAction),
+    "a task whose command raises": (task_raises, ZeroDivisionError),
+    "reset with a bad seed": (lambda env: env.reset(seed=-1), gymnasium.error.Error),
+    "reset with bad options": (
+        lambda env: env.reset(options={"start": "there"}), ConfigError,
+    ),
+    "reset with an unknown option": (lambda env: env.reset(options={"x": 1}), ConfigError),
+    "reset with a great seed": (lambda env: env.reset(seed=2**63), ConfigError),
+    "a task whose command is NaN": (task_says_nan, ConfigError),
+    "a task whose reset raises": (task_raises_in_reset, ZeroDivisionError),
+    "Ctrl-C in step": (interrupted, KeyboardInterrupt),
+    "render that raises": (picture_fails, OSError),
+    "close whose picture raises": (close_fails, ZeroDivisionError),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+@pytest.mark.parametrize("case", list(CASES))
+def test_a_zero_is_the_last_that_cmd_vel_hears(driving, mode, case):
+    act, error = CASES[case]
+    env, peer, heard = driving(mode, render_mode="rgb_array")
+    with pytest.raises(error):
+        act(env)
+    peer.until(lambda: heard[-1] == Twist(), "a zero command")
+    assert all(np.isfinite([each.linear.x, each.angular.z]).all() for each in heard)
+    throw()
+    if not case.startswith("close"):
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            env.step(AHEAD)
+        env.reset(seed=2)
+        heard.clear()
+        peer.until(lambda: step(env) and heard and heard[-1].linear.x > 0.0, "that it drives on")
+
+
+def test_a_command_that_no_other_one_follows_is_followed_by_a_zero(driving):
+    """Its sender may have died of an error that the env never saw."""
+    env, peer, heard = driving("realtime")
+    with pytest.raises(TypeError):
+        env.step()  # refused by a wrapper: the env is not asked
+    peer.until(lambda: heard[-1] == Twist(), "a zero command")
+    known = len(heard)
+    env.step(AHEAD)  # nothing has been lost by it
+    peer.until(lambda: any(each.linear.x > 0.0 for each in heard[known:]), "a command")
+    peer.until(lambda: heard[-1] == Twist(), "another zero command")
+
+
+def test_the_death_of_the_thread_that_listens_leaves_a_zero_behind(driving, monkeypatch):
+    def dies(*_, **__):
+        raise MemoryError("in the executor")
+
+    monkeypatch.setattr(threading, "excepthook", lambda *_: None)
+    env, peer, heard = driving("realtime")
+    env.step(AHEAD)
+    monkeypatch.setattr(link.StandingExecutor, "spin_once", dies)
+    peer.until(lambda: heard[-1] == Twist(), "a zero command")
+    peer.until(lambda: not env.unwrapped._backend._link._context.ok(), "the thread's end")
+    with pytest.raises(BackendError, match="closed"):
+        env.step(AHEAD)
+
+
+def test_one_robot_of_a_fleet_that_cant_be_halted_keeps_none_of_the_others_moving(
+    launch, meet, domain_id, monkeypatch
+):
+    names = ["a", "b", "c"]
+    launch("simulator_node", domain_id, mode="lockstep", robots=names, world="empty")
+    peer = meet(domain_id)
+    heard = [peer.listen(Twist, f"{name}/cmd_vel", qos.EVERY_COMMAND) for name in names]
+    env = gymnasium.make(
+        COOPERATIVE_REACHING, backend="dds", world="empty", task_options={"robots": 3},
+        backend_options={"domain_id": domain_id, "namespaces": names},
+    ).unwrapped  # fmt: skip
+
+    def drive():
+        ended = env.step(np.tile(AHEAD, 3))[2]
+        if ended:
+            env.reset()
+        return all(each and each[-1].linear.x > 0.0 for each in heard)
+
+    def refuses():
+        raise BackendError("can't be halted")
+
+    env.reset(seed=0)
+    try:
+        for deaf in range(3):
+            peer.until(drive, "that all drive")
+            robots = env._backend._robots
+            with monkeypatch.context() as patch:
+                patch.setattr(robots[deaf], "halt", refuses)
+                with pytest.raises(BackendError, match="can't be halted"):
+                    env.step(np.tile(AHEAD, 3) * np.nan)
+            others = [each for k, each in enumerate(heard) if k != deaf]
+            peer.until(lambda others=others: all(x[-1] == Twist() for x in others), "zeros")
+            env.reset(seed=0)
+        peer.until(drive, "that all drive")
+        monkeypatch.setattr(robots[0], "close", refuses)
+        with pytest.raises(BackendError, match="can't be halted"):
+            env.close()
+        peer.until(lambda: all(each[-1] == Twist() for each in heard), "zeros at the end")
+    finally:
+        for robot in robots:
+            robot._link.close()
+
+
+def test_what_a_user_is_told_by_may_raise(simulators, listeners, monkeypatch):
+    """A `say` that raises ends a reset amid waiting for the robot."""
+
+    def say(_):
+        if raising:
+            raise ValueError("of the user")
+
+    mode, raising = "realtime", []
+    told = {"say": say, "vehicle": True, "start": "present"}
+    peer, heard = listeners[mode]
+    options = {"mode": mode, "domain_id": simulators[mode], "stale_after_s": PATIENCE_S, **told}
+    env = BridgeEnv("dds", world="empty", backend_options=options)
+    try:
+        env.reset(seed=0)
+        heard.clear()
+        peer.until(lambda: env.step(AHEAD) and heard and heard[-1].linear.x > 0.0, "driving")
+        monkeypatch.setattr(env._backend, "_missing", lambda _: "nothing, but somebody says so")
+        raising.append(True)
+        with pytest.raises(ValueError, match="of the user"):
+            env.reset(seed=0)
+        peer.until(lambda: heard[-1] == Twist(), "a zero command")
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize("kind", [DdsBackend, RealtimeBackend])
+@pytest.mark.parametrize("command", [[np.nan, 0.0], [0.5, np.inf], [-np.inf, np.nan]])
+def test_a_backend_publishes_nothing_that_is_not_finite(
+    simulators, listeners, model, kind, command
+):
+    mode = "lockstep" if kind is DdsBackend else "realtime"
+    peer, heard = listeners[mode]
+    backend = kind(model, load_world("empty"), domain_id=simulators[mode])
+    try:
+        backend.reset(Start(seed=3, pose=np.zeros(3)))
+        heard.clear()
+        moves = lambda: heard and heard[-1].linear.x > 0.0  # noqa: E731
+        peer.until(lambda: backend.step(np.array([0.5, 0.1])) and moves(), "that it drives")
+        with pytest.raises(BackendError, match="must be finite, a zero was sent instead"):
+            backend.step(np.array(command))
+        peer.until(lambda: heard[-1] == Twist(), "a zero command")
+        assert all(np.isfinite([each.linear.x, each.angular.z]).all() for each in heard)
+    finally:
+        backend.close()
