@@ -1,0 +1,297 @@
+"""How much of a core does the gate take, beside a bare rclpy node that hears the same and does nothing?
+
+Around the real `command_gate` a robot publishes over DDS what a vehicle does: scans of 720 beams,
+commands and the emergency stop's heartbeat at 10 Hz, odometry and the estimate at 50 Hz. Beside it
+a bare node, made and spun as rclpy's examples do, has the same subscriptions with callbacks that do
+nothing, and publishes a constant at the gate's rate. Both hear the same messages in the same
+seconds, so that what else the machine does weighs on both; `ratio` is the gate's share of a core to
+that node's. Shares are of the whole process, threads of the middleware included, from /proc (Linux).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import Twist, TwistStamped
+from measuring.processes import core_seconds
+from measuring.verdict import answer, parser_of
+from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
+
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.nodes import command_gate, conversions, qos
+from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.wire import OdometryWriter, ScanWriter, stamp_of
+
+CONTROLS = {"busy": "the gate decides ten times on each message and tick"}
+ROBOT, SPEED, NANO = "ackermann", 0.5, conversions.NANO
+SCAN_HZ, ODOM_HZ, TICK_HZ = 10, 50, 50
+MOST_RATIO = 1.25
+"""Of the gate's share of a core to that of a bare node that hears the same."""
+LONGEST_GAP_S = 0.2
+"""Between two commands; after such a one the gate itself stops."""
+LEAST_SENT, LEAST_MOVING = 0.9, 0.8
+"""Shares of the messages that were to be sent, and of the commands that came and moved."""
+PATIENCE_S = 60.0
+BUSY = 10
+
+
+class Robot:
+    """Publishes what a robot, its policy and its estimator do, and arms the gate.
+
+    Attributes:
+        heard: (time [s], moves) of each `cmd_vel`.
+        sent: messages of the timer so far.
+    """
+
+    def __init__(self, domain_id: int) -> None:
+        self._context = open_context(domain_id=domain_id)
+        self.node = Node("robot", context=self._context, start_parameter_services=False)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        lidar = builtin_model(ROBOT).lidar
+        self._ranges = np.full(lidar.beams, 2.0, np.float32)
+        self._scans = ScanWriter(conversions.scan_to_ros(lidar, self._ranges, 0, "laser"))
+        frames, variance = ("odom", "base_link"), (1e-4,) * 4
+        self._odometries = OdometryWriter(
+            conversions.odometry_to_ros(np.zeros(3), np.zeros(3), 0, frames, variance)
+        )
+        kinds = {
+            "scan": LaserScan, "odom": Odometry, "odometry/filtered": Odometry,
+            "cmd_vel_raw": TwistStamped, "e_stop": Bool,
+        }  # fmt: skip
+        self._topics = {
+            name: self.node.create_publisher(kind, name, qos.COMMAND)
+            for name, kind in kinds.items()
+        }
+        self.heard: list[tuple[float, bool]] = []
+        self.sent, self._x, self._speed, self._stamp_ns = 0, 0.0, 0.0, 0
+        self.node.create_subscription(Twist, "cmd_vel", self._hear, qos.EVERY_COMMAND)
+        self.node.create_timer(1.0 / ODOM_HZ, self._send)
+        self._clients = {
+            name: self.node.create_client(Trigger, f"command_gate/{name}")
+            for name in ("reset", "arm")
+        }
+
+    def _hear(self, message: Twist) -> None:
+        self._speed = message.linear.x
+        moves = bool(message.linear.x or message.angular.z)
+        self.heard.append((time.monotonic(), moves))
+
+    def _send(self) -> None:
+        now = time.time_ns()
+        self._x += self._speed / ODOM_HZ
+        odometry = self._odometries.write(
+            now, np.array([self._x, 0.0, 0.0]), np.array([self._speed, 0.0, 0.0])
+        )
+        self._topics["odom"].publish(odometry)
+        self._topics["odometry/filtered"].publish(odometry)
+        if self.sent % (ODOM_HZ // SCAN_HZ) == 0:
+            self._ranges += np.float32(1e-4)
+            self._topics["scan"].publish(self._scans.write(now, self._ranges))
+            self._topics["e_stop"].publish(Bool(data=False))
+            self._command(now)
+        self.sent += 1
+
+    def _command(self, stamp_ns: int) -> None:
+        """The policy has answered the scan before this one."""
+        command = TwistStamped(twist=conversions.twist_to_ros([SPEED, 0.0, 0.1]))
+        command.header.stamp = conversions.stamp_to_ros(self._stamp_ns)
+        self._topics["cmd_vel_raw"].publish(command)
+        self._stamp_ns = stamp_ns
+
+    def until(self, done: Callable[[], object], seconds: float) -> bool:
+        """Lives on until something is the case; whether it came to be."""
+        end = time.monotonic() + seconds
+        while not done():
+            if time.monotonic() > end:
+                return False
+            self._executor.spin_once(timeout_sec=0.05)
+        return True
+
+    @property
+    def moves(self) -> bool:
+        """Whether the newest command moves it."""
+        return bool(self.heard) and self.heard[-1][1]
+
+    def drive(self) -> None:
+        """Arms the gate as soon as it lets itself be armed. Raises RuntimeError."""
+        end, told = time.monotonic() + PATIENCE_S, ""
+        while not self.moves:
+            if time.monotonic() > end:
+                raise RuntimeError(f"not within {PATIENCE_S} s: motion ({told})")
+            told = f"{self._call('reset')} {self._call('arm')}"
+            self.until(lambda: self.moves, 1.0)
+
+    def _call(self, name: str) -> str:
+        if not self.until(self._clients[name].service_is_ready, PATIENCE_S):
+            raise RuntimeError(f"not within {PATIENCE_S} s: {name}")
+        future = self._clients[name].call_async(Trigger.Request())
+        self.until(future.done, PATIENCE_S)
+        return str(future.result().message)
+
+    def listeners(self) -> int:
+        """Of its scans."""
+        return self._topics["scan"].get_subscription_count()
+
+    def close(self) -> None:
+        """Leaves the graph."""
+        self._executor.shutdown(timeout_sec=1.0)
+        self.node.destroy_node()
+        self._context.try_shutdown()
+
+
+def bare_node() -> None:
+    """The yardstick: hears what the gate hears and does nothing, until it is killed."""
+    rclpy.init()
+    node = rclpy.create_node("bare")
+    twists = node.create_publisher(Twist, "cmd_vel_of_nobody", qos.COMMAND)
+    for kind, topic, profile in (
+        (LaserScan, "scan", qos.SENSOR),
+        (Odometry, "odom", qos.SENSOR),
+        (Odometry, "odometry/filtered", qos.SENSOR),
+        (TwistStamped, "cmd_vel_raw", qos.COMMAND),
+        (Bool, "e_stop", qos.EVERY_COMMAND),
+    ):
+        node.create_subscription(kind, topic, lambda _: None, profile)
+    node.create_timer(1.0 / TICK_HZ, lambda: twists.publish(Twist()))
+    rclpy.spin(node)
+
+
+def busy_gate(arguments: list[str]) -> None:
+    """The control: a gate that decides again and again, and then as the real one does."""
+    decide = command_gate.decide
+
+    def often(*given: Any) -> Any:
+        for _ in range(BUSY - 1):
+            decide(*given)
+        return decide(*given)
+
+    command_gate.decide = often
+    command_gate.main([sys.argv[0], *arguments])
+
+
+@contextmanager
+def started(part: str, domain_id: int, arguments: list[str]) -> Iterator[int]:
+    """A part of this script as a process; its id."""
+    environment = os.environ | {
+        "ROS_DOMAIN_ID": str(domain_id), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }  # fmt: skip
+    words = [sys.executable, __file__, "--part", part, *arguments]
+    process = subprocess.Popen(words, env=environment, stderr=subprocess.DEVNULL)
+    try:
+        yield process.pid
+    finally:
+        process.kill()
+        process.wait()
+
+
+@contextmanager
+def gate(domain_id: int, folder: Path, busy: bool) -> Iterator[int]:
+    """The gate's process, or the control's; its id."""
+    parameters = {
+        "model": ROBOT, "limits": ROBOT, "e_stop_required": True, "odom_rate": float(ODOM_HZ),
+        "black_box": str(folder / "black_box"), "rate_tolerance": 0.6, "shield": False,
+    }  # fmt: skip
+    if not busy:
+        with NodeProcess("command_gate", folder, parameters, domain_id) as process:
+            yield process.pid
+        return
+    words = [f"{key}:={str(value).lower() if value in (True, False) else value}"
+             for key, value in parameters.items()]  # fmt: skip
+    given = ["--ros-args", *(each for word in words for each in ("-p", word))]
+    with started("busy_gate", domain_id, given) as pid:
+        yield pid
+
+
+def measure(seconds: float, busy: bool) -> dict[str, Any]:
+    """Drives for a time and takes what both processes used of a core meanwhile."""
+    domain_id = free_domain_id()
+    with (
+        tempfile.TemporaryDirectory() as name,
+        gate(domain_id, Path(name), busy) as gate_pid,
+        started("bare", domain_id, []) as bare_pid,
+    ):
+        robot = Robot(domain_id)
+        try:
+            if not robot.until(lambda: robot.listeners() >= 2, PATIENCE_S):
+                raise RuntimeError(f"not within {PATIENCE_S} s: the gate and the bare node")
+            robot.drive()
+            robot.until(lambda: False, 1.0)
+            robot.heard.clear()
+            pids, began, sent = (gate_pid, bare_pid), time.monotonic(), robot.sent
+            used = [core_seconds(pid) for pid in pids]
+            robot.until(lambda: False, seconds)
+            lasted, sent = time.monotonic() - began, robot.sent - sent
+            shares = [(core_seconds(pid) - was) / lasted
+                      for pid, was in zip(pids, used, strict=True)]  # fmt: skip
+        finally:
+            robot.close()
+    times = [began, *(when for when, _ in robot.heard), began + lasted]
+    return {
+        "seconds": round(lasted, 2),
+        "gate_share": round(shares[0], 4),
+        "bare_share": round(shares[1], 4),
+        "ratio": round(shares[0] / shares[1], 3) if shares[1] else float("nan"),
+        "longest_gap_s": round(float(np.diff(times).max()), 4),
+        "sent": round(sent / (lasted * ODOM_HZ), 3),
+        "moving": round(sum(moves for _, moves in robot.heard) / (lasted * TICK_HZ), 3),
+    }
+
+
+def missed_bars(result: dict[str, Any]) -> list[str]:
+    """A sentence for each bar that was missed."""
+    missed = []
+    if not result["ratio"] <= MOST_RATIO:
+        missed.append(
+            f"the gate takes {result['ratio']} times what the bare node takes, bar {MOST_RATIO}"
+        )
+    if not result["longest_gap_s"] <= LONGEST_GAP_S:
+        missed.append(f"no command for {result['longest_gap_s']} s, bar {LONGEST_GAP_S} s")
+    if not result["sent"] >= LEAST_SENT:
+        missed.append(f"invalid: only {result['sent']} of the messages were sent")
+    if not result["moving"] >= LEAST_MOVING:
+        missed.append(f"invalid: only {result['moving']} of the commands came and moved")
+    return missed
+
+
+def main() -> None:
+    """Prints a table, or one JSON object; ends with 1 when a bar was missed."""
+    parser = parser_of(__doc__, CONTROLS)
+    parser.add_argument("--seconds", type=float, default=30.0, help="of driving")
+    parser.add_argument("--part", choices=("bare", "busy_gate"), help=argparse.SUPPRESS)
+    given, rest = parser.parse_known_args()
+    if given.part is not None:
+        bare_node() if given.part == "bare" else busy_gate(rest)
+        return
+    if rest:
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    result = measure(given.seconds, given.control == "busy")
+    table = (
+        f"the gate takes {result['gate_share']:.1%} of a core, the bare node "
+        f"{result['bare_share']:.1%}: {result['ratio']:.2f} times as much, over "
+        f"{result['seconds']:.0f} s\nlongest time between two commands "
+        f"{result['longest_gap_s']:.3f} s\n"
+    )
+    answer(result, missed_bars(result), table, given.json)
+
+
+if __name__ == "__main__":
+    main()
