@@ -3,40 +3,35 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry as OdometryMessage
+from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes import gate_inputs, qos
 from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
 from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.gate_parameters import declare_gate
 from nics_drl_bridge.nodes.qos_watch import QosWatch
 from nics_drl_bridge.nodes.runner import last_word, run_node
+from nics_drl_bridge.nodes.wire import UNREADABLE, TwistWriter
 from nics_drl_bridge.safety import shield
 from nics_drl_bridge.safety.black_box import Entry
 from nics_drl_bridge.safety.gate import decide
-from nics_drl_bridge.safety.inputs import (
-    Arm,
-    Command,
-    Estimate,
-    EStop,
-    Input,
-    Odometry,
-    Press,
-    Reset,
-    Scan,
-    Tick,
-)
+from nics_drl_bridge.safety.inputs import Arm, Input, Press, Reset, Tick
 from nics_drl_bridge.safety.state import Decision, begin
 
+Array = NDArray[np.float64]
 PERIOD_S = 0.02
+ZERO = np.zeros(3)
 
 
 class CommandGate(QosWatch):
@@ -63,47 +58,36 @@ class CommandGate(QosWatch):
             )
         if self._config.shield is not None:
             shield.rehearse()
-        self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
+        self._out, self._twists = (
+            self.create_publisher(Twist, "cmd_vel", qos.COMMAND),
+            TwistWriter(),
+        )
         self._listen()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD_S, lambda: self._decide(Tick()), clock=steady)
         Diagnostics(self, "gate", self._look)
 
     def _listen(self) -> None:
-        self.create_subscription(LaserScan, "scan", self._on_scan, qos.SENSOR)
-        self.create_subscription(OdometryMessage, "odom", self._on_odometry, qos.SENSOR)
-        self.create_subscription(
-            OdometryMessage, "odometry/filtered", self._on_estimate, qos.SENSOR
-        )
-        self.create_subscription(TwistStamped, "cmd_vel_raw", self._on_command, qos.COMMAND)
-        self.create_subscription(Bool, "e_stop", self._on_e_stop, qos.EVERY_COMMAND)
+        for kind, topic, read, profile in (
+            (LaserScan, "scan", partial(gate_inputs.scan, self._lidar), qos.SENSOR),
+            (OdometryMessage, "odom", gate_inputs.odometry, qos.SENSOR),
+            (OdometryMessage, "odometry/filtered", gate_inputs.estimate, qos.SENSOR),
+            (TwistStamped, "cmd_vel_raw", gate_inputs.command, qos.COMMAND),
+            (Bool, "e_stop", gate_inputs.e_stop, qos.EVERY_COMMAND),
+        ):
+            taker = partial(self._take, topic, read)
+            self.create_subscription(kind, topic, taker, profile, raw=True)
         self.create_service(Trigger, "~/arm", self._on_arm)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/e_stop", self._on_e_stop_call)
 
-    def _on_scan(self, message: LaserScan) -> None:
-        stamp = conversions.stamp_from_ros(message.header.stamp)
-        ranges = conversions.scan_from_ros(self._lidar, message)
-        self._decide(Scan(stamp, ranges, (message.angle_min, message.angle_increment)))
-
-    def _on_odometry(self, message: OdometryMessage) -> None:
-        stamp = conversions.stamp_from_ros(message.header.stamp)
-        pose, twist = conversions.odometry_from_ros(message)
-        if not conversions.is_rotation(message.pose.pose.orientation):
-            pose = np.full(3, np.nan)
-        self._decide(Odometry(stamp, pose, twist))
-
-    def _on_estimate(self, message: OdometryMessage) -> None:
-        variance = np.reshape(message.pose.covariance, (6, 6)).diagonal()
-        std = np.sqrt([max(variance[0], variance[1]), variance[5]])
-        self._decide(Estimate(conversions.twist_from_ros(message.twist.twist), std))
-
-    def _on_command(self, message: TwistStamped) -> None:
-        stamp = conversions.stamp_from_ros(message.header.stamp)
-        self._decide(Command(stamp, conversions.twist_from_ros(message.twist)))
-
-    def _on_e_stop(self, message: Bool) -> None:
-        self._decide(EStop(bool(message.data)))
+    def _take(self, topic: str, read: Callable[[bytes], Input], content: bytes) -> None:
+        try:
+            given = read(content)
+        except UNREADABLE as error:  # of a middleware that puts messages otherwise
+            self._log.refuse(f"{topic}: {error}")
+            return
+        self._decide(given)
 
     def _on_arm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         return self._answer(Arm(self.count_publishers(self._out.topic_name)), response)
@@ -125,10 +109,19 @@ class CommandGate(QosWatch):
     def _decide(self, given: Input) -> Decision:
         now, before = time.monotonic(), self._state
         self._state, decision = decide(self._config, before, given, now)
-        if decision.publish:  # first of all: what follows may take its time
-            self._out.publish(conversions.twist_to_ros(decision.twist))
+        good = not decision.publish or self._publish(decision.twist)  # first: the rest takes time
         self._log.note(Entry(now, given, before, decision))
+        if not good:
+            self._log.no_number(decision.twist.tolist())
+            if not isinstance(given, Press):
+                self._decide(Press())
         return decision
+
+    def _publish(self, twist: Array) -> bool:
+        """The only way to the robot: what is not finite leaves as zero, and is no good."""
+        good = bool(np.isfinite(twist).all())
+        self._out.publish(self._twists.write(twist if good else ZERO))
+        return good
 
     def _look(self) -> Finding:
         """What `/diagnostics` tells; also who else moves the robot, which no gate can prevent."""
@@ -142,7 +135,7 @@ class CommandGate(QosWatch):
 
     def stop(self) -> None:
         """Leaves a zero command behind."""
-        last_word(self._out, conversions.twist_to_ros(np.zeros(3)))
+        last_word(self._out, self._twists.write(ZERO))
         self._log.close()
 
 
