@@ -29,7 +29,6 @@ from measuring.verdict import answer, parser_of
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.serialization import serialize_message
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
@@ -38,7 +37,7 @@ from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.nodes import command_gate, conversions, qos
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 from nics_drl_bridge.nodes.runner import open_context
-from nics_drl_bridge.nodes.wire import OdometryWriter, ScanWriter, stamp_of
+from nics_drl_bridge.nodes.wire import OdometryWriter, ScanWriter
 
 CONTROLS = {"busy": "the gate decides ten times on each message and tick"}
 ROBOT, SPEED, NANO = "ackermann", 0.5, conversions.NANO

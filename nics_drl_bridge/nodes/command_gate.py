@@ -20,8 +20,9 @@ from nics_drl_bridge.nodes import gate_inputs, qos
 from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
 from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.gate_parameters import declare_gate
+from nics_drl_bridge.nodes.priority import HIGHEST, take_priority
 from nics_drl_bridge.nodes.qos_watch import QosWatch
-from nics_drl_bridge.nodes.runner import last_word, run_node
+from nics_drl_bridge.nodes.runner import declare, last_word, run_node
 from nics_drl_bridge.nodes.wire import UNREADABLE, TwistWriter
 from nics_drl_bridge.safety import shield
 from nics_drl_bridge.safety.black_box import Entry
@@ -66,6 +67,11 @@ class CommandGate(QosWatch):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD_S, lambda: self._decide(Tick()), clock=steady)
         Diagnostics(self, "gate", self._look)
+        about = "Real-time priority (SCHED_FIFO) of its process, 1 to 99; 0 for none."
+        priority = declare(self, "priority", 0, about, low=0, high=HIGHEST, read_only=True)
+        refused = take_priority(priority)  # when all threads are there
+        if refused:
+            self.get_logger().warning(refused)
 
     def _listen(self) -> None:
         for kind, topic, read, profile in (
