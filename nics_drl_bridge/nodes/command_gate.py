@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry as OdometryMessage
-from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from sensor_msgs.msg import LaserScan
@@ -30,9 +29,9 @@ from nics_drl_bridge.safety.gate import decide
 from nics_drl_bridge.safety.inputs import Arm, Input, Press, Reset, Tick
 from nics_drl_bridge.safety.state import Decision, begin
 
-Array = NDArray[np.float64]
 PERIOD_S = 0.02
-ZERO = np.zeros(3)
+STALE_S = 0.05
+"""A motion that was decided on longer ago is decided on anew [s]."""
 
 
 class CommandGate(QosWatch):
@@ -59,10 +58,9 @@ class CommandGate(QosWatch):
             )
         if self._config.shield is not None:
             shield.rehearse()
-        self._out, self._twists = (
-            self.create_publisher(Twist, "cmd_vel", qos.COMMAND),
-            TwistWriter(),
-        )
+        self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
+        self._twists = TwistWriter()
+        self._zero = self._twists.write(np.zeros(3))
         self._listen()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD_S, lambda: self._decide(Tick()), clock=steady)
@@ -115,19 +113,33 @@ class CommandGate(QosWatch):
     def _decide(self, given: Input) -> Decision:
         now, before = time.monotonic(), self._state
         self._state, decision = decide(self._config, before, given, now)
-        good = not decision.publish or self._publish(decision.twist)  # first: the rest takes time
+        # First of all: what follows may take its time.
+        instead = self._say(decision, now) if decision.publish else None
         self._log.note(Entry(now, given, before, decision))
-        if not good:
-            self._log.no_number(decision.twist.tolist())
-            if not isinstance(given, Press):
-                self._decide(Press())
+        if instead is not None and not isinstance(given, Press):
+            self._decide(instead)
         return decision
 
-    def _publish(self, twist: Array) -> bool:
-        """The only way to the robot: what is not finite leaves as zero, and is no good."""
-        good = bool(np.isfinite(twist).all())
-        self._out.publish(self._twists.write(twist if good else ZERO))
-        return good
+    def _say(self, decision: Decision, now: float) -> Input | None:
+        """Publishes a decision; the only way to the robot but for `stop`.
+
+        Returns:
+            What to decide on in its stead, if it must not be: whatever is not finite leaves as zero
+            and presses the e-stop. A motion that was decided on too long ago, in a process that was
+            frozen since, is not sent at all; so the last thing before that is a look at the clock.
+        """
+        finite, content = (
+            bool(np.isfinite(decision.twist).all()),
+            self._twists.write(decision.twist),
+        )
+        if not finite:
+            self._out.publish(self._zero)
+            self._log.no_number(decision.twist.tolist())
+            return Press()
+        if decision.cause is None and time.monotonic() - now > STALE_S:
+            return Tick()
+        self._out.publish(content)
+        return None
 
     def _look(self) -> Finding:
         """What `/diagnostics` tells; also who else moves the robot, which no gate can prevent."""
@@ -141,7 +153,7 @@ class CommandGate(QosWatch):
 
     def stop(self) -> None:
         """Leaves a zero command behind."""
-        last_word(self._out, self._twists.write(ZERO))
+        last_word(self._out, self._zero)
         self._log.close()
 
 

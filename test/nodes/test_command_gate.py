@@ -329,7 +329,9 @@ def test_a_decision_that_is_no_number_leaves_as_zero_and_latches(domain_id, tmp_
     context = open_context([*GIVEN, f"black_box:={tmp_path}"], domain_id)
     node = command_gate.CommandGate(context)
     try:
-        monkeypatch.setattr(node, "_out", SimpleNamespace(publish=sent.append))
+        monkeypatch.setattr(
+            node, "_out", SimpleNamespace(publish=sent.append, topic_name="/cmd_vel")
+        )
         decide = command_gate.decide
 
         def mad(config, state, given, now):
