@@ -1,11 +1,11 @@
-"""How much of a core does the gate take, beside a bare rclpy node that hears the same and does nothing?
+"""How much of a core does the gate take, beside a bare rclpy node that hears the same?
 
 Around the real `command_gate` a robot publishes over DDS what a vehicle does: scans of 720 beams,
 commands and the emergency stop's heartbeat at 10 Hz, odometry and the estimate at 50 Hz. Beside it
 a bare node, made and spun as rclpy's examples do, has the same subscriptions with callbacks that do
 nothing, and publishes a constant at the gate's rate. Both hear the same messages in the same
 seconds, so that what else the machine does weighs on both; `ratio` is the gate's share of a core to
-that node's. Shares are of the whole process, threads of the middleware included, from /proc (Linux).
+that node's. Shares are of whole processes, threads of the middleware included, from /proc (Linux).
 """
 
 from __future__ import annotations

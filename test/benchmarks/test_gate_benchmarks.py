@@ -60,19 +60,3 @@ def test_a_rule_that_is_taken_out_is_missed_by_a_test(monkeypatch):
     assert gate_rules.tests_fail_without("stop/e_stop_pressed")
     with pytest.raises(SystemExit, match="there is no rule 'stop/nothing'"):
         gate_rules.take_out("stop/nothing")
-
-
-@pytest.mark.timeout(300)
-def test_no_command_moves_a_robot_on_old_data_when_packets_are_lost():
-    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-    done = subprocess.run(
-        [sys.executable, str(BENCHMARKS / "packet_loss.py"), "--json", "--seconds", "8", "--loss",
-         "20"],
-        capture_output=True, text=True, check=False, timeout=280,
-    )  # fmt: skip
-    if done.returncode == 2:
-        pytest.skip(done.stderr.strip())
-    result = json.loads(done.stdout)
-    assert result["loss_20"]["moving_commands"] > 0
-    assert result["loss_20"]["scans_arrived"] < result["loss_20"]["scans_sent"]
-    assert result["unsafe_commands"] == 0
