@@ -6,18 +6,23 @@ a bare node, made and spun as rclpy's examples do, has the same subscriptions wi
 nothing, and publishes a constant at the gate's rate. Both hear the same messages in the same
 seconds, so that what else the machine does weighs on both; `ratio` is the gate's share of a core to
 that node's. Shares are of whole processes, threads of the middleware included, from /proc (Linux).
+
+Then good and NaN commands come in turn for some seconds, each a stop, and the gate is ended by
+SIGINT: `exit_s` is how long it still lives. The first of those stops has to be in the black box.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +39,16 @@ from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.nodes import command_gate, conversions, qos
-from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.nodes import command_gate, conversions, gate_inputs, gate_log, qos
+from nics_drl_bridge.nodes.processes import free_domain_id
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.nodes.wire import OdometryWriter, ScanWriter
+from nics_drl_bridge.safety.black_box import replay
 
-CONTROLS = {"busy": "the gate decides ten times on each message and tick"}
+CONTROLS = {
+    "busy": "the gate reads each message and decides ten times",
+    "slow_disk": "the gate waits for a disk that does not answer, at its end",
+}
 ROBOT, SPEED, NANO = "ackermann", 0.5, conversions.NANO
 SCAN_HZ, ODOM_HZ, TICK_HZ = 10, 50, 50
 MOST_RATIO = 1.25
@@ -48,8 +57,10 @@ LONGEST_GAP_S = 0.2
 """Between two commands; after such a one the gate itself stops."""
 LEAST_SENT, LEAST_MOVING = 0.9, 0.8
 """Shares of the messages that were to be sent, and of the commands that came and moved."""
-PATIENCE_S = 60.0
-BUSY = 10
+LONGEST_EXIT_S = 2.0
+LEAST_STOPS = 3
+PATIENCE_S = 120.0
+BUSY, HUNG_S = 10, 4.0
 
 
 class Robot:
@@ -57,6 +68,7 @@ class Robot:
 
     Attributes:
         heard: (time [s], moves) of each `cmd_vel`.
+        mad: whether the policy sends NaN for half a second of each.
         sent: messages of the timer so far.
     """
 
@@ -82,6 +94,7 @@ class Robot:
         }
         self.heard: list[tuple[float, bool]] = []
         self.sent, self._x, self._speed, self._stamp_ns = 0, 0.0, 0.0, 0
+        self.mad = False
         self.node.create_subscription(Twist, "cmd_vel", self._hear, qos.EVERY_COMMAND)
         self.node.create_timer(1.0 / ODOM_HZ, self._send)
         self._clients = {
@@ -111,7 +124,9 @@ class Robot:
 
     def _command(self, stamp_ns: int) -> None:
         """The policy has answered the scan before this one."""
-        command = TwistStamped(twist=conversions.twist_to_ros([SPEED, 0.0, 0.1]))
+        ill = self.mad and stamp_ns // (NANO // 2) % 2
+        speed = float("nan") if ill else SPEED
+        command = TwistStamped(twist=conversions.twist_to_ros([speed, 0.0, 0.1]))
         command.header.stamp = conversions.stamp_to_ros(self._stamp_ns)
         self._topics["cmd_vel_raw"].publish(command)
         self._stamp_ns = stamp_ns
@@ -174,59 +189,69 @@ def bare_node() -> None:
     rclpy.spin(node)
 
 
-def busy_gate(arguments: list[str]) -> None:
-    """The control: a gate that decides again and again, and then as the real one does."""
-    decide = command_gate.decide
-
-    def often(*given: Any) -> Any:
-        for _ in range(BUSY - 1):
-            decide(*given)
-        return decide(*given)
-
-    command_gate.decide = often
+def ill_gate(control: str, arguments: list[str]) -> None:
+    """A control's gate: the real one, but for what is taken out."""
+    if control == "busy":
+        command_gate.decide = _often(command_gate.decide)
+        for name in ("scan", "odometry", "estimate", "command", "e_stop"):
+            setattr(gate_inputs, name, _often(getattr(gate_inputs, name)))
+    else:
+        gate_log.write = lambda *_: time.sleep(10 * HUNG_S)
+        gate_log.CLOSING_S = HUNG_S
     command_gate.main([sys.argv[0], *arguments])
 
 
+def _often(call: Callable[..., Any]) -> Callable[..., Any]:
+    """Something without effects, done again and again."""
+
+    def again(*given: Any) -> Any:
+        for _ in range(BUSY - 1):
+            call(*given)
+        return call(*given)
+
+    return again
+
+
 @contextmanager
-def started(part: str, domain_id: int, arguments: list[str]) -> Iterator[int]:
-    """A part of this script as a process; its id."""
+def started(words: list[str], domain_id: int) -> Iterator[subprocess.Popen[bytes]]:
+    """This script as another process."""
     environment = os.environ | {
         "ROS_DOMAIN_ID": str(domain_id), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }  # fmt: skip
-    words = [sys.executable, __file__, "--part", part, *arguments]
-    process = subprocess.Popen(words, env=environment, stderr=subprocess.DEVNULL)
-    try:
-        yield process.pid
-    finally:
-        process.kill()
-        process.wait()
+    with subprocess.Popen(
+        [sys.executable, __file__, *words], env=environment, stderr=subprocess.DEVNULL
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
-@contextmanager
-def gate(domain_id: int, folder: Path, busy: bool) -> Iterator[int]:
-    """The gate's process, or the control's; its id."""
+def gate(domain_id: int, folder: Path, control: str) -> Any:
+    """The gate as a process, or a control's."""
     parameters = {
-        "model": ROBOT, "limits": ROBOT, "e_stop_required": True, "odom_rate": float(ODOM_HZ),
-        "black_box": str(folder / "black_box"), "rate_tolerance": 0.6, "shield": False,
+        "model": ROBOT, "limits": ROBOT, "e_stop_required": "true", "odom_rate": float(ODOM_HZ),
+        "black_box": str(folder), "rate_tolerance": 0.6, "shield": "false",
     }  # fmt: skip
-    if not busy:
-        with NodeProcess("command_gate", folder, parameters, domain_id) as process:
-            yield process.pid
-        return
-    words = [f"{key}:={str(value).lower() if value in (True, False) else value}"
-             for key, value in parameters.items()]  # fmt: skip
-    given = ["--ros-args", *(each for word in words for each in ("-p", word))]
-    with started("busy_gate", domain_id, given) as pid:
-        yield pid
+    given = [f"{name}:={value}" for name, value in parameters.items()]
+    return started(
+        [
+            "--part",
+            control or "gate",
+            "--ros-args",
+            *(word for one in given for word in ("-p", one)),
+        ],
+        domain_id,
+    )
 
 
-def measure(seconds: float, busy: bool) -> dict[str, Any]:
-    """Drives for a time and takes what both processes used of a core meanwhile."""
+def measure(seconds: float, burst_s: float, control: str) -> dict[str, Any]:
+    """Drives for a time and takes what both processes used of a core; then stops and ends."""
     domain_id = free_domain_id()
     with (
         tempfile.TemporaryDirectory() as name,
-        gate(domain_id, Path(name), busy) as gate_pid,
-        started("bare", domain_id, []) as bare_pid,
+        gate(domain_id, Path(name), control) as real,
+        started(["--part", "bare"], domain_id) as bare,
     ):
         robot = Robot(domain_id)
         try:
@@ -234,24 +259,53 @@ def measure(seconds: float, busy: bool) -> dict[str, Any]:
                 raise RuntimeError(f"not within {PATIENCE_S} s: the gate and the bare node")
             robot.drive()
             robot.until(lambda: False, 1.0)
-            robot.heard.clear()
-            pids, began, sent = (gate_pid, bare_pid), time.monotonic(), robot.sent
-            used = [core_seconds(pid) for pid in pids]
-            robot.until(lambda: False, seconds)
-            lasted, sent = time.monotonic() - began, robot.sent - sent
-            shares = [(core_seconds(pid) - was) / lasted
-                      for pid, was in zip(pids, used, strict=True)]  # fmt: skip
+            shares = share_of_a_core(robot, (real.pid, bare.pid), seconds)
+            return shares | ended_after_a_burst(robot, real, burst_s, Path(name))
         finally:
             robot.close()
+
+
+def share_of_a_core(robot: Robot, pids: tuple[int, int], seconds: float) -> dict[str, Any]:
+    """What the gate and the bare node use while commands pass."""
+    robot.heard.clear()
+    began, sent = time.monotonic(), robot.sent
+    used = [core_seconds(pid) for pid in pids]
+    robot.until(lambda: False, seconds)
+    lasted, sent = time.monotonic() - began, robot.sent - sent
+    of_gate, of_bare = (
+        (core_seconds(pid) - was) / lasted for pid, was in zip(pids, used, strict=True)
+    )
     times = [began, *(when for when, _ in robot.heard), began + lasted]
     return {
         "seconds": round(lasted, 2),
-        "gate_share": round(shares[0], 4),
-        "bare_share": round(shares[1], 4),
-        "ratio": round(shares[0] / shares[1], 3) if shares[1] else float("nan"),
+        "gate_share": round(of_gate, 4),
+        "bare_share": round(of_bare, 4),
+        "ratio": round(of_gate / of_bare, 3) if of_bare else float("nan"),
         "longest_gap_s": round(float(np.diff(times).max()), 4),
         "sent": round(sent / (lasted * ODOM_HZ), 3),
         "moving": round(sum(moves for _, moves in robot.heard) / (lasted * TICK_HZ), 3),
+    }
+
+
+def ended_after_a_burst(
+    robot: Robot, real: subprocess.Popen[bytes], seconds: float, folder: Path
+) -> dict[str, Any]:
+    """Stops again and again, SIGINT, and what is in the black box then."""
+    robot.heard.clear()
+    robot.mad = True
+    robot.until(lambda: False, seconds)
+    times, moving = [when for when, _ in robot.heard], [moves for _, moves in robot.heard]
+    real.send_signal(signal.SIGINT)
+    began = time.monotonic()
+    robot.until(lambda: real.poll() is not None, PATIENCE_S)
+    exit_s = time.monotonic() - began
+    files = sorted(folder.glob("*_command_malformed.jsonl"))
+    return {
+        "stops": sum(was and not moves for was, moves in pairwise(moving)),
+        "longest_gap_in_burst_s": round(float(np.diff(times).max()), 4),
+        "exit_s": round(exit_s, 3),
+        "files": len(list(folder.iterdir())),
+        "replayed": bool(files) and replay(files[0]).differing == (),
     }
 
 
@@ -262,12 +316,19 @@ def missed_bars(result: dict[str, Any]) -> list[str]:
         missed.append(
             f"the gate takes {result['ratio']} times what the bare node takes, bar {MOST_RATIO}"
         )
-    if not result["longest_gap_s"] <= LONGEST_GAP_S:
-        missed.append(f"no command for {result['longest_gap_s']} s, bar {LONGEST_GAP_S} s")
+    for key in ("longest_gap_s", "longest_gap_in_burst_s"):
+        if not result[key] <= LONGEST_GAP_S:
+            missed.append(f"{key}: no command for {result[key]} s, bar {LONGEST_GAP_S} s")
     if not result["sent"] >= LEAST_SENT:
         missed.append(f"invalid: only {result['sent']} of the messages were sent")
     if not result["moving"] >= LEAST_MOVING:
         missed.append(f"invalid: only {result['moving']} of the commands came and moved")
+    if not result["stops"] >= LEAST_STOPS:
+        missed.append(f"invalid: only {result['stops']} stops in the burst")
+    if not result["exit_s"] <= LONGEST_EXIT_S:
+        missed.append(f"the gate ended {result['exit_s']} s after SIGINT, bar {LONGEST_EXIT_S} s")
+    if not result["replayed"]:
+        missed.append("the first stop of the burst is not in the black box")
     return missed
 
 
@@ -275,19 +336,27 @@ def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a bar was missed."""
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--seconds", type=float, default=30.0, help="of driving")
-    parser.add_argument("--part", choices=("bare", "busy_gate"), help=argparse.SUPPRESS)
+    parser.add_argument("--burst", type=float, default=15.0, help="of stops, before the end [s]")
+    parser.add_argument("--part", help=argparse.SUPPRESS)
     given, rest = parser.parse_known_args()
+    if given.part == "bare":
+        bare_node()
+    elif given.part == "gate":
+        command_gate.main([sys.argv[0], *rest])
+    elif given.part is not None:
+        ill_gate(given.part, rest)
     if given.part is not None:
-        bare_node() if given.part == "bare" else busy_gate(rest)
         return
     if rest:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
-    result = measure(given.seconds, given.control == "busy")
+    result = measure(given.seconds, given.burst, given.control or "")
     table = (
         f"the gate takes {result['gate_share']:.1%} of a core, the bare node "
         f"{result['bare_share']:.1%}: {result['ratio']:.2f} times as much, over "
-        f"{result['seconds']:.0f} s\nlongest time between two commands "
-        f"{result['longest_gap_s']:.3f} s\n"
+        f"{result['seconds']:.0f} s\n"
+        f"longest time between two commands {result['longest_gap_s']:.3f} s, in a burst of "
+        f"{result['stops']} stops {result['longest_gap_in_burst_s']:.3f} s\n"
+        f"{result['exit_s']:.2f} s from SIGINT to the end, files {result['files']}\n"
     )
     answer(result, missed_bars(result), table, given.json)
 
