@@ -33,7 +33,7 @@ def test_a_scan_is_what_the_device_says_in_the_words_of_the_package():
     message = conversions.scan_to_ros(LIDAR, ranges, STAMP_NS, "laser")
     read = gate_inputs.scan(LIDAR, serialize_message(message))
     assert read.stamp_ns == STAMP_NS
-    assert read.angles == (message.angle_min, message.angle_increment)
+    assert read.angles == pytest.approx((message.angle_min, message.angle_increment), rel=1e-6)
     assert read.ranges.tobytes() == from_device(message.ranges, LIDAR).tobytes()
     read.ranges[0] = 1.0  # nobody else's bytes
 
