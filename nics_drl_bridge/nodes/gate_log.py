@@ -20,7 +20,7 @@ BURST_S = 3.0
 """Commands pass for so long before a stop counts as a new one, and not as one more of a burst."""
 LINE_S = 2.0
 """Between two lines of a kind; what comes in between is counted."""
-CLOSING_S = 0.8
+CLOSING_S = 0.7
 """The end waits so long for files that are being written."""
 
 
