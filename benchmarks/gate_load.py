@@ -45,7 +45,7 @@ CONTROLS = {
     "slow_disk": "the gate waits for a disk that does not answer, at its end",
 }
 TICK_HZ = 50
-MOST_RATIO = 1.25
+MOST_RATIO = 1.1
 """Of the gate's share of a core to that of a bare node that hears the same."""
 LONGEST_GAP_S = 0.2
 """Between two commands; after such a one the gate itself stops."""

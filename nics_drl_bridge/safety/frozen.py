@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import between
 from nics_drl_bridge.safety.inputs import Scan
+from nics_drl_bridge.safety.records import replace
 from nics_drl_bridge.safety.state import Cause, GateConfig, GateState, Push, Sameness
 
 IDENTICAL = 3
