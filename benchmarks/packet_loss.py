@@ -4,6 +4,9 @@ The robot (scan, odometry, emergency stop) and the stack (a policy and the real 
 in network namespaces of their own; nftables drops packets where they come in, fragments of a scan
 one by one. A command is unsafe when it moves the robot though the newest scan that the policy had
 used by then is older than the gate's limit and the tolerance below, or is NaN, or exceeds a limit.
+
+A run in which nothing moved, in which no scan was lost, or whose robot was itself too slow to send,
+has measured nothing, and fails.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +26,7 @@ import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from measuring.faulty_robot import NANO, PERIOD_S, ROBOT, SPEED
 from measuring.lossy_link import Link, NoNamespacesError, link
+from measuring.verdict import answer, parser_of
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -34,10 +39,19 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.processes import NodeProcess
 from nics_drl_bridge.nodes.runner import open_context
 
+CONTROLS = {
+    "no_gate": "the policy's last command is repeated to the base without the gate",
+    "standing": "nobody arms the gate: nothing moves",
+    "no_loss": "the network loses nothing",
+    "slow_robot": "the robot sends one scan in three",
+}
 LOSSES = (5, 20)
 SCAN_AGE_S, TOLERANCE_S = 0.35, 0.05
 """The gate's limit, and what its tick (0.02 s) and the way to the robot may add."""
-PATIENCE_S = 90.0
+SENT_SHARES = (0.8, 1.2)
+"""Of the scans that were to be sent; a robot without them tells nothing about the gate."""
+REPEAT_S, SLOW_SKIP = 0.02, 3
+PATIENCE_S, STANDING_S = 90.0, 5.0
 NETWORK = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 """Shared memory would go past the network."""
 
@@ -67,9 +81,13 @@ class Stack(_End):
         used: (time of the command, stamp of its scan), both of the system's clock [s].
     """
 
-    def __init__(self) -> None:
+    def __init__(self, gate: bool = True) -> None:
         super().__init__("policy")
         self.used: list[tuple[float, float]] = []
+        self._last: Twist | None = None
+        if not gate:
+            self._past = self.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
+            self.node.create_timer(REPEAT_S, self._repeat)
         self._raw = self.node.create_publisher(TwistStamped, "cmd_vel_raw", qos.COMMAND)
         self._estimate = self.node.create_publisher(Odometry, "odometry/filtered", qos.COMMAND)
         self.node.create_subscription(LaserScan, "scan", self._act, qos.SENSOR)
@@ -78,8 +96,14 @@ class Stack(_End):
     def _act(self, scan: LaserScan) -> None:
         command = TwistStamped(header=scan.header, twist=conversions.twist_to_ros([SPEED, 0, 0.1]))
         self._raw.publish(command)
+        self._last = command.twist
         stamp = conversions.stamp_from_ros(scan.header.stamp) / NANO
         self.used.append((time.time(), stamp))
+
+    def _repeat(self) -> None:
+        """What a careless bridge does: the robot hears the newest command, however old."""
+        if self._last is not None:
+            self._past.publish(self._last)
 
 
 class Robot(_End):
@@ -89,10 +113,11 @@ class Robot(_End):
         heard: (time, twist (3,)) of `cmd_vel`, on the system's clock [s].
     """
 
-    def __init__(self) -> None:
+    def __init__(self, control: str = "") -> None:
         super().__init__("robot")
         self.heard: list[tuple[float, list[float]]] = []
         self._lidar, self._x, self.sent = builtin_model(ROBOT).lidar, 0.0, 0
+        self._timed, self._skip = 0, SLOW_SKIP if control == "slow_robot" else 1
         self._topics = {
             name: self.node.create_publisher(kind, name, profile)
             for name, kind, profile in (
@@ -105,7 +130,8 @@ class Robot(_End):
         self._arm = self.node.create_client(Trigger, "command_gate/arm")
         self._reset = self.node.create_client(Trigger, "command_gate/reset")
         self.node.create_timer(PERIOD_S, self._send)
-        self.node.create_timer(1.0, self._ask)
+        if control != "standing":
+            self.node.create_timer(1.0, self._ask)
 
     def _hear(self, message: Twist) -> None:
         self.heard.append((time.time(), conversions.twist_from_ros(message).tolist()))
@@ -122,26 +148,34 @@ class Robot(_End):
     def _send(self) -> None:
         speed = self.heard[-1][1][0] if self.heard else 0.0
         self._x, now = self._x + speed * PERIOD_S, time.time_ns()
-        ranges = np.full(self._lidar.beams, 2.0 + 0.1 * np.sin(now * 1e-9), np.float32)
-        self._topics["scan"].publish(conversions.scan_to_ros(self._lidar, ranges, now, "laser"))
+        self._timed += 1
+        if self._timed % self._skip == 0:
+            ranges = np.full(self._lidar.beams, 2.0 + 0.1 * np.sin(now * 1e-9), np.float32)
+            self._topics["scan"].publish(conversions.scan_to_ros(self._lidar, ranges, now, "laser"))
+            self.sent += 1
         self._topics["odom"].publish(
             conversions.odometry_to_ros(
                 [self._x, 0.0, 0.0], [speed, 0.0, 0.0], now, ("odom", "base_link"), (1e-4,) * 4
             )
         )
         self._topics["e_stop"].publish(Bool(data=False))
-        self.sent += 1
 
 
-def run_stack(seconds: float, folder: Path) -> None:
-    """The far end, in its namespace; writes what the policy used when standard input closes."""
+def run_stack(seconds: float, folder: Path, control: str) -> None:
+    """The far end, in its namespace; writes what the policy used when the near end has ended."""
     parameters = {"model": ROBOT, "limits": ROBOT, "e_stop_required": True}
     parameters["black_box"] = str(folder / "black_box")
     domain_id = int(os.environ["ROS_DOMAIN_ID"])
-    stack = Stack()
+    gated = control != "no_gate"
+    stack = Stack(gated)
     deadline = time.monotonic() + 2 * PATIENCE_S + seconds
     try:
-        with NodeProcess("command_gate", folder, parameters, domain_id, discovery="SUBNET"):
+        with ExitStack() as started:
+            if gated:
+                gate = NodeProcess(
+                    "command_gate", folder, parameters, domain_id, discovery="SUBNET"
+                )
+                started.enter_context(gate)
             while not (folder / "ended").exists() and time.monotonic() < deadline:
                 stack.spin()
     finally:
@@ -149,18 +183,19 @@ def run_stack(seconds: float, folder: Path) -> None:
     (folder / "used.json").write_text(json.dumps(stack.used))
 
 
-def run_robot(seconds: float, folder: Path) -> None:
+def run_robot(seconds: float, folder: Path, control: str) -> None:
     """The near end: drives on a whole network, then says so and drives on."""
-    robot = Robot()
+    robot = Robot(control)
     try:
-        deadline = time.monotonic() + PATIENCE_S
+        stands = control in ("standing", "slow_robot")
+        deadline = time.monotonic() + (STANDING_S if stands else PATIENCE_S)
         while not robot.moves and time.monotonic() < deadline:
             robot.spin()
         (folder / "driving").touch()
         sent, end = robot.sent, time.monotonic() + seconds
         while time.monotonic() < end:
             robot.spin()
-        answer = {"scans": robot.sent - sent, "heard": robot.heard, "moved": robot.moves}
+        answer = {"scans": robot.sent - sent, "heard": robot.heard}
         (folder / "heard.json").write_text(json.dumps(answer))
     finally:
         robot.close()
@@ -191,7 +226,7 @@ def judge(heard: list[Any], used: list[Any], since: float) -> dict[str, Any]:
     }
 
 
-def measure(percent: int, seconds: float, cable: Link) -> dict[str, Any]:
+def measure(percent: int, seconds: float, cable: Link, control: str) -> dict[str, Any]:
     """Drives over a network that loses so many packets of a hundred."""
     environment = os.environ | NETWORK | {"ROS_DOMAIN_ID": str(1 + percent)}
     cable.lose(0)
@@ -200,14 +235,14 @@ def measure(percent: int, seconds: float, cable: Link) -> dict[str, Any]:
         parts = []
         for end, part in enumerate(("robot", "stack")):
             words = [sys.executable, __file__, "--part", part, "--folder", name]
-            words = cable.command(end, [*words, "--seconds", str(seconds)])
-            parts.append(subprocess.Popen(words, env=environment))
+            words += ["--seconds", str(seconds), *(["--control", control] if control else [])]
+            parts.append(subprocess.Popen(cable.command(end, words), env=environment))
         try:
             deadline = time.monotonic() + PATIENCE_S
             while not (folder / "driving").exists() and time.monotonic() < deadline:
                 time.sleep(0.05)
             since = time.time()
-            cable.lose(percent)
+            cable.lose(0 if control == "no_loss" else percent)
             parts[0].wait(PATIENCE_S + seconds)
             (folder / "ended").touch()
             parts[1].wait(PATIENCE_S)
@@ -218,13 +253,37 @@ def measure(percent: int, seconds: float, cable: Link) -> dict[str, Any]:
         used = json.loads((folder / "used.json").read_text())
     arrived = sum(stamp >= since for _, stamp in used)
     judged = judge(heard["heard"], used, since)
-    return {"scans_sent": heard["scans"], "scans_arrived": arrived, **judged}
+    asked = round(seconds / PERIOD_S)
+    return {"scans_asked": asked, "scans_sent": heard["scans"], "scans_arrived": arrived, **judged}
+
+
+def missed_bars(name: str, one: dict[str, Any]) -> list[str]:
+    """A sentence for each bar that a loss missed."""
+    missed = []
+    low, high = (share * one["scans_asked"] for share in SENT_SHARES)
+    if not low <= one["scans_sent"] <= high:
+        missed.append(
+            f"invalid: the robot sent {one['scans_sent']} scans, not {one['scans_asked']}"
+        )
+    if not one["scans_arrived"] < one["scans_sent"]:
+        missed.append(
+            f"invalid: {one['scans_arrived']} of {one['scans_sent']} scans arrived, none was lost"
+        )
+    if not one["moving_commands"] > 0:
+        missed.append("invalid: nothing moved")
+    if not one["worst_age_s"] <= SCAN_AGE_S + TOLERANCE_S:  # NaN, too
+        missed.append(
+            f"the data behind a motion were {one['worst_age_s']} s old, bar "
+            f"{SCAN_AGE_S + TOLERANCE_S:.2f} s"
+        )
+    if one["unsafe_commands"] != 0:
+        missed.append(f"{one['unsafe_commands']} unsafe commands, bar 0")
+    return [f"{name}: {line}" for line in missed]
 
 
 def main() -> None:
-    """Prints a table, or one JSON object; ends with 1 when a command was unsafe."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    """Prints a table, or one JSON object; ends with 1 when a bar was missed."""
+    parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--seconds", type=float, default=60.0, help="of driving at each loss")
     parser.add_argument("--loss", type=int, action="append", help="of a hundred packets")
     parser.add_argument("--part", choices=("robot", "stack"), help=argparse.SUPPRESS)
@@ -232,24 +291,24 @@ def main() -> None:
     given = parser.parse_args()
     if given.part is not None:
         part = run_robot if given.part == "robot" else run_stack
-        part(given.seconds, given.folder)
+        part(given.seconds, given.folder, given.control or "")
         return
     try:
         with link() as cable:
-            result: dict[str, Any] = {
-                f"loss_{percent}": measure(percent, given.seconds, cable)
+            runs = {
+                f"loss_{percent}": measure(percent, given.seconds, cable, given.control or "")
                 for percent in given.loss or LOSSES
             }
     except NoNamespacesError as error:
         sys.stderr.write(f"{error}\n")
         raise SystemExit(2) from None
-    unsafe = sum(one["unsafe_commands"] for one in result.values())
-    if given.json:
-        sys.stdout.write(json.dumps(result | {"unsafe_commands": unsafe}) + "\n")
-    else:
-        for name, one in result.items():
-            sys.stdout.write(f"{name}: {', '.join(f'{k} {v}' for k, v in one.items())}\n")
-    raise SystemExit(1 if unsafe else 0)
+    missed = [line for name, one in runs.items() for line in missed_bars(name, one)]
+    unsafe = sum(one["unsafe_commands"] for one in runs.values())
+    table = "".join(
+        f"{name}: {', '.join(f'{key} {value}' for key, value in one.items())}\n"
+        for name, one in runs.items()
+    )
+    answer(runs | {"unsafe_commands": unsafe}, missed, table, given.json)
 
 
 if __name__ == "__main__":

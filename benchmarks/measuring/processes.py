@@ -33,3 +33,11 @@ def use_of(pid: int | None = None) -> Use:
         files=sum(1 for _ in (home / "fd").iterdir()),
         threads=int(rows["Threads"]),
     )
+
+
+def core_seconds(pid: int) -> float:
+    """Time that all threads of a process have spent on a core so far [s], user and system."""
+    # The name, in parentheses, may hold anything; the fields behind it are numbers.
+    fields = (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()
+    user, system = int(fields[11]), int(fields[12])
+    return (user + system) / os.sysconf("SC_CLK_TCK")

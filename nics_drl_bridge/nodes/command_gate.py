@@ -2,39 +2,33 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import time
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.serialization import serialize_message
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes import gate_inputs, qos
 from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
 from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.gate_parameters import declare_gate
+from nics_drl_bridge.nodes.priority import HIGHEST, take_priority
 from nics_drl_bridge.nodes.qos_watch import QosWatch
-from nics_drl_bridge.nodes.runner import last_word, run_node
+from nics_drl_bridge.nodes.runner import declare, last_word, run_node
+from nics_drl_bridge.nodes.wire import UNREADABLE, TwistWriter
 from nics_drl_bridge.safety import shield
 from nics_drl_bridge.safety.black_box import Entry
 from nics_drl_bridge.safety.gate import decide
-from nics_drl_bridge.safety.inputs import (
-    Arm,
-    Command,
-    Estimate,
-    EStop,
-    Input,
-    Odometry,
-    Press,
-    Reset,
-    Scan,
-    Tick,
-)
+from nics_drl_bridge.safety.inputs import Arm, Input, Press, Reset, Tick
 from nics_drl_bridge.safety.limits import PERIOD_S
 from nics_drl_bridge.safety.state import Decision, begin
 
@@ -67,46 +61,39 @@ class CommandGate(QosWatch):
         if self._config.shield is not None:
             shield.rehearse()
         self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
+        self._twists = TwistWriter()
+        self._zero = self._twists.write(np.zeros(3))
         self._listen()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD_S, lambda: self._decide(Tick()), clock=steady)
         Diagnostics(self, "gate", self._look)
+        about = "Real-time priority (SCHED_FIFO) of its process, 1 to 99; 0 for none."
+        priority = declare(self, "priority", 0, about, low=0, high=HIGHEST, read_only=True)
+        refused = take_priority(priority)  # when all threads are there
+        if refused:
+            self.get_logger().warning(refused)
 
     def _listen(self) -> None:
-        self.create_subscription(LaserScan, "scan", self._on_scan, qos.SENSOR)
-        self.create_subscription(OdometryMessage, "odom", self._on_odometry, qos.SENSOR)
-        self.create_subscription(
-            OdometryMessage, "odometry/filtered", self._on_estimate, qos.SENSOR
-        )
-        self.create_subscription(TwistStamped, "cmd_vel_raw", self._on_command, qos.COMMAND)
-        self.create_subscription(Bool, "e_stop", self._on_e_stop, qos.EVERY_COMMAND)
+        for kind, topic, read, profile in (
+            (LaserScan, "scan", partial(gate_inputs.scan, self._lidar), qos.SENSOR),
+            (OdometryMessage, "odom", gate_inputs.odometry, qos.SENSOR),
+            (OdometryMessage, "odometry/filtered", gate_inputs.estimate, qos.SENSOR),
+            (TwistStamped, "cmd_vel_raw", gate_inputs.command, qos.COMMAND),
+            (Bool, "e_stop", gate_inputs.e_stop, qos.EVERY_COMMAND),
+        ):
+            taker = partial(self._take, topic, read)
+            self.create_subscription(kind, topic, taker, profile, raw=True)
         self.create_service(Trigger, "~/arm", self._on_arm)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/e_stop", self._on_e_stop_call)
 
-    def _on_scan(self, message: LaserScan) -> None:
-        stamp = conversions.stamp_from_ros(message.header.stamp)
-        ranges = conversions.scan_from_ros(self._lidar, message)
-        self._decide(Scan(stamp, ranges, (message.angle_min, message.angle_increment)))
-
-    def _on_odometry(self, message: OdometryMessage) -> None:
-        stamp = conversions.stamp_from_ros(message.header.stamp)
-        pose, twist = conversions.odometry_from_ros(message)
-        if not conversions.is_rotation(message.pose.pose.orientation):
-            pose = np.full(3, np.nan)
-        self._decide(Odometry(stamp, pose, twist))
-
-    def _on_estimate(self, message: OdometryMessage) -> None:
-        variance = np.reshape(message.pose.covariance, (6, 6)).diagonal()
-        std = np.sqrt([max(variance[0], variance[1]), variance[5]])
-        self._decide(Estimate(conversions.twist_from_ros(message.twist.twist), std))
-
-    def _on_command(self, message: TwistStamped) -> None:
-        stamp = conversions.stamp_from_ros(message.header.stamp)
-        self._decide(Command(stamp, conversions.twist_from_ros(message.twist)))
-
-    def _on_e_stop(self, message: Bool) -> None:
-        self._decide(EStop(bool(message.data)))
+    def _take(self, topic: str, read: Callable[[bytes], Input], content: bytes) -> None:
+        try:
+            given = read(content)
+        except UNREADABLE as error:  # of a middleware that puts messages otherwise
+            self._log.refuse(f"{topic}: {error}")
+            return
+        self._decide(given)
 
     def _on_arm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         return self._answer(Arm(self.count_publishers(self._out.topic_name)), response)
@@ -128,25 +115,33 @@ class CommandGate(QosWatch):
     def _decide(self, given: Input) -> Decision:
         now, before = time.monotonic(), self._state
         self._state, decision = decide(self._config, before, given, now)
-        published = True
-        if decision.publish:  # first of all: what follows may take its time
-            published = self._say(decision, now)
+        # First of all: what follows may take its time.
+        instead = self._say(decision, now) if decision.publish else None
         self._log.note(Entry(now, given, before, decision))
-        if not published:
-            self._decide(Tick())
+        if instead is not None and not isinstance(given, Press):
+            self._decide(instead)
         return decision
 
-    def _say(self, decision: Decision, now: float) -> bool:
-        """Publishes a decision, unless it is a motion that was decided on too long ago.
+    def _say(self, decision: Decision, now: float) -> Input | None:
+        """Publishes a decision; the only way to the robot but for `stop`.
 
-        A process that is frozen goes on where it was; so the last thing before the publication is a
-        look at the clock. Bytes, since little but the sending is then left to do.
+        Returns:
+            What to decide on in its stead, if it must not be: whatever is not finite leaves as zero
+            and presses the e-stop. A motion that was decided on too long ago, in a process that was
+            frozen since, is not sent at all; so the last thing before that is a look at the clock.
         """
-        message = serialize_message(conversions.twist_to_ros(decision.twist))
+        finite, content = (
+            bool(np.isfinite(decision.twist).all()),
+            self._twists.write(decision.twist),
+        )
+        if not finite:
+            self._out.publish(self._zero)
+            self._log.no_number(decision.twist.tolist())
+            return Press()
         if decision.cause is None and time.monotonic() - now > STALE_S:
-            return False
-        self._out.publish(message)
-        return True
+            return Tick()
+        self._out.publish(content)
+        return None
 
     def _look(self) -> Finding:
         """What `/diagnostics` tells; also who else moves the robot, which no gate can prevent."""
@@ -160,13 +155,18 @@ class CommandGate(QosWatch):
 
     def stop(self) -> None:
         """Leaves a zero command behind."""
-        last_word(self._out, conversions.twist_to_ros(np.zeros(3)))
+        last_word(self._out, self._zero)
         self._log.close()
 
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of the executable."""
     run_node(CommandGate, args, "command_gate")
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # All is closed. To take the interpreter apart, too, costs half a second of a core, and several
+    # where others want it as well.
+    os._exit(0)
 
 
 if __name__ == "__main__":

@@ -49,10 +49,9 @@ def heading_of(x: float, y: float, z: float, w: float) -> float:
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
-def is_rotation(q: Quaternion) -> bool:
+def is_rotation(x: float, y: float, z: float, w: float) -> bool:
     """Whether a quaternion is of about unit length; one of zeros is what nobody filled in."""
-    length2 = q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z
-    return bool(abs(length2 - 1.0) < QUATERNION_TOLERANCE)
+    return abs(w * w + x * x + y * y + z * z - 1.0) < QUATERNION_TOLERANCE
 
 
 def twist_to_ros(twist: ArrayLike) -> Twist:

@@ -39,12 +39,13 @@ class StandingExecutor(SingleThreadedExecutor):
 
     rclpy's executors gather the ends of all nodes, open their handles and make a new wait set
     each time they wait, and they wait three times for one message, woken by their own guard
-    condition. Here that is done when an end comes or goes. Whatever is no subscription (timers,
-    services, clients, events, tasks) is left to rclpy's own executor.
+    condition. Here that is done when an end comes or goes. Whatever is no subscription and no timer
+    (services, clients, events, tasks) is left to rclpy's own executor.
 
     Callbacks of subscriptions are plain functions of the message, or of it and what is known about
-    it; they are called in the thread that spins, one after the other. See `HANDED_OVER` for what
-    they may return.
+    it; those of timers are plain functions of nothing, others are left to rclpy, too. They are
+    called in the thread that spins, one after the other. See `HANDED_OVER` for what those of
+    subscriptions may return.
 
     That needs parts of rclpy that no interface promises. With an rclpy that lacks one of them it
     says so once in the log, and is rclpy's own executor from then on.
@@ -75,9 +76,11 @@ class StandingExecutor(SingleThreadedExecutor):
             return
         # Before anything else is looked at: somebody may wait for the answer to a message.
         _call(received)
-        others = self._others_ready()
+        due, others = self._others_ready()
         if received:
             _call(self._come_since())
+        for timer in due:
+            self._tick(timer)
         if others:
             self._handle_others()
 
@@ -97,18 +100,32 @@ class StandingExecutor(SingleThreadedExecutor):
         """What has come while callbacks ran; to take it costs less than to wait for it."""
         return [] if self._ends is None or not self.context.ok() else self._ends.come()
 
-    def _others_ready(self) -> bool:
-        """Whether anything but subscriptions was ready; a callback may have shut all down."""
-        if self._ends is None or not self.context.ok():
-            return False
+    def _others_ready(self) -> tuple[list[Any], bool]:
+        """Timers that are due, and whether anything else but subscriptions was ready."""
+        if self._ends is None or not self.context.ok():  # a callback may have shut all down
+            return [], False
         try:
+            due = self._ends.due()
             woken, others = self._ends.others_ready(self._guard)
             self._changed |= woken or others  # whoever adds an end to a node wakes the executor
             # So does rclpy itself, after each callback; then there is nothing to handle.
-            return others or (woken and bool(self._tasks))
+            return due, others or (woken and bool(self._tasks))
         except PARTS_MISSING as error:
             self._fall_back(error)
-            return False
+            return [], False
+
+    def _tick(self, timer: Any) -> None:
+        """Calls a timer back, unless a callback before it has ended all, or that timer."""
+        if not self.context.ok() or not any(timer in node.timers for node in self.get_nodes()):
+            return
+        try:
+            if not timer.handle.is_timer_ready():
+                return
+            timer.handle.call_timer()  # it is due again after another period
+        except PARTS_MISSING as error:
+            self._fall_back(error)
+            return
+        timer.callback()
 
     def _fall_back(self, error: Exception) -> None:
         """Goes on as rclpy's own executor."""
@@ -155,6 +172,8 @@ class _Ends:
         self.all = _all_ends(nodes)
         subscriptions, others, timers, clients, services, self._waitables = self.all
         self._subscriptions = [(one, _arguments(one.callback)) for one in subscriptions]
+        self._timers = [(i, one) for i, one in enumerate(timers) if _plain(one.callback)]
+        self._own = {one.handle.pointer for _, one in self._timers}
         kinds = subscriptions, (*guards, *others), timers, clients, services
         self._open = ExitStack()
         for held in (*(end.handle for end in itertools.chain(*kinds)), *self._waitables):
@@ -195,8 +214,13 @@ class _Ends:
         """What any subscription has received by now."""
         return _take(self._subscriptions)
 
+    def due(self) -> list[Any]:
+        """The timers with plain callbacks that waiting found ready."""
+        is_ready = self._wait_set.is_ready
+        return [timer for i, timer in self._timers if is_ready("timer", i)]
+
     def others_ready(self, own: Any) -> tuple[bool, bool]:
-        """Whether the executor's own guard condition is ready, and whether anything else is."""
+        """Whether the executor's own guard condition is ready, and what is left to rclpy."""
         ready = self._wait_set.get_ready_entities
         triggered = list(ready("guard_condition"))
         for guard in self.all[1]:
@@ -205,7 +229,8 @@ class _Ends:
         woken = own is not None and own.handle.pointer in triggered
         if woken:
             triggered.remove(own.handle.pointer)
-        others = bool(triggered or ready("timer") or ready("client") or ready("service"))
+        others = bool(triggered or ready("client") or ready("service"))
+        others = others or any(timer not in self._own for timer in ready("timer"))
         return woken, others or any(
             waitable.is_ready(self._wait_set) for waitable in self._waitables
         )
@@ -241,6 +266,15 @@ def _arguments(callback: Callable[..., Any]) -> int:
     except TypeError:
         return 2
     return 1
+
+
+def _plain(callback: Callable[..., Any] | None) -> bool:
+    """Whether a timer's callback is a function of nothing that does not have to be awaited."""
+    try:
+        inspect.signature(callback).bind()  # type: ignore[arg-type]
+    except TypeError:
+        return False
+    return not inspect.iscoroutinefunction(callback)
 
 
 def _all_ends(nodes: Sequence[Node]) -> tuple[tuple[Any, ...], ...]:

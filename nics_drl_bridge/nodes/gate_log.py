@@ -4,20 +4,50 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Sequence
+from pathlib import Path
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
+from nics_drl_bridge.nodes.box_writer import BoxWriter
 from nics_drl_bridge.nodes.diagnostics import Finding
 from nics_drl_bridge.nodes.gate_parameters import GateParameters
 from nics_drl_bridge.safety.black_box import BlackBox, Entry, write
 from nics_drl_bridge.safety.state import Cause, GateState
 
 FILES_KEPT = 20
+BURST_S = 3.0
+"""Commands pass for so long before a stop counts as a new one, and not as one more of a burst."""
+LINE_S = 2.0
+"""Between two lines of a kind; what comes in between is counted."""
+CLOSING_S = 0.7
+"""The end waits so long for files that are being written."""
+
+
+class _Lines:
+    """Lines of the log, at most one of a kind within `LINE_S`."""
+
+    def __init__(self) -> None:
+        self._said: dict[str, float] = {}
+        self._kept: Counter[str] = Counter()
+
+    def count(self, kind: str) -> None:
+        """There is one more to say."""
+        self._kept[kind] += 1
+
+    def due(self, kind: str, now: float) -> str | None:
+        """None if one has just been said; else what to add about those that were not said."""
+        if now - self._said.get(kind, float("-inf")) < LINE_S:
+            return None
+        kept, self._said[kind] = self._kept.pop(kind, 1) - 1, now
+        return f" ({kept} more since the last such line)" if kept else ""
 
 
 class GateLog:
-    """One line and one file for each stop, and counters of everything.
+    """Counters of everything, lines that do not flood, and one file for each stop that is new.
+
+    Stops that follow each other closely are a burst. Of each rule, the first stop of a burst is
+    written, as it was at that moment; the others are counted.
 
     Args:
         parameters: of the gate.
@@ -29,46 +59,105 @@ class GateLog:
         self._box, self._logger = BlackBox(parameters.config), logger
         self._folder, self._hardware = parameters.black_box, parameters.robot
         self._cause: Cause | None = None
-        self._passing = False
-        # Beside the gate: a disk may take its time.
-        self._writer = ThreadPoolExecutor(1, "black_box")
-        self._writer.submit(lambda: None)  # its thread is there before the first stop
+        self._now = self._since = float("-inf")
+        self._rule: str | None = None
+        """That stops the robot; empty while commands pass, None at first."""
+        self._burst: set[str] = set()
+        """Rules of which a stop was written since commands last passed for long."""
+        self._lines, self._owed = _Lines(), False
+        self._names: list[str] = []
+        self._writer = BoxWriter()
 
     def note(self, entry: Entry) -> None:
         """Takes a decision into account."""
         self._box.note(entry)
         decision, cause = entry.decision, entry.decision.cause
+        self._now = entry.now
         if decision.refused:
-            self.counters[f"refused, {decision.refused.partition(':')[0]}"] += 1
-            self._logger.warning(f"refused: {decision.refused}", throttle_duration_sec=1.0)
+            self.refuse(decision.refused)
         if decision.shielded:
             self.counters["cut by the shield"] += 1
-        if (cause and cause.rule) != (self._cause and self._cause.rule):
-            self._changed(cause)
-        self._cause, self._passing = cause, cause is None
+        rule = "" if cause is None else cause.rule
+        if rule != self._rule:
+            self._changed(rule)
+        self._cause = cause
+        if self._owed:
+            self._tell(rule)
+        if self._burst and not rule and entry.now - self._since >= BURST_S:
+            self._burst.clear()
 
-    def _changed(self, cause: Cause | None) -> None:
-        if cause is None:
-            self._logger.info("commands pass")
+    def refuse(self, reason: str) -> None:
+        """Counts an input that is not used, by what stands before the colon, and tells of it."""
+        kind = f"refused, {reason.partition(':')[0]}"
+        self.counters[kind] += 1
+        self._lines.count(kind)
+        more = self._lines.due(kind, self._now)
+        if more is not None:
+            self._logger.warning(f"refused: {reason}{more}")
+
+    def no_number(self, twist: Sequence[float]) -> None:
+        """Counts a decision that must never have been, and tells of it."""
+        kind = "not finite, sent as zero"
+        self.counters[kind] += 1
+        self._lines.count(kind)
+        more = self._lines.due(kind, self._now)
+        if more is not None:
+            self._logger.error(
+                f"decided on {list(twist)}, which is not finite: zero is sent, and the e-stop is "
+                f"pressed{more}"
+            )
+
+    def _changed(self, rule: str) -> None:
+        """Another rule stops the robot than before, or none."""
+        was_passing = self._rule == ""
+        self._rule, self._since, self._owed = rule, self._now, True
+        self._lines.count(rule)
+        if not rule:
             return
-        self.counters[f"stopped, {cause.rule}"] += 1
-        self._logger.warning(f"stopped by {cause.line}")
-        if self._passing:
-            self._writer.submit(self._write, cause.rule).add_done_callback(self._written)
+        self.counters[f"stopped, {rule}"] += 1
+        if not was_passing:
+            return
+        if rule in self._burst:
+            self.counters["stops of a burst, not in the black box"] += 1
+            return
+        self._burst.add(rule)
+        self._write(rule)
+
+    def _tell(self, rule: str) -> None:
+        """Says what is the case now; later, if it was said a moment ago."""
+        more = self._lines.due(rule, self._now)
+        self._owed = more is None
+        if more is None:
+            return
+        if self._cause is None:
+            self._logger.info(f"commands pass{more}")
+        else:
+            self._logger.warning(f"stopped by {self._cause.line}{more}")
 
     def _write(self, rule: str) -> None:
         name = f"{time.strftime('%Y%m%d_%H%M%S')}_{self.counters.total():06d}_{rule}.jsonl"
-        write(self._box.config, self._box.copy(), self._folder / name)
-        for old in sorted(self._folder.glob("*.jsonl"))[:-FILES_KEPT]:
-            old.unlink(missing_ok=True)
+        self._names = [*self._names[1 - FILES_KEPT :], name]
 
-    def _written(self, done: Future[None]) -> None:
-        error = done.exception()
-        if error is not None:
-            self._logger.error(f"the black box could not be written: {error}")
+        def work() -> None:
+            write(self._box.config, self._box.copy(), self._folder / name)
+            prune(self._folder, self._names)
+
+        try:
+            begun = self._writer.begin(work)
+        except OSError as error:
+            self._failed(str(error))
+            return
+        if not begun:
+            self._failed("the files before it are still being written")
+
+    def _failed(self, reason: str) -> None:
+        self.counters["not written"] += 1
+        self._logger.error(f"the black box could not be written: {reason}")
 
     def finding(self, state: GateState) -> Finding:
         """For `/diagnostics`."""
+        for failure in self._writer.failures():
+            self._failed(failure)
         facts = {
             "armed": state.armed,
             "latched": state.latched is not None,
@@ -78,5 +167,20 @@ class GateLog:
         return Finding(message, self._cause is not None, facts, self._hardware)
 
     def close(self) -> None:
-        """Waits for the files that are being written."""
-        self._writer.shutdown(wait=True)
+        """Waits a moment for the files that are being written; none is left in part."""
+        for failure in self._writer.close(CLOSING_S):
+            self._failed(failure)
+
+
+def prune(folder: Path, own: Sequence[str]) -> None:
+    """Removes files of stops beyond `FILES_KEPT`, the oldest first.
+
+    Args:
+        folder: of the black box.
+        own: names of those that this gate wrote, oldest first. They are the youngest of all: the
+            names of the others may come from a clock that was set back since.
+    """
+    place = {name: i for i, name in enumerate(own, 1)}
+    files = sorted(folder.glob("*.jsonl"), key=lambda file: (place.get(file.name, 0), file.name))
+    for old in files[:-FILES_KEPT]:
+        old.unlink(missing_ok=True)

@@ -71,27 +71,58 @@ def stamp_of(content: Bytes) -> int:
     return int(seconds) * NANO + int(nanoseconds)
 
 
+def numbers_of(content: Bytes) -> Array:
+    """All numbers (85,) of a serialised Odometry, in order. Raises `UNREADABLE`."""
+    order = _order(content)
+    return np.frombuffer(content, f"{order}f8", DOUBLES, _doubles(content, order))
+
+
 def odometry_of(content: Bytes) -> tuple[Array, Array]:
     """Pose (3,) and body twist (3,) of a serialised Odometry. Raises `UNREADABLE`."""
-    order = _order(content)
-    values = np.frombuffer(content, f"{order}f8", DOUBLES, _doubles(content, order))
+    values = numbers_of(content)
     x, y, _, qx, qy, qz, qw = values[:7].tolist()
     vx, vy, wz = values[TWIST], values[TWIST + 1], values[TWIST + 5]
     return np.array([x, y, heading_of(qx, qy, qz, qw)]), np.array([vx, vy, wz])
 
 
+def _scan(content: Bytes, order: str) -> int:
+    """Where the floats of a scan begin."""
+    return _aligned(_after_text(content, FRAME, order), 4)
+
+
 def ranges_of(content: Bytes) -> NDArray[np.float32]:
     """The ranges (B,) of a serialised LaserScan, as the device says. Raises `UNREADABLE`."""
     order = _order(content)
-    place = _aligned(_after_text(content, FRAME, order), 4) + 4 * SCAN_FIELDS
+    place = _scan(content, order) + 4 * SCAN_FIELDS
     (beams,) = struct.unpack_from(f"{order}I", content, place)
     return np.frombuffer(content, f"{order}f4", beams, place + 4)
+
+
+def angles_of(content: Bytes) -> tuple[float, float]:
+    """angle_min and angle_increment [rad] of a serialised LaserScan. Raises `UNREADABLE`."""
+    order = _order(content)
+    first, _, step = struct.unpack_from(f"{order}3f", content, _scan(content, order))
+    return first, step
 
 
 def twist_of(content: Bytes) -> tuple[float, float, float]:
     """linear.x, linear.y, angular.z of a serialised Twist. Raises `UNREADABLE`."""
     x, y, _, _, _, w = struct.unpack_from(f"{_order(content)}6d", content, HEAD)
     return x, y, w
+
+
+def stamped_twist_of(content: Bytes) -> tuple[float, float, float]:
+    """linear.x, linear.y, angular.z of a serialised TwistStamped. Raises `UNREADABLE`."""
+    order = _order(content)
+    place = _aligned(_after_text(content, FRAME, order), 8)
+    x, y, _, _, _, w = struct.unpack_from(f"{order}6d", content, place)
+    return x, y, w
+
+
+def truth_of(content: Bytes) -> bool:
+    """The word of a serialised Bool. Raises `UNREADABLE`."""
+    _order(content)
+    return bool(struct.unpack_from("B", content, HEAD)[0])
 
 
 class OdometryWriter:

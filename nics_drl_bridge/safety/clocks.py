@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 from nics_drl_bridge.safety.inputs import Input, Tick
+from nics_drl_bridge.safety.records import replace
 from nics_drl_bridge.safety.state import Cause, GateConfig, GateState
 
 FROZEN_INPUTS = 20

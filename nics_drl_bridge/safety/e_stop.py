@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
+from nics_drl_bridge.safety.records import replace
 from nics_drl_bridge.safety.state import Cause, EStopState, GateConfig, GateState
 
 TOPIC = "e_stop"

@@ -9,8 +9,7 @@ neither the new present nor the new normal.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
+from nics_drl_bridge.safety.records import replace
 from nics_drl_bridge.safety.state import Arrivals, Cause, GateConfig, GateState, Mark
 
 SCAN, ODOM = "scan", "odom"

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import between
 from nics_drl_bridge.safety import pictures
 from nics_drl_bridge.safety.freshness import ODOM, SCAN
+from nics_drl_bridge.safety.records import replace
 from nics_drl_bridge.safety.state import Cause, GateConfig, GateState, Push, Sameness
 
 Array = NDArray[np.float64]

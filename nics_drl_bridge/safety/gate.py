@@ -6,7 +6,7 @@ inputs replays to the same decisions, bit for bit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from nics_drl_bridge.safety.frozen import watch_motion
 from nics_drl_bridge.safety.inputs import Arm, Input, Reset, Tick
 from nics_drl_bridge.safety.intake import take
 from nics_drl_bridge.safety.limits import LEAST_STEP_S
+from nics_drl_bridge.safety.records import replace
 from nics_drl_bridge.safety.state import Cause, Decision, GateConfig, GateState
 
 

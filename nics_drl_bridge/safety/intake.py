@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from nics_drl_bridge.safety.freshness import NANO, ODOM, SCAN, arrived
 from nics_drl_bridge.safety.frozen import NOISE
 from nics_drl_bridge.safety.inputs import Command, Estimate, EStop, Input, Odometry, Press, Scan
 from nics_drl_bridge.safety.limits import greatest, implausible
+from nics_drl_bridge.safety.records import replace
 from nics_drl_bridge.safety.state import GateConfig, GateState
 
 GREATEST_SPEED = 100.0

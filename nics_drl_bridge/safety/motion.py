@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.safety import limits
+from nics_drl_bridge.safety.records import replace
 from nics_drl_bridge.safety.state import GateConfig, GateState
 
 Array = NDArray[np.float64]

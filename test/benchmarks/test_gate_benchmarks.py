@@ -136,19 +136,3 @@ def test_a_rule_that_a_test_misses_is_found():
 )
 def test_a_rule_that_no_test_misses_is_reported(control, bar):
     assert bar in fails("gate_rules.py", control, *ONE_RULE)[0]
-
-
-@pytest.mark.timeout(300)
-def test_no_command_moves_a_robot_on_old_data_when_packets_are_lost():
-    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
-    done = subprocess.run(
-        [sys.executable, str(BENCHMARKS / "packet_loss.py"), "--json", "--seconds", "8", "--loss",
-         "20"],
-        capture_output=True, text=True, check=False, timeout=280,
-    )  # fmt: skip
-    if done.returncode == 2:
-        pytest.skip(done.stderr.strip())
-    result = json.loads(done.stdout)
-    assert result["loss_20"]["moving_commands"] > 0
-    assert result["loss_20"]["scans_arrived"] < result["loss_20"]["scans_sent"]
-    assert result["unsafe_commands"] == 0

@@ -23,11 +23,15 @@ from std_srvs.srv import Trigger
 
 from nics_drl_bridge.nodes import command_gate, conversions, qos
 from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.wire import TwistWriter
 from nics_drl_bridge.safety.black_box import replay
-from nics_drl_bridge.safety.inputs import Tick
+from nics_drl_bridge.safety.inputs import Press, Tick
 from nodes.peer import DEADLINE_S
 
 pytestmark = pytest.mark.ros
+
+GIVEN = ["gate", "--ros-args", "-p", "limits:=ackermann", "-p"]
+"""The last one is followed by a parameter."""
 
 SOON_S = 0.5  # what the gate is made for, on a machine with time
 LATE_S = 5.0
@@ -317,6 +321,81 @@ def test_every_stop_is_in_the_black_box_and_replays(robot, black_box):
     again = replay(sorted(black_box.glob("*scan_silent.jsonl"))[-1])
     assert again.differing == ()
     assert again.entries[-1].decision.cause.rule == "scan_silent"
+
+
+def test_after_a_burst_of_stops_it_ends_at_once_and_the_first_of_them_is_in_the_black_box(
+    launch, meet, domain_id, model, tmp_path
+):
+    gate = launch("command_gate", domain_id, limits="ackermann", black_box=str(tmp_path), **PATIENT)
+    robot = Robot(meet(domain_id), model.lidar)
+    robot.drives()
+    began = robot.peer.node.get_clock().now().nanoseconds
+    for _ in range(12):
+        robot.wish = (math.nan, 0.0, 0.0)
+        robot.stops()
+        robot.wish = (0.5, 0.0, 0.0)
+        robot.gets(0.5, 0.0, 0.0)
+    stops = int(robot.diagnosed()["stopped, command_malformed"])
+    robot.wish = (math.nan, 0.0, 0.0)
+    robot.stops()
+    assert gate.close() == 0  # by itself: who needs longer than NodeProcess waits is killed
+    named = {path.name for path in tmp_path.iterdir()}
+    (first,) = [name for name in named if name.endswith("_command_malformed.jsonl")]
+    again = replay(tmp_path / first)
+    assert again.differing == ()
+    assert again.entries[-1].decision.cause.rule == "command_malformed"
+    assert [one.decision.cause for one in again.entries[-20:-1]] == [None] * 19
+    assert stops >= 12
+    assert (tmp_path / first).stat().st_mtime_ns - began < 10 * conversions.NANO
+    assert all(name.endswith(".jsonl") for name in named)
+
+
+def test_a_decision_that_is_no_number_leaves_as_zero_and_latches(domain_id, tmp_path, monkeypatch):
+    """Whatever `safety` decides: here it is made to decide on NaN."""
+    sent, wrong = [], np.array([0.5, math.nan, 0.1])
+    context = open_context([*GIVEN, f"black_box:={tmp_path}"], domain_id)
+    node = command_gate.CommandGate(context)
+    try:
+        monkeypatch.setattr(
+            node, "_out", SimpleNamespace(publish=sent.append, topic_name="/cmd_vel")
+        )
+        decide = command_gate.decide
+
+        def mad(config, state, given, now):
+            state, decision = decide(config, state, given, now)
+            return state, decision if given == Press() else replace(
+                decision, twist=wrong, publish=True
+            )
+
+        monkeypatch.setattr(command_gate, "decide", mad)
+        node._decide(Tick())
+        assert sent == [TwistWriter().write(np.zeros(3))]
+        found = node._look()
+        assert found.message.startswith("e_stop_pressed")
+        assert found.facts["not finite, sent as zero"] == 1
+        wrong[:] = math.inf
+        node._decide(Tick())
+        assert set(sent) == {TwistWriter().write(np.zeros(3))}
+    finally:
+        monkeypatch.undo()
+        node.stop()
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def test_bytes_that_are_no_message_are_refused_and_counted(domain_id, tmp_path):
+    context = open_context([*GIVEN, f"black_box:={tmp_path}"], domain_id)
+    node = command_gate.CommandGate(context)
+    try:
+        for subscription in node.subscriptions:
+            if subscription.raw:
+                subscription.callback(b"\x00\x01\x00\x00\x01")
+        facts = node._look().facts
+        for topic in ("scan", "odom", "odometry/filtered", "cmd_vel_raw"):
+            assert facts[f"refused, {topic}"] == 1
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
 
 
 def test_with_a_shield_it_stops_before_an_obstacle_and_counts_it(

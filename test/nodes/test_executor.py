@@ -160,3 +160,54 @@ def test_with_an_rclpy_that_lacks_a_part_it_is_rclpys_own(node, executor, part, 
     spin_until(executor, lambda: not executor.stands, "the part is missed")
     assert heard == [Int32(data=1)]
     assert capfd.readouterr().err.count("slower executor") == 1
+
+
+def test_a_timer_ticks_as_often_as_it_is_due_beside_messages(node, executor):
+    publisher, heard, ticks = node.create_publisher(Int32, "count", 10), [], []
+
+    def tick():
+        ticks.append(1)
+        publisher.publish(Int32())
+
+    node.create_subscription(Int32, "count", heard.append, 10)
+    timer = node.create_timer(0.005, tick)
+    spin_until(executor, lambda: len(ticks) > 20 and len(heard) > 5, "ticks and messages")
+    assert timer.time_until_next_call() <= 5_000_000
+
+
+def test_a_timer_that_is_cancelled_or_destroyed_by_another_does_not_tick(node, executor):
+    ticks, others = [], []
+
+    def first():
+        ticks.append(1)
+        cancelled.cancel()
+        node.destroy_timer(destroyed)
+
+    node.create_timer(0.01, first)
+    cancelled = node.create_timer(0.01, lambda: others.append("cancelled"))
+    destroyed = node.create_timer(0.01, lambda: others.append("destroyed"))
+    spin_until(executor, lambda: len(ticks) > 10, "ticks")
+    assert others == []
+
+
+def test_a_timer_that_destroys_itself_ticks_once(node, executor):
+    ticks, beats = [], []
+
+    def once():
+        ticks.append(1)
+        node.destroy_timer(timer)
+
+    timer = node.create_timer(0.005, once)
+    node.create_timer(0.005, lambda: beats.append(1))
+    spin_until(executor, lambda: len(beats) > 10, "beats")
+    assert ticks == [1]
+
+
+def test_timers_whose_callback_is_awaited_are_left_to_rclpy(node, executor):
+    awaited = []
+
+    async def tick():
+        awaited.append(1)
+
+    node.create_timer(0.005, tick)
+    spin_until(executor, lambda: len(awaited) > 3, "awaited ticks")

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
-from geometry_msgs.msg import Twist
+from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import LaserScan
+from std_msgs.msg import Bool
 
 from nics_drl_bridge.nodes import conversions, wire
 
@@ -138,3 +139,21 @@ def test_bytes_that_are_no_plain_message_are_refused_and_not_read_beyond(read):
     if read not in (wire.stamp_of, wire.twist_of):  # which hold no text
         with pytest.raises((ValueError, struct.error)):
             read(bytes(longer))
+
+
+@pytest.mark.parametrize("frame", TEXTS)
+def test_angles_and_stamped_twists_are_read_as_rclpy_reads_them(frame):
+    message = scan(frame, 7)
+    message.angle_increment = 0.3
+    message = deserialize_message(serialize_message(message), LaserScan)
+    angles = wire.angles_of(serialize_message(message))
+    assert angles == (message.angle_min, message.angle_increment)
+    command = TwistStamped(twist=conversions.twist_to_ros(TWIST))
+    command.twist.angular.x, command.twist.linear.z = 8.0, 9.0
+    command.header.frame_id = frame
+    assert np.array_equal(wire.stamped_twist_of(serialize_message(command)), TWIST)
+
+
+@pytest.mark.parametrize("word", [False, True])
+def test_a_word_is_read_as_rclpy_reads_it(word):
+    assert wire.truth_of(serialize_message(Bool(data=word))) is word

@@ -1,0 +1,249 @@
+"""How much of a core does the gate take, beside a bare rclpy node that hears the same?
+
+Around the real `command_gate` a robot publishes over DDS what a vehicle does: scans of 720 beams,
+commands and the emergency stop's heartbeat at 10 Hz, odometry and the estimate at 50 Hz. Beside it
+a bare node, made and spun as rclpy's examples do, has the same subscriptions with callbacks that do
+nothing, and publishes a constant at the gate's rate. Both hear the same messages in the same
+seconds, so that what else the machine does weighs on both; `ratio` is the gate's share of a core to
+that node's. Shares are of whole processes, threads of the middleware included, from /proc (Linux).
+
+Then good and NaN commands come in turn for some seconds, each a stop, and the gate is ended by
+SIGINT: `exit_s` is how long it still lives. The first of those stops has to be in the black box.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import Twist, TwistStamped
+from measuring.processes import core_seconds
+from measuring.steady_robot import ODOM_HZ, PATIENCE_S, ROBOT, SteadyRobot
+from measuring.verdict import answer, parser_of
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import Bool
+
+from nics_drl_bridge.nodes import command_gate, gate_inputs, gate_log, qos
+from nics_drl_bridge.nodes.processes import free_domain_id
+from nics_drl_bridge.safety.black_box import replay
+
+CONTROLS = {
+    "busy": "the gate reads each message and decides ten times",
+    "slow_disk": "the gate waits for a disk that does not answer, at its end",
+}
+TICK_HZ = 50
+MOST_RATIO = 1.1
+"""Of the gate's share of a core to that of a bare node that hears the same."""
+LONGEST_GAP_S = 0.2
+"""Between two commands; after such a one the gate itself stops."""
+LEAST_SENT, LEAST_MOVING = 0.9, 0.8
+"""Shares of the messages that were to be sent, and of the commands that came and moved."""
+LONGEST_EXIT_S = 2.0
+LEAST_STOPS = 3
+BUSY, HUNG_S = 10, 4.0
+
+
+def bare_node() -> None:
+    """The yardstick: hears what the gate hears and does nothing, until it is killed."""
+    rclpy.init()
+    node = rclpy.create_node("bare")
+    twists = node.create_publisher(Twist, "cmd_vel_of_nobody", qos.COMMAND)
+    for kind, topic, profile in (
+        (LaserScan, "scan", qos.SENSOR),
+        (Odometry, "odom", qos.SENSOR),
+        (Odometry, "odometry/filtered", qos.SENSOR),
+        (TwistStamped, "cmd_vel_raw", qos.COMMAND),
+        (Bool, "e_stop", qos.EVERY_COMMAND),
+    ):
+        node.create_subscription(kind, topic, lambda _: None, profile)
+    node.create_timer(1.0 / TICK_HZ, lambda: twists.publish(Twist()))
+    rclpy.spin(node)
+
+
+def ill_gate(control: str, arguments: list[str]) -> None:
+    """A control's gate: the real one, but for what is taken out."""
+    if control == "busy":
+        command_gate.decide = _often(command_gate.decide)
+        for name in ("scan", "odometry", "estimate", "command", "e_stop"):
+            setattr(gate_inputs, name, _often(getattr(gate_inputs, name)))
+    else:
+        gate_log.write = lambda *_: time.sleep(10 * HUNG_S)
+        gate_log.CLOSING_S = HUNG_S
+    command_gate.main([sys.argv[0], *arguments])
+
+
+def _often(call: Callable[..., Any]) -> Callable[..., Any]:
+    """Something without effects, done again and again."""
+
+    def again(*given: Any) -> Any:
+        for _ in range(BUSY - 1):
+            call(*given)
+        return call(*given)
+
+    return again
+
+
+@contextmanager
+def started(words: list[str], domain_id: int) -> Iterator[subprocess.Popen[bytes]]:
+    """This script as another process."""
+    environment = os.environ | {
+        "ROS_DOMAIN_ID": str(domain_id), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }  # fmt: skip
+    with subprocess.Popen(
+        [sys.executable, __file__, *words], env=environment, stderr=subprocess.DEVNULL
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def gate(domain_id: int, folder: Path, control: str) -> Any:
+    """The gate as a process, or a control's."""
+    parameters = {
+        "model": ROBOT, "limits": ROBOT, "e_stop_required": "true", "odom_rate": float(ODOM_HZ),
+        "black_box": str(folder), "rate_tolerance": 0.6, "shield": "false",
+    }  # fmt: skip
+    given = [f"{name}:={value}" for name, value in parameters.items()]
+    return started(
+        [
+            "--part",
+            control or "gate",
+            "--ros-args",
+            *(word for one in given for word in ("-p", one)),
+        ],
+        domain_id,
+    )
+
+
+def measure(seconds: float, burst_s: float, control: str) -> dict[str, Any]:
+    """Drives for a time and takes what both processes used of a core; then stops and ends."""
+    domain_id = free_domain_id()
+    with (
+        tempfile.TemporaryDirectory() as name,
+        gate(domain_id, Path(name), control) as real,
+        started(["--part", "bare"], domain_id) as bare,
+    ):
+        robot = SteadyRobot(domain_id)
+        try:
+            if not robot.until(lambda: robot.listeners() >= 2, PATIENCE_S):
+                raise RuntimeError(f"not within {PATIENCE_S} s: the gate and the bare node")
+            robot.drive()
+            robot.until(lambda: False, 1.0)
+            shares = share_of_a_core(robot, (real.pid, bare.pid), seconds)
+            return shares | ended_after_a_burst(robot, real, burst_s, Path(name))
+        finally:
+            robot.close()
+
+
+def share_of_a_core(robot: SteadyRobot, pids: tuple[int, int], seconds: float) -> dict[str, Any]:
+    """What the gate and the bare node use while commands pass."""
+    robot.heard.clear()
+    began, sent = time.monotonic(), robot.sent
+    used = [core_seconds(pid) for pid in pids]
+    robot.until(lambda: False, seconds)
+    lasted, sent = time.monotonic() - began, robot.sent - sent
+    of_gate, of_bare = (
+        (core_seconds(pid) - was) / lasted for pid, was in zip(pids, used, strict=True)
+    )
+    times = [began, *(when for when, _ in robot.heard), began + lasted]
+    return {
+        "seconds": round(lasted, 2),
+        "gate_share": round(of_gate, 4),
+        "bare_share": round(of_bare, 4),
+        "ratio": round(of_gate / of_bare, 3) if of_bare else float("nan"),
+        "longest_gap_s": round(float(np.diff(times).max()), 4),
+        "sent": round(sent / (lasted * ODOM_HZ), 3),
+        "moving": round(sum(moves for _, moves in robot.heard) / (lasted * TICK_HZ), 3),
+    }
+
+
+def ended_after_a_burst(
+    robot: SteadyRobot, real: subprocess.Popen[bytes], seconds: float, folder: Path
+) -> dict[str, Any]:
+    """Stops again and again, SIGINT, and what is in the black box then."""
+    robot.heard.clear()
+    robot.mad = True
+    robot.until(lambda: False, seconds)
+    times, moving = [when for when, _ in robot.heard], [moves for _, moves in robot.heard]
+    real.send_signal(signal.SIGINT)
+    began = time.monotonic()
+    robot.until(lambda: real.poll() is not None, PATIENCE_S)
+    exit_s = time.monotonic() - began
+    files = sorted(folder.glob("*_command_malformed.jsonl"))
+    return {
+        "stops": sum(was and not moves for was, moves in pairwise(moving)),
+        "longest_gap_in_burst_s": round(float(np.diff(times).max()), 4),
+        "exit_s": round(exit_s, 3),
+        "files": len(list(folder.iterdir())),
+        "replayed": bool(files) and replay(files[0]).differing == (),
+    }
+
+
+def missed_bars(result: dict[str, Any]) -> list[str]:
+    """A sentence for each bar that was missed."""
+    missed = []
+    if not result["ratio"] <= MOST_RATIO:
+        missed.append(
+            f"the gate takes {result['ratio']} times what the bare node takes, bar {MOST_RATIO}"
+        )
+    for key in ("longest_gap_s", "longest_gap_in_burst_s"):
+        if not result[key] <= LONGEST_GAP_S:
+            missed.append(f"{key}: no command for {result[key]} s, bar {LONGEST_GAP_S} s")
+    if not result["sent"] >= LEAST_SENT:
+        missed.append(f"invalid: only {result['sent']} of the messages were sent")
+    if not result["moving"] >= LEAST_MOVING:
+        missed.append(f"invalid: only {result['moving']} of the commands came and moved")
+    if not result["stops"] >= LEAST_STOPS:
+        missed.append(f"invalid: only {result['stops']} stops in the burst")
+    if not result["exit_s"] <= LONGEST_EXIT_S:
+        missed.append(f"the gate ended {result['exit_s']} s after SIGINT, bar {LONGEST_EXIT_S} s")
+    if not result["replayed"]:
+        missed.append("the first stop of the burst is not in the black box")
+    return missed
+
+
+def main() -> None:
+    """Prints a table, or one JSON object; ends with 1 when a bar was missed."""
+    parser = parser_of(__doc__, CONTROLS)
+    parser.add_argument("--seconds", type=float, default=30.0, help="of driving")
+    parser.add_argument("--burst", type=float, default=15.0, help="of stops, before the end [s]")
+    parser.add_argument("--part", help=argparse.SUPPRESS)
+    given, rest = parser.parse_known_args()
+    if given.part == "bare":
+        bare_node()
+    elif given.part == "gate":
+        command_gate.main([sys.argv[0], *rest])
+    elif given.part is not None:
+        ill_gate(given.part, rest)
+    if given.part is not None:
+        return
+    if rest:
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    result = measure(given.seconds, given.burst, given.control or "")
+    table = (
+        f"the gate takes {result['gate_share']:.1%} of a core, the bare node "
+        f"{result['bare_share']:.1%}: {result['ratio']:.2f} times as much, over "
+        f"{result['seconds']:.0f} s\n"
+        f"longest time between two commands {result['longest_gap_s']:.3f} s, in a burst of "
+        f"{result['stops']} stops {result['longest_gap_in_burst_s']:.3f} s\n"
+        f"{result['exit_s']:.2f} s from SIGINT to the end, files {result['files']}\n"
+    )
+    answer(result, missed_bars(result), table, given.json)
+
+
+if __name__ == "__main__":
+    main()
