@@ -117,7 +117,8 @@ def missed(robot: str, figures: dict[str, Any]) -> list[str]:
     (success, limit_s), said = BARS[robot], []
     if not figures["success_rate"] >= success:
         said.append(
-            f"{robot}: {figures['success_rate']:.1%} success after training, less than {success:.0%}"
+            f"{robot}: {figures['success_rate']:.1%} success after training, "
+            f"less than {success:.0%}"
         )
     if not figures["wall_s"] <= limit_s:
         said.append(f"{robot}: it took {figures['wall_s']:.0f} s, more than {limit_s:.0f} s")

@@ -1,4 +1,4 @@
-"""The benchmark of the estimator in small: it keeps its bars, and misses them under each control."""
+"""The estimator's benchmark in small: it keeps its bars, and misses one under each control."""
 
 from __future__ import annotations
 
