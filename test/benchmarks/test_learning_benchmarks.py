@@ -1,4 +1,4 @@
-"""Benchmarks of policies in small: each misses a bar when nothing is driven, learnt or installed."""
+"""Benchmarks of policies in small: each misses a bar when nothing is driven or learnt."""
 
 from __future__ import annotations
 

@@ -74,12 +74,11 @@ def errors_after(model, simulator, seed, setting, seconds=12.0):
     for k in range(1, round(seconds * 10)):
         if k % 8 == 0:
             command = full_speed(model, rng)
-        newest = middleware.newest_ns
-        behind = None if newest is None else newest + setting.latency * PERIOD
-        middleware.command(behind, command)
+        moved = round(setting.jump_s * SECOND)
+        middleware.command((k - 1) * PERIOD + (moved if k > when else 0), command)
         simulator.step(command[None, None])
         truth.append(simulator.data.pose[0, 0].copy())
-        shift = round(setting.jump_s * SECOND) if k >= when else 0
+        shift = moved if k >= when else 0
         silent = when <= k < when + setting.silent
         if rng.random() >= setting.lost and not silent:
             odom = setting.pose(k - when, simulator.data.odom[0, 0].copy())
