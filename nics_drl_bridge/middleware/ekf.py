@@ -86,6 +86,7 @@ class Estimator:
         self._observe_pose = np.eye(3, 3 + size)
         self._log = CommandLog(len(model.robot.command))
         self._filter, self._trial = (ExtendedKalmanFilter(3 + size, 3) for _ in range(2))
+        self._anchor: Anchor | None = None
         self._foreseen: Foreseen | None = None  # of the present belief and commands
         self.reset(0, np.zeros(3))
 
