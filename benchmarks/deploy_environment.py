@@ -7,7 +7,6 @@ odometry and waits for commands. Where ROS 2 is installed it is used, otherwise 
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shutil
@@ -18,11 +17,17 @@ import time
 from pathlib import Path
 from typing import Any
 
+from measuring.verdict import answer, parser_of
+
 ROOT = Path(__file__).resolve().parents[1]
 ROBOT = "differential"
 FORBIDDEN = ("torch", "stable_baselines3", "mujoco", "tensorboard")
 STAND_IN = Path(__file__).resolve().parent / "measuring" / "deployed_policy.py"
 INSTALL_S, DRIVE_S = 900, 900
+CONTROLS = {
+    "no_policy": "a policy file that is cut short",
+    "training_installed": "an environment in which training is installed",
+}
 
 
 def export(folder: Path) -> tuple[Path, Path]:
@@ -75,38 +80,55 @@ def present(python: Path) -> list[str]:
     return done.stdout.split()
 
 
-def measure() -> dict[str, Any]:
-    """Makes the environment, drives in it, and removes it."""
+def measure(control: str | None, here: bool) -> dict[str, Any]:
+    """Makes the environment, drives in it, and removes it.
+
+    Args:
+        control: one of `CONTROLS`, or None.
+        here: takes the environment that runs this instead of a new one.
+    """
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         model, policy = export(folder)
+        if control == "no_policy":
+            policy.write_bytes(policy.read_bytes()[:100])
         began = time.monotonic()
-        python = installed(folder / "environment")
+        python = Path(sys.executable) if here else installed(folder / "environment")
         install_s = time.monotonic() - began
         found = present(python)
         done = subprocess.run(
             [str(python), str(STAND_IN), str(model), str(policy)],
-            env=environment(), cwd=folder, capture_output=True, text=True, timeout=DRIVE_S,
+            env=environment() | ({"PYTHONPATH": str(ROOT)} if here else {}),
+            cwd=folder, capture_output=True, text=True, timeout=DRIVE_S,
         )  # fmt: skip
-        if done.returncode != 0:
-            raise SystemExit(f"policy_node did not drive:\n{done.stdout}\n{done.stderr}")
-        drove = json.loads(done.stdout.splitlines()[-1])
-    return {"install_s": round(install_s, 1), "training_modules": found, **drove}
+    told = {"install_s": round(install_s, 1), "training_modules": found}
+    if done.returncode != 0:
+        said = [line for line in done.stderr.splitlines() if line.strip()]
+        return {**told, "commands": 0, "said": said[-1] if said else ""}
+    return {**told, **json.loads(done.stdout.splitlines()[-1])}
 
 
-def main() -> int:
+def missed(found: dict[str, Any]) -> list[str]:
+    """A sentence for each bar that was missed."""
+    said = []
+    if not found["commands"] > 0:
+        said.append(f"policy_node sent no command: {found.get('said', '')}")
+    if found["training_modules"]:
+        said.append(f"of training there is {', '.join(found['training_modules'])}")
+    return said
+
+
+def main() -> None:
     """Prints what was found; 0 when the node drove without anything of training."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
-    arguments = parser.parse_args()
-    found = measure()
-    if arguments.json:
-        print(json.dumps(found))
-    else:
-        for name, value in found.items():
-            print(f"{name:<20} {value}")
-    return 0 if found["commands"] > 0 and not found["training_modules"] else 1
+    parser = parser_of(__doc__, CONTROLS)
+    parser.add_argument(
+        "--here", action="store_true", help="in this environment; it takes no time to install"
+    )
+    given = parser.parse_args()
+    found = measure(given.control, given.here or given.control is not None)
+    table = "".join(f"{name:<20} {value}\n" for name, value in found.items())
+    answer(found, missed(found), table, given.json)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -3,28 +3,32 @@
 Simulated drives of robots that drift, with noisy odometry and motion capture, both at 10 Hz, both
 100 ms late, 5 % of them lost. The odometry is compared with where the robot was at its stamp; the
 estimate, harder, with where the robot is when it is asked, 100 ms later. NEES is that of the pose
-at the newest measurement, once at the end of each drive. Then random steps, all of which have to
-leave the covariance finite, symmetric and positive definite.
+at the newest measurement, once at the end of each drive. Then drives by odometry alone whose clock
+is set on the way, and random steps, all of which have to leave the covariance finite, symmetric
+and positive definite.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from measuring import clock_jumps
+from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.calibration.noise_model import Level, Noise
 from nics_drl_bridge.generator import SimulatorModel, builtin_model
+from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.ekf import Estimator
+from nics_drl_bridge.middleware.measurement import ODOM
+from nics_drl_bridge.middleware.trail import Told
 from nics_drl_bridge.middleware.view import Middleware
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
@@ -36,6 +40,24 @@ PERIOD = SECOND // 10
 LATENCY = 100_000_000
 LOST = 0.05
 DRIVE_S = 30
+CONTROLS = {
+    "no_filter": "raw odometry in place of the estimate",
+    "overconfident": "a filter that expects a quarter of the noise",
+    "nan": "an estimate that is no number",
+    "stands": "robots that do not move",
+    "stood_still": "a robot that is taken to have stood still while its clock was set",
+}
+SHARE, SHARE_OF_EACH = 0.2, 0.35
+"""The estimate may be off by this share of what odometry is, over all robots and of each."""
+LEAST_WAY_M = 3.0
+"""A robot that drives less [m] shows nothing."""
+JUMP_ERROR_M, JUMP_END_M = (0.2, 1.0), 2.0
+"""After a jump the estimate may be off by this, at the median and the 99th percentile, and at the
+99th percentile at the end of the drive, by odometry alone [m]."""
+JUMP_NEES, JUMP_NEES_P99 = 4.0, 16.27
+"""Greatest mean and 99th percentile of NEES after a jump; of chi-squared, 99 and 99.9 % of which
+lie below 11.3 and 16.27, a filter around a model that is not linear has somewhat more tail."""
+LEAST_UNSEEN_M = 0.2
 POSE_STD = np.array([0.02, 0.02, 0.02])
 """Of motion capture [m, m, rad]."""
 STATE_DRIFT = 0.02
@@ -64,11 +86,54 @@ class Drive:
         raw: (T,) squared distance of the odometry from the truth at its stamp [m^2].
         estimated: (T,) of the estimate from the truth at the time of asking [m^2].
         nees: of the pose at the newest measurement, at the end.
+        way: that the robot truly drove [m].
     """
 
     raw: Array
     estimated: Array
     nees: float
+    way: float
+
+
+class _NoFilter(Middleware):
+    """Takes odometry's own pose for that of the robot."""
+
+    def view(self, now_ns: int) -> RobotView:
+        seen = super().view(now_ns)
+        newest = self.cache.newest.get(ODOM)
+        return seen if newest is None else replace(seen, pose=newest.value[0])
+
+
+class _NoNumber(Middleware):
+    def view(self, now_ns: int) -> RobotView:
+        return replace(super().view(now_ns), pose=np.full(3, np.nan))
+
+
+class _StoodStill(Middleware):
+    def _follow_clock(self, told: Told) -> None:
+        belief = self.estimator.belief
+        std = np.sqrt(np.diag(belief.covariance)[:3])
+        self.estimator.reset(told.stamp_ns, belief.mean[:3], std)
+        self._begin(told.stamp_ns)
+        self._trail.reset()
+        self.cache.newest.clear()
+
+
+def _overconfident(model: SimulatorModel) -> Middleware:
+    levels = {
+        name: level.model_copy(update={"std": level.std / 4.0})
+        for name in type(NOISE).model_fields
+        if isinstance(level := getattr(model.noise, name), Level)
+    }
+    return Middleware(replace(model, noise=model.noise.model_copy(update=levels)))
+
+
+MAKES: dict[str | None, Callable[[SimulatorModel], Middleware]] = {
+    "no_filter": _NoFilter,
+    "overconfident": _overconfident,
+    "nan": _NoNumber,
+    "stood_still": _StoodStill,
+}
 
 
 def noisy(robot: str) -> SimulatorModel:
@@ -83,9 +148,11 @@ def noisy(robot: str) -> SimulatorModel:
     return replace(model, noise=NOISE.model_copy(update={"state_drift": states}))
 
 
-def drive(model: SimulatorModel, simulator: FastSimulator, seed: int) -> Drive:
+def drive(
+    model: SimulatorModel, simulator: FastSimulator, middleware: Middleware, seed: int, moving: bool
+) -> Drive:
     """Drives at random; measurements are under way for the latency, and some get lost."""
-    rng, middleware = np.random.default_rng(seed), Middleware(model)
+    rng = np.random.default_rng(seed)
     start = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
     simulator.reset([seed], starts=start[None, None])
     middleware.reset(0, start)
@@ -93,7 +160,7 @@ def drive(model: SimulatorModel, simulator: FastSimulator, seed: int) -> Drive:
     raw, estimated = [], []
     for k in range(DRIVE_S * 10):
         if k % 5 == 0:
-            command = rng.uniform(model.robot.command_low, model.robot.command_high)
+            command = rng.uniform(model.robot.command_low, model.robot.command_high) * moving
         middleware.command(k * PERIOD, command)
         simulator.step(command[None, None])
         now, data = (k + 1) * PERIOD, simulator.data
@@ -113,7 +180,8 @@ def drive(model: SimulatorModel, simulator: FastSimulator, seed: int) -> Drive:
     error = belief.mean[:3] - truth[belief.time_ns // PERIOD]
     error[2] = geometry.wrap_angle(error[2])
     nees = float(error @ np.linalg.solve(belief.covariance[:3, :3], error))
-    return Drive(np.array(raw), np.array(estimated), nees)
+    way = np.hypot(*np.diff(np.array(truth)[:, :2], axis=0).T).sum()
+    return Drive(np.array(raw), np.array(estimated), nees, float(way))
 
 
 def summary(drives: list[Drive]) -> dict[str, Any]:
@@ -124,6 +192,7 @@ def summary(drives: list[Drive]) -> dict[str, Any]:
         "ekf_rmse_m": float(np.sqrt(np.mean([each.estimated for each in drives]))),
         "nees_mean": float(np.mean([each.nees for each in drives])),
         "nees_95_band": [float(low), float(high)],
+        "way_m": float(np.mean([each.way for each in drives])),
     }
 
 
@@ -174,24 +243,76 @@ def cycle_us(model: SimulatorModel, cycles: int) -> float:
     return float(np.median(times)) * 1e6
 
 
-def run(drives: int, steps: int, seed: int) -> dict[str, Any]:
-    """Drives every robot, then takes random steps with one after the other."""
-    found = {}
+def run(drives: int, steps: int, seed: int, control: str | None) -> dict[str, Any]:
+    """Drives every robot, sets its clock, then takes random steps with one after the other."""
+    found, jumped, moving = {}, {}, control != "stands"
+    make = MAKES.get(control, Middleware)
     for robot in ROBOTS:
         model = noisy(robot)
-        simulator = FastSimulator(model, WIDE)
-        found[robot] = [drive(model, simulator, seed + k) for k in range(drives)]
+        simulator, seeds = FastSimulator(model, WIDE), range(seed, seed + drives)
+        found[robot] = [drive(model, simulator, make(model), one, moving) for one in seeds]
+        jumped[robot] = clock_jumps.campaign(model, simulator, make, seeds, moving)
     shares = [random_steps(noisy(r), -(-steps // len(ROBOTS)), seed) for r in ROBOTS]
     return {
         **summary([each for robot in ROBOTS for each in found[robot]]),
         "robots": {robot: summary(found[robot]) for robot in ROBOTS},
         "drives": drives * len(ROBOTS),
+        "clock_jump": {
+            **clock_jumps.summary([each for robot in ROBOTS for each in jumped[robot]]),
+            "nees_bars": [JUMP_NEES, JUMP_NEES_P99],
+            "robots": {robot: clock_jumps.summary(jumped[robot]) for robot in ROBOTS},
+        },
         "random_steps": sum(share["random_steps"] for share in shares),
         "finite_and_positive_definite": all(
             share["finite_and_positive_definite"] for share in shares
         ),
         "cycle_us": cycle_us(noisy(ROBOTS[0]), 3000),
     }
+
+
+def missed(result: dict[str, Any], steps: int) -> list[str]:
+    """A sentence for each bar that was missed."""
+    said = _missed_share("all robots", result, SHARE)
+    for robot, each in result["robots"].items():
+        said += _missed_share(robot, each, SHARE_OF_EACH)
+        if not each["way_m"] >= LEAST_WAY_M:
+            said.append(f"{robot} drove {each['way_m']:.2f} m a drive, less than {LEAST_WAY_M} m")
+    low, high = result["nees_95_band"]
+    if not low <= result["nees_mean"] <= high:
+        said.append(f"NEES is {result['nees_mean']:.2f}, not within {low:.2f} to {high:.2f}")
+    if not (result["finite_and_positive_definite"] and result["random_steps"] >= steps > 0):
+        said.append(f"the covariance was unsound after {result['random_steps']} random steps")
+    return said + _missed_jumps(result["clock_jump"])
+
+
+def _missed_share(who: str, figures: dict[str, Any], most: float) -> list[str]:
+    share = figures["ekf_rmse_m"] / figures["raw_rmse_m"]
+    if share <= most:
+        return []
+    return [f"{who}: the estimate is off by {share:.2f} of what odometry is, more than {most}"]
+
+
+def _missed_jumps(jumps: dict[str, Any]) -> list[str]:
+    bars = {
+        "error_p50_m": JUMP_ERROR_M[0],
+        "error_p99_m": JUMP_ERROR_M[1],
+        "end_error_p99_m": JUMP_END_M,
+        "nees_mean": JUMP_NEES,
+        "nees_p99": JUMP_NEES_P99,
+        "end_nees_mean": JUMP_NEES,
+        "end_nees_p99": JUMP_NEES_P99,
+    }
+    said = [
+        f"after a clock jump {name} is {jumps[name]:.3g}, more than {bar:g}"
+        for name, bar in bars.items()
+        if not jumps[name] <= bar
+    ]
+    if not jumps["driven_unseen_m"] >= LEAST_UNSEEN_M:
+        said.append(
+            f"the robots drove {jumps['driven_unseen_m']:.2f} m while their clock was set, less "
+            f"than {LEAST_UNSEEN_M} m"
+        )
+    return said
 
 
 def table_of(result: dict[str, Any]) -> str:
@@ -204,6 +325,13 @@ def table_of(result: dict[str, Any]) -> str:
             name, f"{each['raw_rmse_m']:.3f}", f"{each['ekf_rmse_m']:.3f}",
             f"{each['nees_mean']:.2f}", f"{low:.2f} to {high:.2f}",
         )  # fmt: skip
+    jumps = result["clock_jump"]
+    text += (
+        f"after a clock jump, by odometry alone, {jumps['driven_unseen_m']:.2f} m unseen: off by "
+        f"{jumps['error_p50_m']:.3f} m (99 %: {jumps['error_p99_m']:.3f} m), NEES "
+        f"{jumps['nees_mean']:.2f} (99 %: {jumps['nees_p99']:.1f}); at the end 99 %: "
+        f"{jumps['end_error_p99_m']:.3f} m, {jumps['end_nees_p99']:.1f}\n"
+    )
     sound = "all" if result["finite_and_positive_definite"] else "NOT all"
     return (
         f"{text}{result['random_steps']} random steps, {sound} finite and positive definite; "
@@ -213,14 +341,13 @@ def table_of(result: dict[str, Any]) -> str:
 
 def main() -> None:
     """Prints a table, or one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--drives", type=int, default=100, help="of each robot")
     parser.add_argument("--steps", type=int, default=1_000_000, help="random steps")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    result = run(given.drives, given.steps, given.seed)
-    sys.stdout.write(json.dumps(result) + "\n" if given.json else table_of(result))
+    result = run(given.drives, given.steps, given.seed, given.control)
+    answer(result, missed(result, given.steps), table_of(result), given.json)
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ FIRST_SEED = 1_000_000
 """Far from the seeds of any training."""
 PANELS = 6
 HEADS = (
-    "policy", "world", "success", "95 %", "collision", "time-out", "path [m]", "time [s]",
-    "as in the first", "deviation [m]", "greatest [m]",
+    "policy", "world", "success", "95 %", "believed", "collision", "time-out", "path [m]",
+    "time [s]", "as in the first", "deviation [m]", "greatest [m]",
 )  # fmt: skip
 Say = Callable[[str], None]
 Tell = Callable[[str, int, int], None]
@@ -162,6 +162,7 @@ def _cells(tally: Tally) -> tuple[str, ...]:
     return (
         percent(success.value),
         f"{100 * success.low:.0f} to {100 * success.high:.0f} %",
+        percent(tally.believed.value),
         percent(tally.collision.value),
         percent(tally.time_out.value),
         _figure(tally.length),

@@ -71,11 +71,23 @@ def drive_in(place: str, trial: Trial, told: Told, say: Say = lambda _: None) ->
     check_place(place)
     if place == FAST:
         return drive(trial, "sim", {"estimator": True}, told)
-    with _node(NODES[place], trial, say) as options:
-        return drive(trial, "dds", {"backend_options": options}, told)
+    from nics_drl_bridge.nodes.witness import Witness
+
+    with _node(NODES[place], trial, say) as options, Witness(options["domain_id"]) as witness:
+
+        def touched() -> bool:
+            return witness.touched(NODES[place], START_S)
+
+        return drive(trial, "dds", {"backend_options": options}, told, touched)
 
 
-def drive(trial: Trial, backend: str, arguments: dict[str, Any], told: Told) -> list[Episode]:
+def drive(
+    trial: Trial,
+    backend: str,
+    arguments: dict[str, Any],
+    told: Told,
+    touched: Callable[[], bool] | None = None,
+) -> list[Episode]:
     """Drives the episodes of a trial in an env of a backend, with further arguments of the env."""
     register_envs()
     model = open_model(trial.model)
@@ -84,7 +96,7 @@ def drive(trial: Trial, backend: str, arguments: dict[str, Any], told: Told) -> 
         NAVIGATION, backend=backend, model=model, world=trial.world, task=task, **arguments
     )
     try:
-        return drive_all(env, policy, trial.seeds, told)
+        return drive_all(env, policy, trial.seeds, told, touched)
     finally:
         env.close()
 

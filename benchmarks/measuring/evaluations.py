@@ -13,13 +13,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+BENCHMARKS = Path(__file__).resolve().parents[1]
 AT_ONCE = 2
 DOMAINS = range(1, 102)
 
 
 @dataclass(frozen=True)
 class Run:
-    """One evaluation: a policy, the robot, the world, how many episodes, the first seed."""
+    """One evaluation: a policy, the robot, the world, how many episodes, the first seed.
+
+    And a control, if it is to fail: see `deceived`.
+    """
 
     policy: str
     robot: str
@@ -27,6 +31,7 @@ class Run:
     episodes: int
     seed: int
     out: Path
+    control: str | None = None
 
 
 def evaluations(runs: Mapping[str, Run]) -> dict[str, dict[str, Any]]:
@@ -49,9 +54,11 @@ def _evaluate(run: Run, domain: int) -> dict[str, Any]:
         "evaluate", run.policy, "--model", run.robot, "--world", run.world, "--episodes",
         run.episodes, "--seed", run.seed, "--out", run.out,
     )  # fmt: skip
+    program = ["measuring.deceived", run.control] if run.control else ["nics_drl_bridge.cli"]
+    paths = os.pathsep.join([str(BENCHMARKS), *filter(None, [os.environ.get("PYTHONPATH")])])
     done = subprocess.run(
-        [sys.executable, "-m", "nics_drl_bridge.cli", *map(str, words)],
-        env=os.environ | {"ROS_DOMAIN_ID": str(domain)},
+        [sys.executable, "-m", *program, *map(str, words)],
+        env=os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONPATH": paths},
         capture_output=True,
         text=True,
     )

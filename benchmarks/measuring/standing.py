@@ -1,4 +1,4 @@
-"""The action of an env by which its robots stand."""
+"""A policy that stands still: what every benchmark of driving has to fail with."""
 
 from __future__ import annotations
 
@@ -8,12 +8,33 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env.actions import still
+from nics_drl_bridge.env.actions import discrete_commands, still
+from nics_drl_bridge.env.task import Task
 
 
-def standing_action(env: gymnasium.Env[Any, Any]) -> NDArray[np.float32]:
-    """That of continuous actions: limits need not lie about zero."""
-    robot, robots = env.unwrapped.model.robot, env.unwrapped.robots
-    low, high = robot.command_low, robot.command_high
-    shares = (still(robot) - low) / (high - low)
-    return np.tile(2.0 * shares - 1.0, robots).astype(np.float32)
+class Standing:
+    """Stands still, whatever it sees.
+
+    Args:
+        task: of the robot.
+    """
+
+    def __init__(self, task: Task) -> None:
+        robot, rest = task.robot, still(task.robot)
+        if isinstance(task.action_space, gymnasium.spaces.Discrete):
+            off = np.abs(discrete_commands(robot) - rest).sum(axis=1)
+            self._action = np.asarray(off.argmin())
+        else:
+            share = (rest - robot.command_low) / (robot.command_high - robot.command_low)
+            self._action = (2.0 * share - 1.0).astype(np.float32)
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[Any]:
+        """The same action for every observation (..., O)."""
+        lead = observation.shape[:-1]
+        return np.broadcast_to(self._action, (*lead, *self._action.shape)).copy()
+
+
+def standing_action(env: gymnasium.Env[Any, Any]) -> NDArray[Any]:
+    """The action of an env by which all its robots stand."""
+    still_env: Any = env.unwrapped
+    return np.tile(Standing(still_env.task).act(np.empty(0)), still_env.robots)

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kinematics.kernels import SERIES, term_arrays, wrap
+from nics_drl_bridge.kinematics.kernels import SERIES, term_arrays
 from nics_drl_bridge.middleware import kernels
+from nics_drl_bridge.middleware.belief import Anchor, Belief, Foreseen, parted
 from nics_drl_bridge.middleware.command_log import CommandLog
-from nics_drl_bridge.middleware.measurement import Kind, Measurement, Outcome, Verdict
+from nics_drl_bridge.middleware.measurement import (
+    Kind,
+    Measurement,
+    Outcome,
+    Verdict,
+    pose_residual,
+)
+from nics_drl_bridge.middleware.unseen import Unseen
 
 Array = NDArray[np.float64]
 
@@ -42,38 +48,8 @@ START_STD = 1e-3
 ANYWHERE = (100.0, 100.0, np.pi)
 """How well odometry alone tells where a robot is in the map of a pose sensor [m, rad]."""
 LONGEST_GAP_S = 10.0
-"""Over a longer silence, as when a clock jumps, the robot is taken to have stood still."""
+"""What the robot does in a longer silence is not predicted: it may have driven anywhere."""
 NANO = 1_000_000_000
-
-
-class Belief(NamedTuple):
-    """All that the filter holds at a time; its arrays are never changed in place.
-
-    Attributes:
-        time_ns: of the belief [ns].
-        mean: (3 + S,) x [m], y [m], heading [rad] in `map`, then the state of the RobotSpec.
-        covariance: (3 + S, 3 + S).
-        outliers: how many of each kind came in a row.
-    """
-
-    time_ns: int
-    mean: Array
-    covariance: Array
-    outliers: tuple[int, int, int]
-
-
-class _Foreseen(NamedTuple):
-    """What a prediction comes to: time [ns], mean, covariance, and the twist to measure then.
-
-    And where there was time for it, what such a measurement makes of it, whatever its value: the
-    gain (3 + S, 3) and the covariance after it.
-    """
-
-    time_ns: int
-    mean: Array
-    covariance: Array
-    expected: tuple[Array, Array]
-    update: tuple[Array, Array] | None = None
 
 
 class Estimator:
@@ -106,10 +82,12 @@ class Estimator:
             Kind.YAW_RATE: np.diag([GYRO_STD**2]),
             Kind.POSE: np.diag(np.maximum(model.noise.pose, LEAST_POSE_STD) ** 2),
         }
+        self.unseen = Unseen(model, self._process, self._noise[Kind.TWIST], self._news)
         self._observe_pose = np.eye(3, 3 + size)
         self._log = CommandLog(len(model.robot.command))
         self._filter, self._trial = (ExtendedKalmanFilter(3 + size, 3) for _ in range(2))
-        self._foreseen: _Foreseen | None = None  # of the present belief and commands
+        self._anchor: Anchor | None = None
+        self._foreseen: Foreseen | None = None  # of the present belief and commands
         self.reset(0, np.zeros(3))
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
@@ -123,17 +101,40 @@ class Estimator:
         size = self._filter.dim_x
         mean, deviation = np.zeros(size), np.full(size, START_STD)
         mean[:3], deviation[:3] = pose, std
-        self.belief = Belief(time_ns, mean, np.diag(deviation**2), (0, 0, 0))
+        self.belief = Belief(time_ns, mean, np.diag(deviation**2), (0, 0, 0), None, False)
         self._log.clear()
+
+    def anchor(self, odom: Array) -> None:
+        """Notes the pose (3,) in `odom` of the present."""
+        self._anchor = Anchor(self.time_ns, odom, self._filter.x, self._filter.P)
+
+    def lose(self, time_ns: int, seconds: float, continuous: bool) -> None:
+        """Goes on at a time to which the clock was set, from what was held at the last odometry.
+
+        The robot may have driven anywhere within reach since; the last command goes on.
+
+        Args:
+            time_ns: when [ns].
+            seconds: since that odometry.
+            continuous: whether the next odometry's pose tells how far it came.
+        """
+        anchor = self._anchor or Anchor(0, np.zeros(3), self._filter.x, self._filter.P)
+        covariance = self.unseen.doubted(anchor.covariance, seconds)
+        known = self._anchor is not None and continuous
+        since = anchor._replace(time_ns=time_ns - round(seconds * NANO)) if known else None
+        self.belief = Belief(time_ns, anchor.mean, covariance, (0, 0, 0), since, True)
+        self._log.keep_last()
 
     @property
     def belief(self) -> Belief:
         """What the filter holds; to be set again when the past has changed."""
-        return Belief(self.time_ns, self._filter.x, self._filter.P, self._outliers)
+        kept = self._filter.x, self._filter.P, self._outliers, self._anchor, self._lost
+        return Belief(self.time_ns, *kept)
 
     @belief.setter
     def belief(self, belief: Belief) -> None:
-        self.time_ns, self._filter.x, self._filter.P, self._outliers = belief
+        self.time_ns, self._filter.x, self._filter.P, self._outliers = belief[:4]
+        self._anchor, self._lost = belief.anchor, belief.lost
         self._foreseen = None
 
     @property
@@ -187,6 +188,7 @@ class Estimator:
             return
         if self._foreseen is None or self._foreseen.time_ns != time_ns:
             self._foreseen = self._forecast(time_ns)
+        self._lost = self._lost or time_ns - self.time_ns > self._timing[1]
         self.time_ns, self._filter.x, self._filter.P, *_ = self._foreseen
 
     def foresee(self, time_ns: int) -> None:
@@ -200,21 +202,23 @@ class Estimator:
             foreseen = self._forecast(time_ns)
             self._foreseen = foreseen._replace(update=self._try(foreseen))
 
-    def _try(self, foreseen: _Foreseen) -> tuple[Array, Array]:
+    def _try(self, foreseen: Foreseen) -> tuple[Array, Array]:
         """Gain, and covariance afterwards, of a measured twist; neither depends on its value."""
         trial, (twist, derivative) = self._trial, foreseen.expected
         trial.x, trial.P = foreseen.mean, foreseen.covariance
         trial.update(twist, lambda _: derivative, lambda _: twist, R=self._noise[Kind.TWIST])
         return trial.K, trial.P
 
-    def _forecast(self, time_ns: int) -> _Foreseen:
+    def _forecast(self, time_ns: int) -> Foreseen:
         log = self._log.arrays
         mean, covariance = kernels.forecast(
             self._filter.x, self._filter.P, self._process, self.time_ns, time_ns,
             self._timing, log, self._terms, SERIES,
         )  # fmt: skip
+        if time_ns - self.time_ns > self._timing[1]:
+            covariance = self.unseen.doubted(covariance, (time_ns - self.time_ns) / NANO)
         expected = kernels.expect(mean, time_ns, log, self._terms)
-        return _Foreseen(time_ns, mean, covariance, expected)
+        return Foreseen(time_ns, mean, covariance, expected)
 
     def update_twist(self, twist: ArrayLike) -> Verdict:
         """Corrects by a measured body twist (3,) at the time of the estimate."""
@@ -236,11 +240,36 @@ class Estimator:
         return self.correct(Measurement(Kind.POSE, np.array(pose, dtype=np.float64), noise))
 
     def correct(self, measurement: Measurement) -> Verdict:
-        """Corrects by a measurement at the time of the estimate, unless it is an outlier."""
-        kind, value, noise = measurement
+        """Corrects by a measurement at the time of the estimate, unless it is an outlier.
+
+        Where the robot may have driven unseen, the odometry's pose first tells how far.
+        """
+        kind, odom = measurement.kind, measurement.odom
+        if self._lost and odom is not None:
+            self._bridge(odom)
+        verdict = self._correct(measurement)
+        if odom is not None:
+            self.anchor(odom)
+        elif kind is Kind.POSE and verdict.outcome is not Outcome.OUTLIER:
+            self._lost = False
+        return verdict
+
+    def _bridge(self, odom: Array) -> None:
+        """Puts the estimate where odometry says that the robot came, if it can have come there."""
+        anchor, self._lost = self._anchor, False
+        if anchor is None:
+            return
+        seconds = (self.time_ns - anchor.time_ns) / NANO
+        bridged = self.unseen.bridged(anchor, odom, seconds)
+        if bridged is not None:
+            self._jump(*bridged)
+            self._foreseen = None
+
+    def _correct(self, measurement: Measurement) -> Verdict:
+        kind, value, noise, _ = measurement
         noise = self._noise[kind] if noise is None else noise
         expected, derivative = self._expect(kind)
-        residual = _pose_residual if kind is Kind.POSE else np.subtract
+        residual = pose_residual if kind is Kind.POSE else np.subtract
         innovation = residual(value, expected)
         distance = kernels.distance(innovation, derivative, self._filter.P, noise)
         outcome = Outcome.USED
@@ -299,18 +328,12 @@ class Estimator:
                 return Outcome.NEWS
             if believed:
                 self._filter.P = doubtful
-                self._part()
+                self._filter.P = parted(self._filter.P)
         return Outcome.JUMP if believed else Outcome.OUTLIER
-
-    def _part(self) -> None:
-        """Lets a surprise about the pose tell nothing of the state, nor the other way round."""
-        covariance = np.array(self._filter.P)
-        covariance[:3, 3:], covariance[3:, :3] = 0.0, 0.0
-        self._filter.P = covariance
 
     def _jump(self, pose: Array, noise: Array) -> None:
         """Takes a pose for the pose."""
-        self._part()
+        self._filter.P = parted(self._filter.P)
         mean = np.array(self._filter.x)
         mean[:3], self._filter.P[:3, :3] = pose, noise
         self._filter.x = mean
@@ -325,10 +348,3 @@ def _widened(low: Array, high: Array) -> tuple[Array, Array]:
     """Limits (n,), as far apart as the filter believes in."""
     center, half = (high + low) / 2.0, REACHABLE * (high - low) / 2.0
     return center - half, center + half
-
-
-def _pose_residual(measured: Array, expected: Array) -> Array:
-    """Difference of two poses (3,), its heading in [-pi, pi)."""
-    difference = measured - expected
-    difference[2] = wrap(difference[2])
-    return difference

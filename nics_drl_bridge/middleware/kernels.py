@@ -102,8 +102,7 @@ def carry(mean, transition, begin, end, timing, log, terms, series):  # type: ig
     Args:
         mean, transition, terms, series: see `predict`.
         begin, end: times [ns].
-        timing: the model's step, and the silence over which the robot is taken to have stood
-            still [ns].
+        timing: the model's step, and the silence over which nothing is predicted [ns].
         log: since when each command is in effect [ns] (K,), the commands (K, C), how many.
     """
     step, longest = timing

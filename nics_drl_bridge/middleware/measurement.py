@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nics_drl_bridge.kinematics.kernels import wrap
+
 Array = NDArray[np.float64]
 
 SCAN, ODOM, CMD_VEL, POSE, IMU = "scan", "odom", "cmd_vel", "pose", "imu"
@@ -34,11 +36,13 @@ class Measurement(NamedTuple):
         value: (3,) body twist vx, vy [m/s], wz [rad/s]; (1,) yaw rate [rad/s]; or (3,) pose
             x, y [m], heading [rad] in `map`.
         noise: covariance of the value, (3, 3) or (1, 1); the model's when None.
+        odom: (3,) pose in `odom` that came with a twist; it bridges what was not seen.
     """
 
     kind: Kind
     value: Array
     noise: Array | None = None
+    odom: Array | None = None
 
 
 class Outcome(IntEnum):
@@ -94,3 +98,10 @@ def checked_covariance(covariance: ArrayLike | None, size: int, least_std: float
     if least <= 0.0:
         raise ValueError("covariance: not positive definite")
     return given + max(least_std**2 - least, 0.0) * np.eye(size)
+
+
+def pose_residual(measured: Array, expected: Array) -> Array:
+    """Difference of two poses (3,), its heading in [-pi, pi)."""
+    difference = measured - expected
+    difference[2] = wrap(difference[2])
+    return difference

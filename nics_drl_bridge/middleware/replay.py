@@ -6,9 +6,11 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.middleware.ekf import Belief, Estimator
+from nics_drl_bridge.middleware.belief import Belief
+from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.measurement import Kind, Measurement, Outcome, Verdict
 
 HISTORY_NS = 1_000_000_000
@@ -62,6 +64,12 @@ class Timeline:
     def newest_ns(self) -> int:
         """Stamp of the newest measurement, or of the reset [ns]."""
         return self._entries[-1].moment[0]
+
+    def anchor(self, odom: NDArray[np.float64]) -> None:
+        """Notes the pose (3,) in `odom` of the start, if nothing was measured since."""
+        if len(self._entries) == 1:
+            self._estimator.anchor(odom)
+            self._entries[0].belief = self._estimator.belief
 
     def measure(self, stamp_ns: int, measurement: Measurement) -> str:
         """Takes a measurement; returns why it can not be used, or nothing.

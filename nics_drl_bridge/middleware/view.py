@@ -30,6 +30,9 @@ from nics_drl_bridge.middleware.measurement import (
 )
 from nics_drl_bridge.middleware.replay import BEFORE_START, TOO_OLD, Timeline
 from nics_drl_bridge.middleware.stamps import Stamps
+from nics_drl_bridge.middleware.trail import Told, Trail
+
+Array = NDArray[np.float64]
 
 NOT_FINITE = "NaN or inf"
 
@@ -52,6 +55,7 @@ class Middleware:
         self._unknown = np.full(self._beams, np.nan, np.float32)
         self.estimator = Estimator(model)
         self._timeline = Timeline(self.estimator)
+        self._trail = Trail(self.estimator.unseen.walk)
         self._stamps = Stamps(round(model.control_period * NANO))
         self._off_the_clock = (self._stamps.from_the_future, TOO_OLD, BEFORE_START)
         self.reset(0, np.zeros(3))
@@ -66,12 +70,14 @@ class Middleware:
         """
         self.cache = TopicCache()
         self._clock_jumps = 0
-        self._begin(time_ns, pose, std)
+        self.estimator.reset(time_ns, pose, std)
+        self._trail.reset()
+        self._begin(time_ns)
 
-    def _begin(self, time_ns: int, pose: ArrayLike, std: ArrayLike) -> None:
+    def _begin(self, time_ns: int) -> None:
+        """Goes on from a time with what the estimator holds."""
         self._start_ns, self._unstamped_ns = time_ns, time_ns - 1
         self._stamps.reset()
-        self.estimator.reset(time_ns, pose, std)
         self._timeline.reset()
 
     def expect_beams(self, beams: int) -> None:
@@ -126,18 +132,41 @@ class Middleware:
     def odometry(self, stamp_ns: int, arrival_ns: int, pose: ArrayLike, twist: ArrayLike) -> bool:
         """Takes an odometry: pose (3,) in `odom`, body twist (3,); says whether it was taken.
 
-        The twist corrects the estimate; the pose, which drifts, is only kept.
+        The twist corrects the estimate; the pose, which drifts, tells how far the robot came
+        where nothing else does: while its clock was set, or it was not heard.
         """
         value = np.array(pose, dtype=np.float64), np.array(twist, dtype=np.float64)
         if not (np.isfinite(value[0]).all() and np.isfinite(value[1]).all()):
             self.cache.reject(f"{ODOM}: {NOT_FINITE}")
             return False
+        if fault := self._stamps.fault(stamp_ns, None):
+            self.cache.reject(f"{ODOM}: {fault}")
+            return False
+        told = Told(stamp_ns, arrival_ns, *value)
         if stamp_ns == self._start_ns and ODOM not in self.cache.newest:
             # That of a reset tells nothing new of a robot that stands at a known pose.
-            self._stamps.accept(stamp_ns, arrival_ns)
-            self.cache.take(ODOM, stamp_ns, arrival_ns, value)
-            return True
-        return self._measure(stamp_ns, arrival_ns, Measurement(Kind.TWIST, value[1]), value)
+            self._timeline.anchor(value[0])
+        elif self._trail.contradicts(told):
+            self._follow_clock(told)
+        else:
+            return self._measure_odometry(told, value)
+        self._stamps.accept(stamp_ns, arrival_ns)
+        self.cache.take(ODOM, stamp_ns, arrival_ns, value)
+        self._trail.use(told)
+        return True
+
+    def _measure_odometry(self, told: Told, value: tuple[Array, Array]) -> bool:
+        """Says whether it was taken; where its clock was set, goes on from it."""
+        measurement = Measurement(Kind.TWIST, told.twist, odom=told.pose)
+        reason = self._measure(told.stamp_ns, told.arrival_ns, measurement, value)
+        if not reason:
+            self._trail.use(told)
+        elif reason in self._off_the_clock:
+            if self._stamps.refuse():
+                self._follow_clock(told)
+            else:
+                self._trail.refuse(told)
+        return not reason
 
     def pose(
         self,
@@ -191,25 +220,32 @@ class Middleware:
         except ValueError as error:
             self.cache.reject(f"{kind.topic}: {error}")
             return False
-        return self._measure(stamp_ns, arrival_ns, Measurement(kind, value, noise), value)
+        return not self._measure(stamp_ns, arrival_ns, Measurement(kind, value, noise), value)
 
-    def _measure(self, stamp_ns: int, arrival_ns: int, measurement: Measurement, kept: Any) -> bool:
+    def _measure(self, stamp_ns: int, arrival_ns: int, measurement: Measurement, kept: Any) -> str:
+        """Returns why a measurement can not be used, or nothing."""
         topic = measurement.kind.topic
         fault = self._stamps.fault(stamp_ns, arrival_ns)
         reason = fault or self._timeline.measure(stamp_ns, measurement)
-        if not reason:
+        if reason:
+            self.cache.reject(f"{topic}: {reason}")
+        else:
             self._stamps.accept(stamp_ns, arrival_ns)
             self.cache.take(topic, stamp_ns, arrival_ns, kept)
-            return True
-        self.cache.reject(f"{topic}: {reason}")
-        if topic == ODOM and reason in self._off_the_clock and self._stamps.refuse():
-            self._follow_clock(stamp_ns)
-        return False
+        return reason
 
-    def _follow_clock(self, stamp_ns: int) -> None:
-        """Goes on from a stamp to which the clock was set; the robot has stood still meanwhile."""
-        pose = self.estimator.at(self.estimator.time_ns)[0]
-        self._begin(stamp_ns, pose, np.sqrt(np.diag(self.estimator.covariance)[:3]))
+    def _follow_clock(self, told: Told) -> None:
+        """Goes on from an odometry to whose stamp the clock was set.
+
+        From the pose of the last odometry that was used, by as much as odometry says that the
+        robot has driven since; where it does not say so, the robot may be anywhere within reach.
+        """
+        seconds, continuous = self._trail.seconds(told), self._trail.continuous(told)
+        self.estimator.lose(told.stamp_ns, seconds, continuous)
+        self.estimator.correct(Measurement(Kind.TWIST, told.twist, odom=told.pose))
+        self._begin(told.stamp_ns)
+        self._trail.reset()
+        self._trail.use(told)
         self.cache.newest.clear()
         self._clock_jumps += 1
 

@@ -53,7 +53,7 @@ class DeviceNode(QosWatch):
     runs backwards, also not at a reset. `~/reset` begins the episode of the parameters
     `episode_seed` and `episode_start`; its answer is JSON with the stamp of the first data. In
     lock-step the world moves when each robot has a command, and `~/repeat` publishes its present
-    data again.
+    data again. `~/touched` answers which robots have truly touched something in this episode.
 
     Args:
         name: of the node.
@@ -106,6 +106,7 @@ class DeviceNode(QosWatch):
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(Trigger, "~/repeat", self._on_repeat)
+        self.create_service(Trigger, "~/touched", self._on_touched)
         Diagnostics(self, "simulator", self._look)
 
     def _start_time(self) -> None:
@@ -248,6 +249,11 @@ class DeviceNode(QosWatch):
         if self._time.lockstep:
             self._tell(odom_due=True, scan_due=True)
         response.message = "" if self._time.lockstep else "data are repeated in lock-step alone"
+        return response
+
+    def _on_touched(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Which robots have truly touched something in this episode, as JSON."""
+        response.success, response.message = True, json.dumps(self._world.touched)
         return response
 
     def _publish(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from contextlib import AbstractContextManager
@@ -13,6 +14,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.runner import open_context
 
@@ -86,19 +88,41 @@ class Witness(AbstractContextManager["Witness", None]):
         Returns:
             Nothing, or the gate's last reason not to.
         """
-        client = self._node.create_client(Trigger, f"{gate}/arm")
-        deadline, reason = time.monotonic() + timeout_s, f"{gate}/arm does not answer"
+        answer = self._asked(f"{gate}/arm", timeout_s)
+        return "" if answer.success else str(answer.message)
+
+    def touched(self, simulator: str, timeout_s: float) -> bool:
+        """Asks a simulator whether its robot has truly touched something in this episode.
+
+        Args:
+            simulator: name of the node.
+            timeout_s: for how long [s].
+
+        Raises:
+            BackendError: it does not answer.
+        """
+        answer = self._asked(f"{simulator}/touched", timeout_s)
+        if not answer.success:
+            raise BackendError(f"the episode can't be judged: {answer.message}.")
+        return bool(np.any(json.loads(answer.message)))
+
+    def _asked(self, service: str, timeout_s: float) -> Trigger.Response:
+        """The first answer that is a success, else the last one."""
+        client = self._node.create_client(Trigger, service)
+        answer = Trigger.Response(success=False, message=f"{service} does not answer")
+        deadline = time.monotonic() + timeout_s
         while time.monotonic() < deadline:
             if client.wait_for_service(timeout_sec=ASK_AGAIN_S):
                 answered = threading.Event()
                 future = client.call_async(Trigger.Request())
                 future.add_done_callback(lambda _, answered=answered: answered.set())
                 if answered.wait(ANSWER_S):
-                    if future.result().success:
-                        return ""
-                    reason = str(future.result().message)
+                    answer = future.result()
+                    if answer.success:
+                        break
             threading.Event().wait(ASK_AGAIN_S)
-        return reason
+        self._node.destroy_client(client)
+        return answer
 
     def __exit__(self, *_: object) -> None:
         self._context.try_shutdown()

@@ -12,7 +12,7 @@ import numpy as np
 from nics_drl_bridge.policy.evaluation import Episode, deviation
 from nics_drl_bridge.policy.evaluation_intervals import Estimate, mean, rate
 
-RESULTS = ("success", "collision", "time-out")
+RESULTS = ("success", "collision")
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,9 @@ class Tally:
 
     Attributes:
         episodes: how many.
-        success, collision, time_out: shares of the episodes.
+        success, collision: shares of the episodes, by the truth where it is known.
+        time_out: share of those that ended neither way.
+        believed: share that the robot itself took for a success.
         length: mean path of the successful ones [m].
         time: mean duration of the successful ones [s].
         same: share of the episodes that ended as in the first world.
@@ -39,6 +41,7 @@ class Tally:
     same: float
     deviation: Estimate
     greatest_deviation: float
+    believed: Estimate
 
     def figures(self) -> dict[str, Any]:
         """As plain data; what is not finite is null."""
@@ -65,8 +68,10 @@ def tally(episodes: Sequence[Episode], first: Sequence[Episode], control_period:
     arrived = [episode for episode in episodes if episode.result == "success"]
     gaps = [deviation(one, other) for one, other in zip(episodes, first, strict=True)]
     same = sum(one.result == other.result for one, other in zip(episodes, first, strict=True))
-    success, collision, time_out = (
-        rate(sum(episode.result == name for episode in episodes), count) for name in RESULTS
+    ended = [sum(episode.result == name for episode in episodes) for name in RESULTS]
+    believed = sum(episode.believed_success for episode in episodes)
+    success, collision, time_out, taken = (
+        rate(number, count) for number in (*ended, count - sum(ended), believed)
     )
     return Tally(
         count,
@@ -78,6 +83,7 @@ def tally(episodes: Sequence[Episode], first: Sequence[Episode], control_period:
         same / count,
         mean(gaps),
         max(gaps),
+        taken,
     )
 
 
@@ -92,6 +98,8 @@ def record_of(episode: Episode) -> dict[str, Any]:
     return {
         "seed": episode.seed,
         "result": episode.result,
+        "believed": episode.believed,
+        "goal_distance_m": round(episode.miss, 4),
         "steps": episode.steps,
         "length_m": round(episode.length, 4),
         "goal": episode.goal.tolist(),

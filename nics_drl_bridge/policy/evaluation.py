@@ -1,4 +1,4 @@
-"""Driving episodes with a policy, and keeping what happened."""
+"""Driving episodes with a policy, keeping what happened, and judging it by the truth."""
 
 from __future__ import annotations
 
@@ -12,9 +12,14 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.guard import uninterrupted
+from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.policy.policies import Policy
 
 Array = NDArray[np.float64]
+
+DRIFT_M = 0.1
+"""A robot stops where it believes to be at its goal; odometry may have drifted by this much."""
+ELSEWHERE = "elsewhere"
 
 
 @dataclass(frozen=True)
@@ -23,12 +28,14 @@ class Episode:
 
     Attributes:
         seed: of the episode.
-        result: `success`, `collision` or `time-out`.
+        result: `success`, `collision`, `time-out`, or `elsewhere`, where the robot believed to be
+            at its goal and was not. It is judged by the truth where the backend knows it.
         path: (T, 3) true pose where the backend knows it, else the estimate, after each step.
         estimate: (T, 3) what the robot believed.
         goal: (2,) [m].
         bodies: (K, 7) obstacles as they stood at the start, see `sim.scenes.Scene`.
         reward: sum over the episode.
+        believed: the result by what the robot itself knows; None where that is all that is known.
     """
 
     seed: int
@@ -38,6 +45,17 @@ class Episode:
     goal: Array
     bodies: Array
     reward: float
+    believed: str | None = None
+
+    @property
+    def believed_success(self) -> bool:
+        """Whether the robot believed to have arrived, and to have touched nothing."""
+        return (self.believed or self.result) == "success"
+
+    @property
+    def miss(self) -> float:
+        """How far from the goal the path ends [m]."""
+        return float(np.linalg.norm(self.path[-1, :2] - self.goal))
 
     @property
     def steps(self) -> int:
@@ -56,6 +74,7 @@ def drive(
     seed: int,
     options: dict[str, Any] | None = None,
     on_start: Callable[[], None] = lambda: None,
+    touched: Callable[[], bool] | None = None,
 ) -> Episode:
     """Drives one episode to its end; the robot is halted where the policy or a callback raises.
 
@@ -65,9 +84,10 @@ def drive(
         seed: of the episode.
         options: of `env.reset`.
         on_start: is called when the robot stands at its start.
+        touched: says at the end whether the robot truly touched something, where `info` does not.
     """
     try:
-        return _drive(env, policy, seed, options, on_start)
+        return _drive(env, policy, seed, options, on_start, touched)
     except BaseException:
         if isinstance(env.unwrapped, BridgeEnv):  # which never sees what a policy raises
             with uninterrupted():
@@ -81,6 +101,7 @@ def _drive(
     seed: int,
     options: dict[str, Any] | None,
     on_start: Callable[[], None],
+    touched: Callable[[], bool] | None,
 ) -> Episode:
     observation, info = env.reset(seed=seed, options=options)
     on_start()
@@ -93,9 +114,37 @@ def _drive(
         total += float(reward)
         if terminated or truncated:
             break
-    reached, touched = np.all(info["is_success"]), np.any(info["collision"])
-    result = "success" if reached else "collision" if touched else "time-out"
-    return Episode(seed, result, np.array(paths), np.array(estimates), goal, bodies, total)
+    believed = _believed(info)
+    driven = np.array(paths), np.array(estimates), goal, bodies, total
+    if "true_pose" not in info:
+        return Episode(seed, believed, *driven)
+    known = info.get("true_collision")
+    hit = bool(np.any(known)) if known is not None else touched is not None and touched()
+    there = bool(truly_near(getattr(env.unwrapped, "task", None), info["true_pose"], goal).all())
+    return Episode(seed, _true(believed, there, hit), *driven, believed)
+
+
+def _believed(info: dict[str, Any]) -> str:
+    if np.all(info["is_success"]):
+        return "success"
+    return "collision" if np.any(info["collision"]) else "time-out"
+
+
+def _true(believed: str, there: bool, hit: bool) -> str:
+    if hit:
+        return "collision"
+    return ELSEWHERE if believed == "success" and not there else believed
+
+
+def truly_near(task: Any, poses: Array, goals: Array) -> NDArray[np.bool_]:
+    """Whether robots at true poses (..., 3) are at their goals (..., 2), as far as they can know.
+
+    True for tasks whose robots have no goal each of their own.
+    """
+    if not isinstance(task, Navigation):
+        return np.ones(np.shape(poses)[:-1], np.bool_)
+    gaps = np.hypot(*np.moveaxis(poses[..., :2] - goals, -1, 0))
+    return np.asarray(gaps < task.goal_radius + DRIFT_M)
 
 
 def drive_all(
@@ -103,11 +152,12 @@ def drive_all(
     policy: Policy,
     seeds: Iterable[int],
     on_episode: Callable[[Episode], None] = lambda _: None,
+    touched: Callable[[], bool] | None = None,
 ) -> list[Episode]:
     """Drives one episode per seed and tells of each as it ends."""
     episodes = []
     for seed in seeds:
-        episodes.append(drive(env, policy, seed))
+        episodes.append(drive(env, policy, seed, touched=touched))
         on_episode(episodes[-1])
     return episodes
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.policy.evaluation import truly_near
 from nics_drl_bridge.policy.evaluation_intervals import Estimate, mean, rate
 
 Array = NDArray[np.float64]
@@ -26,7 +27,7 @@ class Outcomes:
 
     Attributes:
         seeds: of the episodes, as `BridgeEnv.reset` takes them.
-        success: the goal was reached and nothing touched.
+        success: the goal was truly reached and nothing touched.
         collision: the task says so, or the robot truly touched something.
         steps: control periods.
         length: of the true path [m]; of a team, the mean of its robots.
@@ -116,7 +117,11 @@ def _drive_once(env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]) -> tup
         ended = running & (terminated | truncated)
         touched = _any_robot(info, "collision") | _any_robot(info, "true_collision")
         collision |= ended & touched
-        success |= ended & ~touched & _all_robots(info, "is_success")
+        arrived = _all_robots(info, "is_success")
+        if arrived.any() and "goal" in info:
+            near = truly_near(env.task, info["true_pose"], info["goal"])
+            arrived = arrived & near.reshape(count, -1).all(axis=1)
+        success |= ended & ~touched & arrived
         running &= ~ended
     return success, collision, steps, length, reward
 

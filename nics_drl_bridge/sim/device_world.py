@@ -70,6 +70,11 @@ class DeviceWorld:
         """M."""
         return len(self.commands)
 
+    @property
+    def touched(self) -> list[bool]:
+        """Of each robot, whether it has touched something in this episode."""
+        return [bool(one) for one in self._simulator.data.collided[0]]
+
     def begin(self, seed: int, starts: Array | None) -> None:
         """Begins the episode of a seed, at x, y, heading of each robot (3 M,) if they are given.
 

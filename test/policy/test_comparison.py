@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -43,6 +44,14 @@ def test_without_any_success_its_length_is_unknown_and_the_json_is_still_json():
     assert math.isnan(told.length.value)
     text = json.dumps(told.figures(), allow_nan=False)
     assert json.loads(text)["length"] == [None, None, None]
+
+
+def test_what_the_robot_took_for_a_success_is_told_beside_what_was_one():
+    lied = replace(episode(0, "elsewhere", line(2.0)), believed="success")
+    told = tallies({"fast": [lied, episode(1, "success", line(1.0))]}, 0.1)["fast"]
+    assert (told.success.value, told.believed.value, told.time_out.value) == (0.5, 1.0, 0.5)
+    assert record_of(lied)["believed"] == "success"
+    assert record_of(lied)["goal_distance_m"] == pytest.approx(2.0)
 
 
 def test_an_episode_as_plain_data_keeps_its_path():

@@ -1,12 +1,21 @@
 from __future__ import annotations
 
+import gymnasium
 import numpy as np
 import pytest
 from gymnasium.wrappers import TimeLimit
 from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.policy.evaluation import Episode, deviation, drive, drive_all, successes
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.policy.evaluation import (
+    ELSEWHERE,
+    Episode,
+    deviation,
+    drive,
+    drive_all,
+    successes,
+)
 
 
 class Constant:
@@ -66,6 +75,62 @@ def test_driving_a_seed_again_gives_the_same_path(env):
     one, other = (drive(env, Constant(0.2, 0.1, 0.3), seed=8) for _ in range(2))
     assert np.array_equal(one.path, other.path)
     assert one.reward == other.reward
+
+
+class Believing(gymnasium.Env):
+    """Ends at once; the robot believes to be at its goal, the truth is what it is given."""
+
+    def __init__(self, task, **truth):
+        self.task, self.truth = task, truth
+
+    def reset(self, *, seed=None, options=None):
+        return None, {"goal": GOAL, "bodies": np.zeros((0, 7)), "start": HOME, "pose": HOME}
+
+    def step(self, action):
+        told = {"is_success": True, "collision": False, "pose": np.array([*GOAL, 0.0])}
+        return None, 10.0, True, False, told | self.truth
+
+
+HOME, GOAL = np.zeros(3), np.array([3.0, 0.0])
+TASK = Navigation(direct_model().robot, direct_model().lidar)
+
+
+def judged(touched=None, task=TASK, **truth):
+    return drive(Believing(task, **truth), Constant(0.0), 0, touched=touched)
+
+
+def at(x):
+    return {"true_pose": np.array([x, 0.0, 0.0])}
+
+
+@pytest.mark.parametrize(("x", "result"), [(2.75, "success"), (2.65, "success"), (2.55, ELSEWHERE)])
+def test_a_robot_is_at_its_goal_where_it_truly_is_not_where_it_believes_to_be(x, result):
+    found = judged(**at(x))
+    assert (found.result, found.believed) == (result, "success")
+    assert found.believed_success
+    assert found.miss == pytest.approx(3.0 - x)
+
+
+def test_a_place_that_is_no_number_is_no_goal():
+    assert judged(**at(np.nan)).result == ELSEWHERE
+
+
+@pytest.mark.parametrize("how", ["info", "asked"])
+def test_a_true_touch_is_a_collision_whatever_the_robot_believes(how):
+    if how == "info":
+        found = judged(**at(2.9), true_collision=True)
+    else:
+        found = judged(lambda: True, **at(2.9))
+    assert (found.result, found.believed) == ("collision", "success")
+
+
+def test_where_no_truth_is_known_what_the_robot_believes_counts_and_it_is_said():
+    found = judged(lambda: pytest.fail("there is nobody to ask"))
+    assert (found.result, found.believed) == ("success", None)
+
+
+def test_a_task_without_a_goal_of_each_robot_is_not_judged_by_places():
+    assert judged(task=object(), **at(9.0)).result == "success"
 
 
 def test_only_goals_count_as_successes():

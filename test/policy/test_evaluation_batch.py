@@ -7,6 +7,7 @@ from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.env.vector_facts import VectorFacts
 from nics_drl_bridge.policy.evaluation import drive
 from nics_drl_bridge.policy.evaluation_batch import Outcomes, drive_worlds, summarise
 from nics_drl_bridge.policy.policies import make_policy
@@ -30,6 +31,23 @@ def test_many_at_once_end_as_one_after_the_other(worlds):
     assert found.success.tolist() == [one.result == "success" for one in episodes]
     assert found.collision.tolist() == [one.result == "collision" for one in episodes]
     assert len({one.result for one in episodes}) > 1
+
+
+def test_arrived_is_who_truly_is_there(monkeypatch):
+    env = BridgeVectorEnv(8, MODEL, WORLD, max_episode_steps=LIMIT)
+    policy = make_policy("straight", env.task)
+    honest = drive_worlds(env, policy.act, range(8))
+    assert honest.success.any()
+    of_step = VectorFacts.of_step
+
+    def aside(self, outcome):
+        facts = of_step(self, outcome)
+        return facts | {"true_pose": facts["true_pose"] + [0.5, 0.0, 0.0]}
+
+    monkeypatch.setattr(VectorFacts, "of_step", aside)
+    lied = drive_worlds(env, policy.act, range(8))
+    assert lied.success.sum() < honest.success.sum()
+    assert lied.collision.tolist() == honest.collision.tolist()
 
 
 def test_a_robot_that_stands_still_runs_out_of_time():

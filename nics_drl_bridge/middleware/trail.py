@@ -1,0 +1,143 @@
+"""What the odometry itself says about its stamps, and about the way on which none could be used."""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.middleware.replay import HISTORY_NS
+from nics_drl_bridge.middleware.stamps import CLOCK_JUMP, FUTURE_NS
+from nics_drl_bridge.middleware.unseen import JITTER_S
+
+Array = NDArray[np.float64]
+NANO = 1_000_000_000
+
+CONTRADICTED_NS = 200_000_000
+"""A stamp that is off by less [ns] can't be told from data that took longer."""
+IN_STEP = 5
+"""So many odometries in a row came when their stamps said: arrivals then tell of time."""
+SIGMA = 6.0
+"""Odometry's pose and twist differ by at most so many standard deviations,"""
+LEAST = 0.01
+"""and may always differ by this [m, rad]."""
+STILL = 0.02
+"""What moves less than this [m/s, rad/s] says nothing about time."""
+NEAR_NS = HISTORY_NS + 2 * NANO
+"""A stamp farther back than this [ns] is refused so often that `Stamps` sees it."""
+
+
+class Told(NamedTuple):
+    """An odometry as it came: stamp and arrival [ns], pose in `odom` (3,), body twist (3,)."""
+
+    stamp_ns: int
+    arrival_ns: int
+    pose: Array
+    twist: Array
+
+
+class Trail:
+    """Follows the odometries since the last one that was used.
+
+    Where a robot moves, the way between two odometries tells the time between them: its twist says
+    how fast it was. So a stamp that says another time, when the arrivals say that of the way, is
+    not late, nor was anything lost: the clock was set.
+
+    Args:
+        walk: (3,) variance per second by which pose and twist of odometry differ [m^2/s, rad^2/s].
+    """
+
+    def __init__(self, walk: Array) -> None:
+        self._walk = walk
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets all."""
+        self._recent: deque[Told] = deque(maxlen=IN_STEP + 1)
+        self._refused: deque[Told] = deque(maxlen=CLOCK_JUMP)
+
+    def use(self, told: Told) -> None:
+        """Notes an odometry that is used."""
+        self._refused.clear()
+        if not self._recent or told.stamp_ns > self._recent[-1].stamp_ns:
+            self._recent.append(told)
+
+    def refuse(self, told: Told) -> None:
+        """Notes an odometry that is not used for its stamp."""
+        self._refused.append(told)
+
+    def contradicts(self, told: Told) -> bool:
+        """Whether an odometry's way and arrival both say that the clock was set, by a little.
+
+        Such stamps look like late data, or like some that follow a gap.
+        """
+        if len(self._recent) <= IN_STEP:
+            return False
+        last = self._recent[-1]
+        passed, waited = told.stamp_ns - last.stamp_ns, told.arrival_ns - last.arrival_ns
+        if abs(passed - waited) < CONTRADICTED_NS or not -NEAR_NS <= passed - waited <= FUTURE_NS:
+            return False
+        if not all(self._in_step(*pair) for pair in pairwise(self._recent)):
+            return False
+        seconds, stamped, arrived = self._time_of_way(last, told, 0.0), passed / NANO, waited / NANO
+        return (
+            seconds > 0.0
+            and abs(seconds - arrived) <= max(0.5 * arrived, 0.5 * CONTRADICTED_NS / NANO)
+            and abs(seconds - stamped) >= CONTRADICTED_NS / NANO
+            and self._fits(last, told, seconds)
+            and not self._fits(last, told, stamped)
+        )
+
+    def _in_step(self, before: Told, after: Told) -> bool:
+        """Whether one came as long after the other as its stamp says, and so does its way."""
+        passed, waited = after.stamp_ns - before.stamp_ns, after.arrival_ns - before.arrival_ns
+        return 2 * abs(waited - passed) <= passed and self._fits(before, after, passed / NANO)
+
+    def seconds(self, now: Told) -> float:
+        """How long ago the last used odometry was, by its arrival and by the stamps since [s]."""
+        if not self._recent:
+            return 0.0
+        last = self._recent[-1]
+        waited = max(now.arrival_ns - last.arrival_ns, 0)
+        stamped = now.stamp_ns - (*self._refused, now)[0].stamp_ns
+        # The first may have been a second late; then the arrivals show less time than has passed.
+        return max(waited, min(stamped, waited + HISTORY_NS)) / NANO
+
+    def continuous(self, now: Told) -> bool:
+        """Whether the poses since the last used odometry are those of one way, and tell of it."""
+        if not self._recent:
+            return False
+        way = [self._recent[-1], *self._refused, now]
+        unmoved = all(np.array_equal(each.pose, way[0].pose) for each in way)
+        if unmoved and any((np.abs(each.twist) > STILL).any() for each in way):
+            return False
+        times = [(b.stamp_ns - a.stamp_ns) / NANO for a, b in pairwise(way[1:])]
+        first = max(self.seconds(now) - sum(times), 0.0)
+        spans = [(max(first - JITTER_S, 0.0), first + JITTER_S)]
+        spans += [(0.5 * each, 1.5 * each) for each in times]
+        return all(
+            self._fits(a, b, float(np.clip(self._time_of_way(a, b, high), low, high)))
+            for (a, b), (low, high) in zip(pairwise(way), spans, strict=True)
+        )
+
+    @staticmethod
+    def _time_of_way(before: Told, after: Told, standing: float) -> float:
+        """The time [s] in which the mean twist leads from one pose to the other, if it moves."""
+        mean = (before.twist + after.twist) / 2.0
+        if not (np.abs(mean) > STILL).any():
+            return standing
+        way = geometry.log(geometry.between(before.pose, after.pose))
+        return float(way @ mean / (mean @ mean))
+
+    def _fits(self, before: Told, after: Told, seconds: float) -> bool:
+        """Whether the twists lead from one pose to the other in a time [s]."""
+        mean, change = (before.twist + after.twist) / 2.0, np.abs(after.twist - before.twist)
+        way = geometry.between(before.pose, after.pose)
+        off = np.abs(geometry.between(geometry.exp(mean * seconds), way))
+        span = abs(seconds)
+        allowed = LEAST + SIGMA * np.sqrt(self._walk * span) + change * span / 2.0
+        return bool((off <= allowed).all())
