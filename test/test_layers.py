@@ -16,7 +16,7 @@ PACKAGE = "nics_drl_bridge"
 # From the bottom up. What stands on one line does not import each other.
 LAYERS = (
     ("errors", "geometry", "random_kernels", "interface", "discovery"),
-    ("strict_yaml",),
+    ("strict_yaml", "seeds"),
     ("files", "npz", "config", "threads"),
     ("kinematics", "lidar"),
     ("calibration",),
