@@ -14,6 +14,7 @@ from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy.comparison import Tally, record_of, tallies
 from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.policy.evaluation_intervals import Estimate
+from nics_drl_bridge.policy.policies import check_name
 from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.world import load_world
@@ -78,6 +79,8 @@ def evaluate(order: Order, say: Say, tell: Tell) -> list[Evaluated]:
     """
     name = model_name(order)
     seeds_of(order)  # before anything is driven
+    for policy in order.policies:
+        check_name(policy)
     model, world = open_model(name), load_world(order.world)
     for place in order.places:
         check_place(place)

@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from measuring import hostile_configs, hostile_data, hostile_policies
+from measuring import hostile_commands, hostile_configs, hostile_data, hostile_policies
 from measuring.abuse import Score
 from measuring.attempt import MOST_MEMORY, Attempt, Outcome, made
 
 Source = Callable[[np.random.Generator, Path], Iterator[Attempt]]
 SOURCES: tuple[Source, ...] = (
     hostile_policies.attempts, hostile_configs.attempts, hostile_data.attempts,
+    hostile_commands.attempts,
 )  # fmt: skip
 
 
@@ -57,7 +58,7 @@ def campaign(seed: int, rounds: int, control: str | None = None) -> FileScore:
 
     Args:
         seed: of all that is drawn.
-        rounds: tries of policies, of configurations, and of data.
+        rounds: tries of policies, of configurations, of data, and of commands.
         control: `credulous` takes the checks of policies and YAML out.
     """
     score = FileScore()

@@ -1,10 +1,9 @@
-"""Recordings, bags, models, black boxes, seeds and paths that an attacker would hand in."""
+"""Recordings, bags, models, black boxes and checkpoints that an attacker would hand in."""
 
 from __future__ import annotations
 
 import io
 import json
-import os
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator
@@ -15,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from measuring.artefacts import SHORT_TRAINING
 from measuring.attempt import Attempt, nics
 from measuring.damaged_bags import samples
 from measuring.gates import Gate, gate_config
@@ -34,7 +32,6 @@ from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
 from nics_drl_bridge.safety import black_box
 from nics_drl_bridge.safety.inputs import Tick
 from nics_drl_bridge.sim.scenes import sample_scene
-from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
 
 Rng = np.random.Generator
@@ -76,13 +73,11 @@ def _whole(folder: Path) -> Whole:
 def attempts(rng: Rng, folder: Path) -> Iterator[Attempt]:
     """Without end."""
     whole = _whole(folder)
-    simulator = FastSimulator(builtin_model("differential"), load_world("arena"), worlds=1)
     makers: tuple[Callable[[], Attempt], ...] = (
         lambda: _recording(rng, folder, whole), lambda: _csv(rng, folder),
         lambda: _bag(rng, folder, whole), lambda: _bag(rng, folder, whole),
         lambda: _box(rng, folder, whole), lambda: _model(rng, folder, whole),
-        lambda: _checkpoint(rng, folder), lambda: _seed(rng, folder, simulator),
-        lambda: _path(rng, folder), lambda: _good(rng, whole),
+        lambda: _checkpoint(rng, folder), lambda: _good(rng, whole),
     )  # fmt: skip
     while True:
         yield makers[int(rng.integers(len(makers)))]()
@@ -316,56 +311,3 @@ def _checkpoint(rng: Rng, folder: Path) -> Attempt:
         torch.save(torch.zeros(1).expand(2**40), buffer)
     path.write_bytes(sealed(buffer.getvalue()))
     return Attempt("checkpoint", f"way {way}", lambda: read_checkpoint(path))
-
-
-def _seed(rng: Rng, folder: Path, simulator: FastSimulator) -> Attempt:
-    values = (2**63, 2**64, -1, -(2**63), 10**30, 10**4200, 1.5, "word", 2**63 + 7, 1e308)
-    seed = values[int(rng.integers(len(values)))]
-    settings = folder / "settings.yaml"
-    settings.write_text(dump_yaml(SHORT_TRAINING), encoding="utf-8")
-    out = folder / "out"
-    short = ("--world", "arena", "--episodes", "1", "--out", out)
-    acts: dict[str, Callable[[], object]] = {
-        "reset": lambda: simulator.reset([seed]),
-        "scene": lambda: sample_scene(load_world("arena"), 0.2, seed),  # type: ignore[arg-type]
-        "evaluate": nics("evaluate", "straight", "--in", "fast", f"--seed={seed}", *short),
-        "train": nics("train", "--settings", settings, f"--seeds={seed}", "--out", out),
-        "record": nics("record", "--preview", f"--seed={seed}", "--out", folder / "d.npz"),
-    }
-    name = str(rng.choice(list(acts)))
-    return Attempt("seed", f"{name} {str(seed)[:30]}", acts[name])
-
-
-def _path(rng: Rng, folder: Path) -> Attempt:
-    """What is no file, in the place of one."""
-    commands: tuple[tuple[str, ...], ...] = (
-        ("policy", "info"), ("replay",), ("bag", "info"), ("bake", "--world"), ("bake", "--shapes"),
-        ("bake", "--lidar"), ("bake", "--robot"), ("generate", "--out", "model", "--robot"),
-        ("generate", "--out", "model"), ("train", "--settings"), ("doctor",),
-        ("evaluate", "--in", "fast", "--out", "evaluated"), ("urdf",),
-        ("evaluate", "straight", "--in", "fast", "--out", "evaluated", "--world"),
-        ("doctor", "--policy"), ("bag", "replay", "x", "--estimate", "--model"),
-    )  # fmt: skip
-    command = commands[int(rng.integers(len(commands)))]
-    suffix = {"info": ".onnx", "replay": ".jsonl", "model": ".npz"}.get(command[-1], ".yaml")
-    path = folder / f"no_file{suffix}"
-    shutil.rmtree(path, ignore_errors=True) if path.is_dir() and not path.is_symlink() else (
-        path.unlink(missing_ok=True)
-    )
-    way = str(rng.choice(["pipe", "/dev/zero", "/dev/null", "loop", "folder", "missing", "large"]))
-    if way == "pipe":
-        os.mkfifo(path)
-    elif way.startswith("/dev"):
-        path.symlink_to(way)
-    elif way == "loop":
-        path.symlink_to(path)
-    elif way == "folder":
-        path.mkdir()
-    elif way == "large":
-        with path.open("wb") as file:
-            file.truncate(2**33)
-    words = [str(folder / w) if w in ("model", "evaluated") else w for w in command]
-    more = ["x.npz"] if command[-1] == "--robot" and command[0] == "generate" else []
-    return Attempt("path", f"{way} for {' '.join(command)}", nics(*words, path, *more))
-
-
