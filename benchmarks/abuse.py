@@ -36,11 +36,11 @@ def missed_of(scores: dict[str, Score]) -> list[str]:
         if not score.tries > 0:
             missed.append(f"{name}: 0 tries, the bar is 1 or more")
         for bar in BARS:
-            if not getattr(score, bar) == 0:
+            if getattr(score, bar) != 0:
                 missed.append(f"{name}: {bar} {getattr(score, bar)} of {score.tries}, the bar is 0")
         if not getattr(score, "good", 1) > 0:
             missed.append(f"{name}: no good input was tried, the bar is 1 or more")
-        if not getattr(score, "good_refused", 0) == 0:
+        if getattr(score, "good_refused", 0) != 0:
             missed.append(f"{name}: good_refused {score.good_refused}, the bar is 0")  # type: ignore[attr-defined]
     return missed
 

@@ -42,7 +42,7 @@ def table_of(result: dict[str, Any], bags: Score) -> str:
 
 def missed_of(result: dict[str, Any]) -> list[str]:
     """A sentence for each bar that is missed."""
-    missed = [f"{bar} {result[bar]}, the bar is 0" for bar in BARS if not result[bar] == 0]
+    missed = [f"{bar} {result[bar]}, the bar is 0" for bar in BARS if result[bar] != 0]
     missed += [f"{key} {result[key]}, the bar is 1" for key in MEASURED if not result[key] > 0]
     during, kills = result["kills_during_a_write"], result["kills"]
     if not during >= LEAST_DURING * kills > 0:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from nics_drl_bridge.errors import ConfigError, nearest, shortened
+from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.strict_yaml import MAX_BYTES, dump_yaml, parse_yaml
 
 __all__ = [

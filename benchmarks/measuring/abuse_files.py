@@ -77,15 +77,17 @@ def campaign(seed: int, rounds: int, control: str | None = None) -> FileScore:
 
 def _take_checks_out() -> None:
     """Policies and YAML are believed, in this process and those that it forks."""
+    import yaml
+
     from nics_drl_bridge import strict_yaml
     from nics_drl_bridge.policy import onnx_graph, onnx_sizes
 
-    strict_yaml.MAX_VALUES = strict_yaml.MAX_BYTES = 10**9
-    onnx_graph.MOST_NODES = onnx_graph.CONTRACT_LIMIT = 10**9
-    onnx_graph.OPERATORS = frozenset(_Everything())
-    onnx_sizes.rows_at_once = lambda *_: 10**9
+    vars(strict_yaml).update(_Loader=yaml.SafeLoader, MAX_BYTES=10**9)
+    vars(onnx_graph).update(
+        check_wire=_believe, check_graph=_believe, check_seal=_believe, CONTRACT_LIMIT=10**9
+    )
+    vars(onnx_sizes).update(rows_at_once=lambda *_: 10**9)
 
 
-class _Everything(frozenset[str]):
-    def __contains__(self, _: object) -> bool:
-        return True
+def _believe(*_: object) -> None:
+    """In the place of a check."""

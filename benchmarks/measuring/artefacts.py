@@ -163,9 +163,7 @@ def _which(found: NDArray[Any], versions: list[NDArray[Any]]) -> int:
     return [np.array_equal(found, version) for version in versions].index(True)
 
 
-def torn(
-    artefact: Artefact, kills: int, rng: np.random.Generator, folder: Path
-) -> dict[str, int]:
+def torn(artefact: Artefact, kills: int, rng: np.random.Generator, folder: Path) -> dict[str, int]:
     """How often something was left that is neither the old nor the new version, whole.
 
     Each time a process that writes both in turn is killed with SIGKILL at a random moment after it

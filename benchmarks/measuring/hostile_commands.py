@@ -86,5 +86,3 @@ def _path(rng: Rng, folder: Path) -> Attempt:
     words = [str(folder / w) if w in ("model", "evaluated") else w for w in command]
     more = ["x.npz"] if command[-1] == "--robot" and command[0] == "generate" else []
     return Attempt("path", f"{way} for {' '.join(command)}", nics(*words, path, *more))
-
-

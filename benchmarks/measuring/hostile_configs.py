@@ -138,7 +138,9 @@ def _syntax(rng: Rng, text: str) -> tuple[str, str]:
         "bytes": "\x00\x01",
     }
     told = str(rng.choice(list(choices)))
-    return f"{told} {n} {times} {tag if 'tag' in told else ''}", text.rstrip() + "\n" + choices[told]
+    return f"{told} {n} {times} {tag if 'tag' in told else ''}", text.rstrip() + "\n" + choices[
+        told
+    ]
 
 
 def _again(i: int, times: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,7 +26,9 @@ def attempts(rng: Rng, folder: Path) -> Iterator[Attempt]:
     while True:
         name = names[int(rng.integers(len(names)))]
         if rng.random() < 0.08:
-            yield Attempt("policy", f"{name} as shipped", _loaded(shipped() / f"{name}.onnx"), "good")
+            yield Attempt(
+                "policy", f"{name} as shipped", _loaded(shipped() / f"{name}.onnx"), "good"
+            )
             continue
         told, data, verdict = makers[int(rng.integers(len(makers)))](rng, name)
         path = folder / "policy.onnx"
@@ -75,7 +78,7 @@ Grown = tuple[list[Any], dict[str, Any]]
 
 def _chain(length: int, make: Callable[[str, str], Any]) -> list[Any]:
     names = ["observation", *(f"x_{k}" for k in range(length))]
-    return [make(a, b) for a, b in zip(names[:-1], names[1:], strict=True)]
+    return [make(a, b) for a, b in itertools.pairwise(names)]
 
 
 def _concat(amount: int, width: int) -> Grown:
@@ -105,9 +108,7 @@ def _products(amount: int, width: int) -> Grown:
     whole = np.zeros((2000, 2000), np.float32)
     first = [node("MatMul", ["observation", "x_first"], ["x_f"])]
     names = ["x_f", *(f"x_{k}" for k in range(6 + 20 * amount))]
-    rest = [
-        node("MatMul", [a, "x_whole"], [b]) for a, b in zip(names[:-1], names[1:], strict=True)
-    ]
+    rest = [node("MatMul", [a, "x_whole"], [b]) for a, b in itertools.pairwise(names)]
     return first + rest, {"first": np.zeros((width, 2000), np.float32), "whole": whole}
 
 

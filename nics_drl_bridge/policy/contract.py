@@ -231,7 +231,9 @@ def read_contract(text: str, source: str) -> Contract:
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         given = data.get("format") if isinstance(data, dict) else None
         raise PolicyError(
-            source, "format", f"is {reprlib.repr(given)}, not {FORMAT!r}; export the policy with this version."
+            source,
+            "format",
+            f"is {reprlib.repr(given)}, not {FORMAT!r}; export the policy with this version.",
         )
     try:
         contract = validate(data, Contract, source)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import onnx
 import pytest
@@ -36,7 +38,7 @@ def concats(proto):
     names = ["observation", *(f"c{k}" for k in range(22))]
     return add(proto, *(
         make_node("Concat", [a, a], [b], axis=1)
-        for a, b in zip(names[:-1], names[1:], strict=True)
+        for a, b in itertools.pairwise(names)
     ))  # fmt: skip
 
 
@@ -51,7 +53,7 @@ def heavy(proto):
     whole, names = np.zeros((2048, 2048), np.float32), [f"h{k}" for k in range(9)]
     first = make_node("MatMul", ["observation", "begin"], ["h0"])
     return add(proto, first, *(
-        make_node("MatMul", [a, "whole"], [b]) for a, b in zip(names[:-1], names[1:], strict=True)
+        make_node("MatMul", [a, "whole"], [b]) for a, b in itertools.pairwise(names)
     ), begin=np.zeros((SECTORS + 6, 2048), np.float32), whole=whole)  # fmt: skip
 
 

@@ -48,9 +48,7 @@ def test_what_grows_when_it_is_parsed_is_not_parsed(tmp_path, monkeypatch, name)
     make, words = BAD[name]
     path = tmp_path / "bad.onnx"
     path.write_bytes(make())
-    monkeypatch.setattr(
-        onnx, "load_model_from_string", lambda _: pytest.fail("it was parsed")
-    )
+    monkeypatch.setattr(onnx, "load_model_from_string", lambda _: pytest.fail("it was parsed"))
     with pytest.raises(PolicyError, match=words) as refused:
         load_policy(path)
     assert refused.value.field == "file"
