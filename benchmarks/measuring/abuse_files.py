@@ -1,4 +1,4 @@
-"""What an attacker hands in as a file or a number: refused in a sentence, soon, in little memory."""
+"""What an attacker hands in, as a file or a number: is it refused in a sentence, and soon?"""
 
 from __future__ import annotations
 

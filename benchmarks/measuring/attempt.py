@@ -13,6 +13,7 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 OWN_TIME_S = 2.0
 MOST_MEMORY = 500 * 2**20
@@ -91,7 +92,8 @@ def made(attempt: Attempt) -> Outcome:
 def _answer(attempt: Attempt, writing: int) -> None:
     """In a process of its own, which it ends."""
     try:
-        size = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        size = pages * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (size + ROOM, size + ROOM))
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         end, words = _end_of(attempt.act)

@@ -66,7 +66,8 @@ USES: dict[str, Callable[[str], object]] = {
 """What is done with the file of each kind."""
 OWN = {
     "shapes": "shapes: [{kind: circle, radius: 0.2}, {kind: rectangle, size: [0.4, 0.2]},\n"
-    "  {kind: polygon, points: [[0, 0], [1, 0], [0, 1]]}, {kind: segment, ends: [[0, 0], [1, 1]]}]\n",
+    "  {kind: polygon, points: [[0, 0], [1, 0], [0, 1]]},\n"
+    "  {kind: segment, ends: [[0, 0], [1, 1]]}]\n",
     "topics": "cmd_vel: /cmd_vel\nodom: /odom\nstamps: header\n",
 }
 
@@ -162,7 +163,8 @@ def _big(rng: Rng) -> float:
 
 _WORLDS: tuple[Callable[[Rng], tuple[str, str]], ...] = (
     lambda rng: ("copies", _with(obstacles=_group(count=int(10 ** rng.uniform(5, 18))))),
-    lambda rng: ("copies, a range", _with(obstacles=_group(count=[0, int(10 ** rng.uniform(5, 18))]))),
+    lambda rng: ("copies, a range", _with(
+        obstacles=_group(count=[0, int(10 ** rng.uniform(5, 18))]))),
     lambda rng: ("many groups", _with(obstacles=_group(count=9000) * int(rng.integers(2, 40)))),
     lambda rng: ("a huge field", _with(size=[_big(rng), _big(rng)])),
     lambda rng: ("a long field", _with(size=[_big(rng), 1e-3])),
@@ -212,8 +214,9 @@ def _picture(rng: Rng, folder: Path) -> Attempt:
 
 
 _VALUES: tuple[Any, ...] = (
-    "word", -1, 0, 1e308, 1e-320, 10**18, 2**63, 10**30, -(2**63), float("nan"), float("inf"), None,
-    True, [], {}, [[[1]]], "x" * 5000, [1.0] * 5000, "a\nb\x1b[2J", 1e9, 1e12, 10**9, {"a": {"b": 1}},
+    "word", -1, 0, 1e308, 1e-320, 10**18, 2**63, 10**30, -(2**63), float("nan"),
+    float("inf"), None, True, [], {}, [[[1]]], "x" * 5000, [1.0] * 5000, "a\nb\x1b[2J", 1e9, 1e12, 10**9,
+    {"a": {"b": 1}},
 )  # fmt: skip
 
 

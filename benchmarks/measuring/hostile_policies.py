@@ -204,7 +204,8 @@ def _raw(rng: Rng, name: str) -> tuple[str, bytes, str]:
             nested = _field(1, _field(5, _field(6, nested)))
         return f"{300 * amount} graphs in graphs", _field(7, nested), "bad"
     text = (
-        "[" * (500_000 * amount), '{"a":' * (300_000 * amount), '"' + "z" * (4_000_000 * amount) + '"'
+        "[" * (500_000 * amount), '{"a":' * (300_000 * amount),
+        '"' + "z" * (4_000_000 * amount) + '"',
     )[which - 5]  # fmt: skip
     return f"contract {text[:5]} of {len(text)}", _with_contract(_proto(name), text), "bad"
 

@@ -47,10 +47,8 @@ def rows_at_once(model: Any, source: str) -> int:
             f"observation, where a policy has {MOST_NUMBERS:.0e} and {MOST_WORK:.0e}; not run."
         )
         raise PolicyError(source, "graph", reason)
-    if (
-        max(a / b for a, b in zip(_costs(model, 2 * ROWS, source), (numbers, work), strict=False))
-        > 2.0
-    ):
+    more_numbers, more_work = _costs(model, 2 * ROWS, source)
+    if more_numbers > 2 * numbers or more_work > 2 * work:
         reason = "grows faster than the number of its observations; not run."
         raise PolicyError(source, "graph", reason)
     return max(1, ROWS * MOST_AT_ONCE // max(numbers, 1))

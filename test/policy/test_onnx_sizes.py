@@ -127,7 +127,7 @@ def test_a_graph_of_very_many_operators_is_refused(file, tmp_path):
     nodes = [make_node("Identity", ["observation"], [name]) for name in names]
     path = tmp_path / "many.onnx"
     path.write_bytes(add(onnx.load(file), *nodes))
-    with pytest.raises(PolicyError, match="has 10.. operators"):
+    with pytest.raises(PolicyError, match=r"has 10\d\d operators"):
         load_policy(path)
 
 
