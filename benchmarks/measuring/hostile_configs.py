@@ -214,8 +214,8 @@ def _picture(rng: Rng, folder: Path) -> Attempt:
 
 
 _VALUES: tuple[Any, ...] = (
-    "word", -1, 0, 1e308, 1e-320, 10**18, 2**63, 10**30, -(2**63), float("nan"),
-    float("inf"), None, True, [], {}, [[[1]]], "x" * 5000, [1.0] * 5000, "a\nb\x1b[2J", 1e9, 1e12, 10**9,
+    "word", -1, 0, 1e308, 1e-320, 10**18, 2**63, 10**30, -(2**63), float("nan"), float("inf"), None,
+    True, [], {}, [[[1]]], "x" * 5000, [1.0] * 5000, "a\nb\x1b[2J", 1e9, 1e12, 10**9,
     {"a": {"b": 1}},
 )  # fmt: skip
 
