@@ -26,20 +26,19 @@ MAX_VALUES = 50_000
 _LONGEST_PROBLEM = 200
 
 
-if yaml.__with_libyaml__:
-    _Events = yaml.cyaml.CParser
-else:
+class _PythonEvents(yaml.reader.Reader, yaml.scanner.Scanner, yaml.parser.Parser):
+    """What libyaml does, in Python, and four times slower."""
 
-    class _Events(yaml.reader.Reader, yaml.scanner.Scanner, yaml.parser.Parser):
-        """The same in Python, four times slower."""
-
-        def __init__(self, text: str) -> None:
-            yaml.reader.Reader.__init__(self, text)
-            yaml.scanner.Scanner.__init__(self)
-            yaml.parser.Parser.__init__(self)
+    def __init__(self, text: str) -> None:
+        yaml.reader.Reader.__init__(self, text)
+        yaml.scanner.Scanner.__init__(self)
+        yaml.parser.Parser.__init__(self)
 
 
-class _Loader(Composer, _Events, SafeConstructor, Resolver):
+_Events: Any = vars(yaml)["cyaml"].CParser if yaml.__with_libyaml__ else _PythonEvents
+
+
+class _Loader(Composer, _Events, SafeConstructor, Resolver):  # type: ignore[misc]
     """YAML 1.2 numbers, no duplicate keys, no tags, and not more than can be read at once."""
 
     def __init__(self, text: str) -> None:

@@ -102,8 +102,8 @@ def _buffer(node: Any, given: list[Shape], made: list[Shape]) -> int:
     """Numbers that the runtime lays out for a convolution besides what it gives."""
     if node.op_type != "Conv":
         return 0
-    groups = next((a.i for a in node.attribute if a.name == "group"), 1)
-    return math.prod(made[0][2:]) * math.prod(given[1][1:]) * max(groups, 1)
+    groups = int(next((a.i for a in node.attribute if a.name == "group"), 1))
+    return int(math.prod(made[0][2:]) * math.prod(given[1][1:]) * max(groups, 1))
 
 
 def _shapes(model: Any, rows: int, source: str) -> dict[str, Shape]:

@@ -100,7 +100,7 @@ def test_an_unknown_key_is_named_with_the_file_and_the_nearest_key(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"size": [0.0, 3.0]}, "size must be greater than 0"),
+        ({"size": [0.0, 3.0]}, "key 'size.0': input should be greater than or equal to 0.01"),
         ({"size": None}, "needs a `size`, a `map`, or both"),
         ({"goal_distance": [3.0, 1.0]}, "goal_distance must be"),
         ({"obstacles": [circles(1, (0.0,))]}, "key 'obstacles.0.shapes.0.circle.radius'"),
