@@ -16,10 +16,10 @@ VALUES = ('"abc"', '""', "[1]", "{a: 1}", '"%%%"')
 
 
 def refusal(text: str) -> str:
-    begin = time.monotonic()
+    begin = time.process_time()
     with pytest.raises(ConfigError) as told:
         parse_yaml(text, "a.yaml")
-    assert time.monotonic() - begin < SOON_S
+    assert time.process_time() - begin < SOON_S
     assert "\n" not in str(told.value)
     assert len(str(told.value)) < 300
     return str(told.value)

@@ -94,7 +94,7 @@ def _work(node: Any, given: list[Shape], made: list[Shape]) -> int:
     if node.op_type == "Conv":
         return moved + math.prod(made[0]) * math.prod(given[1][1:])
     if "kernel_shape" in settings:  # of a pool
-        return moved + math.prod(made[0]) * math.prod(settings["kernel_shape"].ints)
+        return moved + math.prod(made[0]) * int(math.prod(settings["kernel_shape"].ints))
     return moved
 
 
