@@ -171,11 +171,8 @@ def test_a_waypoint_within_the_solid_of_a_map_is_refused(own_world):
 
 def test_what_concerns_several_keys_is_said_without_the_whole_file():
     with pytest.raises(ConfigError) as caught:
-        validate(field().model_dump(mode="json") | {"size": [-1.0, 3.0]}, World, "world.yaml")
-    assert (
-        str(caught.value)
-        == "world.yaml: key 'size.0': input should be greater than or equal to 0.01, not -1.0."
-    )
+        validate(field().model_dump(mode="json") | {"goal_distance": [3, 1]}, World, "world.yaml")
+    assert str(caught.value) == "world.yaml: goal_distance must be [least, greatest] in metres."
 
 
 def world_with(**changes):
