@@ -41,6 +41,8 @@ LONGEST_S = 0.05
 """A writer is killed within this time after it began to write."""
 STARTS_S = 10.0
 """So long it may take until it does."""
+WRITES = mmap(-1, 2)
+"""Shared with the writer: which number of writes began, and which ended, modulo 256."""
 PIECE = 4096
 """Bytes that a naive writer writes at once, as a buffered file does."""
 SHORT_TRAINING = {
@@ -175,17 +177,16 @@ def torn(artefact: Artefact, kills: int, rng: np.random.Generator, folder: Path)
     """
     path, bad, during = folder / artefact.name, 0, 0
     artefact.write(path, 0)
-    writes = mmap(-1, 2)  # which number of writes began, and ended, modulo 256
     for _ in range(kills):
-        writes[:] = bytes(2)
+        WRITES[:] = bytes(2)
         child = os.fork()
         if child == 0:
-            _write_for_ever(artefact, path, writes)
-        _wait_for_a_write(writes)
+            _write_for_ever(artefact, path)
+        _wait_for_a_write()
         time.sleep(rng.uniform(0.0, LONGEST_S))
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
-        during += writes[0] != writes[1]
+        during += WRITES[0] != WRITES[1]
         try:
             artefact.version(path)
         except (BridgeError, ValueError):
@@ -204,36 +205,40 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _wait_for_a_write(writes: mmap) -> None:
+def _wait_for_a_write() -> None:
     """Returns once a write has begun, or after `STARTS_S`."""
     latest = time.monotonic() + STARTS_S
-    while writes[0] == 0 and time.monotonic() < latest:
+    while WRITES[0] == 0 and time.monotonic() < latest:
         time.sleep(0.0)
 
 
-def _write_for_ever(artefact: Artefact, path: Path, writes: mmap) -> None:
-    """In a process of its own; ends with it."""
-    version = 0
+def _write_for_ever(artefact: Artefact, path: Path) -> None:
+    """In a process of its own; ends with it. A write begins with its temporary file or folder."""
+    version, make_file, make_folder = 0, tempfile.mkstemp, tempfile.mkdtemp
+    tempfile.mkstemp = lambda *given, **named: _begun(make_file, given, named)
+    tempfile.mkdtemp = lambda *given, **named: _begun(make_folder, given, named)
     try:
         while True:
             version = 1 - version
-            writes[0] = (writes[0] + 1) % 256
             artefact.write(path, version)
-            writes[1] = writes[0]
+            WRITES[1] = WRITES[0]
     finally:
         os._exit(1)
 
 
+def _begun(make: Callable[..., Any], given: Any, named: Any) -> Any:
+    WRITES[0] = (WRITES[0] + 1) % 256
+    return make(*given, **named)
+
+
 def naive(artefact: Artefact) -> Artefact:
     """The same, written where it is to lie, as `open(path, "w")` does."""
+    with tempfile.TemporaryDirectory() as folder:
+        held = [_content(artefact, Path(folder), n) for n in (0, 1)]
 
     def write(path: Path, n: int) -> None:
-        with tempfile.TemporaryDirectory() as folder:
-            whole = Path(folder) / path.name
-            artefact.write(whole, n)
-            parts = sorted(one for one in whole.rglob("*") if one.is_file()) or [whole]
-            held = {one.relative_to(folder): one.read_bytes() for one in parts}
-        for name, data in held.items():
+        _begun(lambda: None, (), {})
+        for name, data in held[n].items():
             place = path.parent / name
             place.parent.mkdir(exist_ok=True)
             with place.open("wb", buffering=0) as file:
@@ -241,6 +246,14 @@ def naive(artefact: Artefact) -> Artefact:
                     file.write(data[begin : begin + PIECE])
 
     return replace(artefact, write=write)
+
+
+def _content(artefact: Artefact, folder: Path, n: int) -> dict[Path, bytes]:
+    """What a version consists of, by its place."""
+    whole = folder / artefact.name
+    artefact.write(whole, n)
+    parts = sorted(one for one in whole.rglob("*") if one.is_file()) or [whole]
+    return {one.relative_to(folder): one.read_bytes() for one in parts}
 
 
 def unchecked() -> Any:
