@@ -36,13 +36,15 @@ EXTRAS = {
     "bags": ["rosbags>=0.11,<0.12"],
     "mujoco": ["mujoco>=3.3"],
     "multi": ["pettingzoo>=1.25,<1.28"],
-    # Of torch's releases for Linux only some are small, as this one is: no CUDA packages.
+    # Before 2.6, torch.load unpickles whatever a file says unless told not to, and its reader of
+    # weights alone could be made to run code (CVE-2025-32434). Of its releases for Linux only some
+    # are small, as 2.13 is: no CUDA packages.
     "train": [
         "onnx>=1.16",
         "onnxscript>=0.1",
         "stable-baselines3>=2.7,<2.10",
         "tensorboard>=2.16",
-        "torch>=2.3,<2.14",
+        "torch>=2.6,<2.14",
     ],
     # RLlib holds Gymnasium at a version of its own: for an environment apart, as `make test-ray`
     # builds one, and no part of `dev`.

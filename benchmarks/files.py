@@ -8,52 +8,65 @@ package writes them and as others do; whatever can be read of them is read: by `
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from measuring import artefacts
 from measuring.damaged_bags import Score, damage_bags
+from measuring.verdict import answer, parser_of
 
+CONTROLS = {
+    "naive_writer": "the temporary file: what is written is written where it is to lie",
+    "no_checksum": "the checksums of recordings, tables, policies and checkpoints",
+}
 BARS = ("torn", "accepted_corrupt", "tracebacks", "silent_partial")
+MEASURED = ("kills", "flips", "cuts", "changes")
+LEAST_DURING = 0.25
+"""Share of the kills that have to hit a write."""
 
 
 def table_of(result: dict[str, Any], bags: Score) -> str:
     """One line per artefact, and one for the bags."""
     lines = [
-        f"{name}: {one['torn']} torn by a kill, {one['accepted_corrupt']} read with a flipped bit"
+        f"{name}: {one['torn']} torn by {one['kills']} kills, {one['kills_during_a_write']} of "
+        f"them in a write; {one['accepted_corrupt']} of {one['flips']} read with a flipped bit"
         for name, one in result["artefacts"].items()
     ]
     lines.append(
         f"bags: {bags.refused} refused, {bags.accepted} read; {bags.tracebacks} tracebacks, "
         f"{bags.silent_partial} read in part"
     )
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *bags.told]) + "\n"
+
+
+def missed_of(result: dict[str, Any]) -> list[str]:
+    """A sentence for each bar that is missed."""
+    missed = [f"{bar} {result[bar]}, the bar is 0" for bar in BARS if result[bar] != 0]
+    missed += [f"{key} {result[key]}, the bar is 1" for key in MEASURED if not result[key] > 0]
+    during, kills = result["kills_during_a_write"], result["kills"]
+    if not during >= LEAST_DURING * kills > 0:
+        missed.append(
+            f"kills_during_a_write {during} of {kills}, the bar is {100 * LEAST_DURING:.0f} %"
+        )
+    return missed
 
 
 def main() -> None:
     """Prints a table, or one JSON object; ends with 1 when a damage was not found."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--kills", type=int, default=300, help="of the writer of each artefact")
     parser.add_argument("--flips", type=int, default=300, help="of a bit of each artefact")
     parser.add_argument("--cuts", type=int, default=200, help="bags to cut off")
     parser.add_argument("--changes", type=int, default=500, help="bags to change")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    result = artefacts.measure(given.kills, given.flips, given.seed)
+    result = artefacts.measure(given.kills, given.flips, given.seed, given.control)
     with TemporaryDirectory() as folder:
         bags = damage_bags(Path(folder), given.cuts, given.changes, given.seed)
     result |= {"tracebacks": bags.tracebacks, "silent_partial": bags.silent_partial}
-    if given.json:
-        sys.stdout.write(json.dumps({key: result[key] for key in (*BARS, "artefacts")}) + "\n")
-    else:
-        sys.stdout.write(table_of(result, bags))
-    sys.stderr.writelines(f"{line}\n" for line in bags.told)
-    raise SystemExit(1 if any(result[key] for key in BARS) else 0)
+    result |= {"cuts": given.cuts, "changes": given.changes, "told": bags.told}
+    answer(result, missed_of(result), table_of(result, bags), given.json)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
-"""Strict configuration: YAML read without surprises, checked against a schema.
+"""Strict configuration: YAML files that are checked against a schema.
 
-PyYAML alone reads `1e-3` as a string and keeps the last of two equal keys; here the first
-is a number and the second an error. Every error names file, key and the nearest valid name.
+Every error names file, key and the nearest valid name.
 """
 
 from __future__ import annotations
@@ -12,15 +11,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.strict_yaml import MAX_BYTES, dump_yaml, parse_yaml
+
+__all__ = [
+    "MAX_BYTES", "PACKAGE", "Schema", "dump_yaml", "find_config", "load_yaml", "no_device",
+    "parse_yaml", "read_text", "share_folder", "validate",
+]  # fmt: skip
 
 PACKAGE = "nics_drl_bridge"
-MAX_DEPTH = 32
-MAX_BYTES = 8 * 2**20
-"""Of a YAML file; it is read at about 0.5 MB a second."""
 
 
 class Schema(BaseModel):
@@ -30,96 +31,6 @@ class Schema(BaseModel):
 
 
 SchemaT = TypeVar("SchemaT", bound=BaseModel)
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML 1.2 numbers, and no duplicate keys."""
-
-
-class _Dumper(yaml.SafeDumper):
-    """Quotes text that either `_Loader` or YAML 1.1 would take for a number."""
-
-
-_Loader.yaml_implicit_resolvers = {
-    first: [
-        (tag, pattern) for tag, pattern in resolvers if tag.rsplit(":", 1)[-1] in ("null", "merge")
-    ]
-    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")
-)
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:int", re.compile(r"^[-+]?(?:0|[1-9][0-9]*)$"), list("-+0123456789")
-)
-for _kind in (_Loader, _Dumper):
-    _kind.add_implicit_resolver(
-        "tag:yaml.org,2002:float",
-        re.compile(
-            r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
-            r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
-        ),
-        list("-+0123456789."),
-    )
-
-
-def _mapping(loader: _Loader, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-    seen: set[Any] = set()
-    for key_node, _ in node.value:
-        if not isinstance(key_node, yaml.ScalarNode):
-            raise yaml.constructor.ConstructorError(
-                None, None, "a key must be one word or number", key_node.start_mark
-            )
-        key = key_node.value
-        if key in seen:
-            raise yaml.constructor.ConstructorError(
-                None, None, f"the key {key!r} stands twice; keep one", key_node.start_mark
-            )
-        seen.add(key)
-    return yaml.SafeLoader.construct_mapping(loader, node, deep=deep)
-
-
-_Loader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
-
-
-def _check_depth(text: str) -> None:
-    depth = 0
-    for event in yaml.parse(text, Loader=_Loader):
-        if isinstance(event, (yaml.MappingStartEvent, yaml.SequenceStartEvent)):
-            depth += 1
-            if depth > MAX_DEPTH:
-                raise ValueError(f"it is nested more than {MAX_DEPTH} levels deep; flatten it")
-        elif isinstance(event, (yaml.MappingEndEvent, yaml.SequenceEndEvent)):
-            depth -= 1
-
-
-def parse_yaml(text: str, source: str) -> dict[str, Any]:
-    """Reads a YAML mapping.
-
-    Args:
-        text: the YAML.
-        source: the file's name, for errors.
-
-    Returns:
-        The mapping.
-
-    Raises:
-        ConfigError: no YAML, a duplicate key, nothing in it, or no mapping at the top.
-    """
-    try:
-        _check_depth(text)
-        data = yaml.load(text, Loader=_Loader)  # noqa: S506 - _Loader derives from SafeLoader
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        line = f", line {mark.line + 1}" if mark else ""
-        raise ConfigError(f"{source}{line}: {error.problem or 'not YAML'}.") from None
-    except (yaml.YAMLError, ValueError) as error:
-        raise ConfigError(f"{source}: {' '.join(str(error).split())}.") from None
-    if data is None:
-        raise ConfigError(f"{source}: the file is empty; it must hold `key: value` lines.")
-    if not isinstance(data, dict):
-        raise ConfigError(f"{source}: the top level must be `key: value` lines.")
-    return data
 
 
 def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> SchemaT:
@@ -231,11 +142,16 @@ def no_device(path: Path) -> Path:
     return path
 
 
-def read_text(path: str | Path) -> str:
-    """Reads a UTF-8 file, with one sentence when that fails."""
+def read_text(path: str | Path, most: int = MAX_BYTES) -> str:
+    """Reads a UTF-8 file of at most so many bytes, with one sentence when that fails."""
     path = Path(path)
     try:
-        return no_device(path).read_text(encoding="utf-8")
+        size = no_device(path).stat().st_size
+        if size > most and path.is_file():
+            raise ConfigError(
+                f"{path}: is larger than {most // 2**20} MB, which no such file is; give another."
+            )
+        return path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; check the path.") from None
     except IsADirectoryError:
@@ -249,15 +165,7 @@ def read_text(path: str | Path) -> str:
 def load_yaml(path: str | Path, schema: type[SchemaT]) -> SchemaT:
     """Reads and checks a YAML file. Raises ConfigError with file, key and fix."""
     path = Path(path)
-    if path.is_file() and path.stat().st_size > MAX_BYTES:
-        limit = MAX_BYTES // 2**20
-        raise ConfigError(f"{path}: is larger than {limit} MB; give a configuration instead.")
     return validate(parse_yaml(read_text(path), str(path)), schema, str(path))
-
-
-def dump_yaml(data: Any) -> str:
-    """Writes plain data as YAML that `load_yaml` reads back to the same numbers."""
-    return str(yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100))
 
 
 def share_folder() -> Path:

@@ -15,8 +15,29 @@ MISSING_ROS = (
 )
 
 
+LONGEST = 800
+"""Characters of a sentence; of a longer one the middle is left out."""
+LONGEST_NAME = 100
+"""Characters of a name that are compared with the known ones."""
+
+
+def shortened(text: str, most: int) -> str:
+    """A text on one line, without its middle where it is longer than `most` characters.
+
+    What is wrong often stands within it, so nobody is shown megabytes, a line feed or what
+    moves a terminal's cursor.
+    """
+    if len(text) > most:
+        text = f"{text[: most // 2]} ... {text[-(most // 2) :]}"
+    text = " ".join(text.splitlines())
+    return text if text.isprintable() else "".join(c if c.isprintable() else "?" for c in text)
+
+
 class BridgeError(Exception):
-    """Base of all errors that come from what the user gave."""
+    """Base of all errors that come from what the user gave; one line of at most `LONGEST`."""
+
+    def __init__(self, sentence: str = "") -> None:
+        super().__init__(shortened(sentence, LONGEST))
 
 
 class ConfigError(BridgeError):
@@ -47,8 +68,9 @@ class PolicyError(BridgeError):
     """
 
     def __init__(self, source: str, field: str, reason: str) -> None:
-        self.source, self.field, self.reason = source, field, reason
-        super().__init__(f"{source}: field {field!r}: {reason}")
+        self.source, self.field = source, shortened(field, LONGEST_NAME)
+        self.reason = shortened(reason, LONGEST // 2)
+        super().__init__(f"{source}: field {self.field!r}: {self.reason}")
 
     def __reduce__(self) -> tuple[type[PolicyError], tuple[str, str, str]]:
         return type(self), (self.source, self.field, self.reason)  # so that it can be pickled
@@ -89,7 +111,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
     Returns:
         `did you mean 'x'?` or `valid are: 'x', 'y'`.
     """
-    names = sorted(known)
+    names, name = sorted(known), shortened(name, LONGEST_NAME)
     close = difflib.get_close_matches(name, names, n=1)
     if close:
         return f"did you mean {close[0]!r}?"

@@ -14,7 +14,9 @@ from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy.comparison import Tally, record_of, tallies
 from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.policy.evaluation_intervals import Estimate
+from nics_drl_bridge.policy.policies import check_name
 from nics_drl_bridge.report.pictures import trajectories
+from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.world import load_world
 from nics_drl_bridge.trial import LABELS, PLACES, Trial, check_place, drive_in, robot_of
 
@@ -76,6 +78,9 @@ def evaluate(order: Order, say: Say, tell: Tell) -> list[Evaluated]:
         BridgeError: a bad name or file, or a node that does not come up.
     """
     name = model_name(order)
+    seeds_of(order)  # before anything is driven
+    for policy in order.policies:
+        check_name(policy)
     model, world = open_model(name), load_world(order.world)
     for place in order.places:
         check_place(place)
@@ -108,7 +113,7 @@ def model_name(order: Order) -> str:
 def _drive(
     order: Order, policy: str, model: str, place: str, say: Say, tell: Tell
 ) -> list[Episode]:
-    seeds = range(order.seed, order.seed + order.episodes)
+    seeds = seeds_of(order)
     trial = Trial(policy, model, order.world, seeds, order.out / "logs")
     done = []
 
@@ -118,6 +123,13 @@ def _drive(
 
     say(f"driving {order.episodes} episodes of {policy} {LABELS[place]}")
     return drive_in(place, trial, told, say)
+
+
+def seeds_of(order: Order) -> range:
+    """Of its episodes. Raises ConfigError when one of them is no seed."""
+    seeds = range(order.seed, order.seed + order.episodes)
+    checked_seeds([seeds.start, seeds.stop - 1])
+    return seeds
 
 
 def picture_of(out: Path, policy: str) -> Path:

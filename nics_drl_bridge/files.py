@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from nics_drl_bridge.errors import ConfigError
 
@@ -169,20 +170,29 @@ def sha256(data: bytes) -> str:
 
 
 _SEAL = b"sha256 "
+_PART = 2**20
 
 
 def sealed(data: bytes) -> bytes:
-    """Some bytes with their checksum behind them, for `unsealed`."""
+    """Some bytes with their checksum behind them, for `check_sealed`."""
     return data + _SEAL + sha256(data).encode()
 
 
-def unsealed(data: bytes) -> bytes:
-    """What was given to `sealed`.
+def check_sealed(file: BinaryIO) -> None:
+    """Holds what was written as `sealed` against its checksum, without reading it at once.
+
+    Args:
+        file: open, at its beginning, where it is left again.
 
     Raises:
         ValueError: a bit of it has changed, or there is no checksum.
     """
-    inner = data[: -len(_SEAL) - 64]
-    if data != sealed(inner):
+    left = file.seek(0, os.SEEK_END) - len(_SEAL) - 64
+    digest = hashlib.sha256()
+    file.seek(0)
+    while left > 0 and (part := file.read(min(left, _PART))):
+        digest.update(part)
+        left -= len(part)
+    if left or file.read() != _SEAL + digest.hexdigest().encode():
         raise ValueError("its checksum is missing or does not fit the rest")
-    return inner
+    file.seek(0)

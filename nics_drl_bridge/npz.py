@@ -40,6 +40,8 @@ DAMAGE = (
     zlib.error,
 )
 """What reading a damaged `.npz` file may raise besides ValueError."""
+MOST_BYTES = 256 * 2**20
+"""Of a file, and of what is unpacked of it: a day of driving, or the table of a thousand shapes."""
 ALIGNMENT = 64
 _PADDING = 0xD935
 """Id of a zip entry's field that only fills up, the one that Android's zipalign takes."""
@@ -92,8 +94,9 @@ def npz_mapped(path: Path) -> dict[str, NDArray[Any]]:
     """
     arrays = {}
     try:
-        _check_seal(path.read_bytes())
+        _check_seal(read_file(path))
         with zipfile.ZipFile(path) as archive, path.open("rb") as file:
+            _check_unpacked(archive)
             for member in archive.infolist():
                 name = member.filename.removesuffix(".npy")
                 if member.compress_type != zipfile.ZIP_STORED:
@@ -113,6 +116,21 @@ def npz_mapped(path: Path) -> dict[str, NDArray[Any]]:
     except DAMAGE as error:
         raise ValueError(str(error) or type(error).__name__) from None
     return arrays
+
+
+def read_file(path: Path) -> bytes:
+    """The content of a file. Raises ValueError when it is larger than any `.npz` file here."""
+    size = path.stat().st_size
+    if size > MOST_BYTES:
+        raise ValueError(f"it is larger than {MOST_BYTES // 2**20} MB")
+    return path.read_bytes()
+
+
+def _check_unpacked(archive: zipfile.ZipFile) -> None:
+    """Raises ValueError for an archive that is small, but not what is packed in it."""
+    size = sum(member.file_size for member in archive.infolist())
+    if size > MOST_BYTES:
+        raise ValueError(f"unpacked it is larger than {MOST_BYTES // 2**20} MB")
 
 
 def _check_seal(data: bytes) -> None:
@@ -135,6 +153,8 @@ def npz_arrays(data: bytes, seal_needed: bool = True) -> dict[str, NDArray[Any]]
     try:
         if seal_needed:
             _check_seal(data)
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            _check_unpacked(archive)
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except DAMAGE as error:

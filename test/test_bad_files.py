@@ -98,7 +98,7 @@ def test_a_huge_configuration_or_an_endless_device_is_refused_without_reading_it
     path = tmp_path / "huge.yaml"
     with path.open("wb") as huge:
         huge.truncate(MAX_BYTES + 1)
-    with pytest.raises(ConfigError, match=r"huge\.yaml: is larger than 8 MB"):
+    with pytest.raises(ConfigError, match=r"huge\.yaml: is larger than 1 MB"):
         load_robot(str(path))
     endless = tmp_path / "endless.yaml"
     endless.symlink_to("/dev/zero")

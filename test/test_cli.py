@@ -222,3 +222,30 @@ def test_ctrl_c_in_a_compiled_function_is_an_interruption_and_another_fault_is_n
     assert caught.value.exit_code == 130
     with pytest.raises(SystemError, match="of another kind"), console.one_sentence():
         raise SystemError("of another kind")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("bake", "--distances", "abc"),
+        ("evaluate", "straight", "--seed", "-3"),
+        ("evaluate", "straight", "--seed", "1.5"),
+        ("evaluate", "straight", "--seed", "9" * 6000),
+        ("evaluate", "straight", "--seed", str(2**63), "--in", "fast"),
+        ("evaluate", "straight", "--seed", str(2**63 - 1), "--in", "fast"),
+        ("train", "--seeds", str(2**64)),
+        ("record", "--preview", "--seed", str(2**63), "--out", "drive.npz"),
+        ("evaluat",),
+        ("bake", "--unheard-of", "x" * 5000),
+        ("bake", "x" * 50_000),
+    ],
+)
+def test_a_wrong_option_is_one_sentence(tmp_path, words):
+    assert len(refused(nics(*words, cwd=tmp_path))) < 1000
+    assert names(tmp_path) == set()
+
+
+def test_no_command_shows_the_help(tmp_path):
+    done = nics(cwd=tmp_path)
+    assert done.returncode == 2
+    assert "Usage: nics" in done.stdout + done.stderr

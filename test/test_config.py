@@ -162,10 +162,7 @@ def test_aliases_that_multiply_are_refused_at_once():
     lines = ["l0: &l0 [x, x, x, x, x, x, x, x, x]"]
     lines += [f"l{i}: &l{i} [{', '.join([f'*l{i - 1}'] * 9)}]" for i in range(1, 12)]
     lines += ["name: *l11"]
-    assert len(refusal("\n".join(lines))) < 300
-    only_name = parse_yaml("\n".join(lines), "cart.yaml")["name"]
-    with pytest.raises(ConfigError, match="key 'name'"):
-        validate({"name": only_name}, Cart, "cart.yaml")
+    assert "more than 50000 values" in refusal("\n".join(lines))
 
 
 def test_configurations_are_frozen_and_share_no_defaults():

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
@@ -11,9 +12,9 @@ from nics_drl_bridge import files
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import (
     check_folder,
+    check_sealed,
     sealed,
     sha256,
-    unsealed,
     whole_folder,
     write_bytes,
     write_text,
@@ -265,13 +266,15 @@ def test_a_disk_that_takes_no_more_leaves_the_old_file_and_no_other(tmp_path):
 
 def test_any_flipped_bit_of_what_was_sealed_is_noticed():
     whole = sealed(b"content")
-    assert unsealed(whole) == b"content"
-    assert unsealed(sealed(b"")) == b""
+    for good in (whole, sealed(b""), sealed(bytes(3_000_000))):
+        file = io.BytesIO(good)
+        check_sealed(file)
+        assert file.tell() == 0
     for place in range(8 * len(whole)):
         flipped = bytearray(whole)
         flipped[place // 8] ^= 1 << place % 8
         with pytest.raises(ValueError, match="checksum"):
-            unsealed(bytes(flipped))
+            check_sealed(io.BytesIO(flipped))
     for cut in range(len(whole)):
         with pytest.raises(ValueError, match="checksum"):
-            unsealed(whole[:cut])
+            check_sealed(io.BytesIO(whole[:cut]))

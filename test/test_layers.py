@@ -16,6 +16,7 @@ PACKAGE = "nics_drl_bridge"
 # From the bottom up. What stands on one line does not import each other.
 LAYERS = (
     ("errors", "geometry", "random_kernels", "interface", "discovery"),
+    ("strict_yaml", "seeds"),
     ("files", "npz", "config", "threads"),
     ("kinematics", "lidar"),
     ("calibration",),
@@ -43,7 +44,7 @@ HOMES = {
     "ament_index_python": ("nodes/*",),
     "filterpy": ("middleware/ekf.py",),
     "matplotlib": ("report/*", "env/rendering.py"),
-    "yaml": ("config.py",),
+    "yaml": ("strict_yaml.py",),
     "typer": ("cli.py", "commands/*"),
     "gymnasium": ("env/*", "policy/*", "trial.py", "vehicle.py"),
     "numba": ("*kernels.py", "lidar/scanner.py"),
@@ -130,7 +131,8 @@ def package(tmp_path):
     for name, text in {
         "__init__.py": "",
         "errors.py": "import numpy",
-        "config.py": "import yaml\nfrom nics_drl_bridge.errors import E",
+        "strict_yaml.py": "import yaml\nfrom nics_drl_bridge.errors import E",
+        "config.py": "from nics_drl_bridge.strict_yaml import parse_yaml",
         "kinematics/spec.py": "from nics_drl_bridge import config\nfrom . import model",
         "kinematics/model.py": "",
         "kinematics/kernels.py": "from numba import njit",

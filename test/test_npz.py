@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import zipfile
 
 import numpy as np
 import pytest
@@ -93,3 +94,32 @@ def sealed_anew(data):
 def test_objects_are_refused_since_they_would_have_to_be_unpickled():
     with pytest.raises(ValueError, match="allow_pickle"):
         npz_bytes({"a": np.array([object()])})
+
+
+def archive(**parts: bytes) -> bytes:
+    """An archive of packed parts with a checksum that fits."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as made:
+        for name, data in parts.items():
+            made.writestr(f"{name}.npy", data)
+        made.comment = b"sha256 " + bytes(64)
+    data = buffer.getvalue()[:-64]
+    return data + hashlib.sha256(data).hexdigest().encode()
+
+
+def test_an_archive_that_unpacks_to_gigabytes_is_refused_packed(monkeypatch, tmp_path):
+    data = archive(zeros=bytes(3_000_000))
+    monkeypatch.setattr(npz, "MOST_BYTES", 2_000_000)
+    path = tmp_path / "zeros.npz"
+    path.write_bytes(data)
+    for read in (lambda: npz.npz_arrays(data), lambda: npz.npz_mapped(path)):
+        with pytest.raises(ValueError, match="unpacked it is larger than"):
+            read()
+
+
+def test_a_file_that_is_too_large_is_not_read(tmp_path):
+    path = tmp_path / "large.npz"
+    with path.open("wb") as file:
+        file.truncate(npz.MOST_BYTES + 1)
+    with pytest.raises(ValueError, match="larger than 256 MB"):
+        npz.npz_mapped(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
@@ -9,8 +10,10 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from mmap import mmap
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
@@ -35,7 +38,13 @@ from nics_drl_bridge.safety import black_box
 from nics_drl_bridge.safety.inputs import Tick
 
 LONGEST_S = 0.05
-"""A writer is killed within this time after it began."""
+"""A writer is killed within this time after it began to write."""
+STARTS_S = 10.0
+"""So long it may take until it does."""
+WRITES = mmap(-1, 2)
+"""Shared with the writer: which number of writes began, and which ended, modulo 256."""
+PIECE = 4096
+"""Bytes that a naive writer writes at once, as a buffered file does."""
 SHORT_TRAINING = {
     "robot": "differential",
     "worlds": {"empty": 4},
@@ -156,38 +165,107 @@ def _which(found: NDArray[Any], versions: list[NDArray[Any]]) -> int:
     return [np.array_equal(found, version) for version in versions].index(True)
 
 
-def torn(artefact: Artefact, kills: int, rng: np.random.Generator, folder: Path) -> int:
+def torn(artefact: Artefact, kills: int, rng: np.random.Generator, folder: Path) -> dict[str, int]:
     """How often something was left that is neither the old nor the new version, whole.
 
-    Each time a process that writes both in turn is killed with SIGKILL at a random moment.
+    Each time a process that writes both in turn is killed with SIGKILL at a random moment after it
+    began to write.
+
+    Returns:
+        `torn`, `kills`, and `kills_during_a_write`: those before which a write had begun that had
+        not ended.
     """
-    path, bad = folder / artefact.name, 0
+    path, bad, during = folder / artefact.name, 0, 0
     artefact.write(path, 0)
     for _ in range(kills):
+        WRITES[:] = bytes(2)
         child = os.fork()
         if child == 0:
             _write_for_ever(artefact, path)
+        _wait_for_a_write()
         time.sleep(rng.uniform(0.0, LONGEST_S))
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
+        during += WRITES[0] != WRITES[1]
         try:
             artefact.version(path)
         except (BridgeError, ValueError):
             bad += 1
+            _remove(path)
             artefact.write(path, 0)
         for rest in folder.glob(f".{artefact.name}.*"):
-            shutil.rmtree(rest) if rest.is_dir() else rest.unlink()
-    return bad
+            _remove(rest)
+    return {"torn": bad, "kills": kills, "kills_during_a_write": during}
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _wait_for_a_write() -> None:
+    """Returns once a write has begun, or after `STARTS_S`."""
+    latest = time.monotonic() + STARTS_S
+    while WRITES[0] == 0 and time.monotonic() < latest:
+        time.sleep(0.0)
 
 
 def _write_for_ever(artefact: Artefact, path: Path) -> None:
-    """In a process of its own; ends with it."""
+    """In a process of its own; ends with it. A write begins with its temporary file or folder."""
+    version, make_file, make_folder = 0, tempfile.mkstemp, tempfile.mkdtemp
+    tempfile.mkstemp = lambda *given, **named: _begun(make_file, given, named)
+    tempfile.mkdtemp = lambda *given, **named: _begun(make_folder, given, named)
     try:
         while True:
-            artefact.write(path, 1)
-            artefact.write(path, 0)
+            version = 1 - version
+            artefact.write(path, version)
+            WRITES[1] = WRITES[0]
     finally:
         os._exit(1)
+
+
+def _begun(make: Callable[..., Any], given: Any, named: Any) -> Any:
+    WRITES[0] = (WRITES[0] + 1) % 256
+    return make(*given, **named)
+
+
+def naive(artefact: Artefact) -> Artefact:
+    """The same, written where it is to lie, as `open(path, "w")` does."""
+    with tempfile.TemporaryDirectory() as folder:
+        held = [_content(artefact, Path(folder), n) for n in (0, 1)]
+
+    def write(path: Path, n: int) -> None:
+        _begun(lambda: None, (), {})
+        for name, data in held[n].items():
+            place = path.parent / name
+            place.parent.mkdir(exist_ok=True)
+            with place.open("wb", buffering=0) as file:
+                for begin in range(0, len(data), PIECE):
+                    file.write(data[begin : begin + PIECE])
+
+    return replace(artefact, write=write)
+
+
+def _content(artefact: Artefact, folder: Path, n: int) -> dict[Path, bytes]:
+    """What a version consists of, by its place."""
+    whole = folder / artefact.name
+    artefact.write(whole, n)
+    parts = sorted(one for one in whole.rglob("*") if one.is_file()) or [whole]
+    return {one.relative_to(folder): one.read_bytes() for one in parts}
+
+
+def unchecked() -> Any:
+    """Takes every checksum out while it is entered: they fit whatever they are held against."""
+    fits = contextlib.ExitStack()
+    for place in (
+        "npz.is_sealed", "npz._check_seal", "kinematics.recording.is_sealed",
+        "policy.onnx_graph.check_seal", "policy.contract._check_unchanged",
+        "policy.train_checkpoint.check_sealed",
+    ):  # fmt: skip
+        fits.enter_context(mock.patch(f"nics_drl_bridge.{place}", return_value=True))
+    return fits
 
 
 def accepted(artefact: Artefact, flips: int, rng: np.random.Generator, folder: Path) -> int:
@@ -211,15 +289,23 @@ def accepted(artefact: Artefact, flips: int, rng: np.random.Generator, folder: P
     return good
 
 
-def measure(kills: int, flips: int, seed: int) -> dict[str, Any]:
-    """Both figures over all artefacts, and by artefact."""
+def measure(kills: int, flips: int, seed: int, control: str | None = None) -> dict[str, Any]:
+    """All figures over all artefacts, and by artefact.
+
+    Args:
+        kills, flips: of each artefact.
+        seed: of all that is drawn.
+        control: see `CONTROLS` of `files.py`.
+    """
     rng, by_artefact = np.random.default_rng(seed), {}
     for artefact in artefacts():
+        written = naive(artefact) if control == "naive_writer" else artefact
         with tempfile.TemporaryDirectory() as folder:
-            by_artefact[artefact.name] = {
-                "torn": torn(artefact, kills, rng, Path(folder)),
-                "accepted_corrupt": accepted(artefact, flips, rng, Path(folder)),
-            }
-    keys = ("torn", "accepted_corrupt")
+            found = torn(written, kills, rng, Path(folder))
+        believed = unchecked() if control == "no_checksum" else contextlib.nullcontext()
+        with tempfile.TemporaryDirectory() as folder, believed:
+            found["accepted_corrupt"] = accepted(artefact, flips, rng, Path(folder))
+        by_artefact[artefact.name] = {**found, "flips": flips}
+    keys = ("torn", "kills", "kills_during_a_write", "accepted_corrupt", "flips")
     total = {key: sum(one[key] for one in by_artefact.values()) for key in keys}
     return {**total, "artefacts": by_artefact}

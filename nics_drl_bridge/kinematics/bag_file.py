@@ -8,18 +8,20 @@ What no bag keeps a checksum of, a bit that flipped inside of a number, can't be
 from __future__ import annotations
 
 import sqlite3
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from nics_drl_bridge.config import no_device
-from nics_drl_bridge.errors import BridgeError, RecordingError
+from nics_drl_bridge.config import no_device, parse_yaml, read_text
+from nics_drl_bridge.errors import LONGEST_NAME, BridgeError, RecordingError, shortened
 from nics_drl_bridge.kinematics.bag_messages import typestore
 from nics_drl_bridge.kinematics.bag_qos import Offer, offers_of
 from nics_drl_bridge.kinematics.mcap_check import check_mcap
 from nics_drl_bridge.kinematics.mcap_records import DamageError
+from nics_drl_bridge.kinematics.packing import check_message, check_packed
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -83,10 +85,13 @@ def opened(path: str | Path) -> Iterator[BagFile]:
         _check_name(place)
         for file in (place, *(place.iterdir() if place.is_dir() else ())):
             no_device(file)
+        if place.is_dir():
+            _check_metadata(place / METADATA)
         with Reader(place) as reader:
             for storage in _storages(reader):
                 _check_storage(path, Path(str(storage.path)))
             _check_summary(path, reader)
+            _check_topics(path, reader)
             yield BagFile(reader, str(path))
     except BridgeError:
         raise
@@ -132,6 +137,23 @@ def _place(path: Path) -> Path:
             f"{METADATA}."
         )
     return file
+
+
+def _check_metadata(file: Path) -> None:
+    """Reads a bag's metadata with the bounds of `strict_yaml`, which its library has not.
+
+    Raises:
+        ValueError: they are no YAML, or grow; or a file would when it is unpacked.
+    """
+    try:
+        data = parse_yaml(read_text(file), file.name)
+    except BridgeError as error:
+        raise ValueError(str(error)) from None
+    about = data.get("rosbag2_bagfile_information")
+    if isinstance(about, dict) and str(about.get("compression_mode", "")).lower() == "file":
+        for packed in sorted(file.parent.iterdir()):
+            if packed.suffix in COMPRESSED:
+                check_packed(packed)
 
 
 def _storages(reader: Reader) -> list[Any]:
@@ -185,6 +207,37 @@ def _check_summary(path: Path, reader: Reader) -> None:
         )
     if counted == 0:
         raise RecordingError(f"{path}: holds no messages; record a drive of 20 s or more.")
+
+
+def _check_topics(path: Path, reader: Reader) -> None:
+    """Holds the topics of a bag's summary against those of its files."""
+    told: Counter[tuple[str, str]] = Counter()
+    held: Counter[tuple[str, str]] = Counter()
+    for connection in reader.connections:
+        if not (isinstance(connection.topic, str) and connection.topic):
+            raise RecordingError(
+                f"{path}: its summary has lost the name of a topic; it is damaged: try `ros2 bag "
+                "reindex`, save the rest with `nics bag salvage`, or record anew."
+            )
+        told[connection.topic, connection.msgtype] += connection.msgcount
+    for storage in _storages(reader):
+        for connection in storage.connections:
+            held[connection.topic, connection.msgtype] += connection.msgcount
+    for topic, kind in sorted(set(told + held), key=str):
+        if told[topic, kind] != held[topic, kind]:
+            raise RecordingError(
+                f"{path}: topic {_short(topic)} of type {_short(kind)} has {held[topic, kind]} "
+                f"messages in its files, {told[topic, kind]} by its summary; it is damaged: try "
+                "`ros2 bag reindex`, save the rest with `nics bag salvage`, or record anew."
+            )
+    if reader.compression_mode == "message":
+        for storage in _storages(reader):
+            for _, _, data in storage.messages(storage.connections):
+                check_message(data)
+
+
+def _short(name: object) -> str:
+    return repr(shortened(str(name), LONGEST_NAME))
 
 
 class BagFile:

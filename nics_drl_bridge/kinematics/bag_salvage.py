@@ -10,12 +10,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from nics_drl_bridge.config import no_device, parse_yaml
+from nics_drl_bridge.config import parse_yaml, read_text
 from nics_drl_bridge.errors import BridgeError, RecordingError
 from nics_drl_bridge.kinematics.bag_file import COMPRESSED, DATABASE, METADATA, is_storage
 from nics_drl_bridge.kinematics.bag_messages import typestore
 from nics_drl_bridge.kinematics.bag_sink import Storage, bag_sink
 from nics_drl_bridge.kinematics.mcap_salvage import intact
+from nics_drl_bridge.kinematics.packing import unpack
 from nics_drl_bridge.kinematics.sqlite_salvage import intact_rows
 
 ZSTD = b"\x28\xb5\x2f\xfd"
@@ -179,16 +180,14 @@ def _decodable(found: _Found) -> Iterator[tuple[str, int, bytes]]:
 def _unpacked(data: bytes) -> bytes:
     if not data.startswith(ZSTD):
         return data
-    from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
-
-    return bytes(DECOMPRESSORS["zstd"](data, 0))
+    return unpack(data, "zstd")
 
 
 def _promised(path: Path) -> dict[str, int] | None:
     """How many messages of each topic there were by the bag's metadata, if they can be read."""
     file = (path if path.is_dir() else path.parent) / METADATA
     try:
-        data: Any = parse_yaml(no_device(file).read_text(encoding="utf-8"), str(file))
+        data: Any = parse_yaml(read_text(file), str(file))
         topics = data["rosbag2_bagfile_information"]["topics_with_message_count"]
         return {t["topic_metadata"]["name"]: int(t["message_count"]) for t in topics}
     except (BridgeError, OSError, ValueError, TypeError, KeyError):

@@ -27,6 +27,10 @@ REQUIRED = ("cmd.csv", "vrpn.csv")
 ROBOT_CLOCK, POSE_CLOCK = "robot", "mocap"
 MAX_DURATION_S = 1e6
 MAX_DURATION_RATIO = 100.0
+MOST_BYTES = 64 * 2**20
+MOST_ROWS = 500_000
+LONGEST_ROW = 1000
+"""Characters."""
 
 
 def load_csv_folder(path: str | Path) -> Recording:
@@ -69,8 +73,8 @@ def _read(path: Path) -> Array:
     """The numbers of a file, checked row by row; time is the last column."""
     columns = COLUMNS[path.name]
     try:
-        with no_device(path).open(newline="", encoding="utf-8") as file:
-            rows = [(line, row) for line, row in enumerate(csv.reader(file), 1) if row]
+        text = _lines(path)
+        rows = [(line, row) for line, row in enumerate(csv.reader(text), 1) if row]
     except UnicodeDecodeError:
         raise RecordingError(
             f"{path}: is not UTF-8 text; it must hold comma-separated numbers."
@@ -86,6 +90,26 @@ def _read(path: Path) -> Array:
             f"{table[k + 1, -1]:.6f}); sort the rows, or cut the file there."
         )
     return table
+
+
+def _lines(path: Path) -> list[str]:
+    """The lines of a file that is no larger than any drive's, none longer than a row."""
+    size = no_device(path).stat().st_size
+    if size > MOST_BYTES:
+        raise RecordingError(
+            f"{path}: is larger than {MOST_BYTES // 2**20} MB, which no drive is; cut it."
+        )
+    lines = path.read_bytes().split(b"\n")
+    if len(lines) > MOST_ROWS:
+        raise RecordingError(
+            f"{path}: has {len(lines)} rows, and a drive at most {MOST_ROWS}; cut it."
+        )
+    for k, line in enumerate(lines, 1):
+        if len(line) > LONGEST_ROW:
+            raise RecordingError(
+                f"{path}: row {k} has {len(line)} characters, which no row has; remove it."
+            )
+    return [str(line, "utf-8") for line in lines]
 
 
 def _numbers(path: Path, line: int, row: list[str], columns: tuple[str, ...]) -> list[float]:

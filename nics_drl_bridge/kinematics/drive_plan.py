@@ -11,6 +11,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.kinematics.exploration import PERIOD_S, Exploration
 from nics_drl_bridge.kinematics.pattern import Pattern
 from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.seeds import checked_seeds
 
 SHORTEST_S, LONGEST_S = 20.0, 3600.0
 SPREAD, ALIKE = 0.17, 0.6
@@ -45,13 +46,12 @@ class DrivePlan:
             "bound": (self.robot.footprint_radius, 1000.0),
             "duration": (SHORTEST_S, LONGEST_S),
             "speed": (0.05, 1.0),
-            "seed": (0, np.inf),
         }
+        checked_seeds(self.seed)
         for name, (low, high) in ranges.items():
             value = getattr(self, name)
             if not low <= value <= high:
-                limits = f"{low:g} or more" if high == np.inf else f"from {low:g} to {high:g}"
-                raise ConfigError(f"{name} {value:g}: must be {limits}.")
+                raise ConfigError(f"{name} {value:g}: must be from {low:g} to {high:g}.")
 
     def begin(self) -> Exploration:
         """The drive that is previewed, at its start.

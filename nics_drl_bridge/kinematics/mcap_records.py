@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import NamedTuple
 from zlib import crc32
 
+from nics_drl_bridge.kinematics.packing import unpack
+
 Bytes = bytes | memoryview
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -258,9 +260,7 @@ def unpacked(record: Record) -> Bytes:
 def _decompress(chunk: Chunk) -> Bytes:
     if chunk.compression == "":
         return chunk.records
-    from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
-
-    return DECOMPRESSORS[chunk.compression](bytes(chunk.records), chunk.size)
+    return unpack(bytes(chunk.records), chunk.compression, chunk.size)
 
 
 def inner_records(record: Record) -> Iterator[Record]:

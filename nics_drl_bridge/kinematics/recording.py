@@ -21,7 +21,7 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.kinematics.latency import Latency
 from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.npz import is_sealed, npz_arrays, npz_bytes
+from nics_drl_bridge.npz import is_sealed, npz_arrays, npz_bytes, read_file
 
 Array = NDArray[np.float64]
 FORMAT = "nics_drl_bridge/recording/2"
@@ -249,7 +249,7 @@ def load_npz(path: str | Path) -> Recording:
         RecordingError: no such file, not an `.npz`, damaged, or a stream is missing.
     """
     try:
-        data = no_device(Path(path)).read_bytes()
+        data = read_file(no_device(Path(path)))
         sealed, arrays = is_sealed(data), npz_arrays(data, seal_needed=False)
         meta = json.loads(str(arrays["meta"]))
         if meta["format"] == FORMAT and not sealed:

@@ -18,6 +18,14 @@ CmdVelField = Literal["linear.x", "linear.y", "angular.z"]
 CMD_VEL_FIELDS: tuple[CmdVelField, ...] = ("linear.x", "linear.y", "angular.z")
 UNITS = ("m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1")
 """SI units of a state or a command; 1 for a share or a count."""
+LARGEST = 1e3
+"""Greatest radius of a robot [m]."""
+MOST_CORNERS = 512
+"""Of a footprint."""
+MOST_VARIABLES = 32
+"""Of a state, and of a command."""
+FASTEST = 1e6
+"""Greatest value of a variable, in its unit."""
 POSE_RATES = ("vx", "vy", "wz")
 POSE_UNITS = ("m/s", "m/s", "rad/s")
 
@@ -27,8 +35,8 @@ class Variable(Schema):
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
     unit: str
-    min: float
-    max: float
+    min: float = Field(ge=-FASTEST, le=FASTEST)
+    max: float = Field(ge=-FASTEST, le=FASTEST)
 
     @field_validator("unit")
     @classmethod
@@ -87,10 +95,12 @@ class RobotSpec(Schema):
     description: str = ""
     textbook: Literal["ackermann", "differential", "mecanum"] | None = None
     parameters: dict[str, float] = Field(default_factory=dict)
-    footprint_radius: float = Field(gt=0.0)
-    footprint: tuple[tuple[float, float], ...] | None = Field(default=None, min_length=3)
-    state: tuple[StateVariable, ...] = ()
-    command: tuple[CommandVariable, ...] = Field(min_length=1)
+    footprint_radius: float = Field(ge=1e-3, le=LARGEST)
+    footprint: tuple[tuple[float, float], ...] | None = Field(
+        default=None, min_length=3, max_length=MOST_CORNERS
+    )
+    state: tuple[StateVariable, ...] = Field(default=(), max_length=MOST_VARIABLES)
+    command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MOST_VARIABLES)
 
     @model_validator(mode="before")
     @classmethod
@@ -102,9 +112,11 @@ class RobotSpec(Schema):
         ):
             return data
         try:
+            if len(data["footprint"]) > MOST_CORNERS:
+                return data
             corners = np.array(data["footprint"], dtype=np.float64)
             return data | {"footprint_radius": float(np.hypot(*corners.T).max())}
-        except (TypeError, ValueError):
+        except (OverflowError, TypeError, ValueError):
             return data  # the field's own check says what is wrong with it
 
     @model_validator(mode="after")

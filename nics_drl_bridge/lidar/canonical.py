@@ -19,6 +19,7 @@ from nics_drl_bridge.config import Schema, validate
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.geometry import wrap_angle
 from nics_drl_bridge.lidar import canonical_kernels as kernels
+from nics_drl_bridge.lidar.shapes import LARGEST, Place
 from nics_drl_bridge.lidar.spec import FULL_CIRCLE_TOLERANCE, LidarSpec, ScanHeader
 
 Array = NDArray[np.float64]
@@ -49,8 +50,8 @@ class ScanLayout(Schema):
     sectors: int = Field(ge=4, le=1440)
     angle_min: float = -np.pi
     angle_max: float = np.pi
-    range_max: float = Field(gt=0.0)
-    viewpoint: tuple[float, float] = (0.0, 0.0)
+    range_max: float = Field(ge=1e-3, le=LARGEST)
+    viewpoint: tuple[Place, Place] = (0.0, 0.0)
 
     @model_validator(mode="after")
     def _consistent(self) -> ScanLayout:

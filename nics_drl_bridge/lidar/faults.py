@@ -49,8 +49,8 @@ class LidarFaults(Schema):
 
     skew: Skew = "none"
     too_close: TooClose = "minus_inf"
-    noise_proportional: float = Field(default=0.0, ge=0.0)
-    quantisation: float = Field(default=0.0, ge=0.0)
+    noise_proportional: float = Field(default=0.0, ge=0.0, le=10.0)
+    quantisation: float = Field(default=0.0, ge=0.0, le=1e4)
     dropout: float = Field(default=0.0, ge=0.0, le=1.0)
     dropout_far: float = Field(default=0.0, ge=0.0, le=1.0)
 

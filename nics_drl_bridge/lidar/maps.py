@@ -15,10 +15,13 @@ from pydantic import Field, field_validator, model_validator
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.lidar.maps_grid import FREE, NO_MAP, OCCUPIED, UNKNOWN, GridMap
+from nics_drl_bridge.lidar.shapes import Coordinate, Heading
 
 __all__ = ["FREE", "NO_MAP", "OCCUPIED", "UNKNOWN", "GridMap", "MapFile", "load_map"]
 
 MAX_CELLS = 64_000_000
+MAX_BYTES = 4 * MAX_CELLS + 2**20
+"""Of an image; what is longer is none, and not opened."""
 FORMATS = {"PPM": (".pgm", ".pnm", ".ppm", ".pbm"), "PNG": (".png",), "BMP": (".bmp",)}
 LUMA = np.array([0.212656, 0.715158, 0.072186])
 """Brightness of red, green, blue (Rec. 709), as ImageMagick weighs them for Nav2."""
@@ -39,8 +42,8 @@ class MapFile(Schema):
     """
 
     image: str = Field(min_length=1)
-    resolution: float = Field(gt=0.0, le=100.0)
-    origin: tuple[float, float, float]
+    resolution: float = Field(ge=1e-4, le=100.0)
+    origin: tuple[Coordinate, Coordinate, Heading]
     negate: bool
     occupied_thresh: float = Field(ge=0.0, le=1.0)
     free_thresh: float = Field(ge=0.0, le=1.0)
@@ -130,6 +133,8 @@ def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], NDArray[np.b
     if not path.is_file():
         raise ConfigError(f"{source}: key 'image': there is no file {str(path)!r}; {_near(path)}")
     try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ConfigError(_too_large(path, "too many"))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # MAX_CELLS is less
             with Image.open(path, formats=tuple(FORMATS)) as image:

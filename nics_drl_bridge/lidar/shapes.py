@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,8 +16,20 @@ from nics_drl_bridge.errors import ModelError
 
 Array = NDArray[np.float64]
 MOST_CORNERS = 16_384
+MOST_SHAPES = 1_000
+"""Of one file, or of one group of obstacles."""
+SMALLEST, LARGEST = 1e-6, 1e4
+"""Extent of a shape [m]: nothing smaller is seen, nothing larger fits into a world."""
 SAME_PLACE = 1e-9
 """Corners this near to each other, in parts of the shape's radius, coincide."""
+
+
+FARTHEST = 1e8
+"""Greatest coordinate in a map [m], as UTM has them."""
+Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
+Heading = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+Place = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Size = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 
 
 class Surface(Schema):
@@ -28,7 +40,7 @@ class Surface(Schema):
             one, a retroreflector has more; by default that of the lidar's sensor model.
     """
 
-    reflectivity: float | None = Field(default=None, gt=0.0)
+    reflectivity: float | None = Field(default=None, gt=0.0, le=1e6)
 
 
 class Circle(Surface):
@@ -39,7 +51,7 @@ class Circle(Surface):
     """
 
     kind: Literal["circle"] = "circle"
-    radius: float = Field(gt=0.0)
+    radius: Size
 
     @property
     def outline(self) -> Array:
@@ -55,13 +67,14 @@ class Rectangle(Surface):
     """
 
     kind: Literal["rectangle"] = "rectangle"
-    size: tuple[float, float]
+    size: tuple[Size, Size]
 
-    @model_validator(mode="after")
-    def _extended(self) -> Rectangle:
-        if min(self.size) <= 0.0:
+    @field_validator("size", mode="before")
+    @classmethod
+    def _extended(cls, size: Any) -> Any:
+        if isinstance(size, list | tuple) and any(part == 0.0 for part in size):
             raise ValueError("size must be greater than 0; a wall without thickness is a segment")
-        return self
+        return size
 
     @property
     def outline(self) -> Array:
@@ -83,13 +96,15 @@ class Polygon(Surface):
     """
 
     kind: Literal["polygon"] = "polygon"
-    points: tuple[tuple[float, float], ...] = Field(min_length=3, max_length=MOST_CORNERS)
+    points: tuple[tuple[Place, Place], ...] = Field(min_length=3, max_length=MOST_CORNERS)
 
     @field_validator("points")
     @classmethod
     def _distinct(cls, points: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
         if len(set(points)) < 3:
             raise ValueError("a polygon needs at least 3 different corners")
+        if np.ptp(points, axis=0).max() < SMALLEST:
+            raise ValueError(f"a polygon must extend over {SMALLEST:g} m")
         return points
 
     @property
@@ -114,12 +129,14 @@ class Segment(Surface):
     """
 
     kind: Literal["segment"] = "segment"
-    ends: tuple[tuple[float, float], tuple[float, float]]
+    ends: tuple[tuple[Place, Place], tuple[Place, Place]]
 
     @model_validator(mode="after")
     def _extended(self) -> Segment:
         if self.ends[0] == self.ends[1]:
             raise ValueError("ends must be two different points")
+        if np.ptp(self.ends, axis=0).max() < SMALLEST:
+            raise ValueError(f"ends must be {SMALLEST:g} m apart")
         return self
 
     @property
@@ -140,7 +157,7 @@ SHAPES: TypeAdapter[tuple[Shape, ...]] = TypeAdapter(tuple[Shape, ...])
 class ShapeFile(Schema):
     """The keys of a YAML file of shapes."""
 
-    shapes: tuple[Shape, ...] = Field(min_length=1)
+    shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_SHAPES)
 
 
 def load_shapes(path: str | Path) -> tuple[Shape, ...]:

@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.lidar.faults import SKEW, LidarFaults
 from nics_drl_bridge.lidar.sensor_models import SensorModels
+from nics_drl_bridge.lidar.shapes import LARGEST, Heading, Place
 
 FULL_CIRCLE_TOLERANCE = 1e-6
 NoReturn = Literal["inf", "zero", "nan", "range_max"]
@@ -70,10 +71,10 @@ class LidarSpec(Schema):
     angle_min: float
     angle_max: float
     range_min: float = Field(ge=0.0)
-    range_max: float = Field(gt=0.0)
-    rate: float = Field(gt=0.0)
-    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    noise_std: float = Field(default=0.0, ge=0.0)
+    range_max: float = Field(ge=1e-3, le=LARGEST)
+    rate: float = Field(ge=1e-3, le=1e5)
+    mount: tuple[Place, Place, Heading] = (0.0, 0.0, 0.0)
+    noise_std: float = Field(default=0.0, ge=0.0, le=LARGEST)
     frame: str = Field(default="laser", min_length=1)
     no_return: NoReturn = "inf"
     faults: LidarFaults = LidarFaults()

@@ -38,7 +38,7 @@ from nics_drl_bridge.lidar.sensor_models import (
 )
 from nics_drl_bridge.lidar.shapes import SHAPES, Circle, Outlines, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.npz import npz_bytes, npz_mapped
+from nics_drl_bridge.npz import npz_bytes, npz_mapped, read_file
 
 FORMAT = "nics_drl_bridge/lidar_table/3"
 POINT_ANGLE = 0.01
@@ -247,7 +247,7 @@ class LidarTable:
         path = Path(path)
         try:
             no_device(path).open("rb").close()
-            if checksum is not None and sha256(path.read_bytes()) != checksum:
+            if checksum is not None and sha256(read_file(path)) != checksum:
                 raise ModelError(f"{path}: does not match its checksum; generate the model anew.")
             arrays = npz_mapped(path)
             about = json.loads(arrays.pop("about").tobytes())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import json
+import reprlib
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
@@ -24,6 +25,7 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 
 FORMAT = "nics_drl_bridge/policy/1"
 GOLDEN = 16
+MOST_ENTRIES = 20_000
 CHECKSUM = 8
 """Hexadecimal digits of a field's checksum; it finds mistakes, it is no signature."""
 Rows = NDArray[np.float32]
@@ -217,6 +219,10 @@ def read_contract(text: str, source: str) -> Contract:
         PolicyError: an entry is missing, unknown, of a wrong kind, changed after the export, or
             does not agree with another; the field is named.
     """
+    entries = sum(map(text.count, ",[{"))
+    if entries > MOST_ENTRIES:
+        reason = f"has {entries} entries, a contract at most {MOST_ENTRIES}; not read."
+        raise PolicyError(source, "metadata", reason)
     try:
         data = json.loads(text, object_pairs_hook=_once, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
@@ -225,7 +231,9 @@ def read_contract(text: str, source: str) -> Contract:
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         given = data.get("format") if isinstance(data, dict) else None
         raise PolicyError(
-            source, "format", f"is {given!r}, not {FORMAT!r}; export the policy with this version."
+            source,
+            "format",
+            f"is {reprlib.repr(given)}, not {FORMAT!r}; export the policy with this version.",
         )
     try:
         contract = validate(data, Contract, source)

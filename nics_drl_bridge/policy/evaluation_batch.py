@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.policy.evaluation import truly_near
 from nics_drl_bridge.policy.evaluation_intervals import Estimate, mean, rate
+from nics_drl_bridge.seeds import checked_seeds
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -88,7 +89,7 @@ def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcom
         act: the policy, for many robots at once.
         seeds: of the episodes.
     """
-    width, given = env.num_envs, np.asarray(seeds, np.int64)
+    width, given = env.num_envs, checked_seeds(seeds)
     done = []
     for first in range(0, len(given), width):
         # The last ones are filled up with seeds that are driven but not counted.

@@ -13,12 +13,24 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 
 from nics_drl_bridge.errors import PolicyError
 from nics_drl_bridge.files import sha256
+from nics_drl_bridge.policy.onnx_wire import WireError, check_wire
 
 KEY = "nics_drl_bridge"
 """Of the metadata that holds the contract."""
 SEAL = "sha256"
 """Of the metadata at the file's end: the checksum of all that stands before it."""
-SIZE_LIMIT = 64 * 2**20
+SIZE_LIMIT = 32 * 2**20
+MOST_NODES = 1000
+"""An exported network has some dozens."""
+MOST_DIMENSIONS = 8
+"""Of one array of weights."""
+NUMBERS = frozenset(
+    getattr(onnx.TensorProto, kind)
+    for kind in ("FLOAT", "DOUBLE", "FLOAT16", "INT64", "INT32", "BOOL")
+)
+"""Kinds of arrays that are as large in memory as in the file."""
+CONTRACT_LIMIT = 4 * 2**20
+"""Bytes of the contract, whose golden observations are the most of it."""
 INPUT, ACTION, COMMAND = "observation", "action", "command"
 OPERATORS = frozenset({
     "Abs", "Add", "ArgMax", "AveragePool", "Cast", "Clip", "Concat", "Constant", "Conv", "Div",
@@ -50,7 +62,11 @@ def parse(data: bytes, source: str) -> Any:
             reason = f"is {kind}, which is never opened; export the policy with `export_policy`."
             raise PolicyError(source, "file", reason)
     try:
+        check_wire(data)
         model = onnx.load_model_from_string(data)
+    except WireError as error:
+        reason = f"{error}, which no policy is; export or copy it again."
+        raise PolicyError(source, "file", reason) from None
     except (DecodeError, ValueError, TypeError):
         reason = "is no ONNX model, or is cut off; copy it again."
         raise PolicyError(source, "file", reason) from None
@@ -83,7 +99,13 @@ def check_seal(data: bytes, source: str) -> None:
 def check_graph(model: Any, source: str) -> None:
     """Raises PolicyError for a graph that is not self-contained, or holds other operators."""
     graph = model.graph
+    if len(graph.node) > MOST_NODES:
+        reason = f"has {len(graph.node)} operators, a policy at most {MOST_NODES}; not run."
+        raise PolicyError(source, "graph.node", reason)
     for tensor in tensors(graph):
+        if tensor.data_type not in NUMBERS or len(tensor.dims) > MOST_DIMENSIONS:
+            reason = f"is no array of numbers with at most {MOST_DIMENSIONS} dimensions; not run."
+            raise PolicyError(source, f"weights.{tensor.name}", reason)
         location = next((entry.value for entry in tensor.external_data if entry.key), "")
         if tensor.data_location == onnx.TensorProto.EXTERNAL or tensor.external_data:
             reason = f"refers to another file ({location!r}); a policy holds its own weights."
@@ -101,6 +123,8 @@ def check_graph(model: Any, source: str) -> None:
             raise PolicyError(source, "graph.node", reason)
         if any(a.HasField("g") or len(a.graphs) for a in node.attribute):
             raise PolicyError(source, "graph.node", f"{node.op_type} holds a graph of its own.")
+        if any(a.HasField("sparse_tensor") or len(a.sparse_tensors) for a in node.attribute):
+            raise PolicyError(source, "graph.node", f"{node.op_type} holds sparse weights.")
     _check_weights(graph, source)
     try:
         onnx.checker.check_model(model)
@@ -167,6 +191,9 @@ def metadata(model: Any, source: str) -> str:
     found = [entry.value for entry in model.metadata_props if entry.key == KEY]
     if len(found) != 1:
         reason = f"{len(found)} contracts in it; only files of `export_policy` are policies."
+        raise PolicyError(source, "metadata", reason)
+    if len(found[0]) > CONTRACT_LIMIT:
+        reason = f"has {len(found[0])} characters, a contract at most {CONTRACT_LIMIT}; not read."
         raise PolicyError(source, "metadata", reason)
     return str(found[0])
 

@@ -42,6 +42,13 @@ def shipped_policies() -> list[str]:
     return sorted(file.stem for file in (share_folder() / "config" / "policies").glob(f"*{SUFFIX}"))
 
 
+def check_name(name: str) -> None:
+    """Raises ConfigError for what is neither a policy's name nor that of a policy file."""
+    files = shipped_policies()
+    if name not in POLICIES and not name.endswith(SUFFIX) and name not in files:
+        raise ConfigError(f"unknown policy {name!r}; {nearest(name, (*POLICIES, *files))}")
+
+
 def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None) -> Policy:
     """A policy by name.
 
@@ -54,11 +61,9 @@ def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None
         ConfigError: an unknown name, with the nearest.
         PolicyError: the file can't be used, or does not fit; the field is named.
     """
+    check_name(name)
     if name in POLICIES:
         return POLICIES[name](task)
-    files = shipped_policies()
-    if not name.endswith(SUFFIX) and name not in files:
-        raise ConfigError(f"unknown policy {name!r}; {nearest(name, (*POLICIES, *files))}")
     # Imported here: the others need neither onnx nor onnxruntime.
     policy: Policy = import_module("nics_drl_bridge.policy.policy_file").load_policy(name)
     policy.check_fits(model, task)  # type: ignore[attr-defined]

@@ -22,7 +22,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.lidar.canonical import plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.policy import onnx_graph
+from nics_drl_bridge.policy import onnx_graph, onnx_sizes
 from nics_drl_bridge.policy.contract import (
     Contract,
     leaves,
@@ -45,8 +45,9 @@ class PolicyFile:
         contract: what it says about itself.
     """
 
-    def __init__(self, path: Path, contract: Contract, session: Any) -> None:
+    def __init__(self, path: Path, contract: Contract, session: Any, rows_at_once: int) -> None:
         self.path, self.contract, self._session = path, contract, session
+        self._rows_at_once = rows_at_once
 
     def act(self, observation: Rows) -> NDArray[Any]:
         """The action (C,) in [-1, 1], or () discrete, for an observation (O,); or of n at once."""
@@ -63,9 +64,23 @@ class PolicyFile:
             reason = f"is {size}, but was given observations {given.shape}; use its own task."
             raise PolicyError(str(self.path), "observation.size", reason)
         rows = given.reshape(-1, size)
+        out = [
+            self._run_rows(rows[first : first + self._rows_at_once])
+            for first in range(0, len(rows), self._rows_at_once)
+        ] or [self._run_rows(rows)]
+        whole = out[0] if len(out) == 1 else [np.concatenate(p) for p in zip(*out, strict=True)]
+        return [part[0] if given.ndim == 1 else part for part in whole]
+
+    def _run_rows(self, rows: Rows) -> list[NDArray[Any]]:
         names = [onnx_graph.ACTION, onnx_graph.COMMAND]
-        out = self._session.run(names, {onnx_graph.INPUT: rows})
-        return [part[0] if given.ndim == 1 else part for part in out]
+        try:
+            out: list[NDArray[Any]] = self._session.run(names, {onnx_graph.INPUT: rows})
+        except Exception as error:  # noqa: BLE001 - the runtime's errors have no base of their own
+            raise _cannot_run(str(self.path), error) from None
+        if any(len(part) != len(rows) for part in out):
+            reason = f"gives {[part.shape for part in out]} for {len(rows)} observations."
+            raise PolicyError(str(self.path), "graph", reason)
+        return out
 
     @cached_property
     def task_options(self) -> dict[str, Any]:
@@ -206,7 +221,9 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
     if onnx_graph.graph_hash(model) != contract.graph_sha256:
         reason = "does not belong to the graph, which was changed after the export."
         raise PolicyError(source, "graph_sha256", reason)
-    policy = PolicyFile(path, contract, open_session(data, source))
+    rows = onnx_sizes.rows_at_once(model, source)
+    del model  # the runtime makes its own of the bytes
+    policy = PolicyFile(path, contract, open_session(data, source), rows)
     _check_golden(policy, source)
     onnx_graph.check_seal(data, source)  # at last: what can be named was named before
     return policy
@@ -230,19 +247,19 @@ def open_session(data: bytes, source: str) -> Any:
     options.log_severity_level = 4
     try:
         return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    except (RuntimeError, ValueError) as error:
-        words = " ".join(str(error).split())[:120]
-        raise PolicyError(source, "graph", f"onnxruntime can't run it ({words}).") from None
+    except Exception as error:  # noqa: BLE001 - the runtime's errors have no base of their own
+        raise _cannot_run(source, error) from None
+
+
+def _cannot_run(source: str, error: Exception) -> PolicyError:
+    words = " ".join(str(error).split())[:120]
+    return PolicyError(source, "graph", f"onnxruntime can't run it ({words}).")
 
 
 def _check_golden(policy: PolicyFile, source: str) -> None:
     golden = policy.contract.golden
     observations = golden.rows("observations")
-    try:
-        action, command = policy._run(observations)
-    except (RuntimeError, ValueError) as error:
-        words = " ".join(str(error).split())[:120]
-        raise PolicyError(source, "graph", f"onnxruntime can't run it ({words}).") from None
+    action, command = policy._run(observations)
     found = {"actions": action.reshape(len(observations), -1), "commands": command}
     for name, rows in found.items():
         gap = np.abs(rows - golden.rows(name)).max()

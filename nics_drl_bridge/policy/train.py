@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import configure
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import ConfigError, shortened
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy.evaluation_batch import FIRST_SEED, Outcomes, drive_worlds
 from nics_drl_bridge.policy.train_actor import Actor
@@ -139,7 +139,13 @@ def _again(
     check_same(content["about"], about, path)
     size = int(np.prod(env.observation_space.shape))
     algorithm = make_algorithm(settings, env, about["seed"], (np.zeros(size), np.ones(size)))
-    resume(content, algorithm, env)
+    try:
+        resume(content, algorithm, env)
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        reason = shortened(str(error), 120)
+        raise ConfigError(
+            f"{path}: does not hold what a training needs ({reason}); train anew."
+        ) from None
     return algorithm
 
 
@@ -151,6 +157,8 @@ def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
         new: those of the training.
         path: of the checkpoint.
     """
+    if not isinstance(old, dict) or not isinstance(old.get("settings"), dict) or "seed" not in old:
+        raise ConfigError(f"{path}: does not say of which training it is; train anew.")
     for key, value in new["settings"].items():
         if old["settings"].get(key) != value:
             raise ConfigError(

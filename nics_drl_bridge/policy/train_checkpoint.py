@@ -24,10 +24,12 @@ from stable_baselines3.common.utils import set_random_seed
 
 from nics_drl_bridge.env.vector_state import restore, snapshot
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import sealed, unsealed, write_bytes
+from nics_drl_bridge.files import check_sealed, sealed, write_bytes
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 
 FORMAT = "nics_drl_bridge/checkpoint/2"
+MOST_BYTES = 4 * 2**30
+"""Of a file, which holds all of SAC's buffer."""
 COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
 REPLAYED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
@@ -81,13 +83,23 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
     if not path.is_file():
         raise ConfigError(f"{path}: no such checkpoint; leave out --resume to begin anew.")
     try:
-        data = io.BytesIO(unsealed(path.read_bytes()))
-        content = torch.load(data, map_location="cpu", weights_only=True)
+        size = path.stat().st_size
+        if size > MOST_BYTES:
+            raise ValueError("it is larger than any checkpoint")
+        with path.open("rb") as file:
+            check_sealed(file)
+            with zipfile.ZipFile(file) as archive:
+                if any(member.compress_type for member in archive.infolist()):
+                    raise ValueError("torch packs nothing")
+            file.seek(0)
+            # What else a pickle could do, it does not do here; with torch before 2.6 it could.
+            content: Any = torch.load(file, map_location="cpu", weights_only=True)
+        _check_tensors(content, size)
         found = str(content["format"])
         read = {**content, "about": json.loads(content["about"])}
     except (
         RuntimeError, pickle.UnpicklingError, zipfile.BadZipFile, EOFError, OSError, KeyError,
-        TypeError, ValueError,
+        TypeError, ValueError, AttributeError, IndexError, RecursionError,
     ):  # fmt: skip
         raise ConfigError(
             f"{path}: is no checkpoint of a training, or a damaged one; leave out --resume to "
@@ -96,6 +108,15 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
     if found != kind:
         raise ConfigError(f"{path}: is a {found!r}, not a {kind!r}; resume with the same --engine.")
     return read
+
+
+def _check_tensors(content: Any, size: int) -> None:
+    """Raises ValueError for a tensor that is larger than the file, as one repeated number is."""
+    parts = content.values() if isinstance(content, dict) else content
+    for part in parts if isinstance(content, dict | list | tuple) else ():
+        _check_tensors(part, size)
+    if isinstance(content, torch.Tensor) and content.numel() * content.element_size() > size:
+        raise ValueError("a tensor is larger than the file")
 
 
 def resume(content: dict[str, Any], algorithm: BaseAlgorithm, env: TrainVecEnv) -> None:

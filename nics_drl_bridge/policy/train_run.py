@@ -18,8 +18,11 @@ from nics_drl_bridge.policy.evaluation_intervals import Estimate
 from nics_drl_bridge.policy.train import CHECKPOINT, Tell, Trained, evaluate, train
 from nics_drl_bridge.policy.train_export import export_policy
 from nics_drl_bridge.policy.training_settings import TrainingSettings
+from nics_drl_bridge.seeds import checked_seeds
 
 SETTINGS, EVALUATION, POLICY = "settings.yaml", "evaluation.json", "policy.onnx"
+GREATEST_SEED = 2**32 - 1
+"""That numpy's shared generator takes, from which Stable-Baselines3 draws."""
 Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]
 """As `train`: of settings, seed, folder, whom to tell, and whether it was begun before."""
 
@@ -111,8 +114,9 @@ def export(settings: TrainingSettings, result: SeedResult, command: str, path: P
 
 
 def _check(seeds: Sequence[int], out: Path, resumed: bool) -> None:
-    if len(set(seeds)) < len(seeds) or min(seeds, default=-1) < 0:
-        raise ConfigError(f"seeds {list(seeds)}: give one or more, none twice, none negative.")
+    checked_seeds(seeds, GREATEST_SEED)
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise ConfigError(f"seeds {list(seeds)}: give one or more, none twice.")
     begun = any((out / f"seed_{seed}" / CHECKPOINT).is_file() for seed in seeds)
     if begun and not resumed:
         raise ConfigError(

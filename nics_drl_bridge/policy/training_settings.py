@@ -5,13 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml, share_folder, validate
 
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
-Count = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=1, le=10**12)]
+MOST_WORLDS = 65_536
+"""Copies of all worlds together."""
+MOST_LAYERS, MOST_WIDE = 16, 8_192
+MOST_KEPT = 2**26
+"""Transitions that are kept at once: of a rollout in all worlds, or of SAC's buffer."""
 Algorithm = Literal["ppo", "sac"]
+
+
+Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
 
 
 class PpoSettings(Schema):
@@ -87,8 +95,8 @@ class TrainingSettings(Schema):
     steps: Count = 1_000_000
     max_episode_steps: Count = 300
     algorithm: Algorithm = "ppo"
-    hidden: tuple[Count, ...] = Field(default=(64, 64), min_length=1)
-    threads: Count = 1
+    hidden: tuple[Width, ...] = Field(default=(64, 64), min_length=1, max_length=MOST_LAYERS)
+    threads: Annotated[int, Field(ge=1, le=1024)] = 1
     checkpoint_every: Count = 200_000
     ppo: PpoSettings = PpoSettings()
     sac: SacSettings = SacSettings()
@@ -99,6 +107,18 @@ class TrainingSettings(Schema):
         if taken := sorted({"robot", "lidar"} & set(options)):
             raise ValueError(f"task_options can't hold {taken[0]!r}, which the model gives")
         return options
+
+    @model_validator(mode="after")
+    def _holdable(self) -> TrainingSettings:
+        if self.num_envs > MOST_WORLDS:
+            raise ValueError(f"all worlds together may have {MOST_WORLDS} copies")
+        kept = self.num_envs * self.ppo.rollout if self.algorithm == "ppo" else self.sac.buffer
+        if kept > MOST_KEPT:
+            raise ValueError(
+                f"{self.algorithm} would keep {kept} transitions, and may keep {MOST_KEPT}; lower "
+                "the copies of worlds, ppo.rollout or sac.buffer"
+            )
+        return self
 
     @property
     def title(self) -> str:

@@ -8,10 +8,10 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from nics_drl_bridge.config import read_text
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import ConfigError, shortened
 from nics_drl_bridge.files import sha256, write_parts
 from nics_drl_bridge.safety.gate import decide
 from nics_drl_bridge.safety.inputs import Input
@@ -20,6 +20,13 @@ from nics_drl_bridge.safety.state import Decision, GateConfig, GateState
 
 FORMAT = "nics_drl_bridge/black_box/2"
 KEPT_S = 30.0
+LATEST_S = 1e12
+MOST_BYTES = 64 * 2**20
+"""Of a file that is replayed."""
+MOST_VALUES = 1_000_000
+"""In such a file; 30 s of a gate have some 100,000."""
+MOST_INPUTS = 20_000
+"""That are decided on anew; each takes some 30 us."""
 
 
 @dataclass(frozen=True)
@@ -132,22 +139,49 @@ def replay(path: str | Path) -> Replay:
         config, state = from_plain(head["config"]), from_plain(head["state"])
         given = [(line["now"], from_plain(line["given"]), line["decision"]) for line in lines]
         recorded = [from_plain(decision) for *_, decision in given]
-    except (KeyError, TypeError, ValueError) as error:
-        raise ConfigError(f"{path}: is damaged ({error}); it can't be replayed.") from None
+        _check_kinds(config, state, given, recorded)
+    except (KeyError, RecursionError, TypeError, ValueError) as error:
+        raise _damaged(path, error) from None
     entries, differing = [], []
     for index, ((now, event, plain), decision) in enumerate(zip(given, recorded, strict=True)):
         entries.append(Entry(now, event, state, decision))
-        state, anew = decide(config, state, event, now)
+        try:
+            state, anew = decide(config, state, event, now)
+        except Exception as error:  # noqa: BLE001 - false records break the rules in any way
+            raise _damaged(path, error) from None
         if json.dumps(to_plain(anew)) != json.dumps(plain):
             differing.append(index)
     return Replay(tuple(entries), tuple(differing))
 
 
+def _damaged(path: str | Path, error: Exception) -> ConfigError:
+    reason = shortened(f"{error}", 120)
+    return ConfigError(f"{path}: is damaged ({reason}); it can't be replayed.")
+
+
+def _check_kinds(config: Any, state: Any, given: list[Any], recorded: list[Any]) -> None:
+    """Raises TypeError or ValueError unless everything read is what stands in a black box."""
+    if len(given) > MOST_INPUTS:
+        raise ValueError(f"{len(given)} inputs, where at most {MOST_INPUTS} are replayed")
+    kinds = ((config, GateConfig), (state, GateState), *((one, Decision) for one in recorded))
+    for value, kind in kinds:
+        if not isinstance(value, kind):
+            raise TypeError(f"a {type(value).__name__} stands for a {kind.__name__}")
+    for now, event, _ in given:
+        if not (isinstance(now, float | int) and abs(now) < LATEST_S):
+            raise ValueError("the time of an input is no time")
+        if not isinstance(event, get_args(Input)):
+            raise TypeError(f"a {type(event).__name__} is no input")
+
+
 def _lines(path: str | Path) -> list[dict[str, Any]]:
-    text = read_text(path)
+    text = read_text(path, MOST_BYTES)
+    values = sum(map(text.count, ",[{"))
+    if values > MOST_VALUES:
+        raise ConfigError(f"{path}: holds {values} values, no black box more than {MOST_VALUES}.")
     try:
         lines = [json.loads(line) for line in text.splitlines()]
-    except (json.JSONDecodeError, RecursionError):
+    except (ValueError, RecursionError):
         raise ConfigError(f"{path}: is no JSON, line by line; it can't be replayed.") from None
     if not lines or not isinstance(lines[0], dict) or lines[0].get("format") != FORMAT:
         raise ConfigError(f"{path}: is no black box of the gate ({FORMAT}).")

@@ -13,6 +13,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.lidar.maps_grid import GridMap
+from nics_drl_bridge.lidar.shapes import Coordinate
 from nics_drl_bridge.sim import motion_layout as at
 from nics_drl_bridge.sim.motion_layout import MARK, PLAN
 
@@ -26,6 +27,8 @@ Plans = tuple[Array, Array]
 Distances = tuple[NDArray[np.float32], Array]
 FASTEST = 10.0
 """Greatest speed of an obstacle [m/s]; beyond it a control period would be too coarse."""
+STRONGEST = 1e3
+"""Greatest of the parameters of the social force model, each in its unit."""
 NO_DISTANCES: Distances = (np.full((1, 1), np.inf, np.float32), np.array([0.0, 0.0, 1.0, 0.0, 1.0]))
 """What the kernels take where there is no static map."""
 
@@ -63,10 +66,10 @@ class Patrol(Schema):
     """
 
     kind: Literal["patrol"] = "patrol"
-    waypoints: tuple[tuple[float, float], ...] = Field(min_length=2, max_length=1000)
+    waypoints: tuple[tuple[Coordinate, Coordinate], ...] = Field(min_length=2, max_length=1000)
     speed: float = Field(gt=0.0, le=FASTEST)
     loop: bool = True
-    pause: float = Field(default=0.0, ge=0.0)
+    pause: float = Field(default=0.0, ge=0.0, le=1e6)
 
     @model_validator(mode="after")
     def _apart(self) -> Patrol:
@@ -102,14 +105,14 @@ class Pedestrian(Schema):
     kind: Literal["pedestrian"] = "pedestrian"
     speed: Speed = (1.08, 1.6)
     relaxation: float = Field(default=0.5, ge=0.1, le=10.0)
-    repulsion: float = Field(default=2.1, ge=0.0)
-    range: float = Field(default=0.3, gt=0.0)
-    wall_repulsion: float = Field(default=10.0, ge=0.0)
-    wall_range: float = Field(default=0.2, gt=0.0)
-    foresight: float = Field(default=1.0, ge=0.0)
+    repulsion: float = Field(default=2.1, ge=0.0, le=STRONGEST)
+    range: float = Field(default=0.3, ge=1e-3, le=STRONGEST)
+    wall_repulsion: float = Field(default=10.0, ge=0.0, le=STRONGEST)
+    wall_range: float = Field(default=0.2, ge=1e-3, le=STRONGEST)
+    foresight: float = Field(default=1.0, ge=0.0, le=STRONGEST)
     view: float = Field(default=math.radians(200.0), ge=0.0, le=2.0 * math.pi)
     behind: float = Field(default=0.5, ge=0.0, le=1.0)
-    fluctuation: float = Field(default=0.1, ge=0.0)
+    fluctuation: float = Field(default=0.1, ge=0.0, le=STRONGEST)
 
 
 Motion = Annotated[Wander | Patrol | Pedestrian, Field(discriminator="kind")]

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.config import find_config, load_yaml
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import fault_kernels
+from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim import randomisation_bounds as bounds
 from nics_drl_bridge.sim import randomisation_kernels as kernels
 from nics_drl_bridge.sim.randomisation_ranges import Randomisation
@@ -123,7 +124,7 @@ class Sampler:
 
     def draw(self, seeds: ArrayLike) -> Draws:
         """What the episodes of some seeds (n,) get."""
-        chosen = np.asarray(seeds, dtype=np.int64)
+        chosen = checked_seeds(seeds)
         shape = (len(chosen), self._robots)
         coefficient = np.empty((*shape, len(self._coefficient[0])))
         noise = np.empty((*shape, len(self._noise[0])))

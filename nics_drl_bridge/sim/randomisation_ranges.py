@@ -17,6 +17,10 @@ LIDAR_CHOICES = ("skew", "too_close")
 """Faults of which one of some words is drawn; of the others, a number."""
 
 
+GREATEST_FACTOR = 1e3
+GREATEST_LEVEL = 1e6
+
+
 def _ordered(span: tuple[float, float]) -> tuple[float, float]:
     if span[0] > span[1]:
         raise ValueError("a range is [least, greatest]")
@@ -24,14 +28,17 @@ def _ordered(span: tuple[float, float]) -> tuple[float, float]:
 
 
 def _not_negative(span: tuple[float, float]) -> tuple[float, float]:
-    if span[0] < 0.0:
-        raise ValueError("a range must not begin below 0")
+    if not 0.0 <= span[0] <= span[1] <= GREATEST_LEVEL:
+        raise ValueError(f"a range must not begin below 0 or end above {GREATEST_LEVEL:g}")
     return span
 
 
 def _positive(span: tuple[float, float]) -> tuple[float, float]:
-    if span[0] <= 0.0:
-        raise ValueError("a range of factors must begin above 0")
+    if not 1.0 / GREATEST_FACTOR <= span[0] <= span[1] <= GREATEST_FACTOR:
+        raise ValueError(
+            f"a range of factors must begin above 0, at {1.0 / GREATEST_FACTOR:g} or more, and end "
+            f"at {GREATEST_FACTOR:g} or less"
+        )
     return span
 
 

@@ -10,9 +10,22 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import ValidationError
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.lidar.shapes import BODY, Circle, Outlines, Polygon, Rectangle, Segment, Shape
+from nics_drl_bridge.lidar.shapes import (
+    BODY,
+    LARGEST,
+    SMALLEST,
+    Circle,
+    Outlines,
+    Polygon,
+    Rectangle,
+    Segment,
+    Shape,
+    describe,
+)
+from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim import scene_kernels as kernels
 from nics_drl_bridge.sim.areas import Areas, areas_of
 from nics_drl_bridge.sim.motion import Motion
@@ -22,7 +35,6 @@ __all__ = ["Scene", "SceneSampler", "Scenes", "sample_scene", "scaled"]
 
 Array = NDArray[np.float64]
 Search = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
-GREATEST_SEED = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -137,7 +149,7 @@ class SceneSampler:
         Raises:
             ConfigError: a seed is out of range, or the world has no room for a scene.
         """
-        numbers = _seeds(seeds)
+        numbers = checked_seeds(seeds)
         n = len(numbers)
         wanted = np.full(n, -1) if count is None else np.maximum(np.asarray(count), 0)
         sizes = np.zeros(n, np.int64) if size is None else np.asarray(size, dtype=np.int64)
@@ -210,6 +222,16 @@ def scaled(shape: Shape, factor: float) -> Shape:
     """A shape, larger by a factor."""
     if factor == 1.0:
         return shape
+    try:
+        return _scaled(shape, factor)
+    except ValidationError:
+        raise ConfigError(
+            f"the {describe(shape)}, {factor:g} times as large, is beyond {SMALLEST:g} m to "
+            f"{LARGEST:g} m; narrow the factors of its size."
+        ) from None
+
+
+def _scaled(shape: Shape, factor: float) -> Shape:
     if isinstance(shape, Circle):
         return Circle(radius=shape.radius * factor)
     if isinstance(shape, Rectangle):
@@ -238,13 +260,6 @@ def _with_room(world: World, most: int) -> World:
             count = group.counts[0], math.ceil(share * most)
             groups[g] = group.model_copy(update={"count": count})
     return world.model_copy(update={"obstacles": tuple(groups)})
-
-
-def _seeds(seeds: ArrayLike) -> NDArray[np.int64]:
-    for seed in np.atleast_1d(np.asarray(seeds, dtype=object)):
-        if not (isinstance(seed, int | np.integer) and 0 <= seed <= GREATEST_SEED):
-            raise ConfigError(f"seed {seed}: must be a whole number from 0 to {GREATEST_SEED}.")
-    return np.atleast_1d(np.asarray(seeds, dtype=np.int64))
 
 
 def _rules(world: World, footprint: float, areas: Areas) -> tuple[float, ...]:

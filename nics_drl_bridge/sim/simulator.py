@@ -28,6 +28,22 @@ __all__ = ["SLICES", "FastSimulator", "OutsideValidityWarning", "Worlds"]
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 R = TypeVar("R")
+MOST_ROBOTS = 1_000
+"""Of one world; every one is held against every other."""
+MOST_NUMBERS = 2**30
+"""That all worlds together may hold, some GB: beams of robots, states of obstacles."""
+PER_BODY = 64
+
+
+def _check_memory(model: SimulatorModel, world: World, worlds: int, robots: int) -> None:
+    """Raises ConfigError for more copies of a world than fit, before any of them is made."""
+    obstacles = sum(group.counts[1] for group in world.obstacles)
+    each = robots * (model.lidar.beams + PER_BODY) + obstacles * PER_BODY
+    if robots > MOST_ROBOTS or worlds * each > MOST_NUMBERS:
+        raise ConfigError(
+            f"{worlds:.10g} copies of {world.source} with {robots:.10g} robots: a world may have "
+            f"{MOST_ROBOTS} robots, and {max(1, MOST_NUMBERS // each)} copies of it are the most."
+        )
 
 
 class FastSimulator:
@@ -75,6 +91,7 @@ class FastSimulator:
             raise ConfigError(
                 f"a simulator needs at least 1 world and 1 robot, not {worlds} and {robots}."
             )
+        _check_memory(model, world, worlds, robots)
         if isinstance(randomisation, str):
             randomisation = load_randomisation(randomisation)
         self.model, self.world = model, world

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +16,21 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.lidar.maps import load_map
 from nics_drl_bridge.lidar.maps_grid import GridMap
-from nics_drl_bridge.lidar.shapes import Shape
+from nics_drl_bridge.lidar.shapes import LARGEST, MOST_SHAPES, Coordinate, Heading, Shape
 from nics_drl_bridge.sim.motion import Motion, Patrol
 from nics_drl_bridge.sim.space_kernels import wall_distance
 
 Array = NDArray[np.float64]
-Pose = tuple[float, float, float]
-Region = tuple[float, float, float, float]
 MOST_OBSTACLES = 10_000
+MOST_WALLS = 10_000
+MOST_PLACES = 10_000
+SMALLEST_FIELD = 0.01
+"""Side of a field [m]."""
+Distance = Annotated[float, Field(ge=0.0, le=LARGEST)]
+Side = Annotated[float, Field(ge=SMALLEST_FIELD, le=LARGEST)]
+Pose = tuple[Coordinate, Coordinate, Heading]
+Point = tuple[Coordinate, Coordinate]
+Region = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
 
 class Obstacles(Schema):
@@ -36,9 +44,9 @@ class Obstacles(Schema):
         motion: how they move, see `sim.motion`; by default not at all.
     """
 
-    shapes: tuple[Shape, ...] = Field(min_length=1)
+    shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_SHAPES)
     count: int | tuple[int, int] | None = None
-    gap: float = Field(default=0.0, ge=0.0)
+    gap: Distance = 0.0
     at: tuple[Pose, ...] = ()
     motion: Motion | None = None
 
@@ -77,8 +85,8 @@ class Starts(Schema):
         at: x, y [m], heading [rad].
     """
 
-    regions: tuple[Region, ...] = ()
-    at: tuple[Pose, ...] = ()
+    regions: tuple[Region, ...] = Field(default=(), max_length=MOST_PLACES)
+    at: tuple[Pose, ...] = Field(default=(), max_length=MOST_PLACES)
 
     @model_validator(mode="after")
     def _one(self) -> Starts:
@@ -94,8 +102,8 @@ class Goals(Schema):
         at: x, y [m].
     """
 
-    regions: tuple[Region, ...] = ()
-    at: tuple[tuple[float, float], ...] = ()
+    regions: tuple[Region, ...] = Field(default=(), max_length=MOST_PLACES)
+    at: tuple[Point, ...] = Field(default=(), max_length=MOST_PLACES)
 
     @model_validator(mode="after")
     def _one(self) -> Goals:
@@ -125,12 +133,12 @@ class World(Schema):
     """
 
     name: str
-    size: tuple[float, float] | None = None
-    walls: tuple[Region, ...] = ()
+    size: tuple[Side, Side] | None = None
+    walls: tuple[Region, ...] = Field(default=(), max_length=MOST_WALLS)
     map: str | None = None
     obstacles: tuple[Obstacles, ...] = ()
-    clearance: float = Field(default=0.3, ge=0.0)
-    goal_distance: tuple[float, float]
+    clearance: Distance = 0.3
+    goal_distance: tuple[Distance, Distance]
     starts: Starts | None = None
     goals: Goals | None = None
     _file: str | None = PrivateAttr(default=None)
@@ -139,8 +147,6 @@ class World(Schema):
     def _consistent(self) -> World:
         if self.size is None and self.map is None:
             raise ValueError("a world needs a `size`, a `map`, or both")
-        if self.size is not None and min(self.size) <= 0.0:
-            raise ValueError("size must be greater than 0")
         if not 0.0 <= self.goal_distance[0] < self.goal_distance[1]:
             raise ValueError("goal_distance must be [least, greatest] in metres")
         if sum(group.counts[1] for group in self.obstacles) > MOST_OBSTACLES:

@@ -227,3 +227,46 @@ def test_a_bag_without_messages_is_refused(tmp_path, storage):
 def test_a_bag_of_ros_1_comes_with_the_way_to_convert_it(tmp_path):
     (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\n")
     assert "rosbags-convert" in refused(tmp_path / "drive.bag")
+
+
+def renamed(told, k, name):
+    told["topics_with_message_count"][k]["topic_metadata"]["name"] = name
+
+
+@pytest.mark.parametrize("name", [None, "", 7])
+@pytest.mark.parametrize("k", [0, 1])
+def test_a_summary_that_lost_the_name_of_a_topic_is_refused(bag, k, name):
+    with metadata(bag) as told:
+        renamed(told, k, name)
+    assert "lost the name of a topic" in refused(bag)
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_topic_that_only_the_summary_or_only_the_file_has_is_refused(tmp_path, storage):
+    """Also one that the drive is not read from."""
+    topics = bags.drive() | {"/extra": [(0.0, bags.twist(0.0, 0.0, 0.0))]}
+    bag = bags.write(tmp_path / "bag", topics, storage)
+    with metadata(bag) as told:
+        names = [one["topic_metadata"]["name"] for one in told["topics_with_message_count"]]
+        renamed(told, names.index("/extra"), "/other")
+    assert "topic '/extra' of type" in refused(bag)
+
+
+def test_messages_that_the_summary_gives_to_another_topic_are_refused(bag):
+    with metadata(bag) as told:
+        one, other = told["topics_with_message_count"][:2]
+        one["message_count"] -= 3
+        other["message_count"] += 3
+    assert "messages in its files" in refused(bag)
+
+
+BOMB = "k0: &k0 {x: 1}\n" + "".join(
+    f"k{i}: &k{i} {{<<: [{', '.join([f'*k{i - 1}'] * 9)}]}}\n" for i in range(1, 9)
+)
+
+
+@pytest.mark.parametrize("text", [BOMB, "a: !!python/name:os.system x\n", "a: !!timestamp x\n"])
+def test_a_summary_that_grows_or_wants_objects_made_is_refused(bag, text):
+    file = bag / "metadata.yaml"
+    file.write_text(file.read_text(encoding="utf-8") + text, encoding="utf-8")
+    assert "can't be read as a bag" in refused(bag)

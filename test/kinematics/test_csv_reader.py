@@ -144,3 +144,31 @@ def test_the_reader_is_chosen_by_what_lies_there(folder, tmp_path):
 def test_a_path_that_holds_no_recording_is_refused(folder, name, sentence):
     with pytest.raises(RecordingError, match=sentence):
         read_recording(folder / name)
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        ("1" * 2_000_000, "row 3 has 2000000 characters"),
+        ("0.5," * 500_000, "row 3 has 2000000 characters"),
+        ("9" * 900 + ",0,0", "row 3 holds NaN or inf"),
+        ("x" * 900 + ",0,0", "which is no number"),
+    ],
+)
+def test_a_row_of_very_many_characters_is_refused_and_not_told(tmp_path, row, words):
+    (tmp_path / "cmd.csv").write_text(f"0,0,0\n0,0,1\n{row}\n")
+    (tmp_path / "vrpn.csv").write_text("0,0,0,0,0,0,1,0\n")
+    with pytest.raises(RecordingError, match=words) as told:
+        load_csv_folder(tmp_path)
+    assert len(str(told.value)) < 400
+
+
+def test_more_rows_or_bytes_than_any_drive_has_are_refused(tmp_path):
+    (tmp_path / "cmd.csv").write_text("1,1,1\n" * 600_000)
+    (tmp_path / "vrpn.csv").write_text("0,0,0,0,0,0,1,0\n")
+    with pytest.raises(RecordingError, match="has 600001 rows"):
+        load_csv_folder(tmp_path)
+    with (tmp_path / "cmd.csv").open("wb") as file:
+        file.truncate(2**33)
+    with pytest.raises(RecordingError, match="larger than 64 MB"):
+        load_csv_folder(tmp_path)

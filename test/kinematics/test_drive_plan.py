@@ -32,7 +32,7 @@ def test_a_circle_in_which_a_car_can_not_turn_is_refused(bound):
         ({"duration": 5.0}, "duration 5: must be from 20 to 3600"),
         ({"speed": 0.0}, "speed 0: must be from 0.05 to 1"),
         ({"speed": 1.5}, "speed 1.5: must be from"),
-        ({"seed": -1}, "seed -1: must be 0 or more"),
+        ({"seed": -1}, "seed -1: must be a whole number from 0"),
     ],
 )
 def test_a_value_out_of_range_is_named_with_its_range(changes, sentence):

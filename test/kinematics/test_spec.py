@@ -59,7 +59,7 @@ def test_fields_that_a_robot_has_no_use_for_are_dropped():
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"footprint_radius": 0.0}, "greater than 0"),
+        ({"footprint_radius": 0.0}, "greater than or equal to 0.001"),
         ({"command": []}, "at least 1 item"),
         ({"state": data()["command"][:1]}, "unknown key 'state.0.cmd_vel'"),
         ({"state": [{"name": "push", "unit": "m", "min": 0, "max": 1}]}, "a name of its own"),

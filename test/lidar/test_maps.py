@@ -138,7 +138,7 @@ def test_the_shipped_map_is_one_closed_room_with_doors():
     [
         ({"drop": ["negate"]}, "map.yaml: the key 'negate' is missing; add it"),
         ({"resolutoin": 1}, "map.yaml: unknown key 'resolutoin'; did you mean 'resolution'?"),
-        ({"resolution": 0}, "key 'resolution': input should be greater than 0"),
+        ({"resolution": 0}, "key 'resolution': input should be greater than or equal to 0.0001"),
         ({"origin": [0, 0]}, "key 'origin"),
         ({"mode": "trinery"}, "key 'mode': unknown mode; did you mean 'trinary'?"),
         ({"free_thresh": 0.7}, "free_thresh must be less than occupied_thresh"),

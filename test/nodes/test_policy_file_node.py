@@ -203,3 +203,42 @@ def test_inferences_that_are_late_every_time_command_zero(launch, meet, domain_i
     robot = Robot(meet(domain_id))
     assert robot.hears(scan_of(model.lidar.angles)).tolist() == [0.0, 0.0, 0.0]
     assert all(conversions.twist_from_ros(raw.twist).tolist() == [0.0] * 3 for raw in robot.raw)
+
+
+FAILS_LATER = """
+import os
+import onnxruntime
+from onnxruntime.capi.onnxruntime_pybind11_state import Fail
+run = onnxruntime.InferenceSession.run
+def run_or_fail(self, *given):
+    if os.path.exists(os.environ["FAIL_FROM_NOW_ON"]):
+        raise Fail("a shape\\ndoes not fit")
+    return run(self, *given)
+onnxruntime.InferenceSession.run = run_or_fail
+"""
+
+
+def test_a_policy_that_fails_when_it_runs_leaves_a_zero_and_ends_with_a_sentence(
+    launch, meet, domain_id, file, tmp_path
+):
+    (tmp_path / "sitecustomize.py").write_text(FAILS_LATER, encoding="utf-8")
+    paths = [str(tmp_path), os.environ.get("PYTHONPATH", "")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
+        patch.setenv("FAIL_FROM_NOW_ON", str(tmp_path / "now"))
+        node = launch("policy_node", domain_id, policy=str(file), goal=GOAL, deadline=5.0)
+    robot = Robot(meet(domain_id))
+    assert np.abs(robot.hears(scan_of(around(720)))).max() > 0.0
+    (tmp_path / "now").touch()
+
+    def ended():
+        robot.says(scan_of(around(720)))
+        return node._process.poll() is not None
+
+    robot.peer.until(ended, "the end of policy_node")
+    still = TwistStamped().twist
+    robot.peer.until(lambda: robot.raw[-1].twist == still, "a zero command")
+    sentence = node.log.read_text(encoding="utf-8").splitlines()[-1]
+    assert sentence.startswith(f"{file}: field 'graph': onnxruntime can't run it (")
+    assert "Traceback" not in node.log.read_text(encoding="utf-8")
+    assert node.close() == 2

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import zipfile
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from nics_drl_bridge.files import sealed
 from nics_drl_bridge.policy import train as training
 from nics_drl_bridge.policy.train import CHECKPOINT, evaluate, train
 from nics_drl_bridge.policy.train_checkpoint import FORMAT, read_checkpoint
+from nics_drl_bridge.policy.train_run import TrainOrder, run
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
 MODEL, WORLD = direct_model(odometry=(0.02, 0.02)), field(count=2)
@@ -130,3 +132,43 @@ def test_sac_is_refused_for_discrete_actions_and_a_batch_that_no_rollout_fills(t
         train(settings("sac", task_options={"actions": "discrete"}), 0, tmp_path)
     with pytest.raises(ConfigError, match=r"ppo\.batch 999: is more than the 128 transitions"):
         train(settings(ppo={"rollout": 16, "batch": 999}), 0, tmp_path)
+
+
+BAD_CONTENTS = {
+    "a tensor": torch.zeros(3),
+    "a list": [FORMAT],
+    "one number a million times": {
+        "format": FORMAT,
+        "about": "{}",
+        "x": torch.zeros(1).expand(2**40),
+    },
+    "deep words": {"format": FORMAT, "about": "[" * 100_000},
+}
+
+
+@pytest.mark.parametrize("name", BAD_CONTENTS)
+def test_a_checkpoint_that_holds_something_else_is_refused(tmp_path, name):
+    content = io.BytesIO()
+    torch.save(BAD_CONTENTS[name], content)
+    path = tmp_path / CHECKPOINT
+    path.write_bytes(sealed(content.getvalue()))
+    with pytest.raises(ConfigError, match="is no checkpoint"):
+        read_checkpoint(path)
+
+
+def test_a_packed_checkpoint_is_refused_unread(tmp_path):
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", bytes(100_000_000))
+    path = tmp_path / CHECKPOINT
+    path.write_bytes(sealed(content.getvalue()))
+    with pytest.raises(ConfigError, match="is no checkpoint"):
+        read_checkpoint(path)
+
+
+@pytest.mark.parametrize("seed", [2**32, 2**63, 10**30, -1])
+def test_a_seed_that_the_generators_do_not_take_is_refused(tmp_path, seed):
+    order = TrainOrder(settings(steps=128), [0, seed], tmp_path / "run", 1, False, "test")
+    with pytest.raises(ConfigError, match="must be a whole number from 0 to 4294967295"):
+        run(order)
+    assert not (tmp_path / "run").exists()

@@ -2,10 +2,14 @@ from __future__ import annotations
 
 import pytest
 
-from nics_drl_bridge.config import share_folder
+from nics_drl_bridge.config import share_folder, validate
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.policy.training_settings import chosen_settings, load_training
+from nics_drl_bridge.policy.training_settings import (
+    TrainingSettings,
+    chosen_settings,
+    load_training,
+)
 
 SHIPPED = sorted(path.stem for path in (share_folder() / "config" / "training").glob("*.yaml"))
 
@@ -55,3 +59,21 @@ def test_wrong_settings_are_refused_with_the_key(tmp_path, text, sentence):
         load_training(str(file))
     with pytest.raises(ConfigError, match="unknown training 'navigation_mecanun'; did you mean"):
         load_training("navigation_mecanun")
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"worlds": {"circles": 10**9}}, "65536 copies"),
+        ({"worlds": {"circles": 60_000, "arena": 60_000}}, "65536 copies"),
+        ({"hidden": [10**9]}, "hidden.0"),
+        ({"hidden": [8] * 1000}, "hidden"),
+        ({"threads": 10**9}, "threads"),
+        ({"ppo": {"rollout": 10**9}}, "transitions"),
+        ({"algorithm": "sac", "sac": {"buffer": 10**11}}, "transitions"),
+        ({"steps": 10**400}, "steps"),
+    ],
+)
+def test_settings_that_no_machine_could_hold_are_refused(changes, key):
+    with pytest.raises(ConfigError, match=key):
+        validate(changes, TrainingSettings, "settings.yaml")

@@ -114,3 +114,57 @@ def test_a_file_that_is_no_black_box_is_one_sentence(tmp_path, text, sentence):
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=sentence):
         replay(path)
+
+
+def sealed(lines) -> str:
+    text = "".join(line if isinstance(line, str) else json.dumps(line) + "\n" for line in lines)
+    return text + json.dumps({"sha256": hashlib.sha256(text.encode()).hexdigest()}) + "\n"
+
+
+def huge(**changes):
+    return {"kind": "array", "type": "<f8", "shape": [10**15], "data": ""} | changes
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"given": huge()},
+        {"given": huge(type="|O", shape=[1], data="AAAAAAAAAAA=")},
+        {"given": huge(type=f"<U{2**29}")},
+        {"given": {"kind": "Limits"}},
+        {"given": 3},
+        {"given": None},
+        {"now": "x"},
+        {"now": None},
+        {"now": 1e308},
+        {"decision": {"kind": "EStop", "pressed": True}},
+        {"decision": []},
+        {},
+    ],
+    ids=str,
+)
+def test_a_record_that_is_none_of_the_gate_is_one_sentence(tmp_path, change):
+    """Its checksum is right: whoever writes the file can write that too."""
+    path = tmp_path / "stop.jsonl"
+    stopped(path)
+    head, *lines = [json.loads(line) for line in path.read_text().splitlines()[:-1]]
+    if change:
+        lines[1] |= change
+    else:
+        head["config"] = head["state"]
+    path.write_text(sealed([head, *lines]))
+    with pytest.raises(ConfigError, match="can't be replayed") as told:
+        replay(path)
+    assert len(str(told.value)) < 400
+
+
+def test_very_many_records_or_brackets_are_refused_at_once(tmp_path):
+    path = tmp_path / "stop.jsonl"
+    for text, words in (("[" * 3_000_000, "holds 3000000 values"), ("[" * 5000, "no JSON")):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=words):
+            replay(path)
+    with path.open("wb") as file:
+        file.truncate(2**33)
+    with pytest.raises(ConfigError, match="is larger than 64 MB"):
+        replay(path)

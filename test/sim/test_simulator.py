@@ -285,3 +285,9 @@ def test_goals_are_those_of_the_scene():
 def test_a_simulator_of_nothing_is_refused(worlds, robots):
     with pytest.raises(ConfigError, match="at least 1 world and 1 robot"):
         FastSimulator(direct_model(), field(), worlds, robots)
+
+
+@pytest.mark.parametrize(("worlds", "robots"), [(10**9, 1), (1, 10**9), (10**6, 500)])
+def test_more_copies_or_robots_than_fit_are_refused_before_any_is_made(worlds, robots):
+    with pytest.raises(ConfigError, match="copies of it are the most"):
+        FastSimulator(direct_model(), field(), worlds, robots)

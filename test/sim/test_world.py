@@ -100,7 +100,7 @@ def test_an_unknown_key_is_named_with_the_file_and_the_nearest_key(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"size": [0.0, 3.0]}, "size must be greater than 0"),
+        ({"size": [0.0, 3.0]}, "key 'size.0': input should be greater than or equal to 0.01"),
         ({"size": None}, "needs a `size`, a `map`, or both"),
         ({"goal_distance": [3.0, 1.0]}, "goal_distance must be"),
         ({"obstacles": [circles(1, (0.0,))]}, "key 'obstacles.0.shapes.0.circle.radius'"),
@@ -171,5 +171,41 @@ def test_a_waypoint_within_the_solid_of_a_map_is_refused(own_world):
 
 def test_what_concerns_several_keys_is_said_without_the_whole_file():
     with pytest.raises(ConfigError) as caught:
-        validate(field().model_dump(mode="json") | {"size": [-1.0, 3.0]}, World, "world.yaml")
-    assert str(caught.value) == "world.yaml: size must be greater than 0."
+        validate(field().model_dump(mode="json") | {"goal_distance": [3, 1]}, World, "world.yaml")
+    assert str(caught.value) == "world.yaml: goal_distance must be [least, greatest] in metres."
+
+
+def world_with(**changes):
+    return {"name": "w", "size": [6.0, 6.0], "goal_distance": [1.0, 4.0]} | changes
+
+
+def copies(**keys):
+    return [{"shapes": [CIRCLE], **keys}]
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"obstacles": copies(count=10**9)}, "obstacles.0"),
+        ({"obstacles": copies(count=[0, 10**18])}, "obstacles.0"),
+        ({"obstacles": copies(count=9000) * 2}, "all groups"),
+        ({"obstacles": copies(count=1, gap=1e300)}, "gap"),
+        ({"size": [1e300, 1e-3]}, "size"),
+        ({"size": [1e12, 1e12]}, "size"),
+        ({"size": [1e-320, 1e-320]}, "size"),
+        ({"walls": [[0.0, 0.0, 1.0, 1.0]] * 20_000}, "walls"),
+        ({"walls": [[0.0, 0.0, 1e300, 1.0]]}, "walls.0.2"),
+        ({"clearance": 1e300}, "clearance"),
+        ({"goal_distance": [1.0, 1e308]}, "goal_distance.1"),
+        ({"starts": {"regions": [[1e300] * 4]}}, "starts.regions.0.0"),
+        ({"goals": {"at": [[0.0, 0.0]] * 20_000}}, "goals.at"),
+        ({"obstacles": [{"count": 1, "shapes": [CIRCLE | {"radius": 1e308}]}]}, "radius"),
+        ({"obstacles": [{"count": 1, "shapes": [CIRCLE | {"radius": 1e-320}]}]}, "radius"),
+        ({"obstacles": [{"count": 1, "shapes": [CIRCLE] * 2000}]}, "shapes"),
+    ],
+)
+def test_what_no_world_has_is_refused_before_anything_of_it_is_made(changes, key):
+    with pytest.raises(ConfigError) as told:
+        validate(world_with(**changes), World, "w.yaml")
+    assert key in str(told.value)
+    assert len(str(told.value)) < 400

@@ -1,0 +1,153 @@
+"""One input handed to one entry point, in a process of its own: what came of it, at what cost."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import resource
+import select
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+OWN_TIME_S = 2.0
+MOST_MEMORY = 500 * 2**20
+LONGEST_S = 60.0
+"""An answer that takes longer than this is a hang, however little of it is its own time."""
+LONGEST_SENTENCE = 1000
+ROOM = 4 * 2**30
+"""Address space that a process may take besides what it has, so that the machine survives."""
+EXIT_BAD_INPUT = 2
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What is handed to whom.
+
+    Attributes:
+        kind: of input, as `policy`.
+        told: what is wrong with it, in words that reproduce it.
+        act: hands it over; raises what the entry point raises.
+        verdict: `bad` if it has to be refused, `good` if it has to be taken, `any` if either is
+            right as long as it is one of the two.
+    """
+
+    kind: str
+    told: str
+    act: Callable[[], object]
+    verdict: str = "bad"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of an attempt.
+
+    Attributes:
+        end: `accepted`, `refused`, `traceback`, or `hang`.
+        words: of the refusal or the traceback.
+        own_s: processor time that it took [s].
+        memory: that it took at its peak, beyond what the libraries had taken [bytes].
+    """
+
+    end: str
+    words: str
+    own_s: float
+    memory: int
+
+
+def made(attempt: Attempt) -> Outcome:
+    """Makes an attempt in a forked process, which is killed when it takes too long."""
+    reading, writing = os.pipe()
+    begin = time.monotonic()
+    child = os.fork()
+    if child == 0:
+        os.close(reading)
+        _answer(attempt, writing)
+    os.close(writing)
+    data = b""
+    with os.fdopen(reading, "rb", buffering=0) as pipe:
+        while (left := begin + LONGEST_S - time.monotonic()) > 0.0:
+            if not select.select([pipe], [], [], left)[0]:
+                break
+            part = pipe.read(2**16)
+            if not part:
+                break
+            data += part
+    os.kill(child, signal.SIGKILL)
+    _, status, used = os.wait4(child, 0)
+    own_s = used.ru_utime + used.ru_stime
+    if not data:
+        waited = time.monotonic() - begin
+        end = "hang" if waited >= LONGEST_S else "traceback"
+        return Outcome(end, f"no answer after {waited:.1f} s, status {status}", own_s, 0)
+    end, words, memory = pickle.loads(data)
+    return Outcome("hang" if own_s > OWN_TIME_S else end, words, own_s, memory)
+
+
+def _answer(attempt: Attempt, writing: int) -> None:
+    """In a process of its own, which it ends."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        size = pages * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (size + ROOM, size + ROOM))
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        end, words = _end_of(attempt.act)
+        after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        os.write(writing, pickle.dumps((end, words[:3000], (after - before) * 1024)))
+    finally:
+        os._exit(0)
+
+
+def _end_of(act: Callable[[], object]) -> tuple[str, str]:
+    from nics_drl_bridge.errors import BridgeError
+
+    try:
+        act()
+    except BridgeError as error:
+        return _judged(str(error))
+    except BaseException:  # noqa: BLE001 - these are what is counted
+        return "traceback", traceback.format_exc()[-1500:]
+    return "accepted", ""
+
+
+def _judged(sentence: str) -> tuple[str, str]:
+    if "\n" in sentence or not 0 < len(sentence) <= LONGEST_SENTENCE:
+        return "traceback", f"no sentence, but {len(sentence)} characters: {sentence[:300]!r}"
+    return "refused", sentence
+
+
+def nics(*words: object) -> Callable[[], None]:
+    """An act: a command of `nics`. Raises BridgeError where it ends with its sentence."""
+
+    def act() -> None:
+        from nics_drl_bridge.cli import main
+        from nics_drl_bridge.errors import BridgeError
+
+        with tempfile.TemporaryFile("w+", errors="replace") as said:
+            os.dup2(said.fileno(), 1)
+            os.dup2(said.fileno(), 2)
+            sys.argv = ["nics", *map(str, words)]
+            code: object = 0
+            try:
+                main()
+            except SystemExit as end:
+                code = end.code
+            sys.stdout.flush()
+            sys.stderr.flush()
+            said.seek(0)
+            text = said.read()
+        if code == EXIT_BAD_INPUT:
+            raise BridgeError(text.rstrip("\n")) if _is_sentence(text) else ValueError(text[:2000])
+        if code not in (0, None, 1):
+            raise ValueError(f"exit code {code}: {text[:2000]}")
+
+    return act
+
+
+def _is_sentence(text: str) -> bool:
+    return text.startswith("nics: ") and text.count("\n") == 1 and len(text) <= LONGEST_SENTENCE

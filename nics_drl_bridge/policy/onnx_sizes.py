@@ -1,0 +1,156 @@
+"""How much memory and work a policy's graph takes, before anything of it runs.
+
+Shapes are those of onnx's strict inference, on a copy without weights; the counting is done here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import onnx
+
+from nics_drl_bridge.errors import PolicyError
+
+MOST_NUMBERS = 1_000_000
+"""That all nodes together may give for one observation."""
+MOST_WORK = 20_000_000
+"""Multiplications, or numbers read and written, for one observation."""
+MOST_AT_ONCE = 64 * MOST_NUMBERS
+"""Numbers that all nodes together may give in one run, so at most 256 MB of float32."""
+ROWS = 16
+"""Observations for which the sizes are told, as many as there are golden ones."""
+SMALL = 1024
+"""Whole numbers of an array that may be a shape, an axis or an index; larger ones are no such."""
+GREATEST_SETTING = 65_536
+"""Of a kernel's size, stride, padding or dilation."""
+Shape = tuple[int, ...]
+Cost = tuple[int, int]
+
+
+def rows_at_once(model: Any, source: str) -> int:
+    """Observations that a graph may be given in one run.
+
+    Args:
+        model: the ModelProto, whose operators are known ones.
+        source: the file's name.
+
+    Raises:
+        PolicyError: a size can't be told, or is more than any policy needs.
+    """
+    _check_settings(model.graph, source)
+    numbers, work = _costs(model, ROWS, source)
+    if max(numbers / MOST_NUMBERS, work / MOST_WORK) > ROWS:
+        reason = (
+            f"needs {numbers / ROWS:.3g} numbers and {work / ROWS:.3g} multiplications for an "
+            f"observation, where a policy has {MOST_NUMBERS:.0e} and {MOST_WORK:.0e}; not run."
+        )
+        raise PolicyError(source, "graph", reason)
+    more_numbers, more_work = _costs(model, 2 * ROWS, source)
+    if more_numbers > 2 * numbers or more_work > 2 * work:
+        reason = "grows faster than the number of its observations; not run."
+        raise PolicyError(source, "graph", reason)
+    return max(1, ROWS * MOST_AT_ONCE // max(numbers, 1))
+
+
+def _check_settings(graph: Any, source: str) -> None:
+    for node in graph.node:
+        for attribute in node.attribute:
+            wide = any(abs(n) > GREATEST_SETTING for n in attribute.ints)
+            if wide and node.op_type != "Slice":
+                reason = f"of {node.op_type} is beyond {GREATEST_SETTING}; not run."
+                raise PolicyError(source, f"graph.node.{attribute.name}", reason)
+
+
+def _costs(model: Any, rows: int, source: str) -> Cost:
+    """Numbers that all nodes give, and work, for so many observations."""
+    shapes = _shapes(model, rows, source)
+    numbers = work = 0
+    for node in model.graph.node:
+        given, made = _known(node.input, shapes), _known(node.output, shapes)
+        if given is None or made is None:
+            reason = f"the size of what {node.op_type} gives can't be told before it runs."
+            raise PolicyError(source, "graph.node", reason)
+        more = _buffer(node, given, made)
+        numbers += sum(map(math.prod, made)) + more
+        work += _work(node, given, made) + more
+    return numbers, work
+
+
+def _known(names: Any, shapes: Mapping[str, Shape]) -> list[Shape] | None:
+    """Shapes of the tensors of a node, but those left out; None when one is not known."""
+    found = [shapes.get(name) for name in names if name]
+    return None if None in found else [shape for shape in found if shape is not None]
+
+
+def _work(node: Any, given: list[Shape], made: list[Shape]) -> int:
+    """Multiplications of a node, or numbers that it reads and writes."""
+    moved = sum(map(math.prod, (*given, *made)))
+    settings = {attribute.name: attribute for attribute in node.attribute}
+    if node.op_type in ("MatMul", "Gemm"):
+        turned = node.op_type == "Gemm" and "transA" in settings and settings["transA"].i
+        return moved + math.prod(made[0]) * (given[0][0] if turned else given[0][-1])
+    if node.op_type == "Conv":
+        return moved + math.prod(made[0]) * math.prod(given[1][1:])
+    if "kernel_shape" in settings:  # of a pool
+        return moved + math.prod(made[0]) * int(math.prod(settings["kernel_shape"].ints))
+    return moved
+
+
+def _buffer(node: Any, given: list[Shape], made: list[Shape]) -> int:
+    """Numbers that the runtime lays out for a convolution besides what it gives."""
+    if node.op_type != "Conv":
+        return 0
+    groups = int(next((a.i for a in node.attribute if a.name == "group"), 1))
+    return int(math.prod(made[0][2:]) * math.prod(given[1][1:]) * max(groups, 1))
+
+
+def _shapes(model: Any, rows: int, source: str) -> dict[str, Shape]:
+    """The shape of every tensor, for so many observations; one that is not known is missing."""
+    bare = _without_weights(model, rows)
+    try:
+        told = onnx.shape_inference.infer_shapes(bare, strict_mode=True, data_prop=True).graph
+    except Exception as error:  # noqa: BLE001 - it raises what it likes at a damaged graph
+        words = " ".join(str(error).split())[:120]
+        raise PolicyError(source, "graph", f"its shapes do not fit ({words}).") from None
+    shapes = {tensor.name: tuple(tensor.dims) for tensor in told.initializer}
+    for value in (*told.input, *told.value_info, *told.output):
+        dims = value.type.tensor_type.shape.dim
+        if value.type.tensor_type.HasField("shape") and all(d.HasField("dim_value") for d in dims):
+            shapes[value.name] = tuple(d.dim_value for d in dims)
+    return {name: shape for name, shape in shapes.items() if all(size >= 0 for size in shape)}
+
+
+def _without_weights(model: Any, rows: int) -> Any:
+    """The graph for so many observations, with weights and constants as inputs of their shape."""
+    bare = onnx.ModelProto(ir_version=model.ir_version, opset_import=model.opset_import)
+    graph = bare.graph
+    graph.name = "sizes"
+    for tensor in model.graph.initializer:
+        _add_tensor(graph, tensor, tensor.name)
+    for node in model.graph.node:
+        tensor = next((a.t for a in node.attribute if a.name == "value"), None)
+        if node.op_type == "Constant" and tensor is not None and len(node.output) == 1:
+            _add_tensor(graph, tensor, node.output[0])
+        else:
+            graph.node.append(node)
+    held = {tensor.name for tensor in model.graph.initializer}
+    for value in (one for one in model.graph.input if one.name not in held):
+        graph.input.append(value)
+        graph.input[-1].type.tensor_type.shape.dim[0].dim_value = rows
+    for value in model.graph.output:  # whose shapes are to come out, not to be believed
+        kind = value.type.tensor_type.elem_type
+        graph.output.append(onnx.helper.make_tensor_value_info(value.name, kind, None))
+    return bare
+
+
+def _add_tensor(graph: Any, tensor: Any, name: str) -> None:
+    """Adds a small array of whole numbers, which may be a shape; of another the shape alone."""
+    small = math.prod(tensor.dims) <= SMALL
+    if small and tensor.data_type in (onnx.TensorProto.INT64, onnx.TensorProto.INT32):
+        graph.initializer.append(tensor)
+        graph.initializer[-1].name = name
+        return
+    info = onnx.helper.make_tensor_value_info(name, tensor.data_type, list(tensor.dims))
+    graph.input.append(info)

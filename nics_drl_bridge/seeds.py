@@ -1,0 +1,43 @@
+"""Seeds, as they are taken everywhere: whole numbers that fit into 64 bits."""
+
+from __future__ import annotations
+
+import reprlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nics_drl_bridge.errors import ConfigError
+
+GREATEST_SEED = 2**63 - 1
+_SHORT = reprlib.Repr()
+_SHORT.maxlong = _SHORT.maxstring = _SHORT.maxother = 40
+
+
+def checked_seeds(seeds: ArrayLike | Any, greatest: int = GREATEST_SEED) -> NDArray[np.int64]:
+    """Seeds (n,), as the kernels take them.
+
+    Args:
+        seeds: one, or several.
+        greatest: that whoever takes them can take.
+
+    Raises:
+        ConfigError: one is negative, too large, or no whole number.
+    """
+    if isinstance(seeds, np.ndarray) and seeds.dtype == np.int64 and greatest == GREATEST_SEED:
+        numbers = np.atleast_1d(seeds)
+        if not (numbers < 0).any():
+            return numbers
+    given = np.atleast_1d(np.asarray(seeds, dtype=object)).ravel()
+    for seed in given:
+        whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
+        if not (whole and 0 <= seed <= greatest):
+            told = _SHORT.repr(seed) if _is_told(seed) else "of very many digits"
+            raise ConfigError(f"seed {told}: must be a whole number from 0 to {greatest}.")
+    return np.asarray([int(seed) for seed in given], dtype=np.int64)
+
+
+def _is_told(seed: object) -> bool:
+    """Whether a number is short enough to be written in decimals at all."""
+    return not isinstance(seed, int) or seed.bit_length() < 1000

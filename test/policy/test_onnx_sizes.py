@@ -1,0 +1,199 @@
+"""Policies whose graph takes more memory or time than any policy needs: never run."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import onnx
+import pytest
+
+from nics_drl_bridge.errors import PolicyError
+from nics_drl_bridge.policy import onnx_graph, onnx_sizes, policy_file
+from nics_drl_bridge.policy.policy_file import load_policy
+from policy.policy_rig import SECTORS, bytes_of, contract_in, export, signed, with_contract
+
+make_node, from_array = onnx.helper.make_node, onnx.numpy_helper.from_array
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("policies") / "go.onnx"
+    export(path)
+    return path
+
+
+def add(proto, *nodes, **arrays):
+    """Puts nodes in front of a graph's own, with weights by name."""
+    graph = proto.graph
+    graph.initializer.extend(from_array(value, name) for name, value in arrays.items())
+    own = list(graph.node)
+    del graph.node[:]
+    graph.node.extend([*nodes, *own])
+    return bytes_of(signed(proto))
+
+
+def concats(proto):
+    """Each node gives twice what the one before it gave."""
+    names = ["observation", *(f"c{k}" for k in range(22))]
+    return add(proto, *(
+        make_node("Concat", [a, a], [b], axis=1)
+        for a, b in itertools.pairwise(names)
+    ))  # fmt: skip
+
+
+def outer(proto):
+    """As many numbers as the square of the observations."""
+    turned = make_node("Transpose", ["observation"], ["turned"], perm=[1, 0])
+    return add(proto, turned, make_node("MatMul", ["observation", "turned"], ["square"]))
+
+
+def heavy(proto):
+    """Little memory, but one large array multiplied by again and again."""
+    whole, names = np.zeros((2048, 2048), np.float32), [f"h{k}" for k in range(9)]
+    first = make_node("MatMul", ["observation", "begin"], ["h0"])
+    return add(proto, first, *(
+        make_node("MatMul", [a, "whole"], [b]) for a, b in itertools.pairwise(names)
+    ), begin=np.zeros((SECTORS + 6, 2048), np.float32), whole=whole)  # fmt: skip
+
+
+def broadcast(proto):
+    """Two thin arrays that make a wide one, before any observation is seen."""
+    thin = np.zeros((60_000, 1), np.float32)
+    return add(proto, make_node("Add", ["thin", "turned"], ["wide"]), thin=thin, turned=thin.T)
+
+
+def by_value(proto):
+    """A size that only the observation tells."""
+    return add(
+        proto,
+        make_node("Cast", ["observation"], ["whole"], to=onnx.TensorProto.INT64),
+        make_node("Slice", ["whole", "zero", "one", "one"], ["first"]),
+        make_node("Slice", ["observation", "zero", "one", "one"], ["row"]),
+        make_node("Reshape", ["first", "flat"], ["sizes"]),
+        make_node("Slice", ["row", "sizes", "sizes"], ["cut"]),
+        zero=np.array([0]), one=np.array([1]), flat=np.array([-1]),
+    )  # fmt: skip
+
+
+def padded(proto):
+    pool = make_node("MaxPool", ["row"], ["wide"], kernel_shape=[2**40], pads=[2**39, 2**39])
+    row = make_node("Unsqueeze", ["observation", "one"], ["row"])
+    return add(proto, row, pool, one=np.array([1]))
+
+
+def mismatched(proto):
+    proto.graph.initializer.append(from_array(np.zeros((3, 5), np.float32), "wrong"))
+    return add(proto, make_node("MatMul", ["observation", "wrong"], ["never"]))
+
+
+def sparse(proto):
+    made = make_node("Constant", [], ["dense"])
+    values = from_array(np.ones(1, np.float32), "v")
+    index = from_array(np.zeros(1, np.int64), "i")
+    value = onnx.helper.make_sparse_tensor(values, index, [2**31])
+    made.attribute.append(onnx.helper.make_attribute("sparse_value", value))
+    return add(proto, made)
+
+
+REFUSED = {
+    "concatenations": (concats, "graph", "numbers"),
+    "a square": (outer, "graph", "grows faster"),
+    "work": (heavy, "graph", "multiplications"),
+    "broadcasting": (broadcast, "graph", "numbers"),
+    "sizes by value": (by_value, "graph.node", "can't be told"),
+    "a huge kernel": (padded, "graph.node.kernel_shape", "beyond"),
+    "shapes that do not fit": (mismatched, "graph", "do not fit"),
+    "sparse weights": (sparse, "graph.node", "sparse"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_graph_that_grows_is_refused_before_the_runtime_sees_it(
+    file, tmp_path, monkeypatch, name
+):
+    spoil, field, words = REFUSED[name]
+    path = tmp_path / "grows.onnx"
+    path.write_bytes(spoil(onnx.load(file)))
+    monkeypatch.setattr(policy_file, "open_session", lambda *_: pytest.fail("it was opened"))
+    with pytest.raises(PolicyError, match=words) as refused:
+        load_policy(path)
+    assert refused.value.field == field
+    assert "\n" not in str(refused.value)
+
+
+def test_a_graph_of_very_many_operators_is_refused(file, tmp_path):
+    names = [f"n{k}" for k in range(onnx_graph.MOST_NODES + 1)]
+    nodes = [make_node("Identity", ["observation"], [name]) for name in names]
+    path = tmp_path / "many.onnx"
+    path.write_bytes(add(onnx.load(file), *nodes))
+    with pytest.raises(PolicyError, match=r"has 10\d\d operators"):
+        load_policy(path)
+
+
+def test_what_fails_only_when_it_runs_is_a_policy_error(file, tmp_path):
+    """An index that depends on the observation: right for the golden ones, wrong for others."""
+    proto = onnx.load(file)
+    for node in proto.graph.node:
+        for k, name in enumerate(node.input):
+            if name == "observation":
+                node.input[k] = "chosen"
+    data = add(
+        proto,
+        make_node("Slice", ["observation", "from_", "to_", "axis"], ["goal"]),
+        make_node("Cast", ["goal"], ["index"], to=onnx.TensorProto.INT64),
+        make_node("Gather", ["table", "index"], ["offset"]),
+        make_node("Add", ["observation", "offset"], ["chosen"]),
+        from_=np.array([SECTORS]), to_=np.array([SECTORS + 1]), axis=np.array([1]),
+        table=np.zeros(8, np.float32),
+    )  # fmt: skip
+    path = tmp_path / "index.onnx"
+    path.write_bytes(data)
+    policy = load_policy(path)
+    far = np.full(SECTORS + 6, 1e6, np.float32)
+    with pytest.raises(PolicyError, match="onnxruntime can't run it") as failed:
+        policy.act(far)
+    assert failed.value.field == "graph"
+
+
+def test_more_observations_than_fit_at_once_are_run_in_parts(file, monkeypatch):
+    whole = load_policy(file)
+    monkeypatch.setattr(onnx_sizes, "MOST_AT_ONCE", 3 * 30)
+    policy = load_policy(file)
+    rows = np.random.default_rng(0).uniform(0.0, 1.0, (10, SECTORS + 6)).astype(np.float32)
+    assert policy._rows_at_once < len(rows)
+    assert policy.act(rows) == pytest.approx(whole.act(rows), abs=1e-6)
+    assert policy.act(rows[:0]).shape == (0, 3)
+
+
+@pytest.mark.parametrize("entry", ["format", "robot", "actions"])
+def test_megabytes_in_a_field_are_not_told(file, tmp_path, entry):
+    proto = onnx.load(file)
+    data = contract_in(proto)
+    data[entry] = "x" * 2_000_000
+    path = tmp_path / "long.onnx"
+    path.write_bytes(bytes_of(signed(proto, data)))
+    with pytest.raises(PolicyError) as refused:
+        load_policy(path)
+    assert len(str(refused.value)) < 400 + len(str(path))
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 3_000_000, '{"a":[' + "[]," * 500_000 + "0]}", '"' + "x" * (5 * 2**20) + '"']
+)
+def test_a_contract_of_very_many_entries_or_characters_is_not_read(file, tmp_path, text):
+    path = tmp_path / "large.onnx"
+    path.write_bytes(bytes_of(with_contract(onnx.load(file), text)))
+    with pytest.raises(PolicyError, match="at most") as refused:
+        load_policy(path)
+    assert refused.value.field == "metadata"
+
+
+def test_a_long_name_is_not_told_whole(file, tmp_path):
+    proto = onnx.load(file)
+    proto.graph.output[0].name = "y" * 1_000_000
+    path = tmp_path / "name.onnx"
+    path.write_bytes(bytes_of(proto))
+    with pytest.raises(PolicyError) as refused:
+        load_policy(path)
+    assert len(str(refused.value)) < 600 + len(str(path))

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import direct_model
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.evaluate import Order, seeds_of
+from nics_drl_bridge.kinematics.drive_plan import DrivePlan
+from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.seeds import GREATEST_SEED, checked_seeds
+from nics_drl_bridge.sim.scenes import sample_scene
+from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world import load_world
+
+BAD = (2**63, 2**64, -1, -(2**63), 10**30, 10**5000, 1.5, "word", None, True, float("nan"))
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    return FastSimulator(direct_model(), load_world("empty"), 1, randomisation="mild")
+
+
+TAKERS = {
+    "alone": lambda seed, _: checked_seeds(seed),
+    "in a list": lambda seed, _: checked_seeds([0, seed]),
+    "scene": lambda seed, _: sample_scene(load_world("arena"), 0.2, seed),
+    "simulator": lambda seed, simulator: simulator.reset([seed]),
+    "drive": lambda seed, _: DrivePlan(load_robot("differential"), seed=seed),
+}
+
+
+@pytest.mark.parametrize("taker", TAKERS)
+@pytest.mark.parametrize("seed", BAD, ids=lambda seed: "huge" if seed == 10**5000 else str(seed))
+def test_what_is_no_seed_is_one_sentence(simulator, taker, seed):
+    with pytest.raises(ConfigError, match="must be a whole number from 0 to 9223372036854775807"):
+        TAKERS[taker](seed, simulator)
+
+
+@pytest.mark.parametrize("seed", [0, GREATEST_SEED, np.int64(3), np.uint64(7)])
+def test_every_seed_of_63_bits_is_taken(simulator, seed):
+    assert checked_seeds(seed).tolist() == [int(seed)]
+    simulator.reset([seed])
+
+
+def test_the_last_seed_of_an_evaluation_counts_too():
+    with pytest.raises(ConfigError, match="seed 9223372036854775808"):
+        seeds_of(Order(["straight"], None, None, "arena", 2, GREATEST_SEED))
+
+
+def test_a_seed_is_told_shortly():
+    with pytest.raises(ConfigError) as told:
+        checked_seeds("x" * 10_000)
+    assert len(str(told.value)) < 150
