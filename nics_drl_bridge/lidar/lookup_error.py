@@ -1,4 +1,4 @@
-"""How far a look-up is off for one shape: what the renderer `auto` decides by."""
+"""At which distances a shape may be looked up: what the renderer `auto` decides by."""
 
 from __future__ import annotations
 
@@ -11,21 +11,28 @@ from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.shapes import place
 
 Array = NDArray[np.float64]
-PLACES, SEED = 512, 0
+RINGS, PLACES, BANDS, SEED = 13, 256, 8, 0
+"""Rings around the lidar that a shape is put into, times in each, and bands of range that the
+errors are sorted into: both grow by the same factor from one to the next."""
+TOUCHING = 1e-3
+"""The nearest ring ends this far from the shape's circle, in parts of the lidar's range."""
 NO_WALLS = np.zeros((0, 4))
 
 
-def lookup_error(
+def lookup_distances(
     exact: tuple[Any, ...],
     baked: tuple[Any, ...],
     room: tuple[NDArray[Any], ...],
     shape: int,
     radius: float,
-) -> float:
-    """RMSE of the ranges to a shape, over the beams that return when looked up and in truth.
+    greatest: float,
+) -> tuple[float, float]:
+    """The distances between which looking a shape up has an RMSE of no more than `greatest`.
 
-    Silhouettes are no part of it: they are exact. The shape stands at places that are spread
-    evenly over what the lidar sees, the same for all.
+    That is so in each ring of distances between them, and in each band of ranges over all of these
+    rings: long thin shapes err where they are near and seen at a slant, and what is far where a beam
+    grazes it, which an error over all the lidar's range hides. Only beams count that return when looked up and in truth: which beams hit
+    follows from the silhouette, and is exact. Where the shape stands is the same for all shapes.
 
     Args:
         exact: `Scanner.arguments` of that renderer.
@@ -33,25 +40,50 @@ def lookup_error(
         room: see `scanner.Scanner.room`.
         shape: its index in the table.
         radius: of the shape [m].
+        greatest: RMSE [m].
 
     Returns:
-        The error [m]; NaN where no beam returns.
+        Least and greatest distance from the lidar to the shape's origin [m]; the least is inf if it
+        may not be looked up.
     """
-    mount, directions, beams, limits = exact[:4]
+    mount, directions, beams, (low, high) = exact[:4]
+    rings = np.concatenate([[0.0], np.geomspace(TOUCHING * high, high, RINGS)]) + radius
     robots = np.tile([-mount[0], -mount[1], 0.0], (PLACES, 1, 1))  # the lidar is at the origin
-    bodies = _around(mount[2] + beams[0], beams[1] * beams[3], limits[1], shape, radius)
     scans = np.empty((2, PLACES, 1, len(directions)), np.float32)
-    for ranges, sensor in zip(scans, (exact, baked), strict=True):
-        worlds = np.arange(PLACES)
-        scan_kernels.scan_worlds(ranges, robots, worlds, bodies, -1, NO_WALLS, sensor, room)
-    one, other = scans[:, np.isfinite(scans).all(axis=0)].astype(np.float64)
-    return float(np.sqrt(np.mean(np.square(one - other)))) if one.size else float("nan")
+    edges = np.geomspace(max(low, TOUCHING * high), high, BANDS + 1)[1:-1]
+    squares, counts = np.zeros((2, RINGS, BANDS))
+    for i in range(RINGS):
+        begin, view = mount[2] + beams[0], beams[1] * beams[3]
+        bodies = _around(begin, view, rings[i : i + 2], shape, radius, SEED + i)
+        for ranges, sensor in zip(scans, (exact, baked), strict=True):
+            worlds = np.arange(PLACES)
+            scan_kernels.scan_worlds(ranges, robots, worlds, bodies, -1, NO_WALLS, sensor, room)
+        one, other = scans[:, np.isfinite(scans).all(axis=0)].astype(np.float64)
+        band = np.searchsorted(edges, one)
+        squares[i] = np.bincount(band, np.square(one - other), BANDS)
+        counts[i] = np.bincount(band, minlength=BANDS)
+    return _widest(rings, squares, counts, greatest)
 
 
-def _around(begin: float, view: float, range_max: float, shape: int, radius: float) -> Array:
-    """(PLACES, 1, 7) a body anywhere in a view that begins at an angle and is so wide [rad]."""
-    rng = np.random.default_rng(SEED)
-    distance = np.sqrt(rng.uniform(radius**2, (range_max + radius) ** 2, PLACES))
+def _widest(rings: Array, squares: Array, counts: Array, greatest: float) -> tuple[float, float]:
+    """The edges of the widest stretch of rings in which all errors are small."""
+    best = (np.inf, np.inf)
+    width = 0.0
+    for i in range(RINGS):
+        for j in range(i + 1, RINGS + 1):
+            sums = [(squares[i:j].sum(axis=k), counts[i:j].sum(axis=k)) for k in (0, 1)]
+            good = all((square <= greatest**2 * count).all() for square, count in sums)
+            if good and rings[j] - rings[i] > width:
+                best, width = (float(rings[i]), float(rings[j])), rings[j] - rings[i]
+    return best
+
+
+def _around(
+    begin: float, view: float, between: Array, shape: int, radius: float, seed: int
+) -> Array:
+    """(PLACES, 1, 7) a body at distances within a view that begins at an angle and is so wide."""
+    rng = np.random.default_rng(seed)
+    distance = rng.uniform(*between, PLACES)
     bearing, heading = begin + rng.uniform(0.0, view, PLACES), rng.uniform(-np.pi, np.pi, PLACES)
     poses = np.stack([distance * np.cos(bearing), distance * np.sin(bearing), heading], axis=1)
     return place(poses[:, None], radius, shape)
