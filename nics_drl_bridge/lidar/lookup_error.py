@@ -16,6 +16,9 @@ RINGS, PLACES, BANDS, SEED = 13, 256, 8, 0
 errors are sorted into: both grow by the same factor from one to the next."""
 TOUCHING = 1e-3
 """The nearest ring ends this far from the shape's circle, in parts of the lidar's range."""
+DEVIATIONS = 2.0
+"""A squared error may be so many of its standard deviations greater than what was found: rare beams
+make most of it."""
 NO_WALLS = np.zeros((0, 4))
 
 
@@ -51,31 +54,50 @@ def lookup_distances(
     robots = np.tile([-mount[0], -mount[1], 0.0], (PLACES, 1, 1))  # the lidar is at the origin
     scans = np.empty((2, PLACES, 1, len(directions)), np.float32)
     edges = np.geomspace(max(low, TOUCHING * high), high, BANDS + 1)[1:-1]
-    squares, counts = np.zeros((2, RINGS, BANDS))
+    squares, counts = np.zeros((2, RINGS, PLACES, BANDS))
     for i in range(RINGS):
         begin, view = mount[2] + beams[0], beams[1] * beams[3]
         bodies = _around(begin, view, rings[i : i + 2], shape, radius, SEED + i)
         for ranges, sensor in zip(scans, (exact, baked), strict=True):
             worlds = np.arange(PLACES)
             scan_kernels.scan_worlds(ranges, robots, worlds, bodies, -1, NO_WALLS, sensor, room)
-        one, other = scans[:, np.isfinite(scans).all(axis=0)].astype(np.float64)
-        band = np.searchsorted(edges, one)
-        squares[i] = np.bincount(band, np.square(one - other), BANDS)
-        counts[i] = np.bincount(band, minlength=BANDS)
+        both = np.isfinite(scans).all(axis=0)
+        one, other = scans[:, both].astype(np.float64)
+        cell = np.nonzero(both)[0] * BANDS + np.searchsorted(edges, one)
+        square = np.bincount(cell, np.square(one - other), PLACES * BANDS)
+        squares[i] = square.reshape(PLACES, BANDS)
+        counts[i] = np.bincount(cell, minlength=PLACES * BANDS).reshape(PLACES, BANDS)
     return _widest(rings, squares, counts, greatest)
 
 
 def _widest(rings: Array, squares: Array, counts: Array, greatest: float) -> tuple[float, float]:
     """The edges of the widest stretch of rings in which all errors are small."""
-    best = (np.inf, np.inf)
-    width = 0.0
+    best, width = (np.inf, np.inf), 0.0
     for i in range(RINGS):
         for j in range(i + 1, RINGS + 1):
-            sums = [(squares[i:j].sum(axis=k), counts[i:j].sum(axis=k)) for k in (0, 1)]
-            good = all((square <= greatest**2 * count).all() for square, count in sums)
-            if good and rings[j] - rings[i] > width:
+            wider = rings[j] - rings[i] > width
+            if wider and _small(squares[i:j], counts[i:j], greatest):
                 best, width = (float(rings[i]), float(rings[j])), rings[j] - rings[i]
     return best
+
+
+def _small(squares: Array, counts: Array, greatest: float) -> bool:
+    """Whether an RMSE is small in each ring and in each band, beyond what chance has in it.
+
+    Args:
+        squares: (R, P, B) sums of squared errors of R rings, P places in each and B bands.
+        counts: (R, P, B) of how many beams.
+        greatest: RMSE.
+    """
+    rings = squares.sum(axis=2), counts.sum(axis=2)
+    bands = squares.reshape(-1, BANDS).T, counts.reshape(-1, BANDS).T
+    for square, count in (rings, bands):
+        total = np.maximum(count.sum(axis=1), 1.0)
+        mean = square.sum(axis=1) / total
+        spread = np.sqrt(np.square(square - mean[:, None] * count).sum(axis=1)) / total
+        if (mean + DEVIATIONS * spread > greatest**2).any():
+            return False
+    return True
 
 
 def _around(

@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 NO_WALLS = np.zeros((0, 4))
 GREATEST_ERROR = 0.01
 """A shape is looked up by `auto` from the distance on where its ranges have no greater RMSE [m]."""
-SURE = 0.8
-"""Part of it that may be found among random places, so that others stay below it."""
+_MEASURED: dict[tuple[Any, ...], tuple[float, float]] = {}
+"""What `lookup_distances` found, by all that it depends on."""
 WIDEST_BEAMS = 0.2
 """Beams farther apart than this are scanned exactly by `auto`: there are few, and a row of so few
 points says little [rad]."""
@@ -115,12 +115,15 @@ class Scanner:
         return np.square(between)
 
     def _lookup_distances(self, shape: int) -> tuple[float, float]:
-        """Of one shape [m], see `lookup_distances`; found in a moment, and the same every time."""
-        exact, baked = (replace(self, renderer=way, grid=None) for way in ("exact", "baked"))
-        radius, room = float(self.table.outlines.radii[shape]), self.room(1)
-        return lookup_distances(
-            exact.arguments, baked.arguments, room, shape, radius, SURE * GREATEST_ERROR
-        )
+        """Of one shape [m], see `lookup_distances`; measured once per process."""
+        radius, table = float(self.table.outlines.radii[shape]), self.table
+        key = (self.spec, table.shapes[shape], table.density, float(table.grid[shape, 0]))
+        if key not in _MEASURED:
+            exact, baked = (replace(self, renderer=way, grid=None) for way in ("exact", "baked"))
+            _MEASURED[key] = lookup_distances(
+                exact.arguments, baked.arguments, self.room(1), shape, radius, GREATEST_ERROR
+            )
+        return _MEASURED[key]
 
     def room(self, bodies: int) -> Room:
         """Scratch that one thread needs to scan a world, of however many bodies.
