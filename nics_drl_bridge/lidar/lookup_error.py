@@ -32,10 +32,11 @@ def lookup_distances(
 ) -> tuple[float, float]:
     """The distances between which looking a shape up has an RMSE of no more than `greatest`.
 
-    That is so in each ring of distances between them, and in each band of ranges over all of these
-    rings: long thin shapes err where they are near and seen at a slant, and what is far where a beam
-    grazes it, which an error over all the lidar's range hides. Only beams count that return when looked up and in truth: which beams hit
-    follows from the silhouette, and is exact. Where the shape stands is the same for all shapes.
+    That is so in each ring of distances between them, and in each band of ranges over all these
+    rings: long thin shapes err where they are near and seen at a slant, and what is far errs where
+    a beam grazes it, which an error over all the lidar's range hides. Only beams count that return
+    when looked up and in truth: which beams hit follows from the silhouette, and is exact. Where
+    the shape stands is the same for all shapes.
 
     Args:
         exact: `Scanner.arguments` of that renderer.
@@ -105,7 +106,7 @@ def _around(
 ) -> Array:
     """(PLACES, 1, 7) a body at distances within a view that begins at an angle and is so wide."""
     rng = np.random.default_rng(seed)
-    distance = rng.uniform(*between, PLACES)
+    distance = rng.uniform(between[0], between[1], PLACES)
     bearing, heading = begin + rng.uniform(0.0, view, PLACES), rng.uniform(-np.pi, np.pi, PLACES)
     poses = np.stack([distance * np.cos(bearing), distance * np.sin(bearing), heading], axis=1)
     return place(poses[:, None], radius, shape)

@@ -46,8 +46,8 @@ class Scanner:
         renderer: `baked` looks every shape up; `exact` computes every ray; `auto` looks up but for
             shapes larger than the range, in whose circle the lidar nearly always is, for what errs
             by more than `GREATEST_ERROR` (any shape that is very near; long thin ones and deep
-            notches farther away, or anywhere), and for beams wider than `WIDEST_BEAMS`. Straight walls and a body in whose circle the lidar is are computed in
-            all.
+            notches farther away, or anywhere), and for beams wider than `WIDEST_BEAMS`. Straight
+            walls and a body in whose circle the lidar is are computed in all.
         grid: a static map that stands in every world, if any.
     """
 
@@ -112,7 +112,7 @@ class Scanner:
         elif self.renderer == "auto" and self.spec.angle_increment <= WIDEST_BEAMS:
             for h in np.flatnonzero(radii < self.spec.range_max):
                 between[h] = self._lookup_distances(int(h))
-        return np.square(between)
+        return np.asarray(np.square(between))
 
     def _lookup_distances(self, shape: int) -> tuple[float, float]:
         """Of one shape [m], see `lookup_distances`; measured once per process."""

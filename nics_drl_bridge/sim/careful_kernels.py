@@ -1,8 +1,8 @@
 """Compiled motion of the robots of one world where it is tight: up to what they touch.
 
 All bodies move at the same time. At the first touch whoever came nearer stops: a robot until the
-substep is over, an obstacle until the period is. Then the next touch is looked for. Shapes are those
-of `kernels`; `flights`, `events` and `scene` those of `impact_kernels`.
+substep is over, an obstacle until the period is. Then the next touch is looked for. Shapes are
+those of `kernels`; `flights`, `events` and `scene` those of `impact_kernels`.
 """
 
 from __future__ import annotations
@@ -183,8 +183,8 @@ def move_carefully(  # type: ignore[no-untyped-def]
     """Moves robots of one world for one period, up to what they touch.
 
     A robot that touches something is marked and stops there for the rest of the substep, and so in
-    the next ones as long as it would come nearer; it may leave. One that is in something already gets
-    no deeper. A free one moves exactly as by `robot_kernels.move_freely`.
+    the next ones as long as it would come nearer; it may leave. One that is in something already
+    gets no deeper. A free one moves exactly as by `robot_kernels.move_freely`.
 
     Args:
         n: which world.

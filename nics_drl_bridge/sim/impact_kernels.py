@@ -142,7 +142,7 @@ def _next_stop(b, time, until, flights):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
-def touch(a, edge, round_a, b, other, round_b, begin, until, world, flights, first, series):  # type: ignore[no-untyped-def]  # fmt: skip  # noqa: E501
+def touch(a, edge, round_a, b, other, round_b, begin, until, world, flights, first, series):  # type: ignore[no-untyped-def]  # fmt: skip
     """When an edge of one body first touches an edge of another.
 
     Args:

@@ -97,9 +97,9 @@ def require_sane_speed(model: TaylorModel, robot: RobotSpec, extent: tuple[float
     least = min(extent[2] - extent[0], extent[3] - extent[1])
     if not step < least:
         raise ConfigError(
-            f"the robot {robot.name!r} could drive {step:.3g} m in a step of {model.dt:g} s, across "
-            f"a world of {least:.3g} m; lower the limits of its commands, or generate its model "
-            "with a shorter step."
+            f"the robot {robot.name!r} could drive {step:.3g} m in a step of {model.dt:g} s, "
+            f"across a world of {least:.3g} m; lower the limits of its commands, or generate its "
+            "model with a shorter step."
         )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -85,7 +87,7 @@ def test_auto_is_right_within_a_centimetre_in_every_band_for_every_shape(name):
             looked_up += (np.abs(error) > 1e-4).any()
             by_place = np.repeat(gap[:, None], spec.beams, axis=1)
             for which in (true, by_place):
-                for low, high in zip(BANDS[:-1], BANDS[1:], strict=True):
+                for low, high in itertools.pairwise(BANDS):
                     chosen = both & (which >= low) & (which < high)
                     if chosen.sum() >= FEWEST:
                         rmse = float(np.sqrt(np.mean(error[chosen] ** 2)))

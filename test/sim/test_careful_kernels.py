@@ -271,7 +271,7 @@ def test_robots_that_run_into_each_other_stop_there_and_are_marked():
     number, rng = 200, np.random.default_rng(9)
     simulator = FastSimulator(fast_model(0.03), field(10.0), number, 2, tell=silent)
     starts = np.zeros((number, 2, 3))
-    starts[:, 1, :2] = rng.uniform(-0.05, 0.05, (number, 2)) + [0.0, 0.2]
+    starts[:, 1, :2] = rng.uniform(-0.05, 0.05, (number, 2)) + np.array([0.0, 0.2])
     twists = rng.uniform(-1.0, 1.0, (number, 2, 3)) * [FASTEST, FASTEST, TURNS]
     simulator.reset(range(number), starts=starts)
     simulator.step(twists)

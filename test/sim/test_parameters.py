@@ -19,6 +19,8 @@ from nics_drl_bridge.sim.world import World
 
 ORIGIN = np.zeros((1, 1, 3))
 SUBSTEPS, PERIOD = 10, 0.1
+OVERLAP = 1e-6
+"""So deep may a robot be in what it touches [m]."""
 
 
 def random_commands(worlds, steps, robots=1, seed=0):
