@@ -117,7 +117,10 @@ class Scanner:
     def _lookup_distances(self, shape: int) -> tuple[float, float]:
         """Of one shape [m], see `lookup_distances`; measured once per process."""
         radius, table = float(self.table.outlines.radii[shape]), self.table
-        key = (self.spec, table.shapes[shape], table.density, float(table.grid[shape, 0]))
+        key = (
+            self.spec.model_dump_json(), table.shapes[shape], table.density,
+            float(table.grid[shape, 0]),
+        )  # fmt: skip
         if key not in _MEASURED:
             exact, baked = (replace(self, renderer=way, grid=None) for way in ("exact", "baked"))
             _MEASURED[key] = lookup_distances(
