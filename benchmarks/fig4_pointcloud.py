@@ -7,9 +7,6 @@ drifting odometry. yag-slam is LGPL: it gets an environment of its own, made at 
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -19,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from measuring import mujoco_rays
 from measuring.environments import NotInstalledError, python_with, run
+from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -30,6 +28,13 @@ from nics_drl_bridge.lidar.shapes import Circle, Polygon, Rectangle, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.report.drawing import DARK, MEASURED, MODEL, OTHER, png
 
+CONTROLS = {
+    "shifted": "the baked scans are taken 0.1 m beside",
+    "nan": "one range of the baked scans is none",
+}
+BARS_M = {"cloud": {"baked": 0.01, "mujoco": 1e-4}, "range": {"baked": 0.05, "mujoco": 1e-4}}
+SLAM_PART = 0.5
+"""SLAM leaves no more than this part of the odometry's error."""
 Array = NDArray[np.float64]
 HERE = Path(__file__).resolve().parent
 SLAM = ("yag-slam==0.3.0", "opencv-python-headless==5.0.0.93", "numpy==2.4.6", "numba==0.68.1")
@@ -87,6 +92,31 @@ def slam(spec: LidarSpec, ranges: NDArray[np.float32], odometry: Array) -> dict[
         run(python, HERE / "measuring" / "yag_slam_map.py", str(asked), str(answered))
         with np.load(answered) as found:
             return dict(found)
+
+
+def beam_rmse(ranges: NDArray[np.float32], exact: NDArray[np.float32]) -> float:
+    """Root mean square over the beams that return in both [m]; NaN where a range is none."""
+    known = np.isfinite(exact) & ~np.isinf(ranges)
+    return float(np.sqrt(np.mean((ranges[known] - exact[known]) ** 2.0)))
+
+
+def missed_of(result: dict[str, Any]) -> list[str]:
+    """The bars that were missed; what could not be installed is none."""
+    missed = [
+        f"{name}: {kind} RMSE {result[f'{kind}_rmse_m'][name]:.2e} m, bar {bar:g}"
+        for kind, bars in BARS_M.items()
+        for name, bar in bars.items()
+        if name in result["cloud_rmse_m"] and not result[f"{kind}_rmse_m"][name] <= bar
+    ]
+    missed += [f"{name}: no point" for name, count in result["points"].items() if not count > 0]
+    if result["slam"] is not None:
+        after, before = result["slam"]["path_error_m"], result["slam"]["odometry_error_m"]
+        if not after <= SLAM_PART * before:
+            missed.append(
+                f"yag-slam: the path is off by {after:.3f} m, bar {SLAM_PART:g} of the "
+                f"odometry's {before:.3f}"
+            )
+    return missed
 
 
 def path_error(poses: Array, truth: Array) -> float:
@@ -162,13 +192,17 @@ def picture(
     return figure
 
 
-def measure(scans: int, with_slam: bool, out: Path) -> dict[str, Any]:
+def measure(scans: int, with_slam: bool, out: Path, control: str | None) -> dict[str, Any]:
     """Scans the path, compares the clouds, makes the map and the picture."""
     spec, truth = load_lidar("paper_12m"), path(scans)
     baked = make_scanner(spec, OBSTACLES, "baked")
     exact = Scanner(spec, baked.table, "exact")
     bodies = np.broadcast_to(exact.place(OBSTACLES, POSES), (scans, len(OBSTACLES), 7))
-    ranges = {"exact": exact.scan(truth, bodies, WALLS), "baked": baked.scan(truth, bodies, WALLS)}
+    beside = truth.copy()
+    beside[:, 0] += 0.1 if control == "shifted" else 0.0
+    ranges = {"exact": exact.scan(truth, bodies, WALLS), "baked": baked.scan(beside, bodies, WALLS)}
+    if control == "nan":
+        ranges["baked"][0, 0] = np.nan
     missing = {}
     try:
         ranges["mujoco"] = mujoco_rays.scan(spec, truth, OBSTACLES, POSES, WALLS)
@@ -180,10 +214,7 @@ def measure(scans: int, with_slam: bool, out: Path) -> dict[str, Any]:
         "scans": scans,
         "points": {name: len(points) for name, points in clouds.items()},
         "cloud_rmse_m": {name: cloud_rmse(clouds[name], clouds["exact"]) for name in others},
-        "range_rmse_m": {
-            name: float(np.sqrt(np.nanmean((ranges[name] - ranges["exact"]) ** 2.0)))
-            for name in others
-        },
+        "range_rmse_m": {name: beam_rmse(ranges[name], ranges["exact"]) for name in others},
         "slam": None,
     }
     odometry, mapped = drifting(truth, 0), None
@@ -242,14 +273,13 @@ def report(result: dict[str, Any]) -> str:
 
 def main() -> None:
     """Draws the picture; prints a few lines, or one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--scans", type=int, default=200, help="scans along the path")
     parser.add_argument("--without-slam", action="store_true", help="install nothing, draw no map")
     parser.add_argument("--out", type=Path, default=Path("runs/fig4_pointcloud.png"))
     given = parser.parse_args()
-    result = measure(given.scans, not given.without_slam, given.out)
-    sys.stdout.write(json.dumps(result) + "\n" if given.json else report(result))
+    result = measure(given.scans, not given.without_slam, given.out, given.control)
+    answer(result, missed_of(result), report(result), given.json)
 
 
 if __name__ == "__main__":

@@ -10,12 +10,14 @@ simulated seconds per second of one thread, both sides in this run.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.calibration.identify import Identified, identify
 from nics_drl_bridge.calibration.open_loop import open_loop_error
@@ -27,6 +29,13 @@ from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
 
+CONTROLS = {
+    "standing": "a model that says the robot stands",
+    "slow": "MuJoCo itself in place of the model's speed",
+    "nan": "one coefficient is none",
+}
+ERROR, WORST, FASTER = 0.05, 0.1, 1000.0
+"""Bars: error over the path, on average and on the worst drive, and times MuJoCo's speed."""
 ROBOTS = ("ackermann", "differential", "mecanum")
 FIRST_SEED = 201
 HOLDS_S = (0.5, 1.0, 0.3, 2.0)
@@ -52,6 +61,33 @@ def errors(found: Identified, drives: list[Recording], spec: RobotSpec) -> dict[
         "unseen_drives": len(drives),
         "windows": sum(f.windows for f in results),
     }
+
+
+def without(model: TaylorModel, control: str | None) -> TaylorModel:
+    """The model with what a control takes out."""
+    if control == "standing":
+        return replace(model, coefficients=1e-9 * model.coefficients)
+    if control == "nan":
+        return replace(model, coefficients=np.nan * model.coefficients)
+    return model
+
+
+def missed_of(robots: dict[str, dict[str, float]]) -> list[str]:
+    """The bars that were missed."""
+    missed = []
+    for name, robot in robots.items():
+        for key, bar in (
+            ("position_error_over_path", ERROR), ("worst_drive_error_over_path", WORST),
+        ):  # fmt: skip
+            if not robot[key] <= bar:
+                missed.append(f"{name}: {key} {robot[key]:.3g}, bar {bar:g}")
+        if not robot["speed_up_batched"] >= FASTER:
+            missed.append(
+                f"{name}: {robot['speed_up_batched']:.3g} times MuJoCo's speed, bar {FASTER:g}"
+            )
+        if not robot["mean_path_m"] > 0.1:
+            missed.append(f"{name}: the unseen paths are {robot['mean_path_m']:.3g} m long")
+    return missed
 
 
 def batched_speed(model: TaylorModel, spec: RobotSpec) -> float:
@@ -119,7 +155,7 @@ def best_time(work: Callable[[], None]) -> float:
     return min(times)
 
 
-def measure(name: str, given: argparse.Namespace) -> dict[str, float]:
+def measure(name: str, given: argparse.Namespace) -> dict[str, Any]:
     """All figures of one robot."""
     spec = load_robot(name)
     robot = MujocoRobot(spec)
@@ -135,9 +171,15 @@ def measure(name: str, given: argparse.Namespace) -> dict[str, float]:
     ]
     begin = time.perf_counter()
     found = identify(recording, spec, alpha="auto")
-    seconds, model = time.perf_counter() - begin, found.model
+    seconds, model = time.perf_counter() - begin, without(found.model, given.control)
+    found = replace(found, model=model)
     physics = mujoco_speed(robot, 4.0)
-    batched, single = batched_speed(model, spec), single_speed(model, spec)
+    if given.control == "slow":
+        batched = single = physics
+    elif given.control == "nan":
+        batched = single = float("nan")  # it diverges, which is refused
+    else:
+        batched, single = batched_speed(model, spec), single_speed(model, spec)
     return {
         **errors(found, drives, spec),
         "speed_up_batched": batched / physics,
@@ -159,8 +201,7 @@ def table(robots: dict[str, dict[str, float]]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser = parser_of(__doc__, CONTROLS)
     parser.add_argument(
         "--train", type=float, default=90.0, help="length of the drive to learn [s]"
     )
@@ -178,8 +219,7 @@ def main() -> int:
     except BridgeError as error:
         print(error, file=sys.stderr)
         return 2
-    print(json.dumps({"robots": robots}) if given.json else table(robots))
-    return 0
+    answer({"robots": robots}, missed_of(robots), table(robots) + "\n", given.json)
 
 
 if __name__ == "__main__":

@@ -6,14 +6,12 @@ ragged edges and specks. One thread; ranges beyond range_max count as range_max.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from measuring.verdict import answer, parser_of
 from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -22,10 +20,17 @@ from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.maps_grid import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.spec import load_lidar
 
+CONTROLS = {
+    "shifted": "the map that is jumped through lies a cell beside",
+    "slow": "the walk in place of the jumps",
+    "nan": "one range is none",
+}
 SIZE, RESOLUTION = 20.0, 0.05
 CELLS = round(SIZE / RESOLUTION)
 LIDARS = ("paper", "paper_12m")
 SCANS, REPEATS, CLEARANCE = 1000, 7, 0.2
+FASTER, RMSE_M, MOST_OFF = 3.0, 1e-5, 1e-5
+"""Bars: times the walk's speed, RMSE, and the share of beams that may be off by 1 mm."""
 SCRATCH = max(map_kernels.FLOATS, map_kernels.INTS) * map_kernels.LANES
 
 
@@ -106,7 +111,7 @@ def timed(run: Callable[..., None], *arguments: Any) -> tuple[NDArray[np.float32
     return np.minimum(out, arguments[3]), SCANS / best
 
 
-def measure(seed: int) -> dict[str, Any]:
+def measure(seed: int, control: str | None) -> dict[str, Any]:
     """One row per map and lidar."""
     room = tuple(np.zeros(SCRATCH, kind) for kind in (np.float64, np.float32, np.int32))
     walk, jump = batch(map_kernels.exact_map_into), batch(map_kernels.map_into)
@@ -123,7 +128,13 @@ def measure(seed: int) -> dict[str, Any]:
             at = poses(grid, seed + 1)
             arguments = (spec.directions, beams, at, spec.range_max, grid.arrays, room)
             exact, exact_speed = timed(walk, *arguments)
-            baked, baked_speed = timed(jump, *arguments)
+            way = walk if control == "slow" else jump
+            if control == "shifted":
+                moved = np.column_stack([at[:, :1] + RESOLUTION, at[:, 1:]])
+                arguments = (*arguments[:2], moved, *arguments[3:])
+            baked, baked_speed = timed(way, *arguments)
+            if control == "nan":
+                baked[0, 0] = np.nan
             error = baked.astype(np.float64) - exact
             rows.append(
                 {
@@ -143,20 +154,36 @@ def measure(seed: int) -> dict[str, Any]:
     return {"threads": 1, "seed": seed, "rows": rows}
 
 
+def missed_of(result: dict[str, Any]) -> list[str]:
+    """The bars that were missed."""
+    missed = []
+    for row in result["rows"]:
+        name = f"{row['map']}, {row['range_max_m']:g} m"
+        if not row["ratio"] >= FASTER:
+            missed.append(f"{name}: {row['ratio']:.2f} times the walk's speed, bar {FASTER:g}")
+        if not row["rmse_m"] <= RMSE_M:
+            missed.append(f"{name}: RMSE {row['rmse_m']:.2e} m, bar {RMSE_M:g}")
+        off = row["beams_off_by_1_mm"] / row["beams_compared"]
+        if not off <= MOST_OFF:
+            missed.append(f"{name}: {off:.2e} of the beams are off by 1 mm, bar {MOST_OFF:g}")
+    return missed
+
+
+def table_of(result: dict[str, Any]) -> str:
+    """The figures for people."""
+    return "".join(
+        "".join(f"{key:<22}{value}\n" for key, value in row.items()) + "\n"
+        for row in result["rows"]
+    )
+
+
 def main() -> None:
     """Prints a table, or one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
-    result = measure(given.seed)
-    if given.json:
-        sys.stdout.write(json.dumps(result) + "\n")
-        return
-    for row in result["rows"]:
-        for key, value in row.items():
-            sys.stdout.write(f"{key:<22}{value}\n")
-        sys.stdout.write("\n")
+    result = measure(given.seed, given.control)
+    answer(result, missed_of(result), table_of(result), given.json)
 
 
 if __name__ == "__main__":

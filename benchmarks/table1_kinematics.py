@@ -7,15 +7,13 @@ another. Errors are root mean squares per step of 1 ms, in the body frame, in fl
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
@@ -26,6 +24,11 @@ from nics_drl_bridge.kinematics.recording import Samples
 from nics_drl_bridge.kinematics.spec import CommandVariable, RobotSpec, load_robot
 from nics_drl_bridge.kinematics.textbook import textbook
 
+CONTROLS = {
+    "rounded": "the coefficients of the fitted models have two digits",
+    "nan": "one coefficient is none",
+    "slow": "the textbook in plain Python in place of the compiled model",
+}
 Array = NDArray[np.float64]
 DT = 1e-3
 STEPS = 40_000
@@ -40,6 +43,11 @@ PAPER = {
     "differential": (2.56e-7, 5.11e-9, 1.56e-16, 5.72e4),
     "mecanum": (1.23e-17, 9.41e-18, 3.75e-17, 4.73e4),
 }
+EXACT = 1e-12
+"""Below this an error is rounding, whatever the paper has."""
+FASTER_ALONE, FASTER_TOGETHER = 100.0, 1000.0
+"""Times the speed of plain Python in the same run."""
+FLOAT32_M = 1e-4
 ROBOTS, BATCHED_STEPS, SINGLE_STEPS, REPEATS = 1024, 400, 100_000, 7
 
 
@@ -157,23 +165,60 @@ def python_rate(robot: Subject) -> float:
     return steps / (time.perf_counter() - begin)
 
 
-def measure(name: str) -> dict[str, float]:
+def without(model: TaylorModel, control: str | None) -> TaylorModel:
+    """The model with what a control takes out."""
+    coefficients = model.coefficients.copy()
+    if control == "rounded":
+        digits = [float(f"{value:.2g}") for value in coefficients.ravel()]
+        coefficients = np.array(digits).reshape(coefficients.shape)
+    elif control == "nan":
+        coefficients[np.nonzero(coefficients)[0][0], np.nonzero(coefficients)[1][0]] = np.nan
+    return replace(model, coefficients=coefficients)
+
+
+def measure(name: str, control: str | None) -> dict[str, Any]:
     """All figures of one robot."""
     robot = subject(name)
     found = fit(drive(robot, 1), robot.spec)
-    step, twist = errors(found.model, robot, 2)
+    model = without(found.model, control)
+    step, twist = errors(model, robot, 2)
+    if control == "slow":
+        single = batched = python_rate(robot)
+    else:
+        single, batched = single_rate(model, robot), batched_rate(model, np.float64, robot)
     return {
         "rmse_x_m": float(step[0]),
         "rmse_y_m": float(step[1]),
         "rmse_heading_rad": float(step[2]),
         "rmse_twist": [float(value) for value in twist],
-        "terms_kept": found.model.terms_kept,
+        "terms_kept": model.terms_kept,
         "terms_total": found.terms_total,
-        "steps_per_s_single": single_rate(found.model, robot),
-        "steps_per_s_batched": batched_rate(found.model, np.float64, robot),
-        "steps_per_s_batched_float32": batched_rate(found.model, np.float32, robot),
-        "float32_error_after_1000_steps_m": float32_error(found.model, robot),
+        "steps_per_s_single": single,
+        "steps_per_s_batched": batched,
+        "steps_per_s_batched_float32": batched_rate(model, np.float32, robot),
+        "float32_error_after_1000_steps_m": float32_error(model, robot),
     }
+
+
+def missed_of(result: dict[str, Any]) -> list[str]:
+    """The bars that were missed."""
+    missed, python = [], result["python_reference_steps_per_s"]
+    for name, robot in result["robots"].items():
+        keys = ("rmse_x_m", "rmse_y_m", "rmse_heading_rad")
+        for key, paper in zip(keys, PAPER[name], strict=False):
+            bar = max(paper, EXACT)
+            if not robot[key] <= bar:
+                missed.append(f"{name}: {key} {robot[key]:.2e}, bar {bar:.2e}")
+        error = robot["float32_error_after_1000_steps_m"]
+        if not error <= FLOAT32_M:
+            missed.append(f"{name}: float32 is off by {error:.2e} m, bar {FLOAT32_M:g}")
+        for key, bar in (
+            ("steps_per_s_single", FASTER_ALONE), ("steps_per_s_batched", FASTER_TOGETHER),
+        ):  # fmt: skip
+            if not robot[key] >= bar * python:
+                times = robot[key] / python
+                missed.append(f"{name}: {key} is {times:.3g} times plain Python's, bar {bar:g}")
+    return missed
 
 
 def order4_heading() -> float:
@@ -203,15 +248,13 @@ def table(result: dict[str, Any]) -> str:
 
 def main() -> None:
     """Prints a table, or one JSON object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    given = parser.parse_args()
+    given = parser_of(__doc__, CONTROLS).parse_args()
     result = {
-        "robots": {name: measure(name) for name in PARAMETERS},
+        "robots": {name: measure(name, given.control) for name in PARAMETERS},
         "ackermann_order4_rmse_heading_rad": order4_heading(),
         "python_reference_steps_per_s": python_rate(subject("ackermann")),
     }
-    sys.stdout.write(json.dumps(result) + "\n" if given.json else table(result))
+    answer(result, missed_of(result), table(result), given.json)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,9 @@ Terms = tuple[NDArray[np.int64], Array, NDArray[np.int64], NDArray[np.int64]]
 
 SERIES: Array = np.array([1 / 6, 1 / 120, 1 / 5040, 1 / 2, 1 / 24, 1 / 720])
 """Coefficients of sin(t) / t and (1 - cos(t)) / t; exact to 1e-14 for turns below 0.1 rad a step,
-to 1e-8 below 0.5."""
+to 1e-8 below `WIDE_TURN`."""
+WIDE_TURN = 0.5
+"""Beyond this in one step the series are no good: sine and cosine take their place [rad]."""
 GREATEST_ORDER = 4
 
 
@@ -86,13 +88,28 @@ def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
         dt: duration [s].
         series: see the module.
     """
+    if abs(turn) > WIDE_TURN:
+        one = series[3] + series[3]
+        sine, versine = math.sin(turn), one - math.cos(turn)
+        return _along(x, y, c, s, vx, vy, sine / turn, versine / turn, sine, versine, dt)
+    return _move_little(x, y, c, s, vx, vy, turn, dt, series)
+
+
+@njit(cache=True, nogil=True, _nrt=False)
+def _move_little(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
+    """As `move`, of no wide turn."""
     t2 = turn * turn
     a = series[0] - t2 * (series[1] - t2 * series[2])
     a = (series[3] + series[3]) - t2 * a
     b = turn * (series[3] - t2 * (series[4] - t2 * series[5]))
+    return _along(x, y, c, s, vx, vy, a, b, turn * a, turn * b, dt)
+
+
+@njit(cache=True, nogil=True, _nrt=False)
+def _along(x, y, c, s, vx, vy, a, b, sine, versine, dt):  # type: ignore[no-untyped-def]
+    """The end of an arc, by a = sin(t) / t, b = (1 - cos(t)) / t, and t times either."""
     ahead, aside = (a * vx - b * vy) * dt, (b * vx + a * vy) * dt
     x, y = x + (c * ahead - s * aside), y + (s * ahead + c * aside)
-    sine, versine = turn * a, turn * b
     return x, y, c - (c * versine + s * sine), s - (s * versine - c * sine)
 
 
@@ -177,6 +194,26 @@ def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, _nrt=False)
 def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
+    px, py, pc, ps, heading, length = pose[0], pose[1], pose[2], pose[3], pose[4], pose[5]
+    vx, vy, wz = dq[0], dq[1], dq[2]
+    wide = np.int32(0)
+    for i in range(px.shape[0]):
+        wide |= np.int32(abs(wz[i] * dt) > WIDE_TURN)
+    if wide:
+        _move_widely(pose, dq, dt, series)
+        return
+    for i in range(px.shape[0]):
+        turn = wz[i] * dt
+        px[i], py[i], pc[i], ps[i] = _move_little(
+            px[i], py[i], pc[i], ps[i], vx[i], vy[i], turn, dt, series
+        )
+        heading[i] += turn
+        length[i] += (abs(vx[i]) + abs(vy[i])) * dt
+
+
+@njit(cache=True, nogil=True, _nrt=False)
+def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
+    """As `_move_all`, where some of them turn widely: in a loop of its own, as it is slower."""
     px, py, pc, ps, heading, length = pose[0], pose[1], pose[2], pose[3], pose[4], pose[5]
     vx, vy, wz = dq[0], dq[1], dq[2]
     for i in range(px.shape[0]):

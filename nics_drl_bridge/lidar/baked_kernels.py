@@ -69,12 +69,13 @@ def in_sight(found, begin, end, bodies, n, me, scan, range_max, baked, wide, who
         scan: x and y of the lidar in the world [m], the bearing of beam 0 [rad], and the index
             of its range from where the ranges begin.
         range_max: [m].
-        baked: (H,) whether a shape is to be looked up.
+        baked: (H, 2) squares of the distances between which a shape is looked up [m^2]: inf where
+            it never is.
         wide, whole: lanes.
 
     Returns:
-        How many lanes are taken now, and how many bodies in sight can't be looked up: not baked,
-        or so near that the lidar is within their circle.
+        How many lanes are taken now, and how many bodies in sight are not looked up: within
+        their circle, or not between the distances of their shape.
     """
     n, left = np.uintp(n), 0
     sx, sy, ahead, at = scan
@@ -94,7 +95,8 @@ def in_sight(found, begin, end, bodies, n, me, scan, range_max, baked, wide, who
         put(wide, found + AT, at)
         put(whole, found + SHAPE, np.int32(shape * ABOUT))
         seen = (d2 <= reach * reach) & (radius > 0.0) & (k != me)
-        kept = seen & (d2 >= radius * radius) & (baked[np.uintp(shape)] != 0)
+        h = np.uintp(shape)
+        kept = seen & (d2 >= radius * radius) & (d2 >= baked[h, 0]) & (d2 <= baked[h, 1])
         found += kept
         left += seen & (not kept)
     return found, left
@@ -102,12 +104,13 @@ def in_sight(found, begin, end, bodies, n, me, scan, range_max, baked, wide, who
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
 def left_out(bodies, n, k, me, sx, sy, range_max, baked):  # type: ignore[no-untyped-def]
-    """Whether body k is in sight, but can't be looked up; see `in_sight`."""
+    """Whether body k is in sight, but not looked up; see `in_sight`."""
     dx, dy, radius = bodies[n, k, 0] - sx, bodies[n, k, 1] - sy, bodies[n, k, 5]
     d2 = dx * dx + dy * dy
     reach = range_max + radius
     seen = radius > 0.0 and k != me and d2 <= reach * reach
-    return seen and (baked[int(bodies[n, k, 6])] == 0 or d2 < radius * radius)
+    h = int(bodies[n, k, 6])
+    return seen and (d2 < radius * radius or d2 < baked[h, 0] or d2 > baked[h, 1])
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)

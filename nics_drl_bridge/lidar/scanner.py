@@ -15,7 +15,7 @@ from nics_drl_bridge.errors import ConfigError, ModelError, nearest
 from nics_drl_bridge.lidar import intensity_kernels, scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import LANES, SINGLE, WHOLE, WIDE
 from nics_drl_bridge.lidar.baking import bake
-from nics_drl_bridge.lidar.lookup_error import lookup_error
+from nics_drl_bridge.lidar.lookup_error import lookup_distances
 from nics_drl_bridge.lidar.maps_grid import NO_MAP, GridMap
 from nics_drl_bridge.lidar.sensor_models import Intensity, intensity_of
 from nics_drl_bridge.lidar.shapes import BODY, SHAPE, Shape, place
@@ -28,7 +28,9 @@ Room = tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.int32]]
 Array = NDArray[np.float64]
 NO_WALLS = np.zeros((0, 4))
 GREATEST_ERROR = 0.01
-"""A concave shape is looked up by `auto` where its ranges have no greater RMSE [m]."""
+"""A shape is looked up by `auto` from the distance on where its ranges have no greater RMSE [m]."""
+_MEASURED: dict[tuple[Any, ...], tuple[float, float]] = {}
+"""What `lookup_distances` found, by all that it depends on."""
 WIDEST_BEAMS = 0.2
 """Beams farther apart than this are scanned exactly by `auto`: there are few, and a row of so few
 points says little [rad]."""
@@ -42,10 +44,10 @@ class Scanner:
         spec: the lidar.
         table: of the shapes that may stand around.
         renderer: `baked` looks every shape up; `exact` computes every ray; `auto` looks up but for
-            shapes larger than the range, in whose circle the lidar nearly always is, for concave
-            ones whose notches a blended row blurs, see `GREATEST_ERROR`, and for beams wider than
-            `WIDEST_BEAMS`. Straight walls and a body in whose circle the lidar is are computed in
-            all.
+            shapes larger than the range, in whose circle the lidar nearly always is, for what errs
+            by more than `GREATEST_ERROR` (any shape that is very near; long thin ones and deep
+            notches farther away, or anywhere), and for beams wider than `WIDEST_BEAMS`. Straight
+            walls and a body in whose circle the lidar is are computed in all.
         grid: a static map that stands in every world, if any.
     """
 
@@ -85,8 +87,8 @@ class Scanner:
         """What the kernels take as `sensor`.
 
         Mount (3,), directions (B, 2), beams (angle_min, angle_increment, 1 for a full circle,
-        B), limits (range_min, range_max), whether each shape is looked up (H,), the outlines, the
-        table's arrays.
+        B), limits (range_min, range_max), squares of the distances between which each shape is
+        looked up (H, 2), the outlines, the table's arrays.
         """
         spec, table = self.spec, self.table
         beams = (spec.angle_min, spec.angle_increment, float(spec.full_circle), float(spec.beams))
@@ -101,23 +103,30 @@ class Scanner:
             table.lookup,
         )
 
-    def _looked_up(self) -> NDArray[np.uint8]:
-        """(H,) 1 where a shape is looked up."""
+    def _looked_up(self) -> Array:
+        """(H, 2) squares of the distances between which a shape is looked up [m^2]."""
         radii = self.table.outlines.radii
-        if self.renderer == "exact":
-            return np.zeros(len(radii), np.uint8)
+        between = np.full((len(radii), 2), np.inf)
         if self.renderer == "baked":
-            return np.ones(len(radii), np.uint8)
-        fit = (radii < self.spec.range_max) & (self.spec.angle_increment <= WIDEST_BEAMS)
-        for h in np.flatnonzero(fit & self.table.outlines.concave):
-            fit[h] = self._lookup_error(int(h)) <= GREATEST_ERROR
-        return np.asarray(fit, np.uint8)
+            between[:, 0] = radii
+        elif self.renderer == "auto" and self.spec.angle_increment <= WIDEST_BEAMS:
+            for h in np.flatnonzero(radii < self.spec.range_max):
+                between[h] = self._lookup_distances(int(h))
+        return np.asarray(np.square(between))
 
-    def _lookup_error(self, shape: int) -> float:
-        """Of one shape [m], see `lookup_error`; measured in a moment, and the same every time."""
-        exact, baked = (replace(self, renderer=way, grid=None) for way in ("exact", "baked"))
-        radius, room = float(self.table.outlines.radii[shape]), self.room(1)
-        return lookup_error(exact.arguments, baked.arguments, room, shape, radius)
+    def _lookup_distances(self, shape: int) -> tuple[float, float]:
+        """Of one shape [m], see `lookup_distances`; measured once per process."""
+        radius, table = float(self.table.outlines.radii[shape]), self.table
+        key = (
+            self.spec.model_dump_json(), table.shapes[shape], table.density,
+            float(table.grid[shape, 0]),
+        )  # fmt: skip
+        if key not in _MEASURED:
+            exact, baked = (replace(self, renderer=way, grid=None) for way in ("exact", "baked"))
+            _MEASURED[key] = lookup_distances(
+                exact.arguments, baked.arguments, self.room(1), shape, radius, GREATEST_ERROR
+            )
+        return _MEASURED[key]
 
     def room(self, bodies: int) -> Room:
         """Scratch that one thread needs to scan a world, of however many bodies.

@@ -100,8 +100,8 @@ def find_near(near, m, reach, bodies, n, walls, grid, crowded, cells, found):  #
 
 
 @njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
-def contact(body, m, meets, near, bodies, walls, grid, outlines, spare):  # type: ignore[no-untyped-def]
-    """How deep a robot, put as `body` (7,), is in anything, as a clearance; 0 where it is free.
+def contact(body, m, meets, near, bodies, walls, grid, outlines, spare, limit):  # type: ignore[no-untyped-def]
+    """The clearance of a robot, put as `body` (7,), to all that it may meet.
 
     Args:
         body: the robot.
@@ -110,12 +110,14 @@ def contact(body, m, meets, near, bodies, walls, grid, outlines, spare):  # type
         walls: (W, 4).
         grid, spare: see `collision_kernels`.
         outlines: corners and where each outline begins.
+        limit: what is farther is not measured [m].
 
     Returns:
-        The clearance, at most 0 [m], and the body that it is deepest in, or -1.
+        The clearance, at most `limit` [m], less than 0 where it is in something; and the body that
+        it is nearest to, or -1.
     """
     corners, corner = outlines
-    least, whom = 0.0, -1
+    least, whom = limit, -1
     if meets & BODIES:
         me = bodies.shape[0] - near.shape[0] + m
         listed = near[m, 0] <= SEVERAL
@@ -123,16 +125,16 @@ def contact(body, m, meets, near, bodies, walls, grid, outlines, spare):  # type
             k = near[m, 1 + i] if listed else i
             if k == me or bodies[k, 5] <= 0.0:
                 continue
-            gap = body_gap(body, bodies[k], corners, corner, 0.0, spare)
+            gap = body_gap(body, bodies[k], corners, corner, limit, spare)
             if gap < least:
                 least, whom = gap, k
     if meets & WALLS:
         for w in range(walls.shape[0]):
-            gap = wall_gap(body, walls[w], corners, corner, 0.0, spare)
+            gap = wall_gap(body, walls[w], corners, corner, limit, spare)
             if gap < least:
                 least, whom = gap, -1
     if meets & MAP:
-        gap = map_gap(body, grid, corners, corner, 0.0, spare)
+        gap = map_gap(body, grid, corners, corner, limit, spare)
         if gap < least:
             least, whom = gap, -1
     return least, whom
@@ -156,3 +158,10 @@ def move_obstacles(bodies, start, velocity, n, time):  # type: ignore[no-untyped
             heading = wrap(start[k, 2] + velocity[n, k, 2] * time)
             bodies[n, k, 2] = heading
             bodies[n, k, 3], bodies[n, k, 4] = math.cos(heading), math.sin(heading)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def put_body(bodies, n, k, pose):  # type: ignore[no-untyped-def]
+    """Puts body k of world n to a pose (3,)."""
+    bodies[n, k, 0], bodies[n, k, 1], bodies[n, k, 2] = pose[0], pose[1], pose[2]
+    bodies[n, k, 3], bodies[n, k, 4] = math.cos(pose[2]), math.sin(pose[2])

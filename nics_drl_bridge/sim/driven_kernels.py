@@ -11,8 +11,8 @@ from numba import njit
 from nics_drl_bridge.sim import cell_kernels as crowd
 from nics_drl_bridge.sim import sensing_kernels as sensing
 from nics_drl_bridge.sim import sight_kernels as sight
+from nics_drl_bridge.sim.contact_kernels import put_body
 from nics_drl_bridge.sim.kernels import steer_world
-from nics_drl_bridge.sim.robot_kernels import place_robot
 
 
 @njit(cache=True, nogil=True)
@@ -61,7 +61,7 @@ def end_period(packed, true, before, wheels, counted):  # type: ignore[no-untype
         steps[n] += 1
         row = past[n, :, steps[n] % past.shape[2]]
         for m in range(robots):
-            place_robot(bodies, n, first + m, pose[n, m])
+            put_body(bodies, n, first + m, pose[n, m])
             sensing.measure(
                 odom, twist, past, before[n, m], wheels, n, m, counted[n, m], noise, steps[n],
                 seeds[n], steps[n] * robots + m, age[n, m], dt, substeps, series,

@@ -21,6 +21,8 @@ from nics_drl_bridge.sim import motion_kernels as obstacles
 from nics_drl_bridge.sim import robot_kernels as robots
 from nics_drl_bridge.sim import sensing_kernels as sensing
 from nics_drl_bridge.sim import sight_kernels as sight
+from nics_drl_bridge.sim.careful_kernels import rates_at
+from nics_drl_bridge.sim.contact_kernels import put_body
 
 
 @structref.register
@@ -80,7 +82,7 @@ def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[n
     """See `step_worlds`; no counting of references, which took longer than the step."""
     (
         pose, state, history, bodies, _, _, ranges, collided, steps, seeds, faults, coefficient,
-        delay, age, _, velocity, past, _,
+        delay, age, noise, velocity, past, _,
     ) = fields  # fmt: skip
     walls, grid, outlines, crowded, scattered, _ = scene
     lanes, single, robot, crowding, sensors = room
@@ -99,7 +101,8 @@ def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[n
             skip = (n - low) * many
             robots.move_world(
                 n, skip, pose, state, history, coefficient, delay, bodies, velocity, walls, grid,
-                collided, crowded, outlines, lanes, motion, cells, found, robot, single,
+                collided, crowded, outlines, lanes, motion, cells, found, robot, single, noise,
+                seeds[n], steps[n],
             )  # fmt: skip
             _measure(n, skip, fields, motion, single, sensors[0])
             if crowded:
@@ -133,19 +136,17 @@ def _begin_period(low, high, fields, scene, motion, room):  # type: ignore[no-un
 
 @njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
 def _measure(n, skip, fields, motion, single, before):  # type: ignore[no-untyped-def]
-    """Lets the robots of world n drift, puts their bodies there, and reads their wheels."""
+    """Puts the bodies of the robots of world n to where they are, and reads their wheels."""
     (
-        pose, state, history, bodies, odom, twist, _, collided, steps, seeds, _, coefficient,
+        pose, state, history, bodies, odom, twist, _, _, steps, seeds, _, coefficient,
         delay, age, noise, velocity, past, _,
     ) = fields  # fmt: skip
     dof, factors, count, series, (dt, substeps) = motion
     x, dq = single[0], single[1]
     for m in range(pose.shape[1]):
         counter, terms = steps[n] * pose.shape[1] + m, (dof, coefficient[n, m], factors, count)
-        if collided[n, m] == 0:
-            sensing.disturb(pose, state, noise, n, m, seeds[n], counter, dt * substeps, series)
-        robots.place_robot(bodies, n, velocity.shape[1] + m, pose[n, m])
-        robots.rates_at(substeps - 1, dq, x, state, history, n, m, delay[n, m], substeps, terms)
+        put_body(bodies, n, velocity.shape[1] + m, pose[n, m])
+        rates_at(substeps - 1, dq, x, state, history, n, m, delay[n, m], substeps, terms)
         sensing.measure(
             odom, twist, past, before[skip + m], pose, n, m, dq, noise, steps[n], seeds[n],
             counter, age[n, m], dt, substeps, series,

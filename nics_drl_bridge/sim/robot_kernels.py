@@ -9,9 +9,11 @@ import math
 
 from numba import njit
 
-from nics_drl_bridge.kinematics.kernels import delayed, move, rates, run, wrap
+from nics_drl_bridge.kinematics.kernels import delayed, run, wrap
 from nics_drl_bridge.sim import cell_kernels as crowd
 from nics_drl_bridge.sim import contact_kernels as contacts
+from nics_drl_bridge.sim.careful_kernels import drift_carefully, move_carefully
+from nics_drl_bridge.sim.sensing_kernels import most_drift
 
 
 @njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
@@ -59,93 +61,9 @@ def move_freely(begin, end, pose, state, history, coefficient, delay, lanes, mot
 
 
 @njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
-def move_carefully(  # type: ignore[no-untyped-def]
-    n, meets, near, state, history, coefficient, delay, bodies, velocity, moving, walls, grid,
-    collided, pose, outlines, motion, room,
-):  # fmt: skip
-    """Moves robots of one world for one period, looking for touches after each substep.
-
-    A robot that touches something is marked and gets no deeper into it; it may leave. A free
-    one moves exactly as by `move_freely`.
-
-    Args:
-        n: which world.
-        meets: (M,) what each robot may meet; those that meet nothing are left alone.
-        near: see `contact_kernels.find_near`.
-        state, history, coefficient, delay, motion: see `move_freely`.
-        bodies: (N, K + M, 7) obstacles, then robots, see `lidar.shapes.BODY`; in place.
-        velocity, moving: of the obstacles, and whether any has one.
-        walls: (W, 4).
-        grid: see `collision_kernels`.
-        collided: (N, M) set to 1 by a touch.
-        pose: (N, M, 3), in place.
-        outlines: corners and where each outline begins.
-        room: x (V + 1,), dq (D,), trial (7,), spare (F, 2), start (K, 3): scratch.
-    """
-    x, dq, trial, spare, start = room
-    dof, factors, count, series, (dt, substeps) = motion
-    first, world = velocity.shape[1], bodies[n]
-    for m in range(meets.shape[0]):
-        if meets[m] != contacts.FREE:
-            place_robot(bodies, n, first + m, pose[n, m])
-    for j in range(substeps):
-        if moving:
-            contacts.move_obstacles(bodies, start, velocity, n, (j + 1) * dt)
-        for m in range(meets.shape[0]):
-            if meets[m] == contacts.FREE:
-                continue
-            me, terms = first + m, (dof, coefficient[n, m], factors, count)
-            rates_at(j, dq, x, state, history, n, m, delay[n, m], substeps, terms)
-            _advance(trial, world[me], dq, dt, series)
-            for s in range(state.shape[2]):
-                state[n, m, s] += dt * dq[3 + s]
-            free, whom = contacts.contact(
-                trial, m, meets[m], near, world, walls, grid, outlines, spare
-            )
-            if free < 0.0:
-                collided[n, m] = 1
-                before, _ = contacts.contact(
-                    world[me], m, meets[m], near, world, walls, grid, outlines, spare
-                )
-                if before < 0.0 and free < before:
-                    continue
-                if whom >= first:
-                    collided[n, whom - first] = 1
-            for i in range(5):
-                world[me, i] = trial[i]
-    for m in range(meets.shape[0]):
-        if meets[m] != contacts.FREE:
-            for i in range(3):
-                pose[n, m, i] = world[first + m, i]
-
-
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
-def _advance(trial, body, dq, dt, series):  # type: ignore[no-untyped-def]
-    """Puts into `trial` (7,) where a body (7,) of rates dq is after a substep."""
-    turn = dq[2] * dt
-    trial[0], trial[1], trial[3], trial[4] = move(
-        body[0], body[1], body[3], body[4], dq[0], dq[1], turn, dt, series
-    )
-    trial[2] = body[2] + turn
-    trial[5], trial[6] = body[5], body[6]
-
-
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
-def rates_at(j, dq, x, state, history, n, m, delay, substeps, terms):  # type: ignore[no-untyped-def]
-    """Rates dq in substep j of a period, under the command that is then in effect."""
-    row = delayed(j, delay, substeps, history.shape[2])
-    size = state.shape[2]
-    for s in range(size):
-        x[s] = state[n, m, s]
-    for c in range(history.shape[3]):
-        x[size + c] = history[n, m, row, c]
-    rates(dq, x, terms)
-
-
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
 def move_world(  # type: ignore[no-untyped-def]
     n, skip, pose, state, history, coefficient, delay, bodies, velocity, walls, grid, collided,
-    crowded, outlines, lanes, motion, cells, found, robot, room,
+    crowded, outlines, lanes, motion, cells, found, robot, room, noise, seed, step,
 ):  # fmt: skip
     """Moves obstacles and robots of one world: freely, and carefully where it is tight.
 
@@ -155,15 +73,16 @@ def move_world(  # type: ignore[no-untyped-def]
         crowded: whether its bodies are to be sorted into cells.
         cells, found: see `cell_kernels`.
         robot: near (M, 1 + SEVERAL), meets (M,), way (M,), reach (K + M,), and one more: scratch.
+        noise, seed, step: of the drift, see `careful_kernels.drift_carefully`.
         pose and others: see the functions above.
     """
     where, x = lanes[0], lanes[1]
     near, meets, way, reach, _ = robot
-    start = room[4]
+    start, began = room[4], room[5]
     dt, substeps = motion[4]
     robots, size, first = pose.shape[1], state.shape[2], velocity.shape[1]
     for m in range(robots):
-        way[m] = where[5, skip + m]
+        way[m] = where[5, skip + m] + most_drift(noise, n, m, dt * substeps)
     longest, moving = contacts.reaches(reach, bodies, velocity, way, n, dt * substeps)
     if crowded:
         crowd.sort_bodies(bodies, n, cells)
@@ -181,7 +100,7 @@ def move_world(  # type: ignore[no-untyped-def]
     if moving:
         for k in range(first):
             for i in range(3):
-                start[k, i] = bodies[n, k, i]
+                start[k, i] = began[k, i] = bodies[n, k, i]
     if tight:
         move_carefully(
             n, meets, near, state, history, coefficient, delay, bodies, velocity, moving, walls,
@@ -191,10 +110,7 @@ def move_world(  # type: ignore[no-untyped-def]
         contacts.move_obstacles(bodies, start, velocity, n, substeps * dt)
     for m in range(robots):
         pose[n, m, 2] = wrap(pose[n, m, 2])
-
-
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
-def place_robot(bodies, n, k, pose):  # type: ignore[no-untyped-def]
-    """Puts body k of world n to a robot's pose (3,)."""
-    bodies[n, k, 0], bodies[n, k, 1], bodies[n, k, 2] = pose[0], pose[1], pose[2]
-    bodies[n, k, 3], bodies[n, k, 4] = math.cos(pose[2]), math.sin(pose[2])
+    drift_carefully(
+        n, meets, near, state, noise, seed, step, bodies, walls, grid, collided, pose, outlines,
+        motion, room,
+    )  # fmt: skip

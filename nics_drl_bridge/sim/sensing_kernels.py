@@ -122,18 +122,25 @@ def measure(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
-def disturb(pose, state, std, n, m, seed, counter, period, series):  # type: ignore[no-untyped-def]
-    """Moves a robot by what its model does not explain, growing with the root of the time.
+def most_drift(std, n, m, period):  # type: ignore[no-untyped-def]
+    """The greatest distance by which `drift_of` can move a robot in a period [m]."""
+    return math.sqrt(3.0 * period) * (std[n, m, 2] + std[n, m, 3])
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def drift_of(state, std, n, m, seed, counter, period):  # type: ignore[no-untyped-def]
+    """What moves a robot beside its model: it grows with the root of the time.
 
     Args:
-        pose: (N, M, 3), in place.
         state: (N, M, S), in place.
         std: (N, M, 2 + 3 + S) of the odometry, then along x, y and heading of the body, and of
             the state, after a second.
         n, m: which world and robot.
         seed, counter: of the random draws.
         period: [s].
-        series: see `kinematics.kernels`.
+
+    Returns:
+        Ahead and aside [m], and turn [rad].
     """
     # Uniform draws of this variance are cheap, and over some periods they add up to a normal one.
     count, scale = std.shape[2] - 2, math.sqrt(12.0 * period)
@@ -150,8 +157,4 @@ def disturb(pose, state, std, n, m, seed, counter, period, series):  # type: ign
                 turn = draw
             else:
                 state[n, m, i - 3] += draw
-    if ahead != 0.0 or aside != 0.0 or turn != 0.0:
-        x, y, heading = advanced(
-            pose[n, m, 0], pose[n, m, 1], pose[n, m, 2], ahead, aside, turn, 1.0, series
-        )
-        pose[n, m, 0], pose[n, m, 1], pose[n, m, 2] = x, y, heading
+    return ahead, aside, turn

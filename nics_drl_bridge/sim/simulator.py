@@ -18,7 +18,12 @@ from nics_drl_bridge.sim import kernels
 from nics_drl_bridge.sim.motion import distance_arrays, plan_arrays
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
-from nics_drl_bridge.sim.validity import CommandBox, OutsideValidityWarning, warn
+from nics_drl_bridge.sim.validity import (
+    CommandBox,
+    OutsideValidityWarning,
+    require_sane_speed,
+    warn,
+)
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.worlds import SLICES, Sizes, Worlds, allocate, arguments, split
 from nics_drl_bridge.threads import Crew
@@ -94,6 +99,7 @@ class FastSimulator:
         _check_memory(model, world, worlds, robots)
         if isinstance(randomisation, str):
             randomisation = load_randomisation(randomisation)
+        require_sane_speed(model.kinematics, model.robot, world.extent)
         self.model, self.world = model, world
         self.randomisation = randomisation
         self._draws = None if randomisation is None else Sampler(randomisation, model, robots)

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.kinematics import features
 from nics_drl_bridge.kinematics.model import TaylorModel
 from nics_drl_bridge.kinematics.spec import RobotSpec
@@ -77,6 +78,29 @@ class CommandBox:
                 f"{self._range[0][i]:.4g} to {self._range[1][i]:.4g} only: its motion there is "
                 "extrapolated; record a drive that covers it."
             )
+
+
+def require_sane_speed(model: TaylorModel, robot: RobotSpec, extent: tuple[float, ...]) -> None:
+    """Raises ConfigError where a robot could cross a whole world in one step of its kinematics.
+
+    Args:
+        model: the kinematics.
+        robot: limits of the commands.
+        extent: least x, least y, greatest x, greatest y of the world [m].
+    """
+    first = len(robot.state)
+    most = np.maximum(np.abs(model.low), np.abs(model.high))
+    limits = np.maximum(np.abs(robot.command_low), np.abs(robot.command_high))
+    most[first:] = np.maximum(most[first:], limits)
+    products = np.prod(most**model.powers, axis=1)
+    step = float((np.abs(model.coefficients[:2]) @ products).max() * model.dt)
+    least = min(extent[2] - extent[0], extent[3] - extent[1])
+    if not step < least:
+        raise ConfigError(
+            f"the robot {robot.name!r} could drive {step:.3g} m in a step of {model.dt:g} s, "
+            f"across a world of {least:.3g} m; lower the limits of its commands, or generate its "
+            "model with a shorter step."
+        )
 
 
 def _assumed(model: TaylorModel) -> set[str]:

@@ -15,6 +15,7 @@ from nics_drl_bridge.lidar.maps_grid import NO_MAP, GridMap
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.sim.contact_kernels import SEVERAL
+from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT
 from nics_drl_bridge.sim.motion_layout import MARK
 from nics_drl_bridge.sim.sensing_kernels import PAST
 
@@ -213,7 +214,8 @@ def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int)
         ),
         (
             *scratch(kinematics), np.zeros(BODY), np.zeros((max(corners, 4), 2)),
-            np.zeros((sizes.obstacles, 3)),
+            np.zeros((sizes.obstacles, 3)), np.zeros((sizes.obstacles, 3)),
+            np.zeros((bodies, FLIGHT)), np.zeros((robots, EVENT)),
         ),
         (
             np.zeros((robots, 1 + SEVERAL), np.int64), np.zeros(robots, np.int64),

@@ -19,6 +19,8 @@ from nics_drl_bridge.sim.world import World
 
 ORIGIN = np.zeros((1, 1, 3))
 SUBSTEPS, PERIOD = 10, 0.1
+OVERLAP = 1e-6
+"""So deep may a robot be in what it touches [m]."""
 
 
 def random_commands(worlds, steps, robots=1, seed=0):
@@ -188,13 +190,15 @@ def test_an_obstacle_that_meets_a_robot_marks_it():
     assert not simulator.data.pose.any()
 
 
-def test_an_obstacle_that_passes_within_a_period_is_found():
+def test_an_obstacle_that_would_pass_within_a_period_stops_at_the_robot():
     simulator = one_obstacle()
     simulator.data.bodies[0, 0, :2] = 0.0, 1.0
     simulator.data.velocity[0, 0, 1] = -20.0
     still(simulator, 1)
     assert simulator.data.collided[0, 0] == 1
-    assert simulator.data.bodies[0, 0, 1] == pytest.approx(-1.0)
+    stopped = FOOTPRINT + RADIUS
+    assert simulator.data.bodies[0, 0, 1] == pytest.approx(stopped, abs=OVERLAP)
+    assert simulator.data.velocity[0, 0, 1] == pytest.approx((stopped - 1.0) / PERIOD, abs=1e-4)
 
 
 def test_a_late_scan_shows_a_moving_obstacle_where_it_was():
@@ -225,7 +229,7 @@ def test_a_long_robot_passes_a_gap_lengthwise_and_not_across():
         simulator.step([[[1.0, 0.0, 0.0]], [[0.0, -1.0, 0.0]]])
     assert simulator.data.pose[0, 0, 0] == pytest.approx(1.5)
     assert simulator.data.collided[:, 0].tolist() == [0, 1]
-    assert 0.5 <= simulator.data.pose[1, 0, 0] <= 0.5101
+    assert simulator.data.pose[1, 0, 0] == pytest.approx(0.5, abs=OVERLAP)
 
 
 def test_a_long_robot_that_turns_touches_what_it_turns_into():
@@ -234,8 +238,8 @@ def test_a_long_robot_that_turns_touches_what_it_turns_into():
     for _ in range(10):
         simulator.step([[[0.0, 0.0, 1.0]]])
     assert simulator.data.collided[0, 0] == 1
-    # Its corner stands at 0.2 where 0.3 sin a + 0.1 cos a = 0.2.
-    assert 0.363 <= simulator.data.pose[0, 0, 2] <= 0.3731
+    corner = 0.3 * np.sin(simulator.data.pose[0, 0, 2]) + 0.1 * np.cos(simulator.data.pose[0, 0, 2])
+    assert corner == pytest.approx(0.2, abs=OVERLAP)
 
 
 def test_two_long_robots_touch_by_their_outlines():
@@ -248,7 +252,7 @@ def test_two_long_robots_touch_by_their_outlines():
     assert not simulator.data.collided.any()
     for _ in range(5):
         simulator.step([[[0.0, 0.5, 0.0], [0.0, 0.0, 0.0]]])
-    assert 0.3 <= simulator.data.pose[0, 0, 1] <= 0.3051
+    assert simulator.data.pose[0, 0, 1] == pytest.approx(0.3, abs=OVERLAP)
     assert simulator.data.collided.all()
 
 
@@ -271,7 +275,7 @@ def test_a_robot_sees_and_touches_the_static_map(model):
     for _ in range(15):
         simulator.step([[[1.0, 0.0, 0.0]]])
     front = FOOTPRINT if model.robot.footprint is None else 0.3
-    assert 1.0 - front <= simulator.data.pose[0, 0, 0] <= 1.0 - front + 0.0101
+    assert simulator.data.pose[0, 0, 0] == pytest.approx(1.0 - front, abs=OVERLAP)
     assert simulator.data.collided[0, 0] == 1
     for _ in range(5):
         simulator.step([[[-1.0, 0.0, 0.0]]])

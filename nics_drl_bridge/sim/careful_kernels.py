@@ -1,0 +1,323 @@
+"""Compiled motion of the robots of one world where it is tight: up to what they touch.
+
+All bodies move at the same time. At the first touch whoever came nearer stops: a robot until the
+substep is over, an obstacle until the period is. Then the next touch is looked for. Shapes are
+those of `kernels`; `flights`, `events` and `scene` those of `impact_kernels`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from nics_drl_bridge.kinematics.kernels import delayed, move, rates, wrap
+from nics_drl_bridge.sim import contact_kernels as contacts
+from nics_drl_bridge.sim import impact_kernels as impact
+from nics_drl_bridge.sim.impact_kernels import (
+    AFTER,
+    DEPTH,
+    NOTHING,
+    OTHERS,
+    OWN,
+    STOP,
+    TIME,
+    TURN,
+    VX,
+    VY,
+    WITH,
+)
+from nics_drl_bridge.sim.sensing_kernels import drift_of
+
+SHARE = 1e-3
+"""Who makes less than this part of the speed at which two come nearer to each other goes on."""
+SMALL = 0.1
+"""A robot that is in something moves on by so many radii at a time, to see whether it leaves."""
+MOST_MOVES = 1000
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def rates_at(j, dq, x, state, history, n, m, delay, substeps, terms):  # type: ignore[no-untyped-def]
+    """Rates dq in substep j of a period, under the command that is then in effect."""
+    row = delayed(j, delay, substeps, history.shape[2])
+    size = state.shape[2]
+    for s in range(size):
+        x[s] = state[n, m, s]
+    for c in range(history.shape[3]):
+        x[size + c] = history[n, m, row, c]
+    rates(dq, x, terms)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _put(body, base, flight, time, series):  # type: ignore[no-untyped-def]
+    """Puts into `body` (7,) where a robot that began at `base` (7,) is at a time [s]."""
+    turn = flight[TURN] * time
+    body[0], body[1], body[3], body[4] = move(
+        base[0], base[1], base[3], base[4], flight[VX], flight[VY], turn, time, series
+    )
+    body[2] = base[2] + turn
+    body[5], body[6] = base[5], base[6]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _first_touch(m, begin, until, tight, events, scene):  # type: ignore[no-untyped-def]
+    """Finds what robot m touches first from a time of the substep on, see `impact_kernels`."""
+    meets, near, walls, grid = tight
+    world, _, first, _, _ = scene
+    event, me = events[m], first + m
+    event[TIME] = until
+    if meets[m] & contacts.BODIES and event[DEPTH] >= 0.0:
+        listed = near[m, 0] <= contacts.SEVERAL
+        for i in range(near[m, 0] if listed else world.shape[0]):
+            k = near[m, 1 + i] if listed else i
+            if k != me and world[k, 5] > 0.0:
+                impact.touch_body(event, me, k, begin, scene)
+    if meets[m] & contacts.WALLS and event[DEPTH] >= 0.0:
+        impact.touch_walls(event, me, walls, begin, scene)
+    if meets[m] & contacts.MAP and event[DEPTH] >= 0.0:
+        impact.touch_map(event, me, grid, begin, scene)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _leave(m, until, tight, events, scene, trial, spare):  # type: ignore[no-untyped-def]
+    """Lets a robot that is in something move as long as it gets no deeper."""
+    meets, near, walls, grid = tight
+    world, flights, first, outlines, series = scene
+    flight, me = flights[first + m], first + m
+    way = math.sqrt(flight[VX] ** 2 + flight[VY] ** 2) + abs(flight[TURN]) * world[me, 5]
+    moves = int(min(max(math.ceil(way * until / (SMALL * world[me, 5])), 1), MOST_MOVES))
+    flight[STOP], events[m, AFTER] = 0.0, events[m, DEPTH]
+    for i in range(1, moves + 1):
+        time = until if i == moves else until * i / moves
+        _put(trial, world[me], flight, time, series)
+        depth, _ = contacts.contact(
+            trial, m, meets[m], near, world, walls, grid, outlines, spare, 0.0
+        )
+        if depth < events[m, AFTER]:
+            break
+        events[m, AFTER], flight[STOP] = depth, time
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _within(p, b, until, world, flights, first):  # type: ignore[no-untyped-def]
+    """Whether robot p may come near body b within the substep."""
+    a = first + p
+    dx, dy = world[a, 0] - world[b, 0], world[a, 1] - world[b, 1]
+    ways = impact.speed_at(a, -1.0, flights) + impact.speed_at(b, -1.0, flights)
+    far = world[a, 5] + world[b, 5] + ways * until + impact.SLACK
+    return dx * dx + dy * dy <= far * far
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _settle(until, tight, events, touched, scene):  # type: ignore[no-untyped-def]
+    """Stops the bodies of a world at their touches within a substep, in the order of time.
+
+    Args:
+        until: length of the substep [s].
+        tight: what each robot may meet, and near what, walls and map, see `contact_kernels`.
+        events: (M, EVENT) in place.
+        touched: (M,) set to 1 by a touch.
+        scene: its `flights` in place.
+    """
+    world, flights, first, _, _ = scene
+    meets, robots = tight[0], events.shape[0]
+    for m in range(robots):
+        events[m, TIME] = until
+        if meets[m] != contacts.FREE:
+            _first_touch(m, 0.0, until, tight, events, scene)
+    for _ in range(2 * world.shape[0] + 2):
+        m = 0
+        for p in range(1, robots):
+            if events[p, TIME] < events[m, TIME]:
+                m = p
+        time, k = events[m, TIME], int(events[m, WITH])
+        if time >= until:
+            return
+        own, others = -events[m, OWN], -events[m, OTHERS]
+        touched[m] = 1
+        if k >= first:
+            touched[k - first] = 1
+        if own >= SHARE * (own + others):
+            flights[first + m, STOP] = time
+        if k >= 0 and others >= SHARE * (own + others):
+            flights[k, STOP] = min(flights[k, STOP], time)
+        for p in range(robots):
+            if meets[p] != contacts.FREE and (
+                p == m
+                or _within(p, first + m, until, world, flights, first)
+                or (k >= 0 and _within(p, k, until, world, flights, first))
+            ):
+                _first_touch(p, time, until, tight, events, scene)
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _begin_substep(n, time, dt, velocity, moving, bodies, start, flights):  # type: ignore[no-untyped-def]
+    """Puts the obstacles to where they are at a time of the period, and tells how they move on."""
+    if moving:
+        contacts.move_obstacles(bodies, start, velocity, n, time)
+    for k in range(velocity.shape[1]):
+        flights[k, VX], flights[k, VY] = velocity[n, k, 0], velocity[n, k, 1]
+        flights[k, TURN], flights[k, STOP] = velocity[n, k, 2], dt
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _hold_obstacles(n, time, dt, velocity, bodies, start, flights):  # type: ignore[no-untyped-def]
+    """Obstacles that stopped within a substep, which begins at `time`, stand from then on."""
+    for k in range(velocity.shape[1]):
+        stop = flights[k, STOP]
+        if stop < dt:
+            start[k, 0] = bodies[n, k, 0] + velocity[n, k, 0] * stop
+            start[k, 1] = bodies[n, k, 1] + velocity[n, k, 1] * stop
+            start[k, 2] = wrap(bodies[n, k, 2] + velocity[n, k, 2] * stop)
+            contacts.put_body(bodies, n, k, start[k])
+            for i in range(3):
+                velocity[n, k, i] = 0.0
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def move_carefully(  # type: ignore[no-untyped-def]
+    n, meets, near, state, history, coefficient, delay, bodies, velocity, moving, walls, grid,
+    collided, pose, outlines, motion, room,
+):  # fmt: skip
+    """Moves robots of one world for one period, up to what they touch.
+
+    A robot that touches something is marked and stops there for the rest of the substep, and so in
+    the next ones as long as it would come nearer; it may leave. One that is in something already
+    gets no deeper. A free one moves exactly as by `robot_kernels.move_freely`.
+
+    Args:
+        n: which world.
+        meets: (M,) what each robot may meet; those that meet nothing are left alone.
+        near: see `contact_kernels.find_near`.
+        state, history, coefficient, delay, motion: see `robot_kernels.move_freely`.
+        bodies: (N, K + M, 7) obstacles, then robots, see `lidar.shapes.BODY`; in place.
+        velocity, moving: of the obstacles, and whether any has one. One that stopped at a robot
+            is left with its mean velocity of the period.
+        walls: (W, 4).
+        grid: see `collision_kernels`.
+        collided: (N, M) set to 1 by a touch.
+        pose: (N, M, 3), in place.
+        outlines: corners and where each outline begins.
+        room: see `worlds.arguments`.
+    """
+    x, dq, trial, spare, start, began, flights, events = room
+    dof, factors, count, series, (dt, substeps) = motion
+    first, world, touched = velocity.shape[1], bodies[n], collided[n]
+    tight = (meets, near, walls, grid)
+    scene = (world, flights, first, outlines, series)
+    for m in range(meets.shape[0]):
+        flights[first + m, :] = 0.0
+        if meets[m] != contacts.FREE:
+            contacts.put_body(bodies, n, first + m, pose[n, m])
+            _look_within(m, tight, events, touched, scene, spare)
+    for j in range(substeps):
+        _begin_substep(n, j * dt, dt, velocity, moving, bodies, start, flights)
+        for m in range(meets.shape[0]):
+            if meets[m] != contacts.FREE:
+                terms = (dof, coefficient[n, m], factors, count)
+                rates_at(j, dq, x, state, history, n, m, delay[n, m], substeps, terms)
+                flight = flights[first + m]
+                flight[VX], flight[VY], flight[TURN], flight[STOP] = dq[0], dq[1], dq[2], dt
+                for s in range(state.shape[2]):
+                    state[n, m, s] += dt * dq[3 + s]
+                if events[m, DEPTH] < 0.0:
+                    _leave(m, dt, tight, events, scene, trial, spare)
+        _settle(dt, tight, events, touched, scene)
+        _arrive(meets, events, scene, trial)
+        if moving:
+            _hold_obstacles(n, j * dt, dt, velocity, bodies, start, flights)
+    if moving:
+        contacts.move_obstacles(bodies, start, velocity, n, substeps * dt)
+        _tell_velocities(n, substeps * dt, velocity, bodies, start, began)
+    for m in range(meets.shape[0]):
+        if meets[m] != contacts.FREE:
+            for i in range(3):
+                pose[n, m, i] = world[first + m, i]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _look_within(m, tight, events, touched, scene, spare):  # type: ignore[no-untyped-def]
+    """Tells how deep robot m is in something as the period begins, and marks it if it is."""
+    meets, near, walls, grid = tight
+    world, _, first, outlines, _ = scene
+    depth, whom = contacts.contact(
+        world[first + m], m, meets[m], near, world, walls, grid, outlines, spare, 2.0 * NOTHING
+    )
+    events[m, DEPTH] = min(depth, -np.finfo(np.float64).tiny) if depth <= NOTHING else 0.0
+    if depth < 0.0:
+        touched[m] = 1
+        if whom >= first:
+            touched[whom - first] = 1
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _arrive(meets, events, scene, trial):  # type: ignore[no-untyped-def]
+    """Puts the robots to where they are at the end of the substep."""
+    world, flights, first, _, series = scene
+    for m in range(meets.shape[0]):
+        if meets[m] != contacts.FREE:
+            flight = flights[first + m]
+            _put(trial, world[first + m], flight, flight[STOP], series)
+            for i in range(5):
+                world[first + m, i] = trial[i]
+            if events[m, DEPTH] < 0.0:
+                events[m, DEPTH] = events[m, AFTER]
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def _tell_velocities(n, period, velocity, bodies, start, began):  # type: ignore[no-untyped-def]
+    """Leaves obstacles that were stopped with the velocity that they came along by."""
+    for k in range(velocity.shape[1]):
+        stopped = start[k, 0] != began[k, 0] or start[k, 1] != began[k, 1]
+        if stopped or start[k, 2] != began[k, 2]:
+            for i in range(2):
+                velocity[n, k, i] = (bodies[n, k, i] - began[k, i]) / period
+            velocity[n, k, 2] = wrap(bodies[n, k, 2] - began[k, 2]) / period
+
+
+@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+def drift_carefully(  # type: ignore[no-untyped-def]
+    n, meets, near, state, noise, seed, step, bodies, walls, grid, collided, pose, outlines, motion,
+    room,
+):  # fmt: skip
+    """Lets the robots of one world drift, one after the other, up to what they touch.
+
+    Args:
+        noise, seed: see `sensing_kernels.drift_of`.
+        step: of the period, from 1.
+        n and others: see `move_carefully`.
+    """
+    flights, events = room[6], room[7]
+    series, (dt, substeps) = motion[3], motion[4]
+    world, robots = bodies[n], pose.shape[1]
+    first = world.shape[0] - robots
+    tight, scene = (meets, near, walls, grid), (world, flights, first, outlines, series)
+    stood = False
+    for m in range(robots):
+        if collided[n, m] != 0:
+            continue
+        ahead, aside, turn = drift_of(state, noise, n, m, seed, step * robots + m, dt * substeps)
+        if ahead == 0.0 and aside == 0.0 and turn == 0.0:
+            continue
+        stop = 1.0
+        if meets[m] != contacts.FREE:
+            flight = flights[first + m]
+            if not stood:
+                flights[:], stood = 0.0, True
+            contacts.put_body(bodies, n, first + m, pose[n, m])
+            flight[VX], flight[VY], flight[TURN], flight[STOP] = ahead, aside, turn, 1.0
+            events[m, DEPTH] = 0.0
+            _first_touch(m, 0.0, 1.0, tight, events, scene)
+            flight[STOP] = 0.0
+            if events[m, TIME] < 1.0:
+                stop, collided[n, m] = events[m, TIME], 1
+                if events[m, WITH] >= first:
+                    collided[n, int(events[m, WITH]) - first] = 1
+        x, y, _, _ = move(
+            pose[n, m, 0], pose[n, m, 1], math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2]),
+            ahead, aside, turn * stop, stop, series,
+        )  # fmt: skip
+        pose[n, m, 0], pose[n, m, 1], pose[n, m, 2] = x, y, wrap(pose[n, m, 2] + turn * stop)
+        if meets[m] != contacts.FREE:
+            contacts.put_body(bodies, n, first + m, pose[n, m])
