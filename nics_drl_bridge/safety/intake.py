@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nics_drl_bridge.safety import e_stop, frozen, shield
+from nics_drl_bridge.safety import e_stop, frozen, moving, shield
 from nics_drl_bridge.safety.freshness import ODOM, SCAN, arrived
 from nics_drl_bridge.safety.inputs import Command, Estimate, EStop, Input, Odometry, Press, Scan
 from nics_drl_bridge.safety.limits import implausible
@@ -136,8 +136,11 @@ def _take_scan(
     if fault:
         jumped = SCAN if fault == "jumped" else ""
         return replace(state, scans=arrivals, jumped=jumped), f"scan: its stamp {fault}"
-    same, obstacles = frozen.compare(state, scan), shield.obstacles(config, scan.ranges)
-    state = replace(state, scans=arrivals, scan=scan, same=same, obstacles=obstacles)
+    same, views = frozen.compare(state, scan), moving.remember(config, state, scan)
+    state = replace(
+        state, scans=arrivals, scan=scan, same=same, views=views,
+        obstacles=shield.obstacles(config, scan.ranges, views),
+    )  # fmt: skip
     if state.pending is not None and state.pending.stamp_ns == scan.stamp_ns:
         state = _take_command(state, state.pending, now)
     return state, ""
