@@ -17,6 +17,7 @@ import math
 import os
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,12 +51,14 @@ class Plan:
         seed: of the first scene.
         in_process: without processes.
         control: what is taken out; empty for nothing.
+        at_once: so many robots, each with its gate's process, drive side by side over DDS.
     """
 
     episodes: int
     seed: int
     in_process: bool
     control: str
+    at_once: int = len(ROBOTS) * len(WORLDS)
 
     @property
     def shield(self) -> dict[str, float] | None:
@@ -73,7 +76,9 @@ class Plan:
             kind = ADVERSARIES[index // places % len(ADVERSARIES)]
             job = Job(kind, self.seed + index, standing)
             with_it[index % places].append(job)
-            if index // places % WITHOUT == 0 or index < places * len(ADVERSARIES) and not index % 2:
+            if index // places % WITHOUT == 0 or (
+                index < places * len(ADVERSARIES) and not index % 2
+            ):
                 without[index % places].append(job)
         for index in range(max(places, self.episodes // GOALS)):
             job = Job(GOAL, self.seed + index, standing)
@@ -98,15 +103,19 @@ def drive(
     given: dict[str, Any] = {"shield": False}
     if shield is not None:
         given = {f"shield_{name}": value for name, value in shield.items()}
-    with tempfile.TemporaryDirectory() as folder:
-        return shield_over_dds.drive(
-            places, jobs, given, Path(folder), lambda line: sys.stderr.write(f"{line}\n")
-        )
+    outcomes, repeated = [], 0
+    for first in range(0, len(places), plan.at_once):
+        some = slice(first, first + plan.at_once)
+        with tempfile.TemporaryDirectory() as folder:
+            more, again = shield_over_dds.drive(
+                places[some], jobs[some], given, Path(folder),
+                lambda line: sys.stderr.write(f"{line}\n"),
+            )  # fmt: skip
+        outcomes, repeated = outcomes + more, repeated + again
+    return outcomes, repeated
 
 
-def summary(
-    shielded: Sequence[Outcome], bare: Sequence[Outcome], repeated: int
-) -> dict[str, Any]:
+def summary(shielded: Sequence[Outcome], bare: Sequence[Outcome], repeated: int) -> dict[str, Any]:
     """The figures, for the JSON object."""
     tried = [one for one in shielded if one.kind != GOAL]
     goals = [one for one in shielded if one.kind == GOAL]
@@ -118,7 +127,8 @@ def summary(
         "contacts": len(touched),
         "walked_into": sum(one.walked_into for one in shielded),
         "path_m": round(math.fsum(one.path for one in tried), 1),
-        "latched": sum(one.latched for one in tried),
+        "latched": sum(bool(one.latched) for one in tried),
+        "latched_by": dict(Counter(one.latched for one in tried if one.latched)),
         "tried_without": len(without),
         "contacts_without": sum(one.contact for one in without),
         "goals": len(goals),
@@ -187,8 +197,11 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=300, help=f"of {ADVERSARY_S:g} s each")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--in-process", action="store_true", help="without DDS, with drawn delays")
+    parser.add_argument(
+        "--at-once", type=int, default=Plan.at_once, help="robots side by side over DDS"
+    )
     given = parser.parse_args()
-    plan = Plan(given.episodes, given.seed, given.in_process, given.control or "")
+    plan = Plan(given.episodes, given.seed, given.in_process, given.control or "", given.at_once)
     places = [Place(robot, world) for robot in ROBOTS for world in WORLDS]
     with_it, without = plan.jobs(len(places))
     shielded, first = drive(plan, places, with_it, plan.shield)

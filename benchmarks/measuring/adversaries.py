@@ -1,4 +1,4 @@
-"""Who drives in the shield's benchmark: adversaries that know the true scene, and who has a goal."""
+"""Drivers of the shield's benchmark: adversaries that know the true scene, and one with a goal."""
 
 from __future__ import annotations
 
@@ -57,7 +57,8 @@ class Driver(Protocol):
 class Adversary:
     """Picks, among some commands, the one that is worst by its own lights.
 
-    It rams the nearest thing, grazes it, turns into it at the last moment, or jerks the robot about.
+    It rams the nearest thing, grazes it, turns into it at the last moment, or jerks the robot
+    about.
 
     Args:
         kind: which of the adversaries.

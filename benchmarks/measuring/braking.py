@@ -13,7 +13,7 @@ from nics_drl_bridge.safety.stopping import shield_config
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
 
-SHARES = (1.0, 0.5, 0.25, 0.1)
+SHARES = (1.0, 0.5, 0.25)
 PERIODS = 15
 
 

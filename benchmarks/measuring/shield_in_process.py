@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+
 from measuring.gates import NANO, Gate, gate_config
 from measuring.shield_places import SCAN_STEPS, STEP_S, Job, Outcome, Place
-
 from nics_drl_bridge.safety.inputs import Command, Input, Odometry, Scan
 from nics_drl_bridge.safety.limits import load_limits
 from nics_drl_bridge.safety.state import GateConfig
@@ -58,5 +58,6 @@ def _episode(place: Place, config: GateConfig, job: Job) -> Outcome:
         decided = gate.tick().twist
         place.step(told)  # what was decided the tick before is here now
         told, step = decided, step + 1
-    place.outcome.latched = gate.state.latched is not None
+    latched = gate.state.latched
+    place.outcome.latched = "" if latched is None else latched.rule
     return place.outcome

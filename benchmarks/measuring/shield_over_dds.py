@@ -7,6 +7,7 @@ shipped parameters.
 
 from __future__ import annotations
 
+import re
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
-from measuring.shield_places import SCAN_STEPS, SILENCE_S, STEP_S, Job, Outcome, Place
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.executors import SingleThreadedExecutor
@@ -26,6 +26,7 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
+from measuring.shield_places import SCAN_STEPS, SILENCE_S, STEP_S, Job, Outcome, Place
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 from nics_drl_bridge.nodes.runner import open_context
@@ -36,6 +37,8 @@ BEHIND_S = 0.3
 """When this process itself was held up for longer, what it drives is driven again."""
 VARIANCES = (1e-4,) * 4
 GATE = "command_gate"
+LATCHED = re.compile(r"(?:call ~/reset first: |e_stop_released: )(\w+)")
+"""What a gate that refuses to be armed says of a stop that waits for a reset."""
 
 
 class Lane:
@@ -124,10 +127,10 @@ class Lane:
         self._asks = "arm"
         if asked == "arm" and answer.success:
             self._driving = True
-        elif "nothing_latched" in answer.message or "e_stop" in answer.message:
+        elif found := LATCHED.search(answer.message):
             self._asks = "reset"
             if self.outcomes:
-                self.outcomes[-1].latched = True
+                self.outcomes[-1].latched = found[1]
         self.refused = answer.message
 
     def _end(self) -> None:
@@ -222,7 +225,8 @@ def _run(
             count, last = driven, now
         if now - told > 30.0:
             told = now
-            tell(f"{driven} episodes after {now - began:.0f} s")
+            waiting = {lane.refused for lane in lanes if not lane.done}
+            tell(f"{driven} episodes after {now - began:.0f} s; {' | '.join(waiting)}")
         if now - last > PATIENCE_S:
             for gate in gates:
                 gate.check()

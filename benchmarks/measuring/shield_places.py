@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from measuring.adversaries import ADVERSARIES, Adversary, Driver, GoalDriver, Standing, Truth
 from numpy.typing import NDArray
 
+from measuring.adversaries import ADVERSARIES, Adversary, Driver, GoalDriver, Standing, Truth
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.lidar.shapes import RADIUS, X, Y
@@ -55,7 +55,7 @@ class Outcome:
         kind: of its driver.
         contact: the robot moved when it touched something.
         walked_into: it stood when something touched it.
-        latched: the gate latched a stop.
+        latched: the rule by which the gate latched a stop; empty for none.
         reached: it came to its goal.
         path: that it drove [m].
         seconds: that it took [s].
@@ -65,7 +65,7 @@ class Outcome:
     kind: str
     contact: bool = False
     walked_into: bool = False
-    latched: bool = False
+    latched: str = ""
     reached: bool = False
     path: float = 0.0
     seconds: float = 0.0
@@ -140,9 +140,7 @@ class Place:
         if data.collided[0, 0] and not touched:
             moving = max(rolling, moved / STEP_S) > MOVING
             outcome.contact, outcome.walked_into = moving, not moving
-        self.odom = geometry.compose(
-            self._anchor, geometry.between(self._begun, data.odom[0, 0])
-        )
+        self.odom = geometry.compose(self._anchor, geometry.between(self._begun, data.odom[0, 0]))
 
     @property
     def ended(self) -> bool:

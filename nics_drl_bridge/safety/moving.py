@@ -36,9 +36,7 @@ def remember(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ..
     return (*kept, newest)
 
 
-def movers(
-    config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]
-) -> NDArray[np.bool_]:
+def movers(config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]) -> NDArray[np.bool_]:
     """(B,) which beams of the newest view end on something that moves.
 
     One beam alone is noise: a neighbour has to say the same.
@@ -65,6 +63,4 @@ def movers(
 def rehearse() -> None:
     """Compiles what `movers` calls."""
     lidar, scan = (0.0, 0.1, 0.0, 0.0, 0.0), np.ones(1, np.float32)
-    moving_kernels.entered(
-        np.zeros(1, np.bool_), scan, scan, lidar, np.zeros(3), 1.0, (0.0, 0.0)
-    )
+    moving_kernels.entered(np.zeros(1, np.bool_), scan, scan, lidar, np.zeros(3), 1.0, (0.0, 0.0))

@@ -27,7 +27,7 @@ def entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-
     """
     first, increment, mount_x, mount_y, mount_turn = lidar
     beams, circle = len(ranges), 2.0 * math.pi / abs(increment)
-    whole, wide = int(round(circle)), int(math.ceil(WIDTH / abs(increment)))
+    whole, wide = round(circle), math.ceil(WIDTH / abs(increment))
     cosine, sine = math.cos(moved[2]), math.sin(moved[2])
     for b in range(beams):
         if out[b] or not np.isfinite(ranges[b]):
@@ -38,7 +38,7 @@ def entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-
         dy = moved[1] + sine * x + cosine * y - mount_y
         away = math.hypot(dx, dy)
         at = (math.atan2(dy, dx) - mount_turn - first) / increment
-        middle, seen = int(round(at - circle * math.floor(at / circle))), far
+        middle, seen = round(at - circle * math.floor(at / circle)), far
         for i in range(middle - wide, middle + wide + 1):
             index = i % whole
             beyond = old[index] if index < beams else np.nan
