@@ -90,7 +90,7 @@ class Plan:
 def drive(
     plan: Plan, places: Sequence[Place], jobs: Sequence[Sequence[Job]], shield: Any
 ) -> tuple[list[Outcome], int]:
-    """All episodes, in process or over DDS, and how many had to be begun again."""
+    """All episodes, in process or over DDS; and how often this process was held up."""
     if plan.in_process:
         found = []
         for place, some in zip(places, jobs, strict=True):
@@ -103,19 +103,19 @@ def drive(
     given: dict[str, Any] = {"shield": False}
     if shield is not None:
         given = {f"shield_{name}": value for name, value in shield.items()}
-    outcomes, repeated = [], 0
+    outcomes, held_up = [], 0
     for first in range(0, len(places), plan.at_once):
         some = slice(first, first + plan.at_once)
         with tempfile.TemporaryDirectory() as folder:
-            more, again = shield_over_dds.drive(
+            more, late = shield_over_dds.drive(
                 places[some], jobs[some], given, Path(folder),
                 lambda line: sys.stderr.write(f"{line}\n"),
             )  # fmt: skip
-        outcomes, repeated = outcomes + more, repeated + again
-    return outcomes, repeated
+        outcomes, held_up = outcomes + more, held_up + late
+    return outcomes, held_up
 
 
-def summary(shielded: Sequence[Outcome], bare: Sequence[Outcome], repeated: int) -> dict[str, Any]:
+def summary(shielded: Sequence[Outcome], bare: Sequence[Outcome], held_up: int) -> dict[str, Any]:
     """The figures, for the JSON object."""
     tried = [one for one in shielded if one.kind != GOAL]
     goals = [one for one in shielded if one.kind == GOAL]
@@ -136,7 +136,7 @@ def summary(shielded: Sequence[Outcome], bare: Sequence[Outcome], repeated: int)
         "goal_s": _mean([one.seconds for one in goals if one.reached]),
         "goals_reached_without": sum(one.reached for one in goals_without),
         "goal_without_s": _mean([one.seconds for one in goals_without if one.reached]),
-        "begun_again": repeated,
+        "held_up": held_up,
         "touched": [f"{one.kind} {' '.join(map(str, one.where))}" for one in touched],
         "by_world": {
             world: {
@@ -197,18 +197,20 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=300, help=f"of {ADVERSARY_S:g} s each")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--in-process", action="store_true", help="without DDS, with drawn delays")
+    names = [f"{robot}/{world}" for robot in ROBOTS for world in WORLDS]
+    parser.add_argument("--place", action="append", choices=names, help="only there; repeatable")
     parser.add_argument(
         "--at-once", type=int, default=Plan.at_once, help="robots side by side over DDS"
     )
     given = parser.parse_args()
     plan = Plan(given.episodes, given.seed, given.in_process, given.control or "", given.at_once)
-    places = [Place(robot, world) for robot in ROBOTS for world in WORLDS]
+    places = [Place(*name.split("/")) for name in given.place or names]
     with_it, without = plan.jobs(len(places))
     shielded, first = drive(plan, places, with_it, plan.shield)
     bare, second = drive(plan, places, without, None)
     result = summary(shielded, bare, first + second)
     result["driven"] = "in process" if plan.in_process else "over DDS"
-    result["braking"] = round(max(braking_used(robot, plan.shield) for robot in ROBOTS), 3)
+    result["braking"] = round(max(braking_used(place.robot, plan.shield) for place in places), 3)
     result["load"] = round(os.getloadavg()[0], 1)
     answer(result, missed(result, plan.episodes), table_of(result), given.json)
 

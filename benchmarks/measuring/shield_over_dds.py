@@ -34,9 +34,9 @@ from nics_drl_bridge.nodes.runner import open_context
 Array = NDArray[np.float64]
 REST_S, PATIENCE_S = 1.3, 120.0
 BEHIND_S = 0.3
-"""When this process itself was held up for longer, what it drives is driven again."""
+"""When this process itself was held up for longer, its worlds stood still meanwhile."""
 VARIANCES = (1e-4,) * 4
-GATE = "command_gate"
+GATE, NANO = "command_gate", conversions.NANO
 LATCHED = re.compile(r"(?:call ~/reset first: |e_stop_released: )(\w+)")
 """What a gate that refuses to be armed says of a stop that waits for a reset."""
 
@@ -52,11 +52,10 @@ class Lane:
 
     Attributes:
         outcomes: of those that were driven.
-        repeated: episodes that were begun again, since this process was held up.
     """
 
     def __init__(self, node: Node, name: str, place: Place, jobs: Sequence[Job]) -> None:
-        self.place, self.outcomes, self.repeated = place, list[Outcome](), 0
+        self.place, self.outcomes = place, list[Outcome]()
         self._jobs = deque(jobs)
         self._told, self._told_s = np.zeros(3), -np.inf
         self._scan, self._odom, self._estimate, self._e_stop, self._raw = (
@@ -143,12 +142,6 @@ class Lane:
         if self._jobs:
             self.place.begin(self._jobs[0])
 
-    def again(self) -> None:
-        """Begins the running episode again."""
-        if self._driving:
-            self.repeated += 1
-            self._rest()
-
     def close(self) -> None:
         """Leaves the robot's topics quiet."""
         self._jobs.clear()
@@ -172,7 +165,7 @@ def drive(
         tell: gets a line about the progress now and then.
 
     Returns:
-        How the episodes went, and how many were begun again since this process was held up.
+        How the episodes went, and how often this process was held up.
 
     Raises:
         RuntimeError: a gate can't be armed.
@@ -192,10 +185,10 @@ def drive(
             given |= {"black_box": str(logs / "black_box"), **parameters}
             gates.append(stack.enter_context(NodeProcess(GATE, logs, given, domain_id, name)))
             lanes.append(Lane(node, name, place, some))
-        _run(lanes, gates, executor, tell)
+        held_up = _run(lanes, gates, executor, tell)
         for lane in lanes:
             lane.close()
-    return [one for lane in lanes for one in lane.outcomes], sum(lane.repeated for lane in lanes)
+    return [one for lane in lanes for one in lane.outcomes], held_up
 
 
 def _run(
@@ -203,9 +196,10 @@ def _run(
     gates: Sequence[NodeProcess],
     executor: SingleThreadedExecutor,
     tell: Callable[[str], None],
-) -> None:
-    """Moves the worlds by the wall clock until all episodes are driven."""
-    epoch_ns, began, step = time.time_ns(), time.monotonic(), 0
+) -> int:
+    """Moves the worlds by the wall clock until all episodes are driven; how often it was late."""
+    epoch_ns, began, step, held_up = time.time_ns(), time.monotonic(), 0, 0
+    start = began
     last, count, told = began, 0, began
     while not all(lane.done for lane in lanes):
         ahead = began + step * STEP_S - time.monotonic()
@@ -213,22 +207,23 @@ def _run(
             executor.spin_once(timeout_sec=ahead)
             continue
         if -ahead > BEHIND_S:
-            for lane in lanes:
-                lane.again()
-        step_ns = epoch_ns + round(step * STEP_S * conversions.NANO)
+            held_up, began, epoch_ns = held_up + 1, began - ahead, epoch_ns - round(ahead * NANO)
+        step_ns = epoch_ns + round(step * STEP_S * NANO)
         for index, lane in enumerate(lanes):
             lane.step(step_ns, speaks=(step + index) % SCAN_STEPS == 0)
         step += 1
-        executor.spin_once(timeout_sec=0.0)
+        for _ in lanes:  # a command of each, also where there was no time to wait
+            executor.spin_once(timeout_sec=0.0)
         now, driven = time.monotonic(), sum(len(lane.outcomes) for lane in lanes)
         if driven > count:
             count, last = driven, now
         if now - told > 30.0:
             told = now
             waiting = {lane.refused for lane in lanes if not lane.done}
-            tell(f"{driven} episodes after {now - began:.0f} s; {' | '.join(waiting)}")
+            tell(f"{driven} episodes after {now - start:.0f} s; {' | '.join(waiting)}")
         if now - last > PATIENCE_S:
             for gate in gates:
                 gate.check()
             why = "; ".join(lane.refused for lane in lanes if not lane.done)
             raise RuntimeError(f"no episode ended within {PATIENCE_S} s: {why}")
+    return held_up

@@ -28,14 +28,6 @@ def test_no_random_command_at_any_interval_leaves_the_envelope():
     assert result["in_motion"] > 8000
 
 
-@pytest.mark.timeout(300)  # a cold start compiles
-def test_no_adversary_makes_a_shielded_robot_touch_anything():
-    result = result_of("shield.py", "--episodes", "48")
-    assert (result["episodes"], result["contacts"]) == (48, 0)
-    assert result["contacts_without"] > result["tried_without"] / 2
-    assert result["path_m"] > 0.5 * result["episodes"]
-
-
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("fault", ["scan_silent", "e_stop", "policy_hung"])
 def test_a_fault_around_a_real_gate_leads_to_zero(fault):
