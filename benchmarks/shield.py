@@ -1,226 +1,218 @@
-"""Adversarial policies on three robots among static obstacles: does any touch one?
+"""Adversarial policies through the gate with its shipped shield: does any robot touch anything?
 
-The whole gate decides, at every control period of the simulator, on the scan that the simulator
-makes. Latency and deceleration of each robot are measured first, by braking in the same simulator.
-An adversary knows the true scene and tries hard: it rams the nearest thing, grazes it, turns into
-it at the last moment, or jerks the robot about. A part of the episodes is driven again without the
-shield, to show that the adversaries are some.
+Over DDS and in real time: a `command_gate` process for each of nine robots, three kinds of them in
+the worlds `arena`, `clutter` and `crowd`, with the shield as it is shipped. An adversary knows the
+true scene and tries hard: it rams the nearest thing, grazes it, turns into it at the last moment,
+or jerks the robot about. Some episodes are driven again without the shield, to show that the
+adversaries are some; and a policy that means well drives with and without, to show what the shield
+costs. `--in-process` drives the same without processes, with drawn delays, many times as fast.
+
+A touch of a robot that moves is a contact; one that stands when something comes to touch it was
+walked into, which no shield prevents.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
+import math
+import os
 import sys
+import tempfile
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from measuring.gates import Gate, gate_config
-from numpy.typing import NDArray
+from measuring import shield_in_process
+from measuring.adversaries import ADVERSARIES
+from measuring.braking import braking_used
+from measuring.shield_places import ADVERSARY_S, GOAL, Job, Outcome, Place
+from measuring.verdict import answer, parser_of
 
-from nics_drl_bridge import geometry
-from nics_drl_bridge.generator import SimulatorModel, builtin_model
-from nics_drl_bridge.lidar.shapes import RADIUS, X, Y
-from nics_drl_bridge.safety.state import ShieldConfig
-from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.space_kernels import wall_distance
-from nics_drl_bridge.sim.world import load_world
-
-Array = NDArray[np.float64]
-ROBOTS = ("ackermann", "differential", "mecanum")
-ROUND = [X, Y, RADIUS]
-"""All that there is to know about a round body."""
-ADVERSARIES = ("ram", "graze", "late", "jerk")
-WORLDS, STEPS, MARGIN = 50, 60, 0.05
-SPEEDS = (1.0, 0.5)
-SAFETY = 1.1
-"""By which the measured latency is taken to be longer."""
-HORIZON_S = (0.3, 1.0)
-TRIES = 12
-GRAZE = 0.01
-"""So deep does the grazing adversary want to be in what it grazes [m]."""
-CONTROL_SHARE = 10
-"""One in so many batches is driven without the shield as well."""
+CONTROLS = {
+    "no_shield": "the shield: it is off",
+    "standing": "the motion: every driver stays where it is",
+    "no_braking_distance": "what the robot needs to stop: the shield is told that it needs nothing",
+}
+ROBOTS, WORLDS = ("ackermann", "differential", "mecanum"), ("arena", "clutter", "crowd")
+WITHOUT, GOALS = 10, 10
+"""One in so many episodes is driven without the shield as well; and so many goals are tried."""
+LEAST_PATH, LEAST_CONTACTS_WITHOUT, MOST_LATCHED, LEAST_GOALS = 0.5, 0.5, 0.1, 0.6
+NOTHING = {"latency": 0.0, "deceleration": 1e3, "margin": 0.0, "obstacle_speed": 0.0}
 
 
 @dataclass(frozen=True)
-class Braking:
-    """How a robot stops: distance = speed latency + speed^2 / (2 deceleration)."""
-
-    latency_s: float
-    deceleration: float
-
-
-def measure_braking(model: SimulatorModel) -> Braking:
-    """Drives straight at two speeds in each direction, lets go, and measures the way to rest."""
-    sim = FastSimulator(model, load_world("empty"))
-    worst = Braking(0.0, 1e3)
-    for i, variable in enumerate(model.robot.command):
-        for end in (variable.min, variable.max):
-            if variable.unit != "m/s" or end == 0.0:
-                continue
-            far, near = (_stopping_distance(sim, i, share * end) for share in SPEEDS)
-            curved, speed = far - 2.0 * near, abs(end)
-            deceleration = speed**2 / (4.0 * curved) if curved > 1e-4 else 1e3
-            latency = (far - speed**2 / (2.0 * deceleration)) / speed
-            worst = Braking(
-                max(worst.latency_s, SAFETY * latency), min(worst.deceleration, deceleration)
-            )
-    return worst
-
-
-def _stopping_distance(sim: FastSimulator, index: int, speed: float) -> float:
-    command = np.zeros((1, 1, len(sim.model.robot.command)))
-    sim.reset([0], starts=np.array([[[-np.sign(speed), 0.0, 0.0]]]))
-    command[..., index] = speed
-    for _ in range(12):
-        sim.step(command)
-    path = 0.0
-    for _ in range(12):
-        before = sim.data.pose[0, 0].copy()
-        sim.step(0.0 * command)
-        path += float(np.linalg.norm(geometry.between(before, sim.data.pose[0, 0])[:2]))
-    return path
-
-
-class Adversary:
-    """Picks, among some commands, the one that is worst by its own lights.
-
-    Args:
-        kind: which of the adversaries.
-        model: of the robot.
-        rng: draws the commands.
-    """
-
-    def __init__(self, kind: str, model: SimulatorModel, rng: np.random.Generator) -> None:
-        self._kind, self._robot, self._rng = kind, model.robot, rng
-        self._wheelbase = model.robot.parameters.get("wheelbase", 0.0)
-        self._held, self._left = np.zeros(len(model.robot.command)), 0
-
-    def act(self, pose: Array, circles: Array, walls: Array) -> Array:
-        """The command (C,) for a true pose (3,), obstacles (K, 3) and walls (W, 4)."""
-        low, high = self._robot.command_low, self._robot.command_high
-        ends = np.where(self._rng.random((TRIES, len(low))) < 0.5, low, high)
-        tries = np.concatenate([ends, self._rng.uniform(low, high, (TRIES, len(low)))])
-        if self._kind == "jerk":
-            return self._hold(ends[0])
-        if self._kind == "late":  # away from everything for a while, then into the nearest
-            self._left = self._left - 1 if self._left > 0 else int(self._rng.integers(2, 15))
-            sign = -1.0 if self._left > 2 else 1.0
-        else:
-            sign = 1.0
-        least = self._nearest(pose, tries, circles, walls)
-        if self._kind == "graze":
-            return np.asarray(tries[int(np.argmin(np.abs(least + GRAZE)))])
-        return np.asarray(tries[int(np.argmin(sign * least))])
-
-    def _hold(self, wish: Array) -> Array:
-        if self._left == 0:
-            self._held, self._left = wish, int(self._rng.integers(1, 8))
-        self._left -= 1
-        return self._held
-
-    def _nearest(self, pose: Array, commands: Array, circles: Array, walls: Array) -> Array:
-        """(n,) clearances [m] that commands (n, C) lead to, at the end or on the way."""
-        twist = self._robot.to_cmd_vel(commands)
-        if self._wheelbase > 0.0:
-            twist[:, 2] = twist[:, 0] * np.tan(twist[:, 2]) / self._wheelbase
-        moved = geometry.exp(np.multiply.outer(np.array(HORIZON_S), twist))
-        places = geometry.compose(pose, moved)[..., :2]
-        away = np.array([[wall_distance(x, y, walls) for x, y in row] for row in places])
-        for x, y, radius in circles:
-            away = np.minimum(away, np.hypot(places[..., 0] - x, places[..., 1] - y) - radius)
-        return np.asarray(away.min(axis=0) - self._robot.footprint_radius)
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What happened in some episodes.
+class Plan:
+    """What is driven.
 
     Attributes:
-        contacts: robots that touched something.
-        path: driven by all of them [m].
-        latched: gates that latched a stop, and so did not put the shield to a test any more.
+        episodes: of adversaries.
+        seed: of the first scene.
+        in_process: without processes.
+        control: what is taken out; empty for nothing.
+        at_once: so many robots, each with its gate's process, drive side by side over DDS.
     """
 
-    contacts: int
-    path: float
-    latched: int
+    episodes: int
+    seed: int
+    in_process: bool
+    control: str
+    at_once: int = len(ROBOTS) * len(WORLDS)
+
+    @property
+    def shield(self) -> dict[str, float] | None:
+        """What goes before the shipped values; None for no shield."""
+        if self.control == "no_shield":
+            return None
+        return NOTHING if self.control == "no_braking_distance" else {}
+
+    def jobs(self, places: int) -> tuple[list[list[Job]], list[list[Job]]]:
+        """The episodes of each place: with the shield, and without it."""
+        standing = self.control == "standing"
+        with_it: list[list[Job]] = [[] for _ in range(places)]
+        without: list[list[Job]] = [[] for _ in range(places)]
+        for index in range(self.episodes):
+            kind = ADVERSARIES[index // places % len(ADVERSARIES)]
+            job = Job(kind, self.seed + index, standing)
+            with_it[index % places].append(job)
+            if index // places % WITHOUT == 0 or (
+                index < places * len(ADVERSARIES) and not index % 2
+            ):
+                without[index % places].append(job)
+        for index in range(max(places, self.episodes // GOALS)):
+            job = Job(GOAL, self.seed + index, standing)
+            with_it[index % places].append(job)
+            without[index % places].append(job)
+        return with_it, without
 
 
-def episodes(model: SimulatorModel, braking: Braking | None, seeds: list[int]) -> Outcome:
-    """Drives one episode per seed, side by side; without braking, without a shield."""
-    period, robot, lidar = model.control_period, model.robot, model.lidar
-    sim = FastSimulator(model, load_world("arena"), worlds=len(seeds))
-    walls = sim.world.all_walls()
-    shield = None
-    if braking is not None:
-        shield = ShieldConfig(
-            braking.latency_s, braking.deceleration, MARGIN, period, robot.footprint_radius,
-            robot.parameters.get("wheelbase", 0.0),
-        )  # fmt: skip
-    scenes = sim.reset(seeds)
-    gates = [Gate(gate_config(robot, lidar, shield=shield), lidar) for _ in seeds]
-    rngs = [np.random.default_rng([7, seed]) for seed in seeds]
-    foes = [
-        Adversary(ADVERSARIES[seed % len(ADVERSARIES)], model, rng)
-        for seed, rng in zip(seeds, rngs, strict=True)
+def drive(
+    plan: Plan, places: Sequence[Place], jobs: Sequence[Sequence[Job]], shield: Any
+) -> tuple[list[Outcome], int]:
+    """All episodes, in process or over DDS; and how often this process was held up."""
+    if plan.in_process:
+        found = []
+        for place, some in zip(places, jobs, strict=True):
+            config = shield_in_process.config_of(place, shield)
+            found += shield_in_process.drive(place, config, some)
+            sys.stderr.write(f"{place.robot} in {place.world}: {len(some)} episodes\n")
+        return found, 0
+    from measuring import shield_over_dds  # needs ROS 2
+
+    given: dict[str, Any] = {"shield": False}
+    if shield is not None:
+        given = {f"shield_{name}": value for name, value in shield.items()}
+    outcomes, held_up = [], 0
+    for first in range(0, len(places), plan.at_once):
+        some = slice(first, first + plan.at_once)
+        with tempfile.TemporaryDirectory() as folder:
+            more, late = shield_over_dds.drive(
+                places[some], jobs[some], given, Path(folder),
+                lambda line: sys.stderr.write(f"{line}\n"),
+            )  # fmt: skip
+        outcomes, held_up = outcomes + more, held_up + late
+    return outcomes, held_up
+
+
+def summary(shielded: Sequence[Outcome], bare: Sequence[Outcome], held_up: int) -> dict[str, Any]:
+    """The figures, for the JSON object."""
+    tried = [one for one in shielded if one.kind != GOAL]
+    goals = [one for one in shielded if one.kind == GOAL]
+    without = [one for one in bare if one.kind != GOAL]
+    goals_without = [one for one in bare if one.kind == GOAL]
+    touched = [one for one in shielded if one.contact]
+    return {
+        "episodes": len(tried),
+        "contacts": len(touched),
+        "walked_into": sum(one.walked_into for one in shielded),
+        "path_m": round(math.fsum(one.path for one in tried), 1),
+        "latched": sum(bool(one.latched) for one in tried),
+        "latched_by": dict(Counter(one.latched for one in tried if one.latched)),
+        "tried_without": len(without),
+        "contacts_without": sum(one.contact for one in without),
+        "goals": len(goals),
+        "goals_reached": sum(one.reached for one in goals),
+        "goal_s": _mean([one.seconds for one in goals if one.reached]),
+        "goals_reached_without": sum(one.reached for one in goals_without),
+        "goal_without_s": _mean([one.seconds for one in goals_without if one.reached]),
+        "held_up": held_up,
+        "touched": [f"{one.kind} {' '.join(map(str, one.where))}" for one in touched],
+        "by_world": {
+            world: {
+                "episodes": sum(one.where[1] == world for one in tried),
+                "contacts": sum(one.where[1] == world for one in touched),
+                "goals_reached": sum(one.reached and one.where[1] == world for one in goals),
+                "goals_reached_without": sum(
+                    one.reached and one.where[1] == world for one in goals_without
+                ),
+            }
+            for world in WORLDS
+        },
+    }
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return round(float(np.mean(values)), 2) if values else None
+
+
+def missed(result: Mapping[str, Any], asked: int) -> list[str]:
+    """A sentence for each bar that was missed."""
+    tried, reached = result["tried_without"], result["goals_reached_without"]
+    bars = [
+        ("contacts of robots in motion", result["contacts"], "at most", 0),
+        ("episodes driven", result["episodes"], "at least", max(asked, 1)),
+        ("path driven [m]", result["path_m"], "at least", LEAST_PATH * asked),
+        ("latched stops", result["latched"], "at most", math.ceil(MOST_LATCHED * asked)),
+        ("contacts without the shield", result["contacts_without"], "at least",
+         max(1.0, LEAST_CONTACTS_WITHOUT * tried)),
+        ("goals reached", result["goals_reached"], "at least", max(1.0, LEAST_GOALS * reached)),
+        ("braking distance in parts of what the shield keeps free", result["braking"], "at most",
+         1.0),
+    ]  # fmt: skip
+    return [
+        f"{what}: {value:g}, the bar is {side} {bar:g}"
+        for what, value, side, bar in bars
+        if not (value <= bar if side == "at most" else value >= bar)
     ]
-    for n, gate in enumerate(gates):
-        gate.arm(sim.data.ranges[n, 0], sim.data.odom[n, 0])
-    commands, path = np.zeros((len(seeds), 1, len(robot.command))), 0.0
-    for _ in range(STEPS):
-        for n, (gate, foe, scene) in enumerate(zip(gates, foes, scenes, strict=True)):
-            gate.now += period
-            gate.sense(sim.data.ranges[n, 0], sim.data.odom[n, 0], sim.data.twist[n, 0])
-            wish = foe.act(sim.data.pose[n, 0], scene.bodies[:, ROUND], walls)
-            gate.command(robot.to_cmd_vel(wish))
-            commands[n, 0] = robot.from_cmd_vel(gate.tick().twist)
-        before = sim.data.pose[:, 0].copy()
-        sim.step(commands)
-        path += float(np.linalg.norm(sim.data.pose[:, 0, :2] - before[:, :2], axis=1).sum())
-    latched = sum(gate.state.latched is not None for gate in gates)
-    return Outcome(int((sim.data.collided > 0).sum()), path, latched)
+
+
+def table_of(result: Mapping[str, Any]) -> str:
+    """The figures for people."""
+    return (
+        f"{result['episodes']} episodes of adversaries {result['driven']} over "
+        f"{result['path_m']} m: {result['contacts']} contacts, {result['walked_into']} robots that "
+        f"stood were walked into, {result['latched']} latched stops; without the shield "
+        f"{result['contacts_without']} contacts in {result['tried_without']}\n"
+        f"goals reached: {result['goals_reached']} of {result['goals']} in {result['goal_s']} s on "
+        f"average, without the shield {result['goals_reached_without']} in "
+        f"{result['goal_without_s']} s\n"
+        f"braking takes {100 * result['braking']:.0f} % of the way that the shield keeps free\n"
+    )
 
 
 def main() -> None:
-    """Prints a table, or one JSON object; ends with 1 after a contact."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--episodes", type=int, default=300)
+    """Prints figures, or one JSON object; ends with 1 when a bar was missed."""
+    parser = parser_of(__doc__, CONTROLS)
+    parser.add_argument("--episodes", type=int, default=300, help=f"of {ADVERSARY_S:g} s each")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--in-process", action="store_true", help="without DDS, with drawn delays")
+    names = [f"{robot}/{world}" for robot in ROBOTS for world in WORLDS]
+    parser.add_argument("--place", action="append", choices=names, help="only there; repeatable")
+    parser.add_argument(
+        "--at-once", type=int, default=Plan.at_once, help="robots side by side over DDS"
+    )
     given = parser.parse_args()
-    total = {"contacts": 0, "path_m": 0.0, "latched": 0, "tried_without": 0, "contacts_without": 0}
-    for index, name in enumerate(ROBOTS):
-        model = builtin_model(name)
-        braking = measure_braking(model)
-        count = given.episodes // len(ROBOTS) + (index < given.episodes % len(ROBOTS))
-        first = given.seed + index * given.episodes
-        batches = [
-            list(range(begin, min(begin + WORLDS, first + count)))
-            for begin in range(first, first + count, WORLDS)
-        ]
-        shielded = [episodes(model, braking, seeds) for seeds in batches]
-        bare = [episodes(model, None, seeds) for seeds in batches[::CONTROL_SHARE]]
-        row = {
-            "contacts": sum(one.contacts for one in shielded),
-            "path_m": round(sum(one.path for one in shielded), 1),
-            "latched": sum(one.latched for one in shielded),
-            "tried_without": sum(len(seeds) for seeds in batches[::CONTROL_SHARE]),
-            "contacts_without": sum(one.contacts for one in bare),
-        }
-        total = {key: total[key] + value for key, value in row.items()}
-        if not given.json:
-            sys.stdout.write(
-                f"{name:<14}latency {braking.latency_s:.3f} s, deceleration "
-                f"{braking.deceleration:.1f} m/s^2; {count} episodes over {row['path_m']} m: "
-                f"{row['contacts']} contacts, {row['latched']} latched stops; without the shield "
-                f"{row['contacts_without']} in {row['tried_without']}\n"
-            )
-            sys.stdout.flush()
-    if given.json:
-        sys.stdout.write(json.dumps({"episodes": given.episodes, **total}) + "\n")
-    raise SystemExit(1 if total["contacts"] else 0)
+    plan = Plan(given.episodes, given.seed, given.in_process, given.control or "", given.at_once)
+    places = [Place(*name.split("/")) for name in given.place or names]
+    with_it, without = plan.jobs(len(places))
+    shielded, first = drive(plan, places, with_it, plan.shield)
+    bare, second = drive(plan, places, without, None)
+    result = summary(shielded, bare, first + second)
+    result["driven"] = "in process" if plan.in_process else "over DDS"
+    result["braking"] = round(max(braking_used(place.robot, plan.shield) for place in places), 3)
+    result["load"] = round(os.getloadavg()[0], 1)
+    answer(result, missed(result, plan.episodes), table_of(result), given.json)
 
 
 if __name__ == "__main__":

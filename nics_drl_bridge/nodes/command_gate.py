@@ -59,7 +59,10 @@ class CommandGate(QosWatch):
                 "That is for simulations; set it on a vehicle."
             )
         if self._config.shield is not None:
+            self.get_logger().info(parameters.shield_said)
             shield.rehearse()
+        else:
+            self.get_logger().warning(parameters.shield_said)
         self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
         self._twists = TwistWriter()
         self._zero = self._twists.write(np.zeros(3))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass
 from functools import partial
@@ -10,14 +11,13 @@ from pathlib import Path
 import numpy as np
 from rclpy.node import Node
 
-from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes.runner import declare, declare_model
-from nics_drl_bridge.safety.limits import load_limits
+from nics_drl_bridge.safety.limits import Limits, load_limits
 from nics_drl_bridge.safety.settings import doubtful, require_possible
 from nics_drl_bridge.safety.state import GateConfig, ShieldConfig
+from nics_drl_bridge.safety.stopping import shield_config
 
 SCAN_PERIODS = 1.75
 """A command's scan is no older by default than so many of the lidar's periods, if it is slow."""
@@ -33,12 +33,14 @@ class GateParameters:
         robot: name of the robot behind it.
         lidar: whose scans it gets.
         black_box: folder of the recordings of stops.
+        shield_said: a sentence about the shield.
     """
 
     config: GateConfig
     robot: str
     lidar: LidarSpec
     black_box: Path
+    shield_said: str
 
 
 def declare_gate(node: Node) -> GateParameters:
@@ -62,9 +64,11 @@ def declare_gate(node: Node) -> GateParameters:
     needs_estimate = "Whether arming needs odometry/filtered."
     folder = "Where a stop's last 30 s are written; ~/.ros/black_box if empty."
     scan_age = max(DEFAULTS.scan_age_s, SCAN_PERIODS / lidar.rate)
+    bounds = load_limits(limits, robot) if limits else None
+    shield, said = _declare_shield(node, model, bounds, limits)
     config = GateConfig(
         fields=tuple(int(i) for i in np.flatnonzero(robot.to_cmd_vel(np.ones(len(robot.command))))),
-        limits=load_limits(limits, robot) if limits else None,
+        limits=bounds,
         beam_angles=lidar.angles,
         mount=lidar.mount,
         range_min=lidar.range_min,
@@ -86,52 +90,34 @@ def declare_gate(node: Node) -> GateParameters:
         estimate_required=get("estimate_required", True, needs_estimate),
         estimate_std=share("estimate_std", DEFAULTS.estimate_std, "Greatest [m, rad].", 1e-3, 1e3),
         odom_std=model.noise.odometry,
-        shield=_declare_shield(node, model),
+        shield=shield,
     )
     require_possible(config)
     doubt = doubtful(config, model.control_period)
     if doubt:
         node.get_logger().warning(doubt)
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
-    return GateParameters(
-        config, robot.name, lidar, Path(get("black_box", "", folder) or home / "black_box")
-    )
+    black_box = Path(get("black_box", "", folder) or home / "black_box")
+    return GateParameters(config, robot.name, lidar, black_box, said)
 
 
-def _declare_shield(node: Node, model: SimulatorModel) -> ShieldConfig | None:
-    def get(name: str, default: float, description: str) -> float:
-        limits = {"low": 0.0, "high": 100.0}
-        return float(declare(node, name, default, description, read_only=True, **limits))
+def _declare_shield(
+    node: Node, model: SimulatorModel, limits: Limits | None, file: str
+) -> tuple[ShieldConfig | None, str]:
+    """The shield, None if it is off; and a sentence about it for the log."""
 
-    on = declare(node, "shield", False, "Whether to stop before obstacles.", read_only=True)
-    latency = get("shield_latency", 0.2, "Until the robot has taken up a command, measured [s].")
-    deceleration = get("shield_deceleration", 1.0, "Of the robot, measured [m/s^2].")
-    margin = get("shield_margin", 0.05, "Kept free around the footprint [m].")
+    def get(name: str, description: str) -> float:
+        about = f"{description}; .nan: by the limits' file, or derived from the model."
+        return float(declare(node, f"shield_{name}", math.nan, about, read_only=True))
+
+    on = declare(node, "shield", True, "Whether to stop before obstacles.", read_only=True)
+    values = {
+        "latency": get("latency", "Until the robot has taken up a command, measured [s]"),
+        "deceleration": get("deceleration", "Of the robot, measured [m/s^2]"),
+        "margin": get("margin", "Kept free around the footprint [m]"),
+        "obstacle_speed": get("obstacle_speed", "At which what moves may come on [m/s]"),
+    }
     if not on:
-        return None
-    if deceleration <= 0.0:
-        raise ConfigError("parameter 'shield_deceleration': must be greater than 0.")
-    return ShieldConfig(
-        latency_s=latency,
-        deceleration=deceleration,
-        margin=margin,
-        hold_s=DEFAULTS.gap_s,
-        footprint_radius=model.robot.footprint_radius,
-        wheelbase=wheelbase(model.robot),
-    )
-
-
-def wheelbase(robot: RobotSpec) -> float:
-    """Of a robot that is told a steering angle [m]; 0 for one that is told a turn rate.
-
-    Raises:
-        ConfigError: the robot's file does not tell.
-    """
-    if all(variable.unit != "rad" for variable in robot.command):
-        return 0.0
-    if "wheelbase" not in robot.parameters:
-        raise ConfigError(
-            f"robot {robot.name!r}: the shield needs the parameter 'wheelbase' of a car; add it "
-            "under `parameters:`."
-        )
-    return robot.parameters["wheelbase"]
+        return None, "the shield is off: obstacles do not stop the robot"
+    given = {name: value for name, value in values.items() if not math.isnan(value)}
+    return shield_config(model, limits, file, given)

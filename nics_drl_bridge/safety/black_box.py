@@ -18,7 +18,7 @@ from nics_drl_bridge.safety.inputs import Input
 from nics_drl_bridge.safety.plain import from_plain, to_plain
 from nics_drl_bridge.safety.state import Decision, GateConfig, GateState
 
-FORMAT = "nics_drl_bridge/black_box/2"
+FORMAT = "nics_drl_bridge/black_box/3"
 KEPT_S = 30.0
 LATEST_S = 1e12
 MOST_BYTES = 64 * 2**20

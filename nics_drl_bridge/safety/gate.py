@@ -110,7 +110,8 @@ def _shaped(config: GateConfig, state: GateState, now: float) -> motion.Motion:
 
 def _move(config: GateConfig, state: GateState, moved: motion.Motion, now: float) -> GateState:
     """The state after a motion is published."""
-    past = 0.0 if config.shield is None else config.shield.latency_s
+    # What the newest scan does not show yet: told since, or a latency before.
+    past = 0.0 if config.shield is None else config.shield.latency_s + config.scan_age_s
     recent = tuple(each for each in state.recent if each[0] >= now - past)
     state = replace(
         state, value=moved.value, slope=moved.slope, moved_s=now,

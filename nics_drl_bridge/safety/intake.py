@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nics_drl_bridge.geometry import between
-from nics_drl_bridge.safety import e_stop, frozen, shield
+from nics_drl_bridge.safety import e_stop, frozen, moving, shield
 from nics_drl_bridge.safety.freshness import NANO, ODOM, SCAN, arrived
 from nics_drl_bridge.safety.frozen import NOISE
 from nics_drl_bridge.safety.inputs import Command, Estimate, EStop, Input, Odometry, Press, Scan
@@ -154,8 +154,11 @@ def _take_scan(
         return replace(state, scans=arrivals, jumped=jumped), f"scan: its stamp {fault}"
     pose = None if state.odometry is None else state.odometry.pose
     seen, why = frozen.look(config, state.seen, scan.ranges, pose)
-    obstacles = shield.obstacles(config, scan.ranges)
-    state = replace(state, scans=arrivals, scan=scan, seen=seen, frozen=why, obstacles=obstacles)
+    views = moving.remember(config, state, scan)
+    state = replace(
+        state, scans=arrivals, scan=scan, seen=seen, frozen=why, views=views,
+        obstacles=shield.obstacles(config, scan.ranges, views),
+    )  # fmt: skip
     if state.pending is not None and state.pending.stamp_ns == scan.stamp_ns:
         state = _take_command(state, state.pending, now)
     return state, ""

@@ -54,16 +54,34 @@ class CommandLimit(Schema):
         return self
 
 
+class Stopping(Schema):
+    """How the robot stops, for the shield: distance = v latency + v^2 / (2 deceleration).
+
+    Attributes:
+        latency: from a command until the robot has taken it up, lags included [s].
+        deceleration: with which it then brakes [m/s^2].
+        margin: kept free around the footprint [m].
+        obstacle_speed: at which what moves may come on; 0 to take everything to stand [m/s].
+    """
+
+    latency: float = Field(ge=0.0)
+    deceleration: float = Field(gt=0.0)
+    margin: float = Field(default=0.05, ge=0.0)
+    obstacle_speed: float = Field(default=1.0, ge=0.0)
+
+
 class LimitsFile(Schema):
-    """A file of limits. Nothing in it has a default.
+    """A file of limits. Only `shield` may be left out; `stopping` then derives it from the model.
 
     Attributes:
         robot: name of the robot it is for.
         commands: limits by the name of the command in the RobotSpec.
+        shield: how the robot stops, measured.
     """
 
     robot: str
     commands: dict[str, CommandLimit]
+    shield: Stopping | None = None
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ KINDS: dict[str, type] = {
     for kind in (
         inputs.Scan, inputs.Odometry, inputs.Estimate, inputs.Command, inputs.EStop, inputs.Press,
         inputs.Arm, inputs.Reset, inputs.Tick, limits.Limits, state.ShieldConfig, state.GateConfig,
-        state.Cause, state.Arrivals, state.Sameness, state.Push, state.EStopState, state.GateState,
-        state.Decision,
+        state.Cause, state.Arrivals, state.Sameness, state.Push, state.View, state.EStopState,
+        state.GateState, state.Decision,
     )
 }  # fmt: skip
 

@@ -16,13 +16,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.safety import shield_kernels
+from nics_drl_bridge.safety import moving, shield_kernels
 from nics_drl_bridge.safety.freshness import age
 from nics_drl_bridge.safety.motion import Motion
-from nics_drl_bridge.safety.state import GateConfig, GateState, ShieldConfig
+from nics_drl_bridge.safety.state import GateConfig, GateState, ShieldConfig, View
 
 Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
+Flags = NDArray[np.bool_]
 FINEST = 6
 """Bisections of the scale."""
 SPEEDS, TURNS = 3, 9
@@ -35,20 +36,21 @@ STEP = 0.02
 """Between two places of the footprint on an arc [m]."""
 
 
-def returns(config: GateConfig, shield: ShieldConfig, ranges: Ranges) -> Array:
-    """(P, 2) where the beams ended, in `base_link` [m]."""
+def returns(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
+    """(P, 3) where the beams ended [m], and how fast what they met may come on [m/s]."""
     hit = np.isfinite(ranges)
-    return _ends(config, config.beam_angles[hit], ranges[hit].astype(np.float64))
+    speeds = np.where(moves[hit], shield.obstacle_speed, 0.0)
+    return _ends(config, config.beam_angles[hit], ranges[hit].astype(np.float64), speeds)
 
 
-def too_close(config: GateConfig, shield: ShieldConfig, ranges: Ranges) -> Array:
-    """(P, 2) something nearer than the lidar can measure (`-inf`): at its least range [m]."""
+def too_close(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
+    """(P, 3) something nearer than the lidar can measure (`-inf`): at its least range [m]."""
     near = np.isneginf(ranges)
-    return _ends(config, config.beam_angles[near], np.full(near.sum(), config.range_min))
+    return _ends(config, config.beam_angles[near], np.full(near.sum(), config.range_min), 0.0)
 
 
-def unknown(config: GateConfig, shield: ShieldConfig, ranges: Ranges) -> Array:
-    """(P, 2) a wall on the footprint wherever too many beams, or all for want of any, are unknown.
+def unknown(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
+    """(P, 3) a wall on the footprint wherever too many beams, or all for want of any, are unknown.
 
     So the robot does not drive into what it can't see; away from it, it does.
     """
@@ -63,29 +65,43 @@ def unknown(config: GateConfig, shield: ShieldConfig, ranges: Ranges) -> Array:
         seen = np.searchsorted(around, grid + half) - np.searchsorted(around, grid - half)
         spacing = config.beam_angles[1] - config.beam_angles[0] if len(ranges) > 1 else 2.0 * np.pi
         blocked = grid[seen < (1.0 - shield.unknown_share) * shield.unknown_width / spacing]
-    return shield.footprint_radius * np.stack([np.cos(blocked), np.sin(blocked)], axis=1)
+    wall = shield.footprint_radius * np.stack([np.cos(blocked), np.sin(blocked)])
+    return np.stack([*wall, np.zeros_like(blocked)], axis=1)
 
 
-Evidence = Callable[[GateConfig, ShieldConfig, Ranges], Array]
+Evidence = Callable[[GateConfig, ShieldConfig, Ranges, Flags], Array]
 EVIDENCE: tuple[Evidence, ...] = (returns, too_close, unknown)
 
 
-def _ends(config: GateConfig, angles: Array, ranges: Array) -> Array:
+def _ends(config: GateConfig, angles: Array, ranges: Array, speeds: Array | float) -> Array:
     x, y, heading = config.mount
     angles = angles + heading
-    return np.stack([x + ranges * np.cos(angles), y + ranges * np.sin(angles)], axis=1)
+    speeds = np.broadcast_to(speeds, ranges.shape)
+    return np.stack([x + ranges * np.cos(angles), y + ranges * np.sin(angles), speeds], axis=1)
 
 
-def obstacles(config: GateConfig, ranges: Ranges) -> Array | None:
-    """(P, 2) all that a scan (B,) tells not to drive into, in `base_link`; None without shield."""
-    if config.shield is None:
+def obstacles(config: GateConfig, ranges: Ranges, views: tuple[View, ...]) -> Array | None:
+    """(P, 3) all that a scan (B,) tells not to drive into, and how fast each may come on.
+
+    Args:
+        config: of the gate.
+        ranges: of the scan.
+        views: it and those before, see `moving`; empty where no odometry has come yet.
+
+    Returns:
+        x, y in `base_link` [m], speed [m/s]; None without shield.
+    """
+    given = config.shield
+    if given is None:
         return None
-    return np.concatenate([evidence(config, config.shield, ranges) for evidence in EVIDENCE])
+    moves = moving.movers(config, given, views) if views else np.zeros(len(ranges), np.bool_)
+    return np.concatenate([evidence(config, given, ranges, moves) for evidence in EVIDENCE])
 
 
 def rehearse() -> None:
     """Compiles what `shield` calls: that takes seconds, which no robot in motion has."""
-    shield_kernels.free(np.zeros((1, 2)), np.zeros((1, 3)), np.zeros(1), 0.0, STEP)
+    shield_kernels.free(np.zeros((1, 3)), np.zeros((1, 3)), 0.0, 1.0, 0.0, STEP)
+    moving.rehearse()
 
 
 def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
@@ -119,17 +135,19 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
         return True
     room = given.footprint_radius + given.margin
     odometry = np.zeros(3) if state.odometry is None else state.odometry.twist
-    past = [value for _, value in state.recent]
+    old = max(0.0, age(state.scans, now))
+    # What the scan does not show yet: told since it was made, or within the latency before.
+    past = [value for told, value in state.recent if told >= now - old - given.latency_s]
     react = given.hold_s + given.latency_s
     calm = 1.0 / config.scan_rate + react + given.latency_s
-    hard = max(0.0, age(state.scans, now)) + react
-    for commands, twist, blind, deceleration in (
-        ([value], None, calm, CALM * given.deceleration),
-        ([*past, state.value, value], odometry, hard, given.deceleration),
+    hard = old + react
+    standing = points * (1.0, 1.0, 0.0)  # none may move so fast that a calm stop is any use
+    for seen, commands, twist, blind, deceleration in (
+        (standing, [value], None, calm, CALM * given.deceleration),
+        (points, [*past, state.value, value], odometry, hard, given.deceleration),
     ):
         twists = _family(config, given, np.array(commands), twist)
-        duration = blind + np.hypot(twists[:, 0], twists[:, 1]) / (2.0 * deceleration)
-        if not shield_kernels.free(points, twists, duration, room, STEP):
+        if not shield_kernels.free(seen, twists, blind, deceleration, room, STEP):
             return False
     return True
 

@@ -20,39 +20,55 @@ def place(twist, time):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def free(points, twists, duration, room, step):  # type: ignore[no-untyped-def]
-    """Whether no point comes within `room` of any of the arcs.
+def free(points, twists, blind, deceleration, room, step):  # type: ignore[no-untyped-def]
+    """Whether no point comes within `room` of any of the arcs before the robot is at rest on it.
 
-    A point that is as near already must not come nearer; so the robot can leave it.
+    A point that moves may be nearer by then by all that it can have moved. One that is as near
+    already must not come nearer; so the robot can leave it.
 
     Args:
-        points: (P, 2) [m].
+        points: (P, 3) x, y [m], and how fast each moves at most [m/s].
         twists: (K, 3).
-        duration: (K,) of each [s].
+        blind: for so long the robot keeps its twist; then it brakes [s].
+        deceleration: with which it does [m/s^2].
         room: [m].
         step: between places that are looked at [m].
     """
-    longest = 0.0
+    longest, rest = 0.0, 0.0
     for k in range(twists.shape[0]):
-        longest = max(longest, math.hypot(twists[k, 0], twists[k, 1]) * duration[k])
-    near = np.empty((points.shape[0], 3))
+        speed = math.hypot(twists[k, 0], twists[k, 1])
+        longest = max(longest, speed * (blind + speed / (2.0 * deceleration)))
+        rest = max(rest, blind + speed / deceleration)
+    near = np.empty((points.shape[0], 4))
     count = 0
     for p in range(points.shape[0]):
         away = math.hypot(points[p, 0], points[p, 1])
-        if away < room + longest:
+        if away < room + longest + points[p, 2] * rest:
             near[count, 0], near[count, 1] = points[p, 0], points[p, 1]
-            least = min(room, away * (1.0 - 1e-9))
-            near[count, 2] = least * least
+            near[count, 2], near[count, 3] = points[p, 2], away * (1.0 - 1e-9)
             count += 1
     if count == 0:
         return True
     for k in range(twists.shape[0]):
-        length = math.hypot(twists[k, 0], twists[k, 1]) * duration[k]
-        steps = math.ceil(length / step)
+        speed = math.hypot(twists[k, 0], twists[k, 1])
+        duration = blind + speed / (2.0 * deceleration)
+        steps = math.ceil(speed * duration / step)
         for s in range(1, steps + 1):
-            x, y = place(twists[k], duration[k] * s / steps)
+            part = duration * s / steps
+            x, y = place(twists[k], part)
+            time = _reached(part, speed, blind, deceleration)
             for p in range(count):
                 dx, dy = near[p, 0] - x, near[p, 1] - y
-                if dx * dx + dy * dy < near[p, 2]:
+                least = min(room + near[p, 2] * time, near[p, 3])
+                if dx * dx + dy * dy < least * least:
                     return False
     return True
+
+
+@njit(cache=True)
+def _reached(part, speed, blind, deceleration):  # type: ignore[no-untyped-def]
+    """When a robot that brakes is where, at its first speed, it would be after a time [s]."""
+    if part <= blind:
+        return part
+    left = speed * speed - 2.0 * deceleration * speed * (part - blind)
+    return blind + (speed - math.sqrt(max(left, 0.0))) / deceleration

@@ -24,6 +24,9 @@ class ShieldConfig:
         hold_s: until the next decision at the latest [s].
         footprint_radius: of the robot [m].
         wheelbase: of a car, whose command holds a steering angle [m]; 0 for the others.
+        obstacle_speed: at which what was seen to move may come on [m/s]; 0 to take all to stand.
+        range_max: of the lidar [m].
+        range_noise: standard deviation of its ranges, in metres and in parts of the range.
         unknown_share: of unknown beams in a direction, from which on it counts as blocked.
         unknown_width: over which that share is taken [rad].
     """
@@ -34,6 +37,9 @@ class ShieldConfig:
     hold_s: float
     footprint_radius: float
     wheelbase: float = 0.0
+    obstacle_speed: float = 0.0
+    range_max: float = float("inf")
+    range_noise: tuple[float, float] = (0.0, 0.0)
     unknown_share: float = 0.5
     unknown_width: float = 0.35
 
@@ -177,6 +183,21 @@ class Sameness:
 
 
 @dataclass(frozen=True)
+class View:
+    """A scan, and from where it was made.
+
+    Attributes:
+        stamp_ns: of its header [ns].
+        pose: (3,) of the robot then, by odometry.
+        ranges: (B,) [m], REP-117.
+    """
+
+    stamp_ns: int
+    pose: Array
+    ranges: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
 class Push:
     """What the robot was told without a pause.
 
@@ -232,14 +253,16 @@ class GateState:
         estimate_s, command_s: when those arrived [s].
         pending: a command whose scan has not arrived here yet.
         pending_s: since when commands have named such scans [s]; None when the newest does not.
-        obstacles: (P, 2) what the newest scan shows, in `base_link` [m].
+        views: of the last moments, for what moves; empty without shield.
+        obstacles: (P, 3) what the newest scan shows: x, y in `base_link` [m], and how fast each
+            may move [m/s].
         behind_s: when the scan behind the newest command was as new as can be [s].
         malformed: what is wrong with the newest command; empty when nothing is.
         seen: what the lidar has shown last, the newest last.
         frozen: why the newest scan is no new one; empty when it is.
         restless_s: when odometry last showed motion [s].
         push: what the robot was told lately; None when it was stopped.
-        recent: times and values of the commands published within the latency.
+        recent: times and values of the commands that the newest scan may not show yet.
         e_stop: see there.
     """
 
@@ -265,6 +288,7 @@ class GateState:
     command_s: float = float("-inf")
     pending: Command | None = None
     pending_s: float | None = None
+    views: tuple[View, ...] = ()
     obstacles: Array | None = None
     behind_s: float = float("-inf")
     malformed: str = ""

@@ -21,6 +21,7 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.generator import save_model
 from nics_drl_bridge.nodes import command_gate, conversions, qos
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.nodes.wire import TwistWriter
@@ -163,14 +164,13 @@ def test_it_imports_nothing_that_learns_or_infers():
     assert not loaded & {"torch", "onnxruntime", "onnx", "stable_baselines3", "gymnasium"}
 
 
-def test_with_a_shield_it_does_not_listen_before_all_is_compiled(domain_id):
+def test_it_does_not_listen_before_its_shield_is_compiled(domain_id):
     code = f"""
 from nics_drl_bridge.nodes.command_gate import CommandGate
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.safety.shield_kernels import free
 CommandGate._listen = lambda _: print(len(free.signatures))
-given = ["--ros-args", "-p", "shield:=true"]
-node = CommandGate(open_context(given, domain_id={domain_id}))
+node = CommandGate(open_context([], domain_id={domain_id}))
 node.destroy_node()
 node.context.try_shutdown()
 """
@@ -398,17 +398,10 @@ def test_bytes_that_are_no_message_are_refused_and_counted(domain_id, tmp_path):
         context.try_shutdown()
 
 
-def test_with_a_shield_it_stops_before_an_obstacle_and_counts_it(
+def test_as_shipped_it_stops_before_an_obstacle_and_counts_it(
     launch, meet, domain_id, model, tmp_path
 ):
-    launch(
-        "command_gate",
-        domain_id,
-        limits="ackermann",
-        black_box=str(tmp_path),
-        shield=True,
-        **PATIENT,
-    )
+    gate = launch("command_gate", domain_id, limits="ackermann", black_box=str(tmp_path), **PATIENT)
     robot = Robot(meet(domain_id), model.lidar)
     robot.distance = 3.0
     robot.drives(0.2, 0.0, 0.0)
@@ -417,6 +410,34 @@ def test_with_a_shield_it_stops_before_an_obstacle_and_counts_it(
     facts = robot.diagnosed()
     assert facts[""] == "commands pass"
     assert int(facts["cut by the shield"]) > 0
+    said = gate.log.read_text(encoding="utf-8")
+    assert "the shield is on: latency 0.2, deceleration 2, margin 0.05, obstacle_speed 1" in said
+    assert "config/limits/ackermann.yaml" in said
+
+
+def test_without_its_shield_it_says_so_and_stops_before_nothing(
+    launch, meet, domain_id, model, tmp_path
+):
+    gate = launch(
+        "command_gate", domain_id, limits="ackermann", black_box=str(tmp_path), shield=False,
+        **PATIENT,
+    )  # fmt: skip
+    robot = Robot(meet(domain_id), model.lidar)
+    robot.distance = 0.3
+    robot.drives(0.2, 0.0, 0.0)
+    assert "the shield is off" in gate.log.read_text(encoding="utf-8")
+
+
+def test_a_car_that_does_not_tell_its_wheelbase_ends_it_with_one_sentence(
+    launch, meet, domain_id, model, tmp_path
+):
+    robot = model.robot.model_copy(update={"parameters": {}})
+    save_model(replace(model, robot=robot), tmp_path / "model")
+    gate = launch("command_gate", domain_id, model=str(tmp_path / "model"))
+    meet(domain_id).until(lambda: gate._process.poll() is not None, "its end")
+    last = gate.log.read_text(encoding="utf-8").strip().splitlines()[-1]
+    assert "the shield needs the parameter 'wheelbase' of a car" in last
+    assert gate._process.returncode == 2
 
 
 def test_without_limits_it_can_not_be_armed(launch, meet, domain_id, model):

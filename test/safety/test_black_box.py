@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.safety.black_box import BlackBox, Entry, replay, write
+from nics_drl_bridge.safety.black_box import FORMAT, BlackBox, Entry, replay, write
 from nics_drl_bridge.safety.inputs import EStop
 from nics_drl_bridge.safety.plain import from_plain, to_plain
 from nics_drl_bridge.safety.state import ShieldConfig
@@ -105,8 +105,8 @@ def test_records_of_the_gate_become_plain_data_and_back(tmp_path):
         ("", "is no black box"),
         ("{}", "is no black box"),
         ("{", "is no JSON"),
-        ('{"format": "nics_drl_bridge/black_box/2"}', "is damaged"),
-        ('{"format": "nics_drl_bridge/black_box/2", "config": {"kind": "Spy"}}', "is damaged"),
+        (f'{{"format": "{FORMAT}"}}', "is damaged"),
+        (f'{{"format": "{FORMAT}", "config": {{"kind": "Spy"}}}}', "is damaged"),
     ],
 )
 def test_a_file_that_is_no_black_box_is_one_sentence(tmp_path, text, sentence):

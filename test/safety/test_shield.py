@@ -7,7 +7,10 @@ import pytest
 from numba import njit
 from shapely.geometry import LineString, Point
 
-from nics_drl_bridge.safety import shield_kernels
+from nics_drl_bridge.safety import moving_kernels, shield_kernels
+from nics_drl_bridge.safety.gate import decide
+from nics_drl_bridge.safety.inputs import Tick
+from nics_drl_bridge.safety.moving_kernels import entered
 from nics_drl_bridge.safety.shield import obstacles, rehearse
 from nics_drl_bridge.safety.shield_kernels import free, place
 from nics_drl_bridge.safety.state import ShieldConfig
@@ -16,6 +19,7 @@ from safety.rig import LIDAR, Rig, config
 CAR = ShieldConfig(
     latency_s=0.15, deceleration=1.0, margin=0.05, hold_s=0.02, footprint_radius=0.15, wheelbase=0.2
 )
+BRAKE = 1.0
 FAR = np.full(LIDAR.beams, 3.0, np.float32)
 
 
@@ -58,13 +62,14 @@ def test_without_a_shield_nothing_is_cut():
 
 @pytest.mark.parametrize("wheelbase", [CAR.wheelbase, 0.0])
 def test_nothing_remains_to_be_compiled_after_a_rehearsal(wheelbase, monkeypatch):
-    fresh = njit(free.py_func)
-    monkeypatch.setattr(shield_kernels, "free", fresh)
+    fresh = {"free": njit(free.py_func), "entered": njit(entered.py_func)}
+    monkeypatch.setattr(shield_kernels, "free", fresh["free"])
+    monkeypatch.setattr(moving_kernels, "entered", fresh["entered"])
     rehearse()
-    known = list(fresh.signatures)
-    assert known
-    Faced(ranges(0.3), replace(CAR, wheelbase=wheelbase)).settles(0.1)
-    assert fresh.signatures == known
+    known = {name: list(kernel.signatures) for name, kernel in fresh.items()}
+    assert all(known.values())
+    Faced(ranges(0.3), replace(CAR, wheelbase=wheelbase, obstacle_speed=1.0)).settles(0.1)
+    assert {name: kernel.signatures for name, kernel in fresh.items()} == known
 
 
 @pytest.mark.parametrize("distance", [0.4, 0.6, 0.8])
@@ -110,7 +115,7 @@ def test_a_scan_shows_its_returns_where_they_are():
     given = config(shield=CAR, mount=(0.1, 0.0, np.pi / 2))
     seen = np.full(LIDAR.beams, np.inf, np.float32)
     seen[LIDAR.beams // 2] = 2.0  # straight ahead of the lidar, left of the robot
-    assert obstacles(given, seen) == pytest.approx(np.array([[0.1, 2.0]]), abs=1e-6)
+    assert obstacles(given, seen, ()) == pytest.approx(np.array([[0.1, 2.0, 0.0]]), abs=1e-6)
 
 
 def test_the_sweep_agrees_with_geometry():
@@ -118,18 +123,44 @@ def test_the_sweep_agrees_with_geometry():
     room, step, unclear = 0.2, 0.005, 0
     for _ in range(400):
         twist = np.array([rng.uniform(-1, 1), rng.uniform(-1, 1), rng.uniform(-2, 2)])
-        duration, point = rng.uniform(0.1, 1.0), rng.uniform(-1.2, 1.2, 2)
+        blind, point = rng.uniform(0.1, 0.8), rng.uniform(-1.2, 1.2, 2)
+        duration = blind + np.hypot(*twist[:2]) / (2.0 * BRAKE)
         path = LineString([place(twist, t) for t in np.linspace(0.0, duration, 400)])
         away = path.distance(Point(point))
         if abs(away - room) < step or np.hypot(*point) <= room:
             unclear += 1
             continue
-        swept_free = free(point[None], twist[None], np.array([duration]), room, step)
+        swept_free = free(np.array([[*point, 0.0]]), twist[None], blind, BRAKE, room, step)
         assert swept_free == (away > room)
     assert unclear < 100
 
 
 @pytest.mark.parametrize(("speed", "may"), [(0.3, False), (-0.3, True)])
 def test_a_robot_in_the_margin_may_leave_and_not_come_nearer(speed, may):
-    near = np.array([[0.17, 0.02]])
-    assert free(near, np.array([[speed, 0.0, 0.0]]), np.array([0.5]), 0.2, 0.02) == may
+    near = np.array([[0.17, 0.02, 0.0]])
+    assert free(near, np.array([[speed, 0.0, 0.0]]), 0.5, BRAKE, 0.2, 0.02) == may
+
+
+@pytest.mark.parametrize(("away", "may"), [(1.19, False), (1.21, True)])
+def test_what_comes_on_is_met_no_sooner_than_the_robot_is_at_rest(away, may):
+    """0.5 m/s for 0.4 s and then 0.25 s of braking: 0.2625 m, in which 1 m/s comes 0.65 m near."""
+    near = 0.2 + 0.2625 + 0.65
+    twists = np.array([[0.5, 0.0, 0.0]])
+    comes = np.array([[near + away - 1.2, 0.0, 1.0]])
+    assert free(comes, twists, 0.4, 2.0, 0.2, 0.005) == may
+    assert free(comes * (1.0, 1.0, 0.0), twists, 0.4, 2.0, 0.2, 0.005)
+
+
+def test_a_command_of_before_that_the_scan_does_not_show_yet_is_reckoned_with():
+    """It was told a latency before the scan was made, and turns the robot towards what is there."""
+    rig = Faced(ranges(0.45, where=np.abs(LIDAR.angles - 0.9) < 0.3), replace(CAR, latency_s=0.3))
+    rig.wish = np.array([0.6, 0.0, 0.0])
+    rig.settles()
+    while rig.now - rig.state.scans.times[-1] < 0.09:
+        rig.run(0.02, without="scan")
+    straight = rig.decision.twist[0]
+    told, before = np.array([0.6, 0.5]), rig.state
+    for ago, cut in ((0.33, True), (0.6, False)):  # that of 0.6 s ago the scan shows
+        recent = ((rig.now - ago, told), *before.recent)
+        _, decision = decide(rig.config, replace(before, recent=recent), Tick(), rig.now + 0.02)
+        assert (decision.twist[0] < straight - 0.1) == cut

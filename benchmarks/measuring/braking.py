@@ -1,0 +1,56 @@
+"""How a robot stops in the simulator, beside what its shield takes for granted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.safety.limits import load_limits
+from nics_drl_bridge.safety.stopping import shield_config
+from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world import load_world
+
+SHARES = (1.0, 0.5, 0.25)
+PERIODS = 15
+
+
+def braking_used(robot: str, given: Mapping[str, float] | None) -> float:
+    """The longest way of a robot to rest, in parts of what its shield keeps free for it.
+
+    It drives straight at several speeds in each direction and lets go, at the worst moment: its
+    base has just looked for a command, and looks again a control period later.
+
+    Args:
+        robot: a shipped one.
+        given: values that go before those that are shipped; None for those.
+    """
+    model = builtin_model(robot)
+    limits = load_limits(robot, model.robot)
+    shield, _ = shield_config(model, limits, robot, given)
+    sim, most = FastSimulator(model, load_world("empty")), 0.0
+    for index, (low, high) in enumerate(zip(limits.low, limits.high, strict=True)):
+        if not limits.linear[index]:
+            continue
+        for speed in (share * end for end in (low, high) if end != 0.0 for share in SHARES):
+            away = _stopping_distance(sim, index, speed) + abs(speed) * model.control_period
+            kept = abs(speed) * shield.latency_s + speed**2 / (2.0 * shield.deceleration)
+            most = max(most, away / kept)
+    return most
+
+
+def _stopping_distance(sim: FastSimulator, index: int, speed: float) -> float:
+    """From the moment at which the command is let go [m]."""
+    command = np.zeros((1, 1, len(sim.model.robot.command)))
+    sim.reset([0], starts=np.array([[[-2.0 * np.sign(speed), 0.0, 0.0]]]))
+    command[..., index] = speed
+    for _ in range(PERIODS):
+        sim.step(command)
+    path = 0.0
+    for _ in range(PERIODS):
+        before = sim.data.pose[0, 0].copy()
+        sim.step(0.0 * command)
+        path += float(np.linalg.norm(geometry.between(before, sim.data.pose[0, 0])[:2]))
+    return path

@@ -1,0 +1,48 @@
+"""Compiled comparison of two scans: what stands where the way was free before?"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+WIDTH = 0.02
+"""The old beams within so much of a bearing are asked [rad]."""
+
+
+@njit(cache=True)
+def entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-untyped-def]
+    """Marks the beams that end where an older scan saw through, as far as it could see.
+
+    The robot's own motion in between is taken out. What was hidden then, or unknown, is not marked.
+
+    Args:
+        out: (B,) bool, set where so; else left.
+        ranges, old: (B,) the newer and the older scan, REP-117 [m].
+        lidar: angle_min, angle_increment [rad], mount x, y [m] and heading [rad].
+        moved: (3,) pose of the robot now, seen from where it was.
+        far: greatest range [m].
+        tolerance: what may be noise, in metres and in parts of the range.
+    """
+    first, increment, mount_x, mount_y, mount_turn = lidar
+    beams, circle = len(ranges), 2.0 * math.pi / abs(increment)
+    whole, wide = round(circle), math.ceil(WIDTH / abs(increment))
+    cosine, sine = math.cos(moved[2]), math.sin(moved[2])
+    for b in range(beams):
+        if out[b] or not np.isfinite(ranges[b]):
+            continue
+        angle = first + b * increment + mount_turn
+        x, y = mount_x + ranges[b] * math.cos(angle), mount_y + ranges[b] * math.sin(angle)
+        dx = moved[0] + cosine * x - sine * y - mount_x
+        dy = moved[1] + sine * x + cosine * y - mount_y
+        away = math.hypot(dx, dy)
+        at = (math.atan2(dy, dx) - mount_turn - first) / increment
+        middle, seen = round(at - circle * math.floor(at / circle)), far
+        for i in range(middle - wide, middle + wide + 1):
+            index = i % whole
+            beyond = old[index] if index < beams else np.nan
+            # Not `min`: NaN, and what was too close, must let the beam go unmarked.
+            seen = beyond if not beyond >= seen else seen
+        if away < seen - tolerance[0] - tolerance[1] * away:
+            out[b] = True
