@@ -94,7 +94,7 @@ def _many(amount: int, width: int) -> Grown:
 
 
 def _gather(amount: int, width: int) -> Grown:
-    index = np.zeros(100_000 * amount, np.int64)
+    index = np.zeros(400_000 * amount, np.int64)  # 1,200,000 numbers and more
     nodes = _chain(3, lambda a, b: node("Gather", [a, "x_index"], [b], axis=1))
     return nodes, {"index": index}
 
