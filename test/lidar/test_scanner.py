@@ -11,7 +11,7 @@ from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.budget import expected_rmse
 from nics_drl_bridge.lidar.maps_grid import GridMap
 from nics_drl_bridge.lidar.scanner import RENDERERS, Scanner, make_scanner
-from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle, Polygon, Rectangle, Segment
+from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle, Polygon, Rectangle
 from nics_drl_bridge.lidar.table import Density
 
 HALF = np.pi / 2.0
@@ -290,8 +290,8 @@ def test_a_pose_that_is_no_number_neither_hangs_nor_harms_the_others(renderer, w
 def test_auto_looks_up_all_but_huge_shapes_and_those_with_notches():
     huge = Rectangle(size=(8.0, 0.1))
     notch = Polygon(points=((0.0, 0.0), (0.5, 0.0), (0.1, 0.1), (0.0, 0.5)))
-    shapes = (Circle(radius=0.2), SQUARE, Segment(ends=((0.0, -0.3), (0.0, 0.3))), huge, notch)
-    table = bake(lidar(), shapes, Density(distances=5, rotations=4))
+    shapes = (Circle(radius=0.2), Circle(radius=0.1), SQUARE, huge, notch)
+    table = bake(lidar(), shapes)
     scans = {}
     for renderer in RENDERERS:
         scanner = Scanner(lidar(), table, renderer)
@@ -414,7 +414,11 @@ def test_auto_looks_up_a_concave_shape_of_any_corners_where_that_errs_little(mou
         poses = rng.uniform(-1.0, 1.0, (300, 1, 3)) * [2.5, 2.5, np.pi]
         bodies, robots = auto.place([shape], poses), np.zeros((300, 3))
         scans = {way: Scanner(spec, auto.table, way).scan(robots, bodies) for way in RENDERERS}
-        assert np.array_equal(scans["auto"], scans["baked" if looked_up else "exact"])
+        as_baked, as_exact = (
+            (scans["auto"] == scans[way]).all(axis=1) for way in ("baked", "exact")
+        )
+        assert (as_baked | as_exact).all()
+        assert (~as_exact).any() == looked_up
         assert not np.array_equal(scans["baked"], scans["exact"])
         both = np.isfinite(scans["auto"]) & np.isfinite(scans["exact"])
         assert both.sum() > 1000
@@ -426,13 +430,15 @@ def test_auto_looks_up_a_concave_shape_of_any_corners_where_that_errs_little(mou
 )
 def test_auto_computes_the_rays_of_few_and_wide_beams(beams, same):
     spec = lidar(beams=beams)
-    auto = make_scanner(spec, [STRIP])
+    auto, disc = make_scanner(spec, [STRIP, Circle(radius=0.1)]), Circle(radius=0.1)
     poses = np.random.default_rng(0).uniform(-1.0, 1.0, (300, 1, 3)) * [2.0, 2.0, np.pi]
     scans = {
-        way: Scanner(spec, auto.table, way).scan(np.zeros((300, 3)), auto.place([STRIP], poses))
+        way: Scanner(spec, auto.table, way).scan(np.zeros((300, 3)), auto.place([disc], poses))
         for way in RENDERERS
     }
-    assert np.array_equal(scans["auto"], scans[same])
+    as_baked, as_exact = ((scans["auto"] == scans[way]).all(axis=1) for way in ("baked", "exact"))
+    assert (as_baked | as_exact).all()
+    assert (~as_exact).any() == (same == "baked")
     assert not np.array_equal(scans["baked"], scans["exact"])
 
 
