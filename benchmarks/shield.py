@@ -8,7 +8,8 @@ adversaries are some; and a policy that means well drives with and without, to s
 costs. `--in-process` drives the same without processes, with drawn delays, many times as fast.
 
 A touch of a robot that moves is a contact; one that stands when something comes to touch it was
-walked into, which no shield prevents.
+walked into, which no shield prevents. Over DDS this process is all the robots: when it was held up
+itself, the running episodes are driven again, and when that was often, the run is none.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ from measuring.braking import braking_used
 from measuring.shield_places import ADVERSARY_S, GOAL, Job, Outcome, Place
 from measuring.verdict import answer, parser_of
 
+from nics_drl_bridge.safety.state import GateConfig
+
 CONTROLS = {
     "no_shield": "the shield: it is off",
     "standing": "the motion: every driver stays where it is",
@@ -38,7 +41,10 @@ CONTROLS = {
 ROBOTS, WORLDS = ("ackermann", "differential", "mecanum"), ("arena", "clutter", "crowd")
 WITHOUT, GOALS = 10, 10
 """One in so many episodes is driven without the shield as well; and so many goals are tried."""
+MOST_HELD_UP = 0.02
+"""Of the time that this process ran; beyond it the machine was too busy for a run in real time."""
 LEAST_PATH, LEAST_CONTACTS_WITHOUT, MOST_LATCHED, LEAST_GOALS = 0.5, 0.5, 0.1, 0.6
+HELD_UP = ("count", "seconds", "of_s", "repeated")
 NOTHING = {"latency": 0.0, "deceleration": 1e3, "margin": 0.0, "obstacle_speed": 0.0}
 
 
@@ -89,21 +95,21 @@ class Plan:
 
 def drive(
     plan: Plan, places: Sequence[Place], jobs: Sequence[Sequence[Job]], shield: Any
-) -> tuple[list[Outcome], int]:
-    """All episodes, in process or over DDS; and how often this process was held up."""
+) -> tuple[list[Outcome], Mapping[str, float]]:
+    """All episodes, in process or over DDS; and how well this process kept up, for the latter."""
     if plan.in_process:
         found = []
         for place, some in zip(places, jobs, strict=True):
             config = shield_in_process.config_of(place, shield)
             found += shield_in_process.drive(place, config, some)
             sys.stderr.write(f"{place.robot} in {place.world}: {len(some)} episodes\n")
-        return found, 0
+        return found, {}
     from measuring import shield_over_dds  # needs ROS 2
 
     given: dict[str, Any] = {"shield": False}
     if shield is not None:
         given = {f"shield_{name}": value for name, value in shield.items()}
-    outcomes, held_up = [], 0
+    outcomes, held_up = [], shield_over_dds.HeldUp()
     for first in range(0, len(places), plan.at_once):
         some = slice(first, first + plan.at_once)
         with tempfile.TemporaryDirectory() as folder:
@@ -111,12 +117,16 @@ def drive(
                 places[some], jobs[some], given, Path(folder),
                 lambda line: sys.stderr.write(f"{line}\n"),
             )  # fmt: skip
-        outcomes, held_up = outcomes + more, held_up + late
-    return outcomes, held_up
+        outcomes += more
+        held_up.add(late)
+    return outcomes, asdict(held_up)
 
 
-def summary(shielded: Sequence[Outcome], bare: Sequence[Outcome], held_up: int) -> dict[str, Any]:
+def summary(
+    shielded: Sequence[Outcome], bare: Sequence[Outcome], kept_up: Sequence[Mapping[str, float]]
+) -> dict[str, Any]:
     """The figures, for the JSON object."""
+    held_up = {name: sum(each[name] for each in kept_up if each) for name in HELD_UP}
     tried = [one for one in shielded if one.kind != GOAL]
     goals = [one for one in shielded if one.kind == GOAL]
     without = [one for one in bare if one.kind != GOAL]
@@ -136,8 +146,15 @@ def summary(shielded: Sequence[Outcome], bare: Sequence[Outcome], held_up: int) 
         "goal_s": _mean([one.seconds for one in goals if one.reached]),
         "goals_reached_without": sum(one.reached for one in goals_without),
         "goal_without_s": _mean([one.seconds for one in goals_without if one.reached]),
-        "held_up": held_up,
-        "touched": [f"{one.kind} {' '.join(map(str, one.where))}" for one in touched],
+        "held_up": held_up["count"],
+        "held_up_share": round(held_up["seconds"] / max(held_up["of_s"], 1e-9), 4),
+        "repeated": held_up["repeated"],
+        "gate_paused": sum(one.silence > GateConfig.gap_s for one in shielded),
+        "touched": [
+            f"{one.kind} {' '.join(map(str, one.where))} at {one.speed:.3f} m/s, "
+            f"its gate silent for up to {one.silence:.2f} s"
+            for one in touched
+        ],
         "by_world": {
             world: {
                 "episodes": sum(one.where[1] == world for one in tried),
@@ -163,6 +180,8 @@ def missed(result: Mapping[str, Any], asked: int) -> list[str]:
         ("contacts of robots in motion", result["contacts"], "at most", 0),
         ("episodes driven", result["episodes"], "at least", max(asked, 1)),
         ("path driven [m]", result["path_m"], "at least", LEAST_PATH * asked),
+        ("share of the time for which the robots were held up", result["held_up_share"], "at most",
+         MOST_HELD_UP),
         ("latched stops", result["latched"], "at most", math.ceil(MOST_LATCHED * asked)),
         ("contacts without the shield", result["contacts_without"], "at least",
          max(1.0, LEAST_CONTACTS_WITHOUT * tried)),
@@ -187,6 +206,8 @@ def table_of(result: Mapping[str, Any]) -> str:
         f"goals reached: {result['goals_reached']} of {result['goals']} in {result['goal_s']} s on "
         f"average, without the shield {result['goals_reached_without']} in "
         f"{result['goal_without_s']} s\n"
+        f"held up for {100 * result['held_up_share']:.1f} % of the time, {result['repeated']} "
+        f"episodes driven again; {result['gate_paused']} with a gate that paused for too long\n"
         f"braking takes {100 * result['braking']:.0f} % of the way that the shield keeps free\n"
     )
 
@@ -208,7 +229,7 @@ def main() -> None:
     with_it, without = plan.jobs(len(places))
     shielded, first = drive(plan, places, with_it, plan.shield)
     bare, second = drive(plan, places, without, None)
-    result = summary(shielded, bare, first + second)
+    result = summary(shielded, bare, (first, second))
     result["driven"] = "in process" if plan.in_process else "over DDS"
     result["braking"] = round(max(braking_used(place.robot, plan.shield) for place in places), 3)
     result["load"] = round(os.getloadavg()[0], 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,8 +14,30 @@ from nics_drl_bridge.safety.limits import load_limits
 from nics_drl_bridge.safety.state import GateConfig
 from nics_drl_bridge.safety.stopping import shield_config
 
-MOST_STEPS_LATE = 3
-"""Greatest delay of a scan to the gate, and of the command behind it; each is drawn."""
+MOST_SCAN_LATE_S, MOST_TOLD_LATE_S = 0.29, 0.1
+"""Greatest delay of a scan, or of the command behind it, to the gate; and of the gate's command to
+the base, the gate's own pauses included."""
+HURRIED = 0.25
+"""One in so many scans is late by up to the most that the episode has; the others by a fifth."""
+
+
+class Delays:
+    """How late what is sent arrives; nothing overtakes what was sent before.
+
+    Args:
+        rng: draws them.
+        most_s: the greatest [s].
+    """
+
+    def __init__(self, rng: np.random.Generator, most_s: float) -> None:
+        self._rng, self._last = rng, 0
+        self._most = rng.uniform(0.0, most_s / STEP_S)
+
+    def arrival(self, step: int) -> int:
+        """The step at which something arrives that is sent at a step."""
+        most = self._most * (1.0 if self._rng.random() < HURRIED else 0.2)
+        self._last = max(self._last, step + round(self._rng.uniform(0.0, most)))
+        return self._last
 
 
 def config_of(place: Place, shield: dict[str, float] | None) -> GateConfig:
@@ -41,23 +64,28 @@ def _episode(place: Place, config: GateConfig, job: Job) -> Outcome:
     gate, lidar = Gate(config, place.model.lidar), place.model.lidar
     truth = place.truth
     gate.arm(truth.ranges, place.odom)
-    late = np.random.default_rng([11, job.seed]).integers(0, MOST_STEPS_LATE + 1, 2)
-    begun, step, told = gate.now, 0, np.zeros(3)
-    coming: list[tuple[int, Input]] = []
+    rng = np.random.default_rng([11, job.seed, *place.model.robot.name.encode()])
+    to_gate, behind = Delays(rng, MOST_SCAN_LATE_S), Delays(rng, MOST_TOLD_LATE_S)
+    to_base = Delays(rng, MOST_TOLD_LATE_S)
+    begun, step = gate.now, 0
+    coming: deque[tuple[int, Input]] = deque()
+    commands: deque[tuple[int, Command]] = deque()
+    told = deque([(0, np.zeros(3))])
     while not place.ended:
         gate.now = begun + step * STEP_S
         if step % SCAN_STEPS == 0:
-            truth, stamp, seen = place.truth, round(gate.now * NANO), step + int(late[0])
+            truth, stamp, seen = place.truth, round(gate.now * NANO), to_gate.arrival(step)
             scan = Scan(stamp, truth.ranges, (lidar.angle_min, lidar.angle_increment))
             coming += [(seen, Odometry(stamp, place.odom.copy(), truth.twist)), (seen, scan)]
-            coming.append((seen + int(late[1]), Command(stamp, place.wish(truth))))
-        for when, given in coming:
-            if when <= step:
-                gate.give(given)
-        coming = [each for each in coming if each[0] > step]
-        decided = gate.tick().twist
-        place.step(told)  # what was decided the tick before is here now
-        told, step = decided, step + 1
+            commands.append((behind.arrival(seen), Command(stamp, place.wish(truth))))
+        for queue in (coming, commands):
+            while queue and queue[0][0] <= step:
+                gate.give(queue.popleft()[1])
+        told.append((to_base.arrival(step + 1), gate.tick().twist))
+        while len(told) > 1 and told[1][0] <= step:
+            told.popleft()
+        place.step(told[0][1])
+        step += 1
     latched = gate.state.latched
     place.outcome.latched = "" if latched is None else latched.rule
     return place.outcome

@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +34,37 @@ from nics_drl_bridge.nodes.runner import open_context
 
 Array = NDArray[np.float64]
 REST_S, PATIENCE_S = 1.3, 120.0
-BEHIND_S = 0.3
-"""When this process itself was held up for longer, its worlds stood still meanwhile."""
+BEHIND_S = 0.15
+"""When this process itself was held up for longer, no base kept the latency that its shield was
+told: the worlds stood still meanwhile, and the running episodes are driven again."""
+TRIES = 10
+"""So often is an episode begun at most."""
 VARIANCES = (1e-4,) * 4
 GATE, NANO = "command_gate", conversions.NANO
 LATCHED = re.compile(r"(?:call ~/reset first: |e_stop_released: )(\w+)")
 """What a gate that refuses to be armed says of a stop that waits for a reset."""
+
+
+@dataclass
+class HeldUp:
+    """How well this process kept up with the clock.
+
+    Attributes:
+        count: how often it was held up.
+        seconds: for how long in all [s].
+        of_s: of so many that it ran [s].
+        repeated: episodes that were begun anew for that.
+    """
+
+    count: int = 0
+    seconds: float = 0.0
+    of_s: float = 0.0
+    repeated: int = 0
+
+    def add(self, more: HeldUp) -> None:
+        """Sums up."""
+        self.count, self.seconds = self.count + more.count, self.seconds + more.seconds
+        self.of_s, self.repeated = self.of_s + more.of_s, self.repeated + more.repeated
 
 
 class Lane:
@@ -57,7 +83,7 @@ class Lane:
     def __init__(self, node: Node, name: str, place: Place, jobs: Sequence[Job]) -> None:
         self.place, self.outcomes = place, list[Outcome]()
         self._jobs = deque(jobs)
-        self._told, self._told_s = np.zeros(3), -np.inf
+        self._told, self._told_s, self._begun_s = np.zeros(3), -np.inf, np.inf
         self._scan, self._odom, self._estimate, self._e_stop, self._raw = (
             node.create_publisher(kind, f"{name}/{topic}", qos.COMMAND)
             for kind, topic in (
@@ -71,7 +97,7 @@ class Lane:
             for service in ("arm", "reset")
         }
         self._asked: Future | None = None
-        self._asks, self._driving, self._rested = "arm", False, 0
+        self._asks, self._driving, self._rested, self._tries = "arm", False, 0, 1
         self.refused = "nobody answers"
         if self._jobs:
             place.begin(self._jobs[0])
@@ -82,7 +108,10 @@ class Lane:
         return not self._jobs
 
     def _hear(self, message: Twist) -> None:
-        self._told, self._told_s = conversions.twist_from_ros(message), time.monotonic()
+        now, outcome = time.monotonic(), self.place.outcome
+        if self._driving:
+            outcome.silence = max(outcome.silence, now - max(self._told_s, self._begun_s))
+        self._told, self._told_s = conversions.twist_from_ros(message), now
 
     def step(self, stamp_ns: int, speaks: bool) -> None:
         """Moves on by a step, and says what the robot's devices would, if it is time."""
@@ -125,7 +154,7 @@ class Lane:
         answer, asked, self._asked = self._asked.result(), self._asks, None
         self._asks = "arm"
         if asked == "arm" and answer.success:
-            self._driving = True
+            self._driving, self._begun_s = True, time.monotonic()
         elif found := LATCHED.search(answer.message):
             self._asks = "reset"
             if self.outcomes:
@@ -134,8 +163,23 @@ class Lane:
 
     def _end(self) -> None:
         self.outcomes.append(self.place.outcome)
+        self._next()
+
+    def _next(self) -> None:
         self._jobs.popleft()
+        self._tries = 1
         self._rest()
+
+    def void(self) -> bool:
+        """Begins the running episode anew, if one is running, or gives it up at last."""
+        if not self._driving:
+            return False
+        if self._tries < TRIES:
+            self._tries += 1
+            self._rest()
+        else:
+            self._next()
+        return True
 
     def _rest(self) -> None:
         self._driving, self._rested = False, 0
@@ -154,7 +198,7 @@ def drive(
     parameters: Mapping[str, Any],
     folder: Path,
     tell: Callable[[str], None],
-) -> tuple[list[Outcome], int]:
+) -> tuple[list[Outcome], HeldUp]:
     """Drives the episodes of each place, all places side by side.
 
     Args:
@@ -165,7 +209,7 @@ def drive(
         tell: gets a line about the progress now and then.
 
     Returns:
-        How the episodes went, and how often this process was held up.
+        How the episodes went, and how well this process kept up.
 
     Raises:
         RuntimeError: a gate can't be armed.
@@ -196,9 +240,9 @@ def _run(
     gates: Sequence[NodeProcess],
     executor: SingleThreadedExecutor,
     tell: Callable[[str], None],
-) -> int:
-    """Moves the worlds by the wall clock until all episodes are driven; how often it was late."""
-    epoch_ns, began, step, held_up = time.time_ns(), time.monotonic(), 0, 0
+) -> HeldUp:
+    """Moves the worlds by the wall clock until all episodes are driven; how well it kept up."""
+    epoch_ns, began, step, held_up = time.time_ns(), time.monotonic(), 0, HeldUp()
     start = began
     last, count, told = began, 0, began
     while not all(lane.done for lane in lanes):
@@ -207,7 +251,8 @@ def _run(
             executor.spin_once(timeout_sec=ahead)
             continue
         if -ahead > BEHIND_S:
-            held_up, began, epoch_ns = held_up + 1, began - ahead, epoch_ns - round(ahead * NANO)
+            began, epoch_ns = began - ahead, epoch_ns - round(ahead * NANO)
+            held_up.add(HeldUp(1, -ahead, 0.0, sum(lane.void() for lane in lanes)))
         step_ns = epoch_ns + round(step * STEP_S * NANO)
         for index, lane in enumerate(lanes):
             lane.step(step_ns, speaks=(step + index) % SCAN_STEPS == 0)
@@ -226,4 +271,5 @@ def _run(
                 gate.check()
             why = "; ".join(lane.refused for lane in lanes if not lane.done)
             raise RuntimeError(f"no episode ended within {PATIENCE_S} s: {why}")
+    held_up.of_s = time.monotonic() - start
     return held_up

@@ -6,6 +6,7 @@ does, and stops when commands fall silent.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,8 +22,9 @@ from nics_drl_bridge.sim.world import load_world
 Array = NDArray[np.float64]
 STEP_S, SCAN_STEPS, BASE_STEPS = 0.02, 5, 5
 ADVERSARY_S, GOAL_S = 5.0, 25.0
-MOVING = 0.01
-"""A robot that is slower at a touch stood, and was walked into [m/s]."""
+MOVING, MOVING_STEPS = 0.02, 10
+"""A robot whose true place moved more slowly than that, over so many steps before a touch, stood
+and was walked into [m/s]. At rest the car's own noise shakes it by up to 0.012 m/s."""
 SILENCE_S = 0.5
 GOAL = "goal"
 
@@ -59,6 +61,8 @@ class Outcome:
         reached: it came to its goal.
         path: that it drove [m].
         seconds: that it took [s].
+        speed: at the touch, if any [m/s].
+        silence: the longest time for which its gate said nothing, over DDS [s].
         where: robot, world and seed.
     """
 
@@ -69,6 +73,8 @@ class Outcome:
     reached: bool = False
     path: float = 0.0
     seconds: float = 0.0
+    speed: float = 0.0
+    silence: float = 0.0
     where: tuple[str, str, int] = field(default=("", "", 0))
 
 
@@ -99,6 +105,7 @@ class Place:
         self.job, self._steps = job, 0
         self._sim.reset([job.seed])
         self._begun, self._anchor = self._sim.data.odom[0, 0].copy(), self.odom.copy()
+        self._lately = deque([self._sim.data.pose[0, 0, :2].copy()], maxlen=MOVING_STEPS + 1)
         self.outcome = Outcome(job.kind, where=(self.robot, self.world, job.seed))
         rng = np.random.default_rng([7, job.seed])
         self._phase = int(rng.integers(BASE_STEPS))
@@ -130,17 +137,24 @@ class Place:
         data, outcome = self._sim.data, self.outcome
         if (self._steps + self._phase) % BASE_STEPS == 0:
             self._command[0, 0] = self.model.robot.from_cmd_vel(told)
-        before, rolling = data.pose[0, 0].copy(), float(np.hypot(*data.twist[0, 0, :2]))
         touched = bool(data.collided[0, 0])
         self._sim.step(self._command)
         self._steps += 1
-        moved = float(np.hypot(*(data.pose[0, 0, :2] - before[:2])))
-        outcome.path += moved
+        before = self._speed()
+        outcome.path += float(np.hypot(*(data.pose[0, 0, :2] - self._lately[-1])))
+        self._lately.append(data.pose[0, 0, :2].copy())
         outcome.seconds = self._steps * STEP_S
         if data.collided[0, 0] and not touched:
-            moving = max(rolling, moved / STEP_S) > MOVING
-            outcome.contact, outcome.walked_into = moving, not moving
+            outcome.speed = max(before, self._speed())  # the touch itself may have stopped it
+            outcome.contact = outcome.speed > MOVING
+            outcome.walked_into = not outcome.contact
         self.odom = geometry.compose(self._anchor, geometry.between(self._begun, data.odom[0, 0]))
+
+    def _speed(self) -> float:
+        """Over the last steps, by true places; what odometry says of it is noisy [m/s]."""
+        steps = len(self._lately) - 1
+        way = float(np.hypot(*(self._lately[-1] - self._lately[0])))
+        return way / (steps * STEP_S) if steps else 0.0
 
     @property
     def ended(self) -> bool:

@@ -7,8 +7,10 @@ inputs replays to the same decisions, bit for bit.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.safety import arming, motion, rules
 from nics_drl_bridge.safety.clocks import take_time
@@ -20,6 +22,8 @@ from nics_drl_bridge.safety.intake import take
 from nics_drl_bridge.safety.limits import LEAST_STEP_S
 from nics_drl_bridge.safety.records import replace
 from nics_drl_bridge.safety.state import Cause, Decision, GateConfig, GateState
+
+Array = NDArray[np.float64]
 
 
 def decide(
@@ -50,14 +54,14 @@ def decide(
         if latches and state.armed:
             state = replace(state, latched=cause)
         publish = was_moving or isinstance(given, Tick)
-        state = _stopped(state, now if publish else state.moved_s, disarm=latches)
+        state = _stopped(config, state, now if publish else state.moved_s, disarm=latches)
         return state, _decision(config, state, publish, cause, refused, answer)
     if not isinstance(given, Tick) or now - state.moved_s < LEAST_STEP_S:
         return state, _decision(config, state, False, None, refused, answer)
     moved = _shaped(config, state, now)
     if moved.fault:
         cause = Cause("motion_unfit", "", moved.fault)
-        state = _stopped(replace(state, latched=cause), now, disarm=True)
+        state = _stopped(config, replace(state, latched=cause), now, disarm=True)
         return state, _decision(config, state, True, cause, refused, answer)
     state = _move(config, state, moved, now)
     decision = _decision(config, state, True, None, refused, answer)
@@ -92,12 +96,25 @@ def _serve(
     return state, _Answer()
 
 
-def _stopped(state: GateState, moved_s: float, disarm: bool) -> GateState:
-    zero = np.zeros_like(state.value)
+def _stopped(config: GateConfig, state: GateState, moved_s: float, disarm: bool) -> GateState:
+    zero, told = np.zeros_like(state.value), moved_s > state.moved_s
     return replace(
-        state, value=zero, slope=zero, moved_s=moved_s, push=None, recent=(),
+        state, value=zero, slope=zero, moved_s=moved_s, push=None,
+        recent=_recent(config, state, zero, moved_s) if told else state.recent,
         armed=state.armed and not disarm,
     )  # fmt: skip
+
+
+def _recent(
+    config: GateConfig, state: GateState, value: Array, now: float
+) -> tuple[tuple[float, Array], ...]:
+    """What the newest scan may not show yet: told since, or a latency before; now a value, too."""
+    if config.shield is None:
+        return ()
+    since = now - config.shield.latency_s - config.scan_age_s
+    told = (*state.recent, (now, value))
+    # That of before `since` was in force until the next one.
+    return tuple(one for one, after in pairwise((*told, told[-1])) if after[0] >= since)
 
 
 def _shaped(config: GateConfig, state: GateState, now: float) -> motion.Motion:
@@ -110,12 +127,9 @@ def _shaped(config: GateConfig, state: GateState, now: float) -> motion.Motion:
 
 def _move(config: GateConfig, state: GateState, moved: motion.Motion, now: float) -> GateState:
     """The state after a motion is published."""
-    # What the newest scan does not show yet: told since, or a latency before.
-    past = 0.0 if config.shield is None else config.shield.latency_s + config.scan_age_s
-    recent = tuple(each for each in state.recent if each[0] >= now - past)
     state = replace(
         state, value=moved.value, slope=moved.slope, moved_s=now,
-        recent=(*recent, (now, moved.value)) if past > 0.0 else (),
+        recent=_recent(config, state, moved.value, now),
     )  # fmt: skip
     return watch_motion(config, state, now)
 

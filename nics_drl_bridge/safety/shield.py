@@ -137,7 +137,8 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
     odometry = np.zeros(3) if state.odometry is None else state.odometry.twist
     old = max(0.0, age(state.scans, now))
     # What the scan does not show yet: told since it was made, or within the latency before.
-    past = [value for told, value in state.recent if told >= now - old - given.latency_s]
+    since, ends = now - old - given.latency_s, [told for told, _ in state.recent[1:]]
+    past = [told[1] for told, end in zip(state.recent, [*ends, now], strict=False) if end >= since]
     react = given.hold_s + given.latency_s
     calm = 1.0 / config.scan_rate + react + given.latency_s
     hard = old + react

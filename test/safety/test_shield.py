@@ -161,6 +161,33 @@ def test_a_command_of_before_that_the_scan_does_not_show_yet_is_reckoned_with():
     straight = rig.decision.twist[0]
     told, before = np.array([0.6, 0.5]), rig.state
     for ago, cut in ((0.33, True), (0.6, False)):  # that of 0.6 s ago the scan shows
-        recent = ((rig.now - ago, told), *before.recent)
+        later = (one for one in before.recent if one[0] > rig.now - ago)
+        recent = ((rig.now - ago, told), *later)
         _, decision = decide(rig.config, replace(before, recent=recent), Tick(), rig.now + 0.02)
         assert (decision.twist[0] < straight - 0.1) == cut
+
+
+def test_a_stop_in_between_does_not_make_it_forget_what_the_robot_was_told():
+    """The base may take up what was told before the stop, and the scan does not show it yet."""
+    rig = Faced(FAR)
+    rig.settles()
+    rig.command((np.nan, 0.0, 0.0))
+    assert rig.decision.cause.rule == "command_malformed"
+    rig.run(0.04)
+    assert max(value[0] for _, value in rig.state.recent) == 1.0
+    rig.run(1.0)
+    told = [told for told, _ in rig.state.recent]
+    reach = CAR.latency_s + rig.config.scan_age_s
+    assert rig.now - reach - 0.05 < told[0] <= rig.now - reach + 0.02
+
+
+def test_what_was_told_before_a_pause_of_the_gate_counts_as_long_as_it_was_in_force():
+    rig = Faced(ranges(0.45, where=np.abs(LIDAR.angles - 0.9) < 0.3), replace(CAR, latency_s=0.3))
+    rig.wish = np.array([0.6, 0.0, 0.0])
+    rig.settles()
+    straight, before = rig.decision.twist[0], rig.state
+    since = rig.now - before.scans.times[-1] + 0.3
+    kept = tuple(one for one in before.recent if one[0] > rig.now - since + 0.05)
+    recent = ((rig.now - since - 0.05, np.array([0.6, 0.5])), *kept)
+    _, decision = decide(rig.config, replace(before, recent=recent), Tick(), rig.now + 0.02)
+    assert decision.twist[0] < straight - 0.1
