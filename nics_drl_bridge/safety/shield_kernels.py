@@ -23,8 +23,8 @@ def place(twist, time):  # type: ignore[no-untyped-def]
 def free(points, twists, blind, deceleration, room, step):  # type: ignore[no-untyped-def]
     """Whether no point comes within `room` of any of the arcs before the robot is at rest on it.
 
-    A point that moves may be nearer by then by all that it can have moved. One that is as near
-    already must not come nearer; so the robot can leave it.
+    One that is as near already must not come nearer; so the robot can leave it. A point that moves
+    may be nearer by then by all that it can have moved, also one that the robot drives away from.
 
     Args:
         points: (P, 3) x, y [m], and how fast each moves at most [m/s].
@@ -59,7 +59,7 @@ def free(points, twists, blind, deceleration, room, step):  # type: ignore[no-un
             time = _reached(part, speed, blind, deceleration)
             for p in range(count):
                 dx, dy = near[p, 0] - x, near[p, 1] - y
-                least = min(room + near[p, 2] * time, near[p, 3])
+                least = min(room, near[p, 3]) + near[p, 2] * time
                 if dx * dx + dy * dy < least * least:
                     return False
     return True

@@ -151,6 +151,14 @@ def test_what_comes_on_is_met_no_sooner_than_the_robot_is_at_rest(away, may):
     assert free(comes * (1.0, 1.0, 0.0), twists, 0.4, 2.0, 0.2, 0.005)
 
 
+@pytest.mark.parametrize(("away", "may"), [(0.3, False), (0.6, False), (1.5, True)])
+def test_who_catches_up_from_behind_finds_the_robot_at_rest(away, may):
+    """At 0.3 m/s it is no faster than who comes on, and would be met in motion."""
+    behind = np.array([[-away, 0.1, 1.0]])
+    assert free(behind, np.array([[0.3, 0.0, 0.0]]), 0.5, BRAKE, 0.2, 0.02) == may
+    assert free(behind * (1.0, 1.0, 0.0), np.array([[0.3, 0.0, 0.0]]), 0.5, BRAKE, 0.2, 0.02)
+
+
 def test_a_command_of_before_that_the_scan_does_not_show_yet_is_reckoned_with():
     """It was told a latency before the scan was made, and turns the robot towards what is there."""
     rig = Faced(ranges(0.45, where=np.abs(LIDAR.angles - 0.9) < 0.3), replace(CAR, latency_s=0.3))
