@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
@@ -83,6 +84,29 @@ def test_there_are_never_more_at_work_than_a_few(writer):
     assert begun == [True] * MOST_AT_WORK + [False] * 2
     assert len(writer.close(0.0)) == MOST_AT_WORK
     assert writer.begin(lambda: None)
+
+
+def test_those_that_have_ended_make_room_before_anybody_asks_what_failed(tmp_path, writer):
+    for number in range(2 * MOST_AT_WORK):
+        assert writer.begin(lambda name=str(number): (tmp_path / name / "file").write_text(""))
+        with contextlib.suppress(ChildProcessError):
+            os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)
+    assert len(writer.close(DEADLINE_S)) == 2 * MOST_AT_WORK
+
+
+def test_one_that_does_not_even_give_up_is_ended_for_the_next_to_have_room(writer, monkeypatch):
+    def deaf():
+        signal.pthread_sigmask(signal.SIG_BLOCK, box_writer.ENDING)
+        hung()
+
+    for _ in range(MOST_AT_WORK):
+        writer.begin(deaf)
+    assert not writer.begin(deaf)
+    monkeypatch.setattr(box_writer, "OVERDUE_S", 0.0)
+    deadline = time.monotonic() + DEADLINE_S
+    while not writer.begin(lambda: None):
+        assert time.monotonic() < deadline, "they stay for ever"
+        time.sleep(0.01)
 
 
 def test_an_error_is_told_by_its_sentence(tmp_path, writer):

@@ -78,6 +78,28 @@ def test_a_lidar_that_is_frozen_but_for_a_few_beams_is_frozen(beams):
     stopped_by_scan(rig)
 
 
+@pytest.mark.parametrize("beams", [24, 36, 72])
+@pytest.mark.parametrize("flickers", [0, 12])
+def test_a_lidar_of_few_beams_that_is_frozen_but_for_one_is_frozen(beams, flickers):
+    every = LIDAR.beams // beams
+    rig = Looking(config(beam_angles=LIDAR.angles[::every]))
+    rig.broken = lambda true: true[::every]
+    angles = (LIDAR.angle_min, LIDAR.angle_increment * every)
+    rig.scan = lambda: Looking.scan(rig, angles=angles)
+    rig.drive()
+    held = rig.shown[-1][::every]
+
+    def broken(true):
+        shown = held.copy()
+        shown[flickers] += np.float32(1e-3 * len(rig.shown))
+        return shown
+
+    assert rig.run(2.0).cause is None  # one that lives is fine
+    held = rig.shown[-1][::every]
+    rig.broken = broken
+    stopped_by_scan(rig)
+
+
 @pytest.mark.parametrize("angle", [0.0, 1.5])
 def test_a_frozen_scan_of_a_single_pole_is_frozen(angle):
     rig = looking()
