@@ -255,6 +255,18 @@ def test_odometry_that_teleports_is_refused_and_stops_the_robot_for_good(leap):
     assert rig.arm().granted
 
 
+@pytest.mark.parametrize("armed", [True, False])
+def test_a_simulator_that_is_reset_wants_the_gate_to_be_armed_anew_and_no_more(armed):
+    rig = driving()
+    if not armed:
+        rig.give(Reset())
+    rig.speed, rig.pose = 0.0, np.array([5.0, -3.0, 2.0])
+    rig.run(1.5)
+    assert rig.rule == ("odom_jumped" if armed else "disarmed")
+    rig.give(Reset())
+    rig.drive()
+
+
 def test_odometry_may_be_silent_and_have_driven_on_meanwhile():
     rig = driving()
     told(rig, 1.0)
