@@ -20,7 +20,7 @@ PATIENCE_S = 20.0
 OVERDUE_S = PATIENCE_S + 5.0
 """One that has not even given up by then never will: another thread may have held a lock when it
 was copied, or the disk holds it."""
-GRACE_S, POLL_S = 0.2, 0.005
+GRACE_S, POLL_S = 0.5, 0.005
 NICENESS = 5
 MOST_TOLD = 500
 ENDING = (signal.SIGTERM, signal.SIGALRM)

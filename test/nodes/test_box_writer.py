@@ -42,6 +42,13 @@ def test_it_writes_what_there_was_at_the_moment_it_was_asked(tmp_path, writer):
     assert (tmp_path / "file").read_text() == "then"
 
 
+@pytest.fixture
+def patient(monkeypatch):
+    """This machine may be busy: a writer that is to give up has all the time to clean up."""
+    monkeypatch.setattr(box_writer, "GRACE_S", DEADLINE_S)
+
+
+@pytest.mark.usefixtures("patient")
 def test_a_disk_that_hangs_holds_up_neither_the_start_nor_the_end(writer):
     began = time.monotonic()
     assert writer.begin(hung)
@@ -61,6 +68,7 @@ def test_one_that_does_not_even_hear_that_it_is_to_give_up_is_left_behind(writer
     assert time.monotonic() - began < LONG_S / 4
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_file_that_is_given_up_leaves_nothing_behind(tmp_path, writer):
     def parts():
         yield b"the beginning"

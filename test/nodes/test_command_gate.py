@@ -36,7 +36,7 @@ GIVEN = ["gate", "--ros-args", "-p", "limits:=ackermann", "-p"]
 
 SOON_S = 0.5  # what the gate is made for, on a machine with time
 LATE_S = 5.0
-PERIOD_S = 0.1
+PERIOD_S, START_NS = 0.1, 10**18
 MOST_ARMINGS = 3
 PATIENT = {
     "scan_age": 1.0, "odom_age": 1.0, "command_age": 1.0, "rate_tolerance": 0.6,
@@ -49,7 +49,7 @@ class Robot:
     """A robot with its policy around a gate; it does what it is told."""
 
     def __init__(self, peer, lidar):
-        self.peer, self.lidar, self.stamp_ns, self.x = peer, lidar, 10**18, 0.0
+        self.peer, self.lidar, self.stamp_ns, self.x = peer, lidar, START_NS, 0.0
         self.silent, self.wish, self.stamped = set(), (0.5, 0.0, 0.0), None
         self.distance = 1.0
         self.passed = peer.listen(Twist, "cmd_vel", qos.COMMAND)
@@ -66,7 +66,7 @@ class Robot:
         """What arrives in a period."""
         speed = self.passed[-1].linear.x if self.passed else 0.0
         self.x += speed * PERIOD_S
-        self.stamp_ns += round(PERIOD_S * conversions.NANO)
+        self.stamp_ns = START_NS + time.monotonic_ns()  # a busy machine leaves out some
         odometry = conversions.odometry_to_ros(
             [self.x, 0.0, 0.0], [speed, 0.0, 0.0], self.stamp_ns, ("odom", "base_link"), (1e-4,) * 4
         )
