@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import signal
 import subprocess
@@ -27,6 +26,7 @@ from typing import Any
 
 from measuring.machine import commit_of, describe, load
 from measuring.plan import Run, runs_of
+from measuring.verdict import finite
 
 SCRIPTS = Path(__file__).resolve().parents[1]
 RESULTS = SCRIPTS / "results.json"
@@ -72,15 +72,6 @@ def sweep(mark: str) -> int:
         while marked(mark) and time.monotonic() < deadline:
             time.sleep(0.05)
     return len(left)
-
-
-def finite(value: Any) -> Any:
-    """The same, with `None` for numbers that JSON does not know."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Mapping):
-        return {key: finite(each) for key, each in value.items()}
-    return [finite(each) for each in value] if isinstance(value, list) else value
 
 
 def object_in(printed: str) -> dict[str, Any] | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
@@ -42,13 +43,23 @@ def answer(result: Mapping[str, Any], missed: Sequence[str], table: str, as_json
     """Prints a result and the bars that were missed, and ends with 1 if there are any, else 0.
 
     Args:
-        result: what was measured, as JSON can hold it.
+        result: what was measured, as JSON can hold it; what is not finite becomes null.
         missed: a sentence for each bar that was missed, with the figure and the bar.
         table: the result for people, which ends with a line feed.
         as_json: whether to print one JSON object instead, with the sentences as `failures`.
     """
     if as_json:
-        sys.stdout.write(json.dumps({**result, FAILURES: list(missed)}) + "\n")
+        told = finite({**result, FAILURES: list(missed)})
+        sys.stdout.write(json.dumps(told, allow_nan=False) + "\n")
     else:
         sys.stdout.write(table + "".join(f"FAILED: {line}\n" for line in missed))
     raise SystemExit(1 if missed else 0)
+
+
+def finite(value: Any) -> Any:
+    """The same with None for each number that JSON does not know: NaN and the infinities."""
+    if isinstance(value, Mapping):
+        return {key: finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -17,7 +17,10 @@ MOST_AT_WORK = 3
 """Writers that a disk may hold up at a time; each keeps a copy of this process's memory."""
 PATIENCE_S = 20.0
 """A writer that takes longer gives up."""
-GRACE_S, POLL_S = 0.2, 0.005
+OVERDUE_S = PATIENCE_S + 5.0
+"""One that has not even given up by then never will: another thread may have held a lock when it
+was copied, or the disk holds it."""
+GRACE_S, POLL_S = 0.5, 0.005
 NICENESS = 5
 MOST_TOLD = 500
 ENDING = (signal.SIGTERM, signal.SIGALRM)
@@ -27,6 +30,7 @@ ENDING = (signal.SIGTERM, signal.SIGALRM)
 class _Writer:
     pid: int
     told: int
+    begun_s: float
 
 
 class BoxWriter:
@@ -41,6 +45,7 @@ class BoxWriter:
 
     def __init__(self) -> None:
         self._writers: list[_Writer] = []
+        self._failed: list[str] = []
 
     def begin(self, write: Callable[[], object]) -> bool:
         """Lets a copy of this process write; False when too many are at work.
@@ -51,6 +56,7 @@ class BoxWriter:
         Raises:
             OSError: the system can't make another process.
         """
+        self._look()
         if len(self._writers) >= MOST_AT_WORK:
             return False
         heard, told = os.pipe()
@@ -65,21 +71,27 @@ class BoxWriter:
             raise
         finally:
             os.close(told)
-        self._writers.append(_Writer(pid, heard))
+        self._writers.append(_Writer(pid, heard, time.monotonic()))
         return True
 
     def failures(self) -> list[str]:
         """What went wrong with those that have ended since the last look."""
-        failed = []
+        self._look()
+        failed, self._failed = self._failed, []
+        return failed
+
+    def _look(self) -> None:
+        """Parts with the writers that have ended, and ends those that are overdue."""
         for writer in tuple(self._writers):
             status = _ended(writer.pid)
             if status is None:
+                if time.monotonic() - writer.begun_s > OVERDUE_S:
+                    os.kill(writer.pid, signal.SIGKILL)
                 continue
             self._writers.remove(writer)
             if status != 0:
-                failed.append(_read(writer.told) or f"its writer ended with {status}")
+                self._failed.append(_read(writer.told) or f"its writer ended with {status}")
             os.close(writer.told)
-        return failed
 
     def close(self, seconds: float) -> list[str]:
         """Waits for the writers, and makes those give up that take longer.

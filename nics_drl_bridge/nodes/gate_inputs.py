@@ -37,7 +37,8 @@ def odometry(content: bytes) -> Odometry:
 def estimate(content: bytes) -> Estimate:
     """A serialised Odometry of an estimator. Raises `wire.UNREADABLE`."""
     x, y, heading = (wire.numbers_of(content)[place] for place in VARIANCES)
-    std = np.sqrt([max(x, y), heading])
+    with np.errstate(invalid="ignore"):  # a variance below 0 is no number, either
+        std = np.sqrt([np.maximum(x, y), heading])
     return Estimate(wire.odometry_of(content)[1], std)
 
 

@@ -62,7 +62,7 @@ def declare_gate(node: Node) -> GateParameters:
     limits = get("limits", "", "Limits of the robot: a shipped file, or a YAML file; no default.")
     needs_e_stop = "Whether e_stop must have been heard before arming; false in simulations alone."
     needs_estimate = "Whether arming needs odometry/filtered."
-    folder = "Where a stop's last 30 s are written; ~/.ros/black_box if empty."
+    folder = "Where a stop's last 30 s are written, by namespace; ~/.ros/black_box if empty."
     scan_age = max(DEFAULTS.scan_age_s, SCAN_PERIODS / lidar.rate)
     bounds = load_limits(limits, robot) if limits else None
     shield, said = _declare_shield(node, model, bounds, limits)
@@ -97,7 +97,9 @@ def declare_gate(node: Node) -> GateParameters:
     if doubt:
         node.get_logger().warning(doubt)
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
+    # Gates of other namespaces have folders of their own, so that none removes another's files.
     black_box = Path(get("black_box", "", folder) or home / "black_box")
+    black_box /= node.get_namespace().strip("/")
     return GateParameters(config, robot.name, lidar, black_box, said)
 
 

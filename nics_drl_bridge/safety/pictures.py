@@ -16,7 +16,7 @@ from nics_drl_bridge.safety.state import GateConfig
 Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
 SAME_SHARE = 0.99
-"""Of the beams, from which on two scans are the same picture: one beam may flicker."""
+"""Of the beams, from which on two scans are the same picture; of few beams one may flicker, too."""
 TELLING_SHARE = 0.9
 """Of those that must have changed, from which on it is none of now; a lidar that lives has none."""
 CHANGE = 0.02
@@ -36,7 +36,7 @@ def same(one: Ranges, other: Ranges) -> bool:
     returned = np.isfinite(one) | np.isfinite(other)
     count = int(np.count_nonzero(returned))
     equal = int(np.count_nonzero((one == other) & returned))
-    return count > 0 and equal >= SAME_SHARE * count
+    return _but_for_one(equal, count, SAME_SHARE)
 
 
 def shown_again(config: GateConfig, old: Ranges, ranges: Ranges, moved: Array) -> bool:
@@ -44,7 +44,12 @@ def shown_again(config: GateConfig, old: Ranges, ranges: Ranges, moved: Array) -
     telling = must_differ(config, old, moved)
     count = int(np.count_nonzero(telling))
     equal = int(np.count_nonzero((old == ranges) & telling))
-    return count >= LEAST_BEAMS and equal >= TELLING_SHARE * count
+    return count >= LEAST_BEAMS and _but_for_one(equal, count, TELLING_SHARE)
+
+
+def _but_for_one(equal: int, count: int, share: float) -> bool:
+    """Whether such a share of some beams is equal, or all but one of them."""
+    return equal > 0 and equal >= min(share * count, count - 1)
 
 
 def must_differ(config: GateConfig, ranges: Ranges, moved: Array) -> NDArray[np.bool_]:

@@ -19,7 +19,11 @@ def asked(script: str, *options: str, timeout_s: float = 280.0) -> tuple[int, di
         capture_output=True, text=True, check=False, timeout=timeout_s,
     )  # fmt: skip
     assert done.stdout.count("\n") == 1, done.stdout + done.stderr
-    return done.returncode, json.loads(done.stdout)
+    return done.returncode, json.loads(done.stdout, parse_constant=_no_json)
+
+
+def _no_json(word: str) -> None:
+    raise ValueError(f"{word} is no JSON")
 
 
 def controls_of(script: str) -> list[str]:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
@@ -41,6 +42,13 @@ def test_it_writes_what_there_was_at_the_moment_it_was_asked(tmp_path, writer):
     assert (tmp_path / "file").read_text() == "then"
 
 
+@pytest.fixture
+def patient(monkeypatch):
+    """This machine may be busy: a writer that is to give up has all the time to clean up."""
+    monkeypatch.setattr(box_writer, "GRACE_S", DEADLINE_S)
+
+
+@pytest.mark.usefixtures("patient")
 def test_a_disk_that_hangs_holds_up_neither_the_start_nor_the_end(writer):
     began = time.monotonic()
     assert writer.begin(hung)
@@ -60,6 +68,7 @@ def test_one_that_does_not_even_hear_that_it_is_to_give_up_is_left_behind(writer
     assert time.monotonic() - began < LONG_S / 4
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_file_that_is_given_up_leaves_nothing_behind(tmp_path, writer):
     def parts():
         yield b"the beginning"
@@ -83,6 +92,29 @@ def test_there_are_never_more_at_work_than_a_few(writer):
     assert begun == [True] * MOST_AT_WORK + [False] * 2
     assert len(writer.close(0.0)) == MOST_AT_WORK
     assert writer.begin(lambda: None)
+
+
+def test_those_that_have_ended_make_room_before_anybody_asks_what_failed(tmp_path, writer):
+    for number in range(2 * MOST_AT_WORK):
+        assert writer.begin(lambda name=str(number): (tmp_path / name / "file").write_text(""))
+        with contextlib.suppress(ChildProcessError):
+            os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)
+    assert len(writer.close(DEADLINE_S)) == 2 * MOST_AT_WORK
+
+
+def test_one_that_does_not_even_give_up_is_ended_for_the_next_to_have_room(writer, monkeypatch):
+    def deaf():
+        signal.pthread_sigmask(signal.SIG_BLOCK, box_writer.ENDING)
+        hung()
+
+    for _ in range(MOST_AT_WORK):
+        writer.begin(deaf)
+    assert not writer.begin(deaf)
+    monkeypatch.setattr(box_writer, "OVERDUE_S", 0.0)
+    deadline = time.monotonic() + DEADLINE_S
+    while not writer.begin(lambda: None):
+        assert time.monotonic() < deadline, "they stay for ever"
+        time.sleep(0.01)
 
 
 def test_an_error_is_told_by_its_sentence(tmp_path, writer):

@@ -36,20 +36,20 @@ GIVEN = ["gate", "--ros-args", "-p", "limits:=ackermann", "-p"]
 
 SOON_S = 0.5  # what the gate is made for, on a machine with time
 LATE_S = 5.0
-PERIOD_S = 0.1
+PERIOD_S, START_NS, MOST_S = 0.1, 10**18, 1.0
 MOST_ARMINGS = 3
 PATIENT = {
-    "scan_age": 1.0, "odom_age": 1.0, "command_age": 1.0, "rate_tolerance": 0.6,
+    "scan_age": 1.0, "odom_age": 0.6, "command_age": 1.0, "rate_tolerance": 0.6,
     "e_stop_silence": 1.0,
 }  # fmt: skip
-"""This machine may be busy with other tests."""
+"""This machine may be busy with other tests. Odometry that is silent for 0.75 s is `no_motion`."""
 
 
 class Robot:
     """A robot with its policy around a gate; it does what it is told."""
 
     def __init__(self, peer, lidar):
-        self.peer, self.lidar, self.stamp_ns, self.x = peer, lidar, 10**18, 0.0
+        self.peer, self.lidar, self.stamp_ns, self.x = peer, lidar, START_NS, 0.0
         self.silent, self.wish, self.stamped = set(), (0.5, 0.0, 0.0), None
         self.distance = 1.0
         self.passed = peer.listen(Twist, "cmd_vel", qos.COMMAND)
@@ -65,8 +65,9 @@ class Robot:
     def sends(self):
         """What arrives in a period."""
         speed = self.passed[-1].linear.x if self.passed else 0.0
-        self.x += speed * PERIOD_S
-        self.stamp_ns += round(PERIOD_S * conversions.NANO)
+        before, self.stamp_ns = self.stamp_ns, START_NS + time.monotonic_ns()
+        # A busy machine leaves out some periods; the robot drives on all the same.
+        self.x += speed * min((self.stamp_ns - before) / conversions.NANO, MOST_S)
         odometry = conversions.odometry_to_ros(
             [self.x, 0.0, 0.0], [speed, 0.0, 0.0], self.stamp_ns, ("odom", "base_link"), (1e-4,) * 4
         )

@@ -78,3 +78,10 @@ def test_bytes_that_end_too_early_are_unreadable(read):
     for content in (b"", b"\x00\x01", b"\x00\x01\x00\x00", b"\x00\x07\x00\x00" + bytes(800)):
         with pytest.raises(wire.UNREADABLE):
             read(content)
+
+
+@pytest.mark.parametrize(("place", "variance"), [(0, np.nan), (7, np.nan), (35, np.nan), (35, -1)])
+def test_an_estimate_one_of_whose_variances_is_no_number_is_uncertain(place, variance):
+    message = odometry()
+    message.pose.covariance[place] = variance
+    assert np.isnan(gate_inputs.estimate(serialize_message(message)).std).any()

@@ -104,3 +104,20 @@ def test_scans_of_a_slow_lidar_may_get_older(declared, monkeypatch, rate, age):
     slow = replace(model, lidar=model.lidar.model_copy(update={"rate": rate}))
     monkeypatch.setattr(gate_parameters, "declare_model", lambda _: slow)
     assert declared({"odom_rate": 10.0}).scan_age_s == pytest.approx(age)
+
+
+def test_each_namespace_has_a_black_box_of_its_own(domain_id, tmp_path):
+    def folder(*remapped):
+        given = ["node", "--ros-args", "-p", f"black_box:={tmp_path}", *remapped]
+        context = open_context(given, domain_id)
+        try:
+            node = Node("command_gate", context=context)
+            try:
+                return gate_parameters.declare_gate(node).black_box
+            finally:
+                node.destroy_node()
+        finally:
+            context.try_shutdown()
+
+    assert folder() == tmp_path
+    assert folder("-r", "__ns:=/hall/robot_1") == tmp_path / "hall" / "robot_1"

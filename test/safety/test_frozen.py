@@ -78,6 +78,28 @@ def test_a_lidar_that_is_frozen_but_for_a_few_beams_is_frozen(beams):
     stopped_by_scan(rig)
 
 
+@pytest.mark.parametrize("beams", [24, 36, 72])
+@pytest.mark.parametrize("flickers", [0, 12])
+def test_a_lidar_of_few_beams_that_is_frozen_but_for_one_is_frozen(beams, flickers):
+    every = LIDAR.beams // beams
+    rig = Looking(config(beam_angles=LIDAR.angles[::every]))
+    rig.broken = lambda true: true[::every]
+    angles = (LIDAR.angle_min, LIDAR.angle_increment * every)
+    rig.scan = lambda: Looking.scan(rig, angles=angles)
+    rig.drive()
+    held = rig.shown[-1][::every]
+
+    def broken(true):
+        shown = held.copy()
+        shown[flickers] += np.float32(1e-3 * len(rig.shown))
+        return shown
+
+    assert rig.run(2.0).cause is None  # one that lives is fine
+    held = rig.shown[-1][::every]
+    rig.broken = broken
+    stopped_by_scan(rig)
+
+
 @pytest.mark.parametrize("angle", [0.0, 1.5])
 def test_a_frozen_scan_of_a_single_pole_is_frozen(angle):
     rig = looking()
@@ -231,6 +253,18 @@ def test_odometry_that_teleports_is_refused_and_stops_the_robot_for_good(leap):
     assert not rig.moves
     assert rig.give(Reset()).granted
     assert rig.arm().granted
+
+
+@pytest.mark.parametrize("armed", [True, False])
+def test_a_simulator_that_is_reset_wants_the_gate_to_be_armed_anew_and_no_more(armed):
+    rig = driving()
+    if not armed:
+        rig.give(Reset())
+    rig.speed, rig.pose = 0.0, np.array([5.0, -3.0, 2.0])
+    rig.run(1.5)
+    assert rig.rule == ("odom_jumped" if armed else "disarmed")
+    rig.give(Reset())
+    rig.drive()
 
 
 def test_odometry_may_be_silent_and_have_driven_on_meanwhile():
