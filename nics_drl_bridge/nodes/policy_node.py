@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import traceback
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import BridgeError, ConfigError, shortened
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.lidar.spec import LidarSpec
@@ -28,6 +29,8 @@ from nics_drl_bridge.policy.policies import open_policy
 POLLS = 0.1
 """How often it looks whether it is time to act, in shares of the control period."""
 DIAGNOSTICS_PERIOD_S = 1.0
+LONGEST_REASON = 300
+"""Characters of what a policy raised."""
 
 
 class PolicyNode(ManagedNode):
@@ -108,7 +111,7 @@ class PolicyNode(ManagedNode):
         self._policy, self._task = open_policy(name, model)
         view = rehearse(model)
         self._task.judge(view, {"goal": np.zeros(2)})
-        self._command(view, np.zeros(2))
+        self._asked(view, np.zeros(2))
 
     def _on_lidar(self, lidar: LidarSpec) -> None:
         """Looks through another lidar from now on. Raises ConfigError where that can't be done."""
@@ -184,7 +187,22 @@ class PolicyNode(ManagedNode):
             why = "touching something, stopped" if verdict.touched else "goal reached"
             self.get_logger().info(why, throttle_duration_sec=5.0)
             return np.zeros(3)
-        return self._command(view, self._goal)
+        return self._asked(view, self._goal)
+
+    def _asked(self, view: RobotView, goal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the policy wants (3,). Raises BridgeError, which ends the node, where it raises."""
+        try:
+            return self._command(view, goal)
+        except BridgeError:
+            raise
+        except Exception as error:
+            self.get_logger().debug(traceback.format_exc())
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            words = shortened(f"{type(error).__name__}: {error}", LONGEST_REASON)
+            raise BridgeError(
+                f"policy {self.get_parameter('policy').value!r} raised {words} ({place.filename}, "
+                f"line {place.lineno}); the robot is stopped, mend the policy."
+            ) from error
 
     def _command(self, view: RobotView, goal: NDArray[np.float64]) -> NDArray[np.float64]:
         """What the policy wants (3,)."""

@@ -25,6 +25,11 @@ SMALL = 1024
 """Whole numbers of an array that may be a shape, an axis or an index; larger ones are no such."""
 GREATEST_SETTING = 65_536
 """Of a kernel's size, stride, padding or dilation."""
+MOST_AXES = 256
+"""That all nodes together may add to their arrays, each of which makes inference longer."""
+FLOATS = frozenset({onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE, onnx.TensorProto.FLOAT16})
+DIVIDING = frozenset({"Div", "ReduceMean"})
+"""Of whole numbers, division by zero, or of the least by -1, ends the process."""
 Shape = tuple[int, ...]
 Cost = tuple[int, int]
 
@@ -40,6 +45,8 @@ def rows_at_once(model: Any, source: str) -> int:
         PolicyError: a size can't be told, or is more than any policy needs.
     """
     _check_settings(model.graph, source)
+    _check_axes(model.graph, source)
+    _check_whole_numbers(model, source)
     numbers, work = _costs(model, ROWS, source)
     if max(numbers / MOST_NUMBERS, work / MOST_WORK) > ROWS:
         reason = (
@@ -61,6 +68,43 @@ def _check_settings(graph: Any, source: str) -> None:
             if wide and node.op_type != "Slice":
                 reason = f"of {node.op_type} is beyond {GREATEST_SETTING}; not run."
                 raise PolicyError(source, f"graph.node.{attribute.name}", reason)
+
+
+def _check_axes(graph: Any, source: str) -> None:
+    """Refuses arrays of thousands of dimensions, for which inference itself takes too long."""
+    lengths = {tensor.name: math.prod(tensor.dims) for tensor in graph.initializer}
+    for node in graph.node:
+        if node.op_type == "Constant":
+            given = (max(len(a.ints), math.prod(a.t.dims)) for a in node.attribute)
+            lengths.update(dict.fromkeys(node.output, max(given, default=0)))
+    added = 0
+    for node in graph.node:
+        if node.op_type in ("Reshape", "Unsqueeze"):
+            told = [lengths.get(name, 1) for name in node.input[1:2]]
+            added += max(told + [len(a.ints) for a in node.attribute], default=0)
+    if added > MOST_AXES:
+        reason = f"reshapes to {added} dimensions in all, a policy to {MOST_AXES}; not run."
+        raise PolicyError(source, "graph.node", reason)
+
+
+def _check_whole_numbers(model: Any, source: str) -> None:
+    """Refuses what whole numbers can do: to divide, and to grow while they are only looked at."""
+    told = _inferred(_without_weights(model, ROWS), source, values=False)
+    kinds = {tensor.name: tensor.data_type for tensor in told.initializer}
+    sizes = {}
+    for value in (*told.input, *told.value_info, *told.output):
+        tensor = value.type.tensor_type
+        kinds[value.name] = tensor.elem_type
+        sizes[value.name] = math.prod(d.dim_value for d in tensor.shape.dim)
+    for node in model.graph.node:
+        if node.op_type in DIVIDING and kinds.get(node.input[0]) not in FLOATS:
+            reason = f"{node.op_type} of whole numbers may end the process; use float32."
+            raise PolicyError(source, "graph.node", reason)
+        if node.op_type in ("Concat", "Gather") and kinds.get(node.output[0]) not in FLOATS:
+            size = sizes.get(node.output[0], 0)
+            if size > SMALL * ROWS:
+                reason = f"{node.op_type} of {size} whole numbers is no shape and no index; not run"
+                raise PolicyError(source, "graph.node", f"{reason}.")
 
 
 def _costs(model: Any, rows: int, source: str) -> Cost:
@@ -108,18 +152,22 @@ def _buffer(node: Any, given: list[Shape], made: list[Shape]) -> int:
 
 def _shapes(model: Any, rows: int, source: str) -> dict[str, Shape]:
     """The shape of every tensor, for so many observations; one that is not known is missing."""
-    bare = _without_weights(model, rows)
-    try:
-        told = onnx.shape_inference.infer_shapes(bare, strict_mode=True, data_prop=True).graph
-    except Exception as error:  # noqa: BLE001 - it raises what it likes at a damaged graph
-        words = " ".join(str(error).split())[:120]
-        raise PolicyError(source, "graph", f"its shapes do not fit ({words}).") from None
+    told = _inferred(_without_weights(model, rows), source, values=True)
     shapes = {tensor.name: tuple(tensor.dims) for tensor in told.initializer}
     for value in (*told.input, *told.value_info, *told.output):
         dims = value.type.tensor_type.shape.dim
         if value.type.tensor_type.HasField("shape") and all(d.HasField("dim_value") for d in dims):
             shapes[value.name] = tuple(d.dim_value for d in dims)
     return {name: shape for name, shape in shapes.items() if all(size >= 0 for size in shape)}
+
+
+def _inferred(bare: Any, source: str, values: bool) -> Any:
+    """A graph with the types and shapes that follow; `values`: from those of whole numbers too."""
+    try:
+        return onnx.shape_inference.infer_shapes(bare, strict_mode=True, data_prop=values).graph
+    except Exception as error:  # noqa: BLE001 - it raises what it likes at a damaged graph
+        words = " ".join(str(error).split())[:120]
+        raise PolicyError(source, "graph", f"its shapes do not fit ({words}).") from None
 
 
 def _without_weights(model: Any, rows: int) -> Any:

@@ -164,13 +164,21 @@ def test_a_policy_that_raises_leaves_a_zero_command_behind(robot, domain_id, err
     raw = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
     process = subprocess.Popen(
         [sys.executable, "-c", POLICY, error],
-        env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)}, stderr=subprocess.DEVNULL,
+        env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)}, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
         peer.until(lambda: tell() or process.poll() is not None, "its end", 200.0)
         peer.until(lambda: raw and raw[-1].twist == Twist(), "a zero command")
+        said = process.communicate()[1]
         assert process.returncode != 0
         assert any(each.twist.linear.x > 0.0 for each in raw)
+        if not error.startswith("SystemExit"):
+            assert process.returncode == 2
+            assert "Traceback" not in said
+            name = error.partition("(")[0]
+            told = [line for line in said.splitlines() if f"'go_to_goal' raised {name}" in line]
+            assert len(told) == 1
+            assert "the robot is stopped" in told[0]
     finally:
         process.kill()
         process.wait()

@@ -96,7 +96,32 @@ def sparse(proto):
     return add(proto, made)
 
 
+def divided(proto):
+    """A quotient that no 64 bits hold; the processor's answer to it ends the process."""
+    least, minus = np.array([-(2**63)], np.int64), np.array([-1], np.int64)
+    return add(proto, make_node("Div", ["least", "minus"], ["none"]), least=least, minus=minus)
+
+
+def dimensions(proto):
+    """Each node adds axes, so that to infer the shapes takes longer and longer."""
+    names = ["observation", *(f"d{k}" for k in range(60))]
+    return add(proto, *(
+        make_node("Unsqueeze", [a, "axes"], [b]) for a, b in itertools.pairwise(names)
+    ), axes=np.arange(2, 102))  # fmt: skip
+
+
+def whole_numbers(proto):
+    """Shapes that double are computed while they are only looked at."""
+    names = ["w0", *(f"w{k}" for k in range(1, 18))]
+    return add(proto, *(
+        make_node("Concat", [a, a], [b], axis=0) for a, b in itertools.pairwise(names)
+    ), w0=np.arange(9))  # fmt: skip
+
+
 REFUSED = {
+    "division of whole numbers": (divided, "graph.node", "may end the process"),
+    "dimensions": (dimensions, "graph.node", "6000 dimensions in all"),
+    "whole numbers": (whole_numbers, "graph.node", "is no shape"),
     "concatenations": (concats, "graph", "numbers"),
     "a square": (outer, "graph", "grows faster"),
     "work": (heavy, "graph", "multiplications"),
