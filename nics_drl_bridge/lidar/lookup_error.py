@@ -24,7 +24,7 @@ make most of it."""
 SLANT = np.radians(1.5)
 """So nearly along an edge the lidar looks where outliers are looked for [rad]."""
 NARROWEST = 0.1
-"""A stretch of distances narrower than this part of the lidar's range is not looked up over: the few
+"""A stretch of distances narrower than this part of the lidar's range is not looked up over: few
 places in it say too little."""
 NO_WALLS = np.zeros((0, 4))
 
