@@ -10,6 +10,7 @@ RECORDING ?=
 PYTEST_ARGS ?=
 BENCHMARKS ?=
 QUICK ?=
+OUT ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -183,9 +184,9 @@ $(CLIENTS)/.ready: Makefile
 	@touch $@
 
 # To its end whatever one of them says; each is told with machine, commit and load.
-benchmark: setup ## run every benchmark, write benchmarks/results.json: make benchmark [BENCHMARKS="parity files"] [QUICK=1]
+benchmark: setup ## run every benchmark, write benchmarks/results.json: make benchmark [BENCHMARKS="parity files"] [QUICK=1] [OUT=file]
 	@cd benchmarks && ../$(BIN)/python -m measuring.run_all \
-		$(if $(BENCHMARKS),--only $(BENCHMARKS)) $(if $(QUICK),--quick)
+		$(if $(BENCHMARKS),--only $(BENCHMARKS)) $(if $(QUICK),--quick) $(if $(OUT),--out "$(abspath $(OUT))")
 
 tables: setup ## make the tables of README and docs from benchmarks/results.json
 	@cd benchmarks && ../$(BIN)/python -m measuring.tables

@@ -258,6 +258,7 @@ TABLES: Mapping[str, Table] = {
     "lidar_complexity": lidar.COMPLEXITY,
     "sensor_models": lidar.MODELS,
     "maps": lidar.MAPS,
+    "fig4": lidar.FIG4,
     "estimator": ESTIMATOR,
     "transfer": TRANSFER,
     "baselines": BASELINES,

@@ -38,18 +38,20 @@ PAPER_SCANS = {
     "mixture": ("5.7", "339", "0.091", "0.0072"),
 }
 TABLE2 = Table(
-    ("scene", "", "scan mode [1/s]", "baked [1/s]", "RMSE [m]", "RMSE of the area [m²]", "table"),
+    ("scene", "", "scan mode [1/s]", "baked [1/s]", "RMSE [m]", "RMSE of the area [m²]",
+     "of the write limit", "table"),
     tuple(
         row
         for name, title in SHAPES.items()
         for row in (
             ("table2_lidar", title, "here", f"{{scenes.{name}.exact_scans_per_s|.1e}}",
              f"{{scenes.{name}.baked_scans_per_s|.1e}}", f"{{scenes.{name}.rmse_m|.4f}}",
-             f"{{scenes.{name}.area_rmse_m2|.4f}}", f"{{table_bytes.{name} x1e-6|.2g}} MB"),
+             f"{{scenes.{name}.area_rmse_m2|.4f}}",
+             f"{{scenes.{name}.share_of_write_limit|.0%}}", f"{{table_bytes.{name} x1e-6|.2g}} MB"),
             ("table2_lidar", "", "nearest row", "", "",
              f"{{scenes.{name}.nearest_row_rmse_m|.3f}}",
-             f"{{scenes.{name}.nearest_row_area_rmse_m2|.3f}}", ""),
-            ("table2_lidar", "", "paper", *PAPER_SCANS[name], ""),
+             f"{{scenes.{name}.nearest_row_area_rmse_m2|.3f}}", "", ""),
+            ("table2_lidar", "", "paper", *PAPER_SCANS[name], "", ""),
         )
     ),
 )  # fmt: skip
@@ -100,3 +102,18 @@ MAPS = Table(
         for k, title in enumerate((*("office",) * 2, *("as SLAM leaves it",) * 2))
     ),
 )  # fmt: skip
+FIG4 = Table(
+    ("", "against scan mode", "[mm]"),
+    (
+        *(
+            ("fig4_pointcloud", title, what, f"{{{path} x1000|{how}}}")
+            for title, key, how in (("baked", "baked", ".1f"), ("MuJoCo", "mujoco", ".1g"))
+            for what, path in (
+                ("RMSE of the cloud, to the nearest point", f"cloud_rmse_m.{key}"),
+                ("RMSE beam by beam", f"range_rmse_m.{key}"),
+            )
+        ),
+        ("fig4_pointcloud", "odometry", "error of the path", "{slam.odometry_error_m x1000|.0f}"),
+        ("fig4_pointcloud", "SLAM", "error of the path", "{slam.path_error_m x1000|.0f}"),
+    ),
+)

@@ -79,14 +79,15 @@ def object_in(printed: str) -> dict[str, Any] | None:
     lines = printed.strip().splitlines()
     try:
         found = json.loads(lines[-1]) if lines else None
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return found if isinstance(found, dict) else None
 
 
 def judged(code: int | None, result: dict[str, Any] | None, last: str) -> dict[str, Any]:
     """State, failures, result and error of a run that ended with a code, `None` if it was ended."""
-    failures = list((result or {}).pop("failures", []))
+    told = (result or {}).pop("failures", None)
+    failures = [str(each) for each in told] if isinstance(told, list) else []
     state, error = BROKEN, None
     if code is None:
         error = "was ended, since it took too long"
@@ -95,6 +96,10 @@ def judged(code: int | None, result: dict[str, Any] | None, last: str) -> dict[s
         error = f"{how}: {last}"
     elif result is None:
         error = f"ended with exit code {code} and printed no JSON object: {last}"
+    elif not isinstance(told, list):
+        error = f"does not say which bars were missed: `failures` is {str(told)[:40]!r}, no list"
+    elif not result:
+        error = "measured nothing: its JSON object holds no figure"
     else:
         state = MISSED if code or failures else MET
     return {
@@ -163,7 +168,8 @@ def known(file: Path) -> dict[str, Any]:
         return {"machine": dict(found["machine"]), "runs": dict(found["runs"])}
     except (OSError, ValueError, KeyError, TypeError):
         raise SystemExit(
-            f"{file}: holds no results; remove it, or name another by --out."
+            f"{file}: holds no results; remove it, or name another (make benchmark "
+            "OUT=runs/results.json, or --out of the runner)."
         ) from None
 
 
@@ -183,7 +189,8 @@ def run_all(runs: Mapping[str, Run], given: argparse.Namespace) -> dict[str, dic
         raise SystemExit(
             f"{given.out}: its figures are from {kept['machine'].get('cores')} cores of "
             f"{kept['machine'].get('cpu')}, this machine has {machine['cores']} of "
-            f"{machine['cpu']}; name another file by --out, or remove it."
+            f"{machine['cpu']}; name another file (make benchmark OUT=runs/results.json, or --out "
+            "of the runner), or remove this one."
         )
     every = runs_of(given.scripts)
     entries = {name: one for name, one in kept.get("runs", {}).items() if name in every}

@@ -23,6 +23,9 @@ DEVIATIONS = 2.0
 make most of it."""
 SLANT = np.radians(1.5)
 """So nearly along an edge the lidar looks where outliers are looked for [rad]."""
+NARROWEST = 0.1
+"""A stretch of distances narrower than this part of the lidar's range is not looked up over: few
+places in it say too little."""
 NO_WALLS = np.zeros((0, 4))
 
 
@@ -76,8 +79,8 @@ def lookup_distances(
 
 
 def _widest(rings: Array, squares: Array, counts: Array, greatest: Array) -> tuple[float, float]:
-    """The edges of the widest stretch of rings in which all errors are small."""
-    best, width = (np.inf, np.inf), 0.0
+    """The edges of the widest stretch of rings in which all errors are small, if it is wide."""
+    best, width = (np.inf, np.inf), NARROWEST * (rings[-1] - rings[0])
     for i in range(RINGS):
         for j in range(i + 1, RINGS + 1):
             wider = rings[j] - rings[i] > width and (greatest[i:j] > 0.0).all()

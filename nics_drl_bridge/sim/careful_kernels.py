@@ -139,7 +139,7 @@ def _settle(until, tight, events, touched, scene):  # type: ignore[no-untyped-de
         if k >= first:
             touched[k - first] = 1
         if own >= SHARE * (own + others):
-            flights[first + m, STOP] = time
+            flights[first + m, STOP] = min(flights[first + m, STOP], time)
         if k >= 0 and others >= SHARE * (own + others):
             flights[k, STOP] = min(flights[k, STOP], time)
         for p in range(robots):

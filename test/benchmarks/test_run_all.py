@@ -83,6 +83,11 @@ def test_bars_that_are_met_end_with_0_and_stand_in_the_file_with_machine_commit_
         ("print('[1, 2]')\n", "broken", "printed no JSON object"),
         ("print('{\"figure\": 1.5')\n", "broken", "printed no JSON object"),
         ("import sys\nsys.stdout.buffer.write(b'\\xff\\x00\\x80')\n", "broken", "no JSON object"),
+        ("print('{\"figure\": 1.5}')\n", "broken", "does not say which bars were missed"),
+        ('print(\'{"figure": 1, "failures": 5}\')\n', "broken", "`failures` is '5', no list"),
+        ('print(\'{"figure": 1, "failures": [5]}\')\n', "missed", "5"),
+        ("print('{\"failures\": []}')\n", "broken", "measured nothing"),
+        ("print('[' * 100000)\n", "broken", "printed no JSON object"),
         ("", "broken", "printed no JSON object: no message"),
         ("import os, signal\nos.kill(os.getpid(), signal.SIGKILL)\n", "broken", "by signal 9"),
         ("import os\nos.abort()\n", "broken", "by signal 6"),
@@ -193,6 +198,7 @@ def test_results_of_another_machine_are_not_mixed_with_those_of_this_one(scripts
     assert done.returncode == 1
     assert "its figures are from" in done.stderr
     assert "Zuse Z3" in done.stderr
+    assert "make benchmark OUT=" in done.stderr
     assert after == found
 
 

@@ -103,3 +103,19 @@ def test_a_long_segment_near_the_lidar_is_scanned_exactly():
     true = cast(shape, poses, spec.directions, spec.range_max)
     both = np.isfinite(found) & np.isfinite(true)
     assert np.abs(found[both] - true[both]).max() < 1e-4
+
+
+def test_a_star_that_the_lidar_all_but_touches_is_right_where_few_places_err():
+    corners = np.arange(6) * np.pi / 3.0
+    star = np.where(np.arange(6) % 2, 0.176, 0.402)[:, None] * np.stack(
+        [np.cos(corners), np.sin(corners)], axis=1
+    )
+    spec, shape = load_lidar("turtlebot3_lds_02"), Polygon(points=tuple(map(tuple, star)))
+    scanner, rng = make_scanner(spec, [shape]), np.random.default_rng(2)
+    away = shape.radius + rng.uniform(0.001, 0.008, 4000)
+    bearing, heading = rng.uniform(-np.pi, np.pi, (2, len(away)))
+    poses = np.stack([away * np.cos(bearing), away * np.sin(bearing), heading], axis=1)
+    found = scanner.scan(np.zeros((len(poses), 3)), scanner.place([shape], poses[:, None]))
+    true = cast(shape, poses, spec.directions, spec.range_max)
+    both = np.isfinite(found) & np.isfinite(true)
+    assert np.sqrt(np.mean((found[both] - true[both]) ** 2)) <= BAR
