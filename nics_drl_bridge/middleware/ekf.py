@@ -98,8 +98,7 @@ class Estimator:
             pose: x [m], y [m], heading [rad] in `map`.
             std: how well it is known [m, rad]: one number, or (3,).
         """
-        size = self._filter.dim_x
-        mean, deviation = np.zeros(size), np.full(size, START_STD)
+        mean, deviation = np.zeros(self._filter.dim_x), np.full(self._filter.dim_x, START_STD)
         mean[:3], deviation[:3] = pose, std
         self.belief = Belief(time_ns, mean, np.diag(deviation**2), (0, 0, 0), None, False)
         self._log.clear()
@@ -109,12 +108,13 @@ class Estimator:
         self._anchor = Anchor(self.time_ns, odom, self._filter.x, self._filter.P)
 
     def lose(self, time_ns: int, seconds: float, continuous: bool, command: Array) -> None:
-        """Goes on at a time to which the clock was set, from what was held at the last odometry.
+        """Goes on from the last odometry at a time to which the clock was set.
 
         The robot may have driven anywhere within reach since.
 
         Args:
-            time_ns, seconds: when [ns], and how long after that odometry.
+            time_ns: when [ns].
+            seconds: since that odometry.
             continuous: whether the next odometry's pose tells how far it came.
             command: (C,) that it follows now.
         """
