@@ -69,12 +69,7 @@ NOISE = Noise(
     heading_drift=Level(std=0.03, unit="rad/sqrt(s)", source="measured"),
 )
 WIDE = World.model_validate(
-    {
-        "name": "wide",
-        "size": [200.0, 200.0],
-        "clearance": 0.1,
-        "goal_distance": [1.0, 3.0],
-    }
+    {"name": "wide", "size": [200.0, 200.0], "clearance": 0.1, "goal_distance": [1.0, 3.0]}
 )
 
 

@@ -33,11 +33,10 @@ class CommandLog:
         self._commands[0] = 0.0
         self._count = 1
 
-    def keep_last(self) -> None:
-        """Forgets all commands but the last, which is taken to have been in effect ever since."""
-        self._commands[0] = self._commands[self._count - 1]
-        self._effective[0] = np.iinfo(np.int64).min
-        self._count = 1
+    def keep(self, command: ArrayLike) -> None:
+        """Forgets all commands but this one (C,), taken to have been in effect ever since."""
+        self.clear()
+        self._commands[0] = command
 
     def add(self, effective_ns: int, command: ArrayLike, needed_ns: int) -> bool:
         """Notes a command (C,).

@@ -98,8 +98,7 @@ class Estimator:
             pose: x [m], y [m], heading [rad] in `map`.
             std: how well it is known [m, rad]: one number, or (3,).
         """
-        size = self._filter.dim_x
-        mean, deviation = np.zeros(size), np.full(size, START_STD)
+        mean, deviation = np.zeros(self._filter.dim_x), np.full(self._filter.dim_x, START_STD)
         mean[:3], deviation[:3] = pose, std
         self.belief = Belief(time_ns, mean, np.diag(deviation**2), (0, 0, 0), None, False)
         self._log.clear()
@@ -108,22 +107,23 @@ class Estimator:
         """Notes the pose (3,) in `odom` of the present."""
         self._anchor = Anchor(self.time_ns, odom, self._filter.x, self._filter.P)
 
-    def lose(self, time_ns: int, seconds: float, continuous: bool) -> None:
-        """Goes on at a time to which the clock was set, from what was held at the last odometry.
+    def lose(self, time_ns: int, seconds: float, continuous: bool, command: Array) -> None:
+        """Goes on from the last odometry at a time to which the clock was set.
 
-        The robot may have driven anywhere within reach since; the last command goes on.
+        The robot may have driven anywhere within reach since.
 
         Args:
             time_ns: when [ns].
             seconds: since that odometry.
             continuous: whether the next odometry's pose tells how far it came.
+            command: (C,) that it follows now.
         """
         anchor = self._anchor or Anchor(0, np.zeros(3), self._filter.x, self._filter.P)
         covariance = self.unseen.doubted(anchor.covariance, seconds)
         known = self._anchor is not None and continuous
         since = anchor._replace(time_ns=time_ns - round(seconds * NANO)) if known else None
         self.belief = Belief(time_ns, anchor.mean, covariance, (0, 0, 0), since, True)
-        self._log.keep_last()
+        self._log.keep(np.minimum(np.maximum(command, self._least), self._most))
 
     @property
     def belief(self) -> Belief:

@@ -70,6 +70,7 @@ class Middleware:
         """
         self.cache = TopicCache()
         self._clock_jumps = 0
+        self._commanded = np.zeros(self._width)
         self.estimator.reset(time_ns, pose, std)
         self._trail.reset()
         self._begin(time_ns)
@@ -105,6 +106,9 @@ class Middleware:
             reason = f"shape {value.shape}, not ({self._width},)"
         elif not np.isfinite(value).all():
             reason = NOT_FINITE
+        else:
+            # Whatever its stamp, the robot follows it: the clock may have been set meanwhile.
+            self._commanded = value
         reason = reason or self._stamps.fault(stamp_ns, arrival_ns)
         reason = reason or self._timeline.command(stamp_ns, value)
         if reason:
@@ -241,7 +245,7 @@ class Middleware:
         robot has driven since; where it does not say so, the robot may be anywhere within reach.
         """
         seconds, continuous = self._trail.seconds(told), self._trail.continuous(told)
-        self.estimator.lose(told.stamp_ns, seconds, continuous)
+        self.estimator.lose(told.stamp_ns, seconds, continuous, self._commanded)
         self.estimator.correct(Measurement(Kind.TWIST, told.twist, odom=told.pose))
         self._begin(told.stamp_ns)
         self._trail.reset()

@@ -32,9 +32,8 @@ def test_after_a_jump_the_estimate_is_off_by_no_more_than_it_claims(robot, jumps
     first, nees, last, nees_at_end = campaign(robot, 2 * len(settings), settings)
     assert np.hypot(*first[:, :2].T).max() < 0.6  # the drift of some seconds, and no way on top
     assert np.median(np.hypot(*first[:, :2].T)) < 0.2
-    assert np.mean(nees) < 5.0
-    assert np.quantile(nees, 0.9) < CHI2_999  # one of a few drives may be far off, by chance
-    assert max(nees) < 2.5 * CHI2_999
+    assert np.mean(nees) < 5.0  # chi-squared of some fifteen drives
+    assert max(nees) < CHI2_999
     assert np.mean(nees_at_end) < 5.0
     assert np.hypot(*last[:, :2].T).max() < 2.5
 
@@ -100,6 +99,21 @@ def test_the_first_command_after_a_jump_need_not_be_waited_for():
     driven(middleware)
     driven(middleware, 10, shift_ns=3600 * SECOND, begin=20)
     assert middleware.view(middleware.estimator.time_ns).twist[0] == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("jump_s", [-500.0, -0.3, 0.3, 3600.0])
+def test_the_robot_follows_the_command_that_came_last_whatever_its_stamp(jump_s):
+    middleware, shift, x = started(), round(jump_s * SECOND), 0.0
+    for k in range(1, 42):
+        now, speed = SECOND + k * PERIOD, 1.0 if k <= 24 else 0.5
+        moved = shift if k > 20 else 0
+        middleware.command(now - PERIOD + moved, [speed, 0.0, 0.0])
+        x += speed * 0.1
+        middleware.odometry(now + moved, now, [x, 0.0, 0.0], [speed, 0.0, 0.0])
+        if middleware.health(0).noticed.get("clock: jump") and k > 24:
+            break
+    ahead = middleware.estimator.time_ns + 5 * PERIOD
+    assert middleware.view(ahead).twist[0] == pytest.approx(0.5, abs=0.05)
 
 
 def test_scans_of_the_new_clock_are_taken_and_those_of_the_old_one_forgotten():
