@@ -21,6 +21,8 @@ OUTLIER = 0.3
 DEVIATIONS = 2.0
 """A squared error may be so many of its standard deviations greater than what was found: rare beams
 make most of it."""
+LEAST_WIDTH = 0.1
+"""A stretch of distances is worth a look-up from this part of the lidar's range on."""
 SLANT = np.radians(1.5)
 """So nearly along an edge the lidar looks where outliers are looked for [rad]."""
 NO_WALLS = np.zeros((0, 4))
@@ -77,7 +79,7 @@ def lookup_distances(
 
 def _widest(rings: Array, squares: Array, counts: Array, greatest: Array) -> tuple[float, float]:
     """The edges of the widest stretch of rings in which all errors are small."""
-    best, width = (np.inf, np.inf), 0.0
+    best, width = (np.inf, np.inf), LEAST_WIDTH * (rings[-1] - rings[0])
     for i in range(RINGS):
         for j in range(i + 1, RINGS + 1):
             wider = rings[j] - rings[i] > width and (greatest[i:j] > 0.0).all()
