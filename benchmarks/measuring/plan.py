@@ -43,7 +43,7 @@ RUNS: dict[str, Run] = {
     "fig4_pointcloud": row("fig4_pointcloud", "", "--scans 12 --without-slam"),
     "files": row("files", "", "--kills 5 --flips 20 --cuts 10 --changes 20"),
     "gate_envelope": row("gate_envelope", "--steps 1000000", "--steps 5000"),
-    "gate_faults": row("gate_faults", "--repeats 100", "--repeats 1", 3 * HOUR),
+    "gate_faults": row("gate_faults", "--load 2 --repeats 100", "--repeats 1", 4 * HOUR),
     "gate_rules": row("gate_rules", timeout_s=2 * HOUR),
     "generate_from_mujoco": row("generate_from_mujoco", "", "--drives 1 --train 30", HOUR),
     "lidar_complexity": row("lidar_complexity", "", "--most 16 --scans 64 --repeats 5"),

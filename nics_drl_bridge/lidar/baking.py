@@ -125,8 +125,6 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
     """Where the cells of a shape lie and how wide their rows are."""
     shape, radius, order = outlines.shapes[h], outlines.radii[h], outlines.orders[h]
     distances = np.linspace(radius, spec.range_max + radius, density.distances)
-    if not math.isclose(distances[-1] - radius, spec.range_max, rel_tol=1e-9):
-        raise ConfigError(f"{describe(shape)} is too large to bake; give it in metres.")
     distances[0] *= 1.0 + TOUCHING
     round_ = isinstance(shape, Circle)
     count = 1 if round_ else max(1, -(-density.rotations // order))
