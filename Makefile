@@ -8,6 +8,8 @@ SHELL := /bin/bash
 PYTHON ?= python3
 RECORDING ?=
 PYTEST_ARGS ?=
+# Tests of one file run one after the other; PARALLEL= runs all of them so.
+PARALLEL ?= -n auto --dist loadfile
 BENCHMARKS ?=
 QUICK ?=
 OUT ?=
@@ -110,7 +112,7 @@ types: setup ## mypy
 	$(BIN)/mypy nics_drl_bridge
 
 pytest: setup
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest $(PARALLEL) $(PYTEST_ARGS)
 
 # Environments apart, of what clashes with .venv; what they share with it has the same pins.
 # $(1): folder. $(2): command that prints its constraints. $(3): what it holds.
