@@ -45,13 +45,15 @@ def halts_on_error(
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Lets no second Ctrl-C cut short what leaves a robot standing still."""
+    """Lets no Ctrl-C cut short what leaves a robot standing still: it is answered afterwards."""
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread is interrupted
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
     try:
         yield
     finally:
-        if before is not None:
-            signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
+        if came:
+            signal.raise_signal(signal.SIGINT)
