@@ -16,6 +16,7 @@ from nics_drl_bridge.safety.limits import load_limits
 from nics_drl_bridge.safety.state import Decision, GateConfig, begin
 
 Array = NDArray[np.float64]
+Witness = Callable[[Decision, float], None]
 NANO = 1_000_000_000
 START_S = 1000.0
 SETTLE_PERIODS = 12
@@ -49,7 +50,7 @@ class Gate:
 
     def __init__(self, config: GateConfig, lidar: LidarSpec) -> None:
         self.config, self._lidar = config, lidar
-        self.witness: Callable[[Decision, float], None] | None = None
+        self.witness: Witness | None = None
         self.state, self.now, self.stamp_ns = begin(config), START_S, NANO
 
     def give(self, given: Input) -> Decision:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from measuring.gates import NANO, Gate, gate_config
+from measuring.gates import NANO, Gate, Witness, gate_config
 from measuring.shield_places import SCAN_STEPS, STEP_S, Job, Outcome, Place
 from nics_drl_bridge.safety.inputs import Command, Input, Odometry, Scan
 from nics_drl_bridge.safety.limits import load_limits
@@ -54,14 +54,24 @@ def config_of(place: Place, shield: dict[str, float] | None) -> GateConfig:
     return gate_config(robot, place.model.lidar, shield=given)
 
 
-def drive(place: Place, config: GateConfig, jobs: Sequence[Job]) -> list[Outcome]:
-    """Drives episodes one after the other, each with a gate of its own."""
-    return [_episode(place, config, job) for job in jobs]
+def drive(
+    place: Place, config: GateConfig, jobs: Sequence[Job], witness: Witness | None = None
+) -> list[Outcome]:
+    """Drives episodes one after the other, each with a gate of its own.
+
+    Args:
+        place: the robot in its world.
+        config: of its gate.
+        jobs: the episodes.
+        witness: sees every decision of the gates, with its time.
+    """
+    return [_episode(place, config, job, witness) for job in jobs]
 
 
-def _episode(place: Place, config: GateConfig, job: Job) -> Outcome:
+def _episode(place: Place, config: GateConfig, job: Job, witness: Witness | None) -> Outcome:
     place.begin(job)
     gate, lidar = Gate(config, place.model.lidar), place.model.lidar
+    gate.witness = witness
     truth = place.truth
     gate.arm(truth.ranges, place.odom)
     rng = np.random.default_rng([11, job.seed, *place.model.robot.name.encode()])
