@@ -12,6 +12,7 @@ how many kernels are compiled, and about how long that takes.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import sys
 import threading
@@ -19,7 +20,7 @@ import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, overload
 
 import numba
 from numba.core import event
@@ -37,8 +38,18 @@ _IMPORT = re.compile(
 )
 
 
+@overload
+def kernel(function: Function) -> Function: ...
+
+
+@overload
 def kernel(
-    function: Function | None = None,
+    *, allocates: bool = ..., contracts: bool = ..., inline: bool = ...
+) -> Callable[[Function], Function]: ...
+
+
+def kernel(
+    function: Any = None,
     *,
     allocates: bool = False,
     contracts: bool = False,
@@ -94,7 +105,7 @@ def digest_of(module: Path) -> str:
         if file not in files:
             files.add(file)
             left += imports_of(file)
-    parts = sorted((str(file.relative_to(PACKAGE.parent)), _read(file)) for file in files)
+    parts = sorted((os.path.relpath(file, PACKAGE), _read(file)) for file in files)
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 

@@ -47,7 +47,7 @@ HOMES = {
     "yaml": ("strict_yaml.py",),
     "typer": ("cli.py", "commands/*"),
     "gymnasium": ("env/*", "policy/*", "trial.py", "vehicle.py"),
-    "numba": ("*kernels.py", "lidar/scanner.py"),
+    "numba": ("*kernels.py",),
     "PIL": ("lidar/maps.py",),
     "llvmlite": ("*kernels.py",),
     "mujoco": ("highfidelity/*",),

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from nics_drl_bridge.kernels import kernel
 
 SMALL_TURN = 0.3
 """Below this the series of sin(a)/a below is exact to the last digits [rad]."""
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _product(row, factors, count):  # type: ignore[no-untyped-def]
     value = 1.0
     for f in range(count):
@@ -19,7 +20,7 @@ def _product(row, factors, count):  # type: ignore[no-untyped-def]
     return value
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _sinc(half):  # type: ignore[no-untyped-def]
     """sin(a) / a."""
     if abs(half) > SMALL_TURN:
@@ -28,7 +29,7 @@ def _sinc(half):  # type: ignore[no-untyped-def]
     return 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
 
 
-@njit(cache=True, forceinline=True)
+@kernel(allocates=True, inline=True)
 def _follow_derivatives(now, values, dof, free, arc, along_x, along_y, dt):  # type: ignore[no-untyped-def]
     """Moves the derivatives (3, P) of a pose along one arc: (dx, dy, turn)."""
     dx, dy, turn = arc
@@ -52,7 +53,7 @@ def _follow_derivatives(now, values, dof, free, arc, along_x, along_y, dt):  # t
             now[2, p] += dt * value
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-untyped-def]
     """Integrates body twists along courses of X that no coefficient changes.
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.canonical_kernels import resample
 from nics_drl_bridge.random_kernels import episode_seed
 
@@ -20,14 +20,14 @@ LIMIT = 1000.0
 """Greatest distance [m], speed [m/s] and turn rate [rad/s] in an observation."""
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def episode_seeds(seeds, numbers, out):  # type: ignore[no-untyped-def]
     """Seeds (n,) of the episodes with these numbers (n,) in envs with these seeds (n,)."""
     for i in range(seeds.shape[0]):
         out[i] = episode_seed(seeds[i], numbers[i])
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def commands(out, actions, low, high):  # type: ignore[no-untyped-def]
     """Commands (R, C) between their limits (C,) for actions (R, C) float32, cut to [-1, 1]."""
     for i in range(out.shape[0]):
@@ -36,7 +36,7 @@ def commands(out, actions, low, high):  # type: ignore[no-untyped-def]
             out[i, c] = low[c] + share * (high[c] - low[c])
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def finite(values):  # type: ignore[no-untyped-def]
     """Whether all values (R, C) are."""
     for i in range(values.shape[0]):
@@ -46,7 +46,7 @@ def finite(values):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def look(shares, ranges, per_metre, leaves):  # type: ignore[no-untyped-def]
     """Writes a scan in shares of the greatest range; says whether something is too near.
 
@@ -67,7 +67,7 @@ def look(shares, ranges, per_metre, leaves):  # type: ignore[no-untyped-def]
     return hits != 0
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def look_by_sector(shares, ranges, sensor):  # type: ignore[no-untyped-def]
     """Writes the nearest returns in sectors (S,) in shares; says whether something is too near.
 
@@ -87,7 +87,7 @@ def look_by_sector(shares, ranges, sensor):  # type: ignore[no-untyped-def]
     return hits != 0
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def bearing(pose, x, y):  # type: ignore[no-untyped-def]
     """Distance [m] from a pose (3,) to a point, and cosine and sine of its bearing."""
     dx, dy = x - pose[0], y - pose[1]
@@ -99,7 +99,7 @@ def bearing(pose, x, y):  # type: ignore[no-untyped-def]
     return distance, min(max(forward, -1.0), 1.0), min(max(left, -1.0), 1.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def bearings(out, poses, points):  # type: ignore[no-untyped-def]
     """Distance [m], cosine and sine (R, 3) of points (R, 2) as seen from poses (R, 3)."""
     for i in range(out.shape[0]):
@@ -107,7 +107,7 @@ def bearings(out, poses, points):  # type: ignore[no-untyped-def]
         out[i, 0] = min(distance, LIMIT)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def looks(shares, touched, ranges, sensor):  # type: ignore[no-untyped-def]
     """Scans of R robots: `look` for each, or `look_by_sector`; touched (R,) is the answer."""
     for i in range(ranges.shape[0]):
@@ -117,7 +117,7 @@ def looks(shares, touched, ranges, sensor):  # type: ignore[no-untyped-def]
             touched[i] = look_by_sector(shares[i], ranges[i], sensor)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def navigate(out, approach, reached, touched, before, pose, twist, ranges, goals, sensor, radius):  # type: ignore[no-untyped-def]
     """Observations of the navigation task, and what the robots came to.
 
@@ -148,7 +148,7 @@ def navigate(out, approach, reached, touched, before, pose, twist, ranges, goals
             out[i, parts + 3 + k] = min(max(twist[i, k], -LIMIT), LIMIT)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def distances(out, poses, points):  # type: ignore[no-untyped-def]
     """Distances (R,) [m] from poses (R, 3) to points (R, 2)."""
     for i in range(out.shape[0]):
@@ -156,7 +156,7 @@ def distances(out, poses, points):  # type: ignore[no-untyped-def]
         out[i] = math.sqrt(dx * dx + dy * dy)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def pair_bearings(out, poses, points):  # type: ignore[no-untyped-def]
     """`bearing` (R, M, P, 3) of each of the points (R, P, 2) from each of the poses (R, M, 3)."""
     for r in range(out.shape[0]):
@@ -167,7 +167,7 @@ def pair_bearings(out, poses, points):  # type: ignore[no-untyped-def]
                 out[r, m, p, 0] = min(distance, LIMIT)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def pair_distances(out, poses, points):  # type: ignore[no-untyped-def]
     """Distances (R, M, P) [m] from poses (R, M, 3) to points (R, P, 2)."""
     for r in range(out.shape[0]):

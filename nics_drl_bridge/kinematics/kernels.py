@@ -15,11 +15,12 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.extending import overload
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ModelError
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.kinematics.model import TaylorModel
 
 Array = NDArray[np.float64]
@@ -64,7 +65,7 @@ def scratch(model: TaylorModel) -> tuple[Array, Array]:
     return x, np.zeros(len(model.dofs))
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@kernel
 def rates(dq, x, terms):  # type: ignore[no-untyped-def]
     """dQ/dt (3 + S) of one robot."""
     dof, coefficient, factors, count = terms
@@ -76,7 +77,7 @@ def rates(dq, x, terms):  # type: ignore[no-untyped-def]
         dq[dof[k]] += product
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@kernel
 def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
     """Position and direction after the exact arc of a constant body twist.
 
@@ -95,7 +96,7 @@ def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
     return _move_little(x, y, c, s, vx, vy, turn, dt, series)
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@kernel
 def _move_little(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
     """As `move`, of no wide turn."""
     t2 = turn * turn
@@ -105,7 +106,7 @@ def _move_little(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyp
     return _along(x, y, c, s, vx, vy, a, b, turn * a, turn * b, dt)
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@kernel
 def _along(x, y, c, s, vx, vy, a, b, sine, versine, dt):  # type: ignore[no-untyped-def]
     """The end of an arc, by a = sin(t) / t, b = (1 - cos(t)) / t, and t times either."""
     ahead, aside = (a * vx - b * vy) * dt, (b * vx + a * vy) * dt
@@ -113,13 +114,13 @@ def _along(x, y, c, s, vx, vy, a, b, sine, versine, dt):  # type: ignore[no-unty
     return x, y, c - (c * versine + s * sine), s - (s * versine - c * sine)
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@kernel
 def wrap(heading):  # type: ignore[no-untyped-def]
     """Brings a heading [rad] into [-pi, pi)."""
     return heading - 2.0 * math.pi * math.floor((heading + math.pi) / (2.0 * math.pi))
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@kernel
 def advance(pose, twist, dt, series):  # type: ignore[no-untyped-def]
     """Moves a pose (3,) in place along the exact arc of a body twist (3,)."""
     turn = twist[2] * dt
@@ -140,7 +141,7 @@ def _own(value, lane):  # type: ignore[no-untyped-def]
     return lambda value, lane: value
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@kernel
 def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
     """Moves many robots by the same number of steps, each under a constant command.
 
@@ -162,7 +163,7 @@ def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
                 state[i] += dt * rate[i]
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@kernel
 def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
     dof, coefficient, factors, count = terms
     n = x.shape[1]
@@ -192,7 +193,7 @@ def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
                 rate[i] += own(value, i)
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@kernel
 def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
     px, py, pc, ps, heading, length = pose[0], pose[1], pose[2], pose[3], pose[4], pose[5]
     vx, vy, wz = dq[0], dq[1], dq[2]
@@ -211,7 +212,7 @@ def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
         length[i] += (abs(vx[i]) + abs(vy[i])) * dt
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@kernel
 def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
     """As `_move_all`, where some of them turn widely: in a loop of its own, as it is slower."""
     px, py, pc, ps, heading, length = pose[0], pose[1], pose[2], pose[3], pose[4], pose[5]
@@ -225,7 +226,7 @@ def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
         length[i] += (abs(vx[i]) + abs(vy[i])) * dt
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-untyped-def]
     """Moves robots open-loop by the steps of their commands, one robot after the other.
 
@@ -255,7 +256,7 @@ def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-unty
             poses[w, n + 1, 0], poses[w, n + 1, 1], poses[w, n + 1, 2] = px, py, heading
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@kernel
 def delayed(substep, delay, substeps, periods):  # type: ignore[no-untyped-def]
     """Which of the last `periods` commands, newest first, is in effect in a substep."""
     if delay <= substep:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import kernels
 
 EDGE = 1e-6
 """So far within an edge, as a part of the whole width, is its range taken."""
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[no-untyped-def]
     """Outermost directions of a shape straight ahead, and the corners that make them.
 
@@ -46,7 +46,7 @@ def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[n
             hints[t, d, 0], hints[t, d, 1] = right, left
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untyped-def]
     """Range to a shape straight ahead in one direction [rad]; see `row`."""
     ray, out = np.empty((1, 2)), np.full(1, np.inf, np.float32)
@@ -63,7 +63,7 @@ def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untype
     return out[0]
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # type: ignore[no-untyped-def]
     """Ranges (P,) of a shape straight ahead, continued beyond its edges.
 
@@ -96,7 +96,7 @@ def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # 
     fine[last + 1 :] = along(edge[1] - inside, corners, radius, distance, cos, sin)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def into_phases(rows, fine, width, phases):  # type: ignore[no-untyped-def]
     """Sorts points (width * phases,) so that those of one phase stand together."""
     for phase in range(phases):
@@ -104,7 +104,7 @@ def into_phases(rows, fine, width, phases):  # type: ignore[no-untyped-def]
             rows[phase * width + k] = fine[k * phases + phase]
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
     """All rows of one rotation.
 

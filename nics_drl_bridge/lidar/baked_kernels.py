@@ -13,8 +13,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.map_memory_kernels import get, peek, put
 
 LANES = 144
@@ -56,7 +56,7 @@ ATAN = tuple(
 )
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+@kernel(contracts=True, inline=True)
 def in_sight(found, begin, end, bodies, n, me, scan, range_max, baked, wide, whole):  # type: ignore[no-untyped-def]
     """First pass: packs the bodies in sight of one scan into the lanes.
 
@@ -102,7 +102,7 @@ def in_sight(found, begin, end, bodies, n, me, scan, range_max, baked, wide, who
     return found, left
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def left_out(bodies, n, k, me, sx, sy, range_max, baked):  # type: ignore[no-untyped-def]
     """Whether body k is in sight, but not looked up; see `in_sight`."""
     dx, dy, radius = bodies[n, k, 0] - sx, bodies[n, k, 1] - sy, bodies[n, k, 5]
@@ -113,7 +113,7 @@ def left_out(bodies, n, k, me, sx, sy, range_max, baked):  # type: ignore[no-unt
     return seen and (d2 < radius * radius or d2 < baked[h, 0] or d2 > baked[h, 1])
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+@kernel(contracts=True, inline=True)
 def arctan2_single(y, x):  # type: ignore[no-untyped-def]
     """As `kernels.arctan2` in single precision, within 2e-7 rad."""
     ax, ay = abs(x), abs(y)
@@ -132,7 +132,7 @@ def arctan2_single(y, x):  # type: ignore[no-untyped-def]
     return math.copysign(r, y)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def directions(padded, wide, single):  # type: ignore[no-untyped-def]
     """Second pass: distance and bearing in the world of each."""
     for k in range(padded):
@@ -145,7 +145,7 @@ def directions(padded, wide, single):  # type: ignore[no-untyped-def]
         put(single, k + BEARING, arctan2_single(get(single, k + ACROSS), get(single, k + ALONG)))
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def cells_of(padded, distances, about, wide, single, whole):  # type: ignore[no-untyped-def]
     """Third pass: which cell each looks up, and where its hull begins.
 
@@ -171,7 +171,7 @@ def cells_of(padded, distances, about, wide, single, whole):  # type: ignore[no-
         put(wide, k + ROUND, peek(about, h + ROUND_RADIUS))
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def fetch(found, cells, hulls, wide, whole):  # type: ignore[no-untyped-def]
     """Fourth pass: the only one that waits for the cells, and does nothing else.
 
@@ -205,7 +205,7 @@ def fetch(found, cells, hulls, wide, whole):  # type: ignore[no-untyped-def]
         put(wide, k + LEFT_Y2, hulls[np.uintp(corner + 1)])
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+@kernel(contracts=True, inline=True)
 def seen_from(d2, cos, sin, x, y):  # type: ignore[no-untyped-def]
     """A corner (x, y) of a hull as (along, across) the bearing, times the distance.
 
@@ -215,7 +215,7 @@ def seen_from(d2, cos, sin, x, y):  # type: ignore[no-untyped-def]
     return d2 + cos * x - sin * y, sin * x + cos * y
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def silhouettes(padded, wide, single):  # type: ignore[no-untyped-def]
     """Fifth pass: the two silhouettes as (along, across), of two corners the outer one."""
     for k in range(padded):
@@ -237,7 +237,7 @@ def silhouettes(padded, wide, single):  # type: ignore[no-untyped-def]
         put(single, k + ACROSS2, np.float32(radius if radius > 0.0 else ay))
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def outermost(hulls, skip, corners, first, stride, d2, cos, sin, side):  # type: ignore[no-untyped-def]
     """Climbs along a hull to its right (side 1) or left (-1) silhouette, as (along, across).
 
@@ -271,7 +271,7 @@ def outermost(hulls, skip, corners, first, stride, d2, cos, sin, side):  # type:
     return x, y
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+@kernel(contracts=True, inline=True)
 def climb(k, about, cells, hulls, wide, single, whole):  # type: ignore[no-untyped-def]
     """Replaces the silhouettes of one body for which the cell names no two corners."""
     x, y, c, s = get(wide, k + X), get(wide, k + Y), get(wide, k + COS), get(wide, k + SIN)

@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from nics_drl_bridge.kernels import kernel
 
 TURN = 2.0 * math.pi
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
     """The nearest return (S,) in each sector, of one scan (B,)."""
     first, count, directions, shift, ring = plan
@@ -24,14 +25,14 @@ def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
         _by_beam(out, ranges, first, count)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def resample_all(out, ranges, plan):  # type: ignore[no-untyped-def]
     """`resample` of scans (R, B) into (R, S)."""
     for i in range(ranges.shape[0]):
         resample(out[i], ranges[i], plan)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
     """A sector takes `count` beams from `first` on, past the last one from beam 0 again."""
     beams = ranges.shape[0]
@@ -47,7 +48,7 @@ def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
         out[s] = near if known != 0 else np.float32(np.nan)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def _by_place(out, ranges, directions, shift, ring):  # type: ignore[no-untyped-def]
     """A sector takes the returns that lie in it as seen from the layout's viewpoint.
 
@@ -88,7 +89,7 @@ def _by_place(out, ranges, directions, shift, ring):  # type: ignore[no-untyped-
                 out[s] = _nearer(out[s], near)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def _seen(r, direction, shift, ring):  # type: ignore[no-untyped-def]
     """Sector of a return as seen from the viewpoint, -1 unknown, and its distance from there."""
     if r != r:
@@ -100,7 +101,7 @@ def _seen(r, direction, shift, ring):  # type: ignore[no-untyped-def]
     return s, np.float32(math.sqrt(x * x + y * y)) if math.isfinite(r) else r
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def _nearer(one, other):  # type: ignore[no-untyped-def]
     """The lesser of two; `other` where `one` is NaN."""
     return one if one <= other else other

@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from nics_drl_bridge import random_kernels as random
+from nics_drl_bridge.kernels import kernel
 
 # Columns of a row of faults; `faults.LidarFaults` says what they mean.
 NOISE_STD, NOISE_PROPORTIONAL, DROPOUT, DROPOUT_FAR, TOO_CLOSE, QUANTISATION, SKEW = range(7)
@@ -29,7 +29,7 @@ ROUNDING = 1e-9
 """Of a multiple of the quantisation step, in metres."""
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-def]
     """Does to one exact scan what the device does to it.
 
@@ -50,7 +50,7 @@ def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-d
         _drop(ranges, limits, faults[DROPOUT], faults[DROPOUT_FAR], seed, counter)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _too_close(ranges, limits, behaviour, seed, counter):  # type: ignore[no-untyped-def]
     count = ranges.shape[0]
     for i in range(count):
@@ -65,7 +65,7 @@ def _too_close(ranges, limits, behaviour, seed, counter):  # type: ignore[no-unt
             ranges[i] = limits[0] + draw * (limits[1] - limits[0])
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _noise(ranges, limits, std, proportional, seed, counter):  # type: ignore[no-untyped-def]
     count = ranges.shape[0]
     for i in range(count):
@@ -75,7 +75,7 @@ def _noise(ranges, limits, std, proportional, seed, counter):  # type: ignore[no
             ranges[i] = min(max(noisy, limits[0]), limits[1])
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _quantise(ranges, limits, step):  # type: ignore[no-untyped-def]
     for i in range(ranges.shape[0]):
         if np.isfinite(ranges[i]):
@@ -87,7 +87,7 @@ def _quantise(ranges, limits, step):  # type: ignore[no-untyped-def]
             ranges[i] = value
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _drop(ranges, limits, share, far, seed, counter):  # type: ignore[no-untyped-def]
     count = ranges.shape[0]
     for i in range(count):
@@ -98,7 +98,7 @@ def _drop(ranges, limits, share, far, seed, counter):  # type: ignore[no-untyped
                 ranges[i] = np.inf
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
     """The pose `ago` seconds before a pose, at a constant body twist, along the exact arc.
 
@@ -119,7 +119,7 @@ def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
     out[2] = pose[2] + turn
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def slice_poses(out, pose, twist, sweep, direction):  # type: ignore[no-untyped-def]
     """Where the robot was when each of G equal groups of beams was measured.
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.baked_kernels import (
     ACROSS,
     ACROSS2,
@@ -53,7 +53,7 @@ ABOVE_ZERO = 2.0**24
 """Added before a number is cut to a whole one, so that it is rounded down."""
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def spans(padded, beams, wide, single):  # type: ignore[no-untyped-def]
     """Sixth pass: bearing and both silhouettes in beams, the right one within the first turn."""
     per_beam = 1.0 / beams[1]
@@ -71,7 +71,7 @@ def spans(padded, beams, wide, single):  # type: ignore[no-untyped-def]
         put(wide, k + LEFT, middle + high)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+@kernel(contracts=True, inline=True)
 def aim(k, count, shift, wide, single, whole):  # type: ignore[no-untyped-def]
     """Seventh pass, of one body: which beams are hit, and where in `rows` their points begin.
 
@@ -109,14 +109,14 @@ def aim(k, count, shift, wide, single, whole):  # type: ignore[no-untyped-def]
     put(whole, k + FAR2, np.int32(far - phase * width2 + one if last_phase else far + width2))
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def aims(padded, count, shift, wide, single, whole):  # type: ignore[no-untyped-def]
     """Seventh pass, see `aim`."""
     for k in range(padded):
         aim(k, count, shift, wide, single, whole)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+@kernel(contracts=True, inline=True)
 def lower(ranges, k, limits, rows, wide, single, whole):  # type: ignore[no-untyped-def]
     """Last pass, of one body: lowers the beams of its span to the blended rows of its cell."""
     begin, hits, back = get(whole, k + BEGIN), get(whole, k + HITS), get(whole, k + BACK)
@@ -144,7 +144,7 @@ def lower(ranges, k, limits, rows, wide, single, whole):  # type: ignore[no-unty
             lower_beam(ranges, at + j, value)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def fuse(found, ranges, beams, limits, rows, shift, wide, single, whole):  # type: ignore[no-untyped-def]
     """Last pass: all spans, and once more those over the seam of the turn."""
     turn, count = 2.0 * math.pi / beams[1], np.int32(ranges.shape[2])
@@ -164,7 +164,7 @@ def fuse(found, ranges, beams, limits, rows, shift, wide, single, whole):  # typ
             lower(ranges, k, within, rows, wide, single, whole)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def look_up(found, ranges, beams, limits, lookup, room):  # type: ignore[no-untyped-def]
     """All passes after the first: fuses the bodies on the lanes into their scans.
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import bake_kernels, kernels, map_kernels, scan_kernels
 from nics_drl_bridge.lidar import baked_kernels as baking
 from nics_drl_bridge.lidar.sensor_models import NEAREST
@@ -21,21 +21,21 @@ GAIN, SATURATION, EXPONENT, REFLECTIVITY = range(4)
 """Numbers of a device, see `sensor_models.Intensity.device`."""
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def shine(cosine, exponent, reflectivity):  # type: ignore[no-untyped-def]
     """The reflectance of one point."""
     cosine = min(abs(cosine), 1.0)
     return reflectivity * (cosine if exponent == 1.0 else cosine**exponent)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def keep(before, nearest):  # type: ignore[no-untyped-def]
     """Copies `nearest`; a plain assignment would look after arrays that overlap, in a new one."""
     for i in range(nearest.shape[0]):
         before[i] = nearest[i]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def circle(scan, directions, beams, x, y, radius, surface, range_max):  # type: ignore[no-untyped-def]
     """As `kernels.circle`: at a point its normal is the direction from the centre.
 
@@ -53,7 +53,7 @@ def circle(scan, directions, beams, x, y, radius, surface, range_max):  # type: 
             light[i] = shine((nearest[i] - along) / radius, surface[0], surface[1])
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def segment(scan, directions, beams, x1, y1, x2, y2, surface):  # type: ignore[no-untyped-def]
     """As `kernels.segment`: cos(incidence) is the distance of its line over the range."""
     nearest, light, before = scan
@@ -73,7 +73,7 @@ def segment(scan, directions, beams, x1, y1, x2, y2, surface):  # type: ignore[n
             light[i] = shine(away / nearest[i], surface[0], surface[1])
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def outline(scan, directions, beams, x, y, c, s, corners, radius, surface, range_max):  # type: ignore[no-untyped-def]
     """A circle, which has no corners, or a polygon, turned by (c, s), with its origin at (x, y)."""
     if corners.shape[0] == 0:
@@ -86,7 +86,7 @@ def outline(scan, directions, beams, x, y, c, s, corners, radius, surface, range
         ax, ay = bx, by
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def body(scan, directions, beams, place, body, corners, corner, surface, range_max):  # type: ignore[no-untyped-def]
     """As `kernels.body_into`, from a lidar at `place`: x, y, cos, sin."""
     sx, sy, c, s = place
@@ -98,7 +98,7 @@ def body(scan, directions, beams, place, body, corners, corner, surface, range_m
     outline(scan, directions, beams, x, y, cos, sin, own, body[5], surface, range_max)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def walls(scan, directions, beams, place, lines, surface):  # type: ignore[no-untyped-def]
     """As `kernels.walls_into`."""
     sx, sy, c, s = place
@@ -110,7 +110,7 @@ def walls(scan, directions, beams, place, lines, surface):  # type: ignore[no-un
         segment(scan, directions, beams, ax, ay, bx, by, surface)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def grid(  # type: ignore[no-untyped-def]
     scan, directions, beams, place, range_max, surface, map_arrays, exact, room
 ):
@@ -138,7 +138,7 @@ def grid(  # type: ignore[no-untyped-def]
             light[i] = shine(du if upright else dv, surface[0], surface[1])
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def fuse(scan, beams, bearing, half, ranges, reflectance):  # type: ignore[no-untyped-def]
     """Fuses a body that was looked up alone: its ranges (B,) and its reflectance (B,).
 
@@ -156,7 +156,7 @@ def fuse(scan, beams, bearing, half, ranges, reflectance):  # type: ignore[no-un
                 nearest[i], light[i] = ranges[i], reflectance[i]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def report(intensities, ranges, scan, device, range_min):  # type: ignore[no-untyped-def]
     """Intensities (B,) of the beams that return anything, 0 of the others.
 
@@ -171,7 +171,7 @@ def report(intensities, ranges, scan, device, range_min):  # type: ignore[no-unt
         intensities[i] = value if abs(ranges[i]) < np.float32(np.inf) else nothing
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def set_apart(apart, pose, bodies, n, me, sx, sy, range_max, baked):  # type: ignore[no-untyped-def]
     """Puts every body of a world that can be looked up into a world of its own, with the robot.
 
@@ -192,7 +192,7 @@ def set_apart(apart, pose, bodies, n, me, sx, sy, range_max, baked):  # type: ig
             alone[k, 0, 5] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def intensities_of_worlds(  # type: ignore[no-untyped-def]
     intensities, ranges, poses, chosen, bodies, first, lines, sensors, room, scan, apart, found,
     surfaces, device, map_arrays, exact,
@@ -246,7 +246,7 @@ def intensities_of_worlds(  # type: ignore[no-untyped-def]
             report(intensities[n, m], ranges[n, m], scan, device, limits[0])
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def cosines_of_turn(cosines, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
     """The cosine of the angle of incidence at every point of the rows of one rotation.
 
@@ -276,7 +276,7 @@ def cosines_of_turn(cosines, layout, shape, distances, turn, edges, step, phases
         bake_kernels.into_phases(cosines[start : start + count], fine, width, phases)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[no-untyped-def]
     """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it."""
     directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)

@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from nics_drl_bridge.kernels import kernel
 
 TWO_PI = 2.0 * math.pi
 ROUNDING = 1e-6
@@ -36,7 +37,7 @@ ATAN = (
 )
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
+@kernel(inline=True)
 def arctan2(y, x):  # type: ignore[no-untyped-def]
     """The angle of (x, y) within 3e-10 rad, without a branch and so many at a time.
 
@@ -61,14 +62,14 @@ def arctan2(y, x):  # type: ignore[no-untyped-def]
     return math.copysign(r, y)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def _lower(out, i, value):  # type: ignore[no-untyped-def]
     """Fuses one return into beam i of a full or partial circle."""
     if value < out[i]:
         out[i] = value
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def beam_span(low, high, beams, count):  # type: ignore[no-untyped-def]
     """First beam index and number of beams in the angles [low, high].
 
@@ -83,7 +84,7 @@ def beam_span(low, high, beams, count):  # type: ignore[no-untyped-def]
     return first, max(last - first + 1, 0)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def circle(out, directions, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
     """Exact ranges to a circle at (x, y)."""
     d2 = x * x + y * y
@@ -115,13 +116,13 @@ def circle(out, directions, beams, x, y, radius, range_max):  # type: ignore[no-
                 _lower(out, i, c * x + s * y - math.sqrt(rest))
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def segment(out, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
     """Exact ranges to the straight wall from (x1, y1) to (x2, y2)."""
     edge(out, directions, beams, x1, y1, arctan2(y1, x1), x2, y2, arctan2(y2, x2), False)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
+@kernel(inline=True)
 def edge(out, directions, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore[no-untyped-def]
     """The same, with the directions of its ends [rad]; `one_sided`: only seen from its right."""
     count = out.shape[0]
@@ -141,7 +142,7 @@ def edge(out, directions, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # 
             _cross(out, directions, 0, first + hits - count, cross, ex, ey)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
+@kernel(inline=True)
 def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyped-def]
     """Fuses a straight line into the beams from `begin` to `end`, many at a time."""
     for k in range(end - begin):
@@ -152,7 +153,7 @@ def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyp
         out[i] = distance if distance < held else held
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def polygon(out, directions, beams, x, y, c, s, corners):  # type: ignore[no-untyped-def]
     """Exact ranges to the outline `corners` (V, 2), turned by (c, s), with its origin at (x, y)."""
     last, cull = corners.shape[0] - 1, beside_convex(x, y, c, s, corners)
@@ -165,7 +166,7 @@ def polygon(out, directions, beams, x, y, c, s, corners):  # type: ignore[no-unt
         ax, ay, angle = bx, by, next_angle
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
     """Whether an outline only turns to the left, and not around the lidar; see `polygon`.
 
@@ -187,13 +188,13 @@ def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
     return rounds == 0
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
+@kernel(inline=True)
 def turned(x, y, c, s, corner):  # type: ignore[no-untyped-def]
     """Where a corner (2,) lies when its shape is turned by (c, s) and put at (x, y)."""
     return x + c * corner[0] - s * corner[1], y + s * corner[0] + c * corner[1]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def clear(ranges, n, m):  # type: ignore[no-untyped-def]
     """Begins the scan of robot m in world n of `ranges` (N, M, B): no return anywhere."""
     nothing = np.float32(np.inf)
@@ -201,7 +202,7 @@ def clear(ranges, n, m):  # type: ignore[no-untyped-def]
         ranges[n, m, i] = nothing
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
     """Ends a scan (B,) of exact ranges: too far is `inf`, too close is `-inf` (REP-117)."""
     low, high = np.float32(range_min), np.float32(range_max)
@@ -211,7 +212,7 @@ def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
         out[i] = value if value >= low else np.float32(-np.inf)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
+@kernel(inline=True)
 def sensor_pose(poses, n, m, mount):  # type: ignore[no-untyped-def]
     """x, y, heading of a lidar in its world, from poses (N, M, 3) and the mount (3,)."""
     x, y, heading = poses[n, m, 0], poses[n, m, 1], poses[n, m, 2]
@@ -221,14 +222,14 @@ def sensor_pose(poses, n, m, mount):  # type: ignore[no-untyped-def]
     return x, y, heading + mount[2]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def to_sensor(poses, n, m, mount):  # type: ignore[no-untyped-def]
     """The same, and cos and sin of its heading."""
     x, y, heading = sensor_pose(poses, n, m, mount)
     return x, y, heading, math.cos(heading), math.sin(heading)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def walls_into(out, directions, beams, sx, sy, c, s, walls, range_max):  # type: ignore[no-untyped-def]
     """Fuses straight walls (W, 4), given in the world, into a scan from (sx, sy, c, s).
 
@@ -259,7 +260,7 @@ def walls_into(out, directions, beams, sx, sy, c, s, walls, range_max):  # type:
     return near
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def body_into(out, directions, beams, sx, sy, c, s, body, corners, corner, range_max):  # type: ignore[no-untyped-def]
     """Fuses one body (7,), see `shapes.BODY`, into a scan from (sx, sy, c, s)."""
     dx, dy = body[0] - sx, body[1] - sy

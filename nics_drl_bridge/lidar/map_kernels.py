@@ -22,8 +22,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.map_memory_kernels import get, peek, put
 
 LANES = 48
@@ -37,7 +37,7 @@ SLACK = 1.0 + 1e-6
 """A return at exactly range_max must not be lost to rounding; `finish` decides."""
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def free_squares(blocked):  # type: ignore[no-untyped-def]
     """The bake: squares (rows + 2, columns + 2) of a map (rows, columns), see the module."""
     rows, columns = blocked.shape
@@ -59,7 +59,7 @@ def free_squares(blocked):  # type: ignore[no-untyped-def]
     return squares
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def _line(at, step, cell):  # type: ignore[no-untyped-def]
     """Cells along a beam to where it leaves `cell`, along one axis."""
     if step == 0.0:
@@ -67,7 +67,7 @@ def _line(at, step, cell):  # type: ignore[no-untyped-def]
     return (cell + (1 if step > 0.0 else 0) - at) / step
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def _entry(at, step, size):  # type: ignore[no-untyped-def]
     """Cells along a beam to where it comes into and goes out of [0, size], along one axis."""
     if step == 0.0:
@@ -76,7 +76,7 @@ def _entry(at, step, size):  # type: ignore[no-untyped-def]
     return min(one, other), max(one, other)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def ray(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
     """Exact distance [cells] from (u, v) to the boundary of the solid cells, `inf` beyond `limit`.
 
@@ -114,7 +114,7 @@ def ray(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
             return t
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def to_grid(sx, sy, c, s, frame):  # type: ignore[no-untyped-def]
     """Place [cells] and cosine, sine of the lidar in the grid."""
     dx, dy = sx - frame[0], sy - frame[1]
@@ -123,7 +123,7 @@ def to_grid(sx, sy, c, s, frame):  # type: ignore[no-untyped-def]
     return u, v, c * frame[2] + s * frame[3], s * frame[2] - c * frame[3]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def exact_map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays, room):  # type: ignore[no-untyped-def]
     """Fuses a map into a scan (B,) from (sx, sy, c, s), cell by cell in float64; see `ray`."""
     squares, frame = map_arrays
@@ -139,7 +139,7 @@ def exact_map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays, 
             out[i] = value
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays, room):  # type: ignore[no-untyped-def]
     """Fuses a map into a scan (B,) float32 from (sx, sy, c, s), by jumps; see the module.
 
@@ -175,7 +175,7 @@ def map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays, room):
         _finish(out[first:last], floats, ints, x, y, columns - 2, rows - 2, limit, frame[4])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def _start(floats, ints, directions, u, v, c, s, columns):  # type: ignore[no-untyped-def]
     """Puts beams into the lanes, each mirrored so that it goes right and up.
 
@@ -213,7 +213,7 @@ def _start(floats, ints, directions, u, v, c, s, columns):  # type: ignore[no-un
             ints[n * LANES + k] = ints[n * LANES + count - 1]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def _jump(floats, ints, flat, here, limit):  # type: ignore[no-untyped-def]
     """Moves each lane to the end of the free square that it is in; whether any moved."""
     here = np.int32(here)
@@ -246,7 +246,7 @@ def _jump(floats, ints, flat, here, limit):  # type: ignore[no-untyped-def]
     return moved > 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def _finish(out, floats, ints, x, y, columns, rows, limit, resolution):  # type: ignore[no-untyped-def]
     """Fuses the lanes that ended at a solid cell, not in the frame around the map."""
     x, y, columns, rows = np.int32(x), np.int32(y), np.int32(columns), np.int32(rows)

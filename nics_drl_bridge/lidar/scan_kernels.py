@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import baked_kernels as baking
 from nics_drl_bridge.lidar import fuse_kernels, kernels, map_kernels
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # type: ignore[no-untyped-def]
     """Scans of the robots of some worlds.
 
@@ -64,7 +63,7 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
     fuse_kernels.look_up(found, ranges, beams, limits, lookup, room)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def add_map(ranges, poses, chosen, sensor, map_arrays, exact, room):  # type: ignore[no-untyped-def]
     """Fuses a static map into the scans of some worlds.
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.kinematics.kernels import advance, rates, wrap
 
 NANO = 1_000_000_000
@@ -18,7 +18,7 @@ LEAST_VARIANCE = 1e-18
 """nor better than this."""
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
     """Derivative (3 + S, V) of `rates` by X."""
     dof, coefficient, factors, count = terms
@@ -32,7 +32,7 @@ def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
             jacobian[dof[k], factors[k, f]] += product
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def predict(mean, transition, command, dt, steps, terms, series):  # type: ignore[no-untyped-def]
     """Moves the mean (3 + S) by `steps` steps of `dt` under one command (C,), in place.
 
@@ -66,7 +66,7 @@ def predict(mean, transition, command, dt, steps, terms, series):  # type: ignor
             mean[3 + i] += dt * dq[3 + i]
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def twist_of(mean, command, terms):  # type: ignore[no-untyped-def]
     """Body twist (3,) and its derivative (3, 3 + S) at a mean (3 + S) under a command (C,)."""
     size, width = mean.shape[0] - 3, command.shape[0]
@@ -79,7 +79,7 @@ def twist_of(mean, command, terms):  # type: ignore[no-untyped-def]
     return dq[:3].copy(), derivative
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def in_effect(effective, count, time):  # type: ignore[no-untyped-def]
     """Which command is in effect just before a time: the last that took effect earlier."""
     low, high = 0, count
@@ -92,7 +92,7 @@ def in_effect(effective, count, time):  # type: ignore[no-untyped-def]
     return max(low - 1, 0)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def carry(mean, transition, begin, end, timing, log, terms, series):  # type: ignore[no-untyped-def]
     """Moves a mean (3 + S) from one time to another, command by command, in place.
 
@@ -126,7 +126,7 @@ def carry(mean, transition, begin, end, timing, log, terms, series):  # type: ig
         transition[:] = np.eye(mean.shape[0])
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def forecast(mean, covariance, process, begin, end, timing, log, terms, series):  # type: ignore[no-untyped-def]
     """Mean and covariance at a later time; `process` (3 + S, 3 + S) grows with every second."""
     moved, transition = mean.copy(), np.eye(mean.shape[0])
@@ -135,7 +135,7 @@ def forecast(mean, covariance, process, begin, end, timing, log, terms, series):
     return moved, (spread + spread.T) * 0.5
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def look_ahead(mean, begin, end, timing, log, terms, series):  # type: ignore[no-untyped-def]
     """Mean (3 + S) and body twist (3,) at a time; the present one when that is earlier."""
     moved = mean.copy()
@@ -146,21 +146,21 @@ def look_ahead(mean, begin, end, timing, log, terms, series):  # type: ignore[no
     return moved, twist_of(moved, command, terms)[0]
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def expect(mean, now, log, terms):  # type: ignore[no-untyped-def]
     """The body twist (3,) to measure at the time of the mean, and its derivative (3, 3 + S)."""
     effective, commands, count = log
     return twist_of(mean, commands[in_effect(effective, count, now)], terms)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def distance(innovation, derivative, covariance, noise):  # type: ignore[no-untyped-def]
     """Squared, normalised innovation (Mahalanobis): chi-squared when the filter is right."""
     spread = derivative @ covariance @ derivative.T + noise
     return innovation @ np.linalg.solve(spread, innovation)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def settle(mean, covariance, low, high):  # type: ignore[no-untyped-def]
     """Brings an estimate to where it can be, in place.
 

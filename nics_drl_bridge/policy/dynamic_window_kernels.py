@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from nics_drl_bridge.kernels import kernel
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def choose_all(out, scans, goals, twists, candidates, sight, body, weights):  # type: ignore[no-untyped-def]
     """`choose` for N robots, into out (N,): which of the candidates each takes."""
     hits = np.empty((scans.shape[1], 2))
@@ -17,7 +18,7 @@ def choose_all(out, scans, goals, twists, candidates, sight, body, weights):  # 
         out[n] = choose(hits[:count], goals[n], twists[n], candidates, body, weights)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def hits_of(hits, shares, sight):  # type: ignore[no-untyped-def]
     """Writes where a scan ended into hits (P, 2) [m] in `base_link`; how many there are.
 
@@ -36,7 +37,7 @@ def hits_of(hits, shares, sight):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def choose(hits, goal, twist, candidates, body, weights):  # type: ignore[no-untyped-def]
     """The candidate that costs least; of those within the window, if any is.
 
@@ -62,7 +63,7 @@ def choose(hits, goal, twist, candidates, body, weights):  # type: ignore[no-unt
     return best
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def cost_of(hits, goal, aimed, body, weights):  # type: ignore[no-untyped-def]
     """What it costs to hold a twist (3,): it may not lead to a contact before it can be stopped."""
     _, radius, period, steps, rest = body
@@ -92,7 +93,7 @@ def cost_of(hits, goal, aimed, body, weights):  # type: ignore[no-untyped-def]
     return cost + (1e3 if moves and free * period < rest else 0.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def nearest_hit(hits, x, y):  # type: ignore[no-untyped-def]
     """Distance [m] from a point to the nearest of hits (H, 2)."""
     least = math.inf

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from nics_drl_bridge.kernels import kernel
 
 WIDTH = 0.02
 """The old beams within so much of a bearing are asked [rad]."""
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-untyped-def]
     """Marks the beams that end where an older scan saw through, as far as it could see.
 

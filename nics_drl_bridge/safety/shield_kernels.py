@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from nics_drl_bridge.kernels import kernel
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def place(twist, time):  # type: ignore[no-untyped-def]
     """Where the exact arc of a body twist (3,) leads to in a time: x, y."""
     turn = twist[2] * time
@@ -19,7 +20,7 @@ def place(twist, time):  # type: ignore[no-untyped-def]
     return (a * twist[0] - b * twist[1]) * time, (b * twist[0] + a * twist[1]) * time
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def free(points, twists, blind, deceleration, room, step):  # type: ignore[no-untyped-def]
     """Whether no point comes within `room` of any of the arcs before the robot is at rest on it.
 
@@ -65,7 +66,7 @@ def free(points, twists, blind, deceleration, room, step):  # type: ignore[no-un
     return True
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _reached(part, speed, blind, deceleration):  # type: ignore[no-untyped-def]
     """When a robot that brakes is where, at its first speed, it would be after a time [s]."""
     if part <= blind:

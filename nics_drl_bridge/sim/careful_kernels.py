@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.kinematics.kernels import delayed, move, rates, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import impact_kernels as impact
@@ -37,7 +37,7 @@ SMALL = 0.1
 MOST_MOVES = 1000
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def rates_at(j, dq, x, state, history, n, m, delay, substeps, terms):  # type: ignore[no-untyped-def]
     """Rates dq in substep j of a period, under the command that is then in effect."""
     row = delayed(j, delay, substeps, history.shape[2])
@@ -49,7 +49,7 @@ def rates_at(j, dq, x, state, history, n, m, delay, substeps, terms):  # type: i
     rates(dq, x, terms)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _put(body, base, flight, time, series):  # type: ignore[no-untyped-def]
     """Puts into `body` (7,) where a robot that began at `base` (7,) is at a time [s]."""
     turn = flight[TURN] * time
@@ -60,7 +60,7 @@ def _put(body, base, flight, time, series):  # type: ignore[no-untyped-def]
     body[5], body[6] = base[5], base[6]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _first_touch(m, begin, until, tight, events, scene):  # type: ignore[no-untyped-def]
     """Finds what robot m touches first from a time of the substep on, see `impact_kernels`."""
     meets, near, walls, grid = tight
@@ -79,7 +79,7 @@ def _first_touch(m, begin, until, tight, events, scene):  # type: ignore[no-unty
         impact.touch_map(event, me, grid, begin, scene)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _leave(m, until, tight, events, scene, trial, spare):  # type: ignore[no-untyped-def]
     """Lets a robot that is in something move as long as it gets no deeper."""
     meets, near, walls, grid = tight
@@ -99,7 +99,7 @@ def _leave(m, until, tight, events, scene, trial, spare):  # type: ignore[no-unt
         events[m, AFTER], flight[STOP] = depth, time
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _within(p, b, until, world, flights, first):  # type: ignore[no-untyped-def]
     """Whether robot p may come near body b within the substep."""
     a = first + p
@@ -109,7 +109,7 @@ def _within(p, b, until, world, flights, first):  # type: ignore[no-untyped-def]
     return dx * dx + dy * dy <= far * far
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _settle(until, tight, events, touched, scene):  # type: ignore[no-untyped-def]
     """Stops the bodies of a world at their touches within a substep, in the order of time.
 
@@ -151,7 +151,7 @@ def _settle(until, tight, events, touched, scene):  # type: ignore[no-untyped-de
                 _first_touch(p, time, until, tight, events, scene)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _begin_substep(n, time, dt, velocity, moving, bodies, start, flights):  # type: ignore[no-untyped-def]
     """Puts the obstacles to where they are at a time of the period, and tells how they move on."""
     if moving:
@@ -161,7 +161,7 @@ def _begin_substep(n, time, dt, velocity, moving, bodies, start, flights):  # ty
         flights[k, TURN], flights[k, STOP] = velocity[n, k, 2], dt
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _hold_obstacles(n, time, dt, velocity, bodies, start, flights):  # type: ignore[no-untyped-def]
     """Obstacles that stopped within a substep, which begins at `time`, stand from then on."""
     for k in range(velocity.shape[1]):
@@ -175,7 +175,7 @@ def _hold_obstacles(n, time, dt, velocity, bodies, start, flights):  # type: ign
                 velocity[n, k, i] = 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def move_carefully(  # type: ignore[no-untyped-def]
     n, meets, near, state, history, coefficient, delay, bodies, velocity, moving, walls, grid,
     collided, pose, outlines, motion, room,
@@ -236,7 +236,7 @@ def move_carefully(  # type: ignore[no-untyped-def]
                 pose[n, m, i] = world[first + m, i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _look_within(m, tight, events, touched, scene, spare):  # type: ignore[no-untyped-def]
     """Tells how deep robot m is in something as the period begins, and marks it if it is."""
     meets, near, walls, grid = tight
@@ -251,7 +251,7 @@ def _look_within(m, tight, events, touched, scene, spare):  # type: ignore[no-un
             touched[whom - first] = 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _arrive(meets, events, scene, trial):  # type: ignore[no-untyped-def]
     """Puts the robots to where they are at the end of the substep."""
     world, flights, first, _, series = scene
@@ -265,7 +265,7 @@ def _arrive(meets, events, scene, trial):  # type: ignore[no-untyped-def]
                 events[m, DEPTH] = events[m, AFTER]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _tell_velocities(n, period, velocity, bodies, start, began):  # type: ignore[no-untyped-def]
     """Leaves obstacles that were stopped with the velocity that they came along by."""
     for k in range(velocity.shape[1]):
@@ -276,7 +276,7 @@ def _tell_velocities(n, period, velocity, bodies, start, began):  # type: ignore
             velocity[n, k, 2] = wrap(bodies[n, k, 2] - began[k, 2]) / period
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def drift_carefully(  # type: ignore[no-untyped-def]
     n, meets, near, state, noise, seed, step, bodies, walls, grid, collided, pose, outlines, motion,
     room,

@@ -14,17 +14,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from nics_drl_bridge.kernels import kernel
 
 X, Y, PER_METRE, RADIUS, MOVED = range(5)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _clamp(place, side):  # type: ignore[no-untyped-def]
     return int(min(max(place, 0.0), side - 1.0))
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def sort_bodies(bodies, n, cells):  # type: ignore[no-untyped-def]
     """Sorts the bodies of world n into cells; about two cells for a body."""
     begin, order, cell_of, frame = cells
@@ -61,7 +62,7 @@ def sort_bodies(bodies, n, cells):  # type: ignore[no-untyped-def]
     begin[begin.shape[0] - 1] = count
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def bodies_around(x, y, reach, cells, found):  # type: ignore[no-untyped-def]
     """Writes to `found` (K,) the bodies that may come within `reach` [m] of (x, y); how many."""
     begin, order, _, frame = cells

@@ -18,7 +18,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from nics_drl_bridge.kernels import kernel
 
 TOUCHING = 1e-12
 """Outlines this near to each other touch: whether they overlap is seen by their depth [m]."""
@@ -28,7 +29,7 @@ FLOAT32 = 1e-6
 """Distances of a map are rounded to so many parts of themselves."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def segment_distance2(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
     """Square of the distance from (x, y) to the segment from (ax, ay) to (bx, by) [m^2]."""
     ex, ey, dx, dy = bx - ax, by - ay, x - ax, y - ay
@@ -40,12 +41,12 @@ def segment_distance2(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
     return dx * dx + dy * dy
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _side(ax, ay, bx, by, x, y):  # type: ignore[no-untyped-def]
     return (bx - ax) * (y - ay) - (by - ay) * (x - ax)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _edges_distance2(ax, ay, bx, by, px, py, qx, qy):  # type: ignore[no-untyped-def]
     """Square of the distance between two segments; -1 where one crosses the other."""
     if (_side(ax, ay, bx, by, px, py) > 0.0) != (_side(ax, ay, bx, by, qx, qy) > 0.0) and (
@@ -60,7 +61,7 @@ def _edges_distance2(ax, ay, bx, by, px, py, qx, qy):  # type: ignore[no-untyped
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def outline_point(x, y, corners, begin, end):  # type: ignore[no-untyped-def]
     """Signed distance from (x, y) to the outline of `corners[begin:end]`; negative inside."""
     if end - begin == 2:
@@ -81,7 +82,7 @@ def outline_point(x, y, corners, begin, end):  # type: ignore[no-untyped-def]
     return -math.sqrt(least) if inside else math.sqrt(least)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _next_cut(ax, ay, ex, ey, after, q, q_begin, q_end):  # type: ignore[no-untyped-def]
     """Where outline q next cuts the edge from (ax, ay) along (ex, ey), in parts of its length."""
     least = 1.0
@@ -100,7 +101,7 @@ def _next_cut(ax, ay, ex, ey, after, q, q_begin, q_end):  # type: ignore[no-unty
     return least
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _deepest(p, p_begin, p_end, q, q_begin, q_end):  # type: ignore[no-untyped-def]
     """How deep the edges of outline p lie within outline q; 0 where they don't."""
     depth = 0.0
@@ -123,7 +124,7 @@ def _deepest(p, p_begin, p_end, q, q_begin, q_end):  # type: ignore[no-untyped-d
     return depth
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def outline_gap(p, p_begin, p_end, x, y, reach, q, q_begin, q_end, limit):  # type: ignore[no-untyped-def]
     """Signed clearance of two outlines in one frame.
 
@@ -164,7 +165,7 @@ def outline_gap(p, p_begin, p_end, x, y, reach, q, q_begin, q_end, limit):  # ty
     return -TOUCHING if crossing and (q_end - q_begin > 2 or p_end - p_begin > 2) else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def body_gap(body, other, corners, corner, limit, spare):  # type: ignore[no-untyped-def]
     """Signed clearance of two bodies; see the module."""
     dx, dy = body[0] - other[0], body[1] - other[1]
@@ -195,7 +196,7 @@ def body_gap(body, other, corners, corner, limit, spare):  # type: ignore[no-unt
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def wall_gap(body, wall, corners, corner, limit, spare):  # type: ignore[no-untyped-def]
     """Signed clearance of a body and a straight wall (4,)."""
     distance2 = segment_distance2(body[0], body[1], wall[0], wall[1], wall[2], wall[3])
@@ -214,7 +215,7 @@ def wall_gap(body, wall, corners, corner, limit, spare):  # type: ignore[no-unty
     return min(gap, limit)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _in_grid(body, frame):  # type: ignore[no-untyped-def]
     """Place [m], cosine and sine of a body in the frame of the map."""
     dx, dy = body[0] - frame[0], body[1] - frame[1]
@@ -223,7 +224,7 @@ def _in_grid(body, frame):  # type: ignore[no-untyped-def]
     return x, y, c, s
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _bounds(x, y, distances, size):  # type: ignore[no-untyped-def]
     """Least and greatest distance that (x, y) can have to a solid cell, by the nearest cell [m]."""
     rows, columns = distances.shape
@@ -237,7 +238,7 @@ def _bounds(x, y, distances, size):  # type: ignore[no-untyped-def]
     return middle * (1.0 - FLOAT32) - within, middle * (1.0 + FLOAT32) + within + outside
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def map_bound(body, grid):  # type: ignore[no-untyped-def]
     """A distance [m] that the circle around a body keeps from the map at least."""
     distances, frame = grid
@@ -247,7 +248,7 @@ def map_bound(body, grid):  # type: ignore[no-untyped-def]
     return _bounds(x, y, distances, frame[4])[0] - body[5]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def map_gap(body, grid, corners, corner, limit, spare):  # type: ignore[no-untyped-def]
     """Signed clearance of a body and the solid cells of a map."""
     distances, frame = grid

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.kinematics.kernels import wrap
 from nics_drl_bridge.sim.cell_kernels import bodies_around
 from nics_drl_bridge.sim.collision_kernels import (
@@ -27,7 +26,7 @@ SEVERAL = 32
 """So many bodies may be near a robot; where there are more, all are looked at."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def reaches(reach, bodies, velocity, way, n, period):  # type: ignore[no-untyped-def]
     """How far the circle of each body may come from where its centre is now [m].
 
@@ -57,7 +56,7 @@ def reaches(reach, bodies, velocity, way, n, period):  # type: ignore[no-untyped
     return longest, moving
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def find_near(near, m, reach, bodies, n, walls, grid, crowded, cells, found):  # type: ignore[no-untyped-def]
     """What robot m of world n may meet within the period.
 
@@ -99,7 +98,7 @@ def find_near(near, m, reach, bodies, n, walls, grid, crowded, cells, found):  #
     return meets
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def contact(body, m, meets, near, bodies, walls, grid, outlines, spare, limit):  # type: ignore[no-untyped-def]
     """The clearance of a robot, put as `body` (7,), to all that it may meet.
 
@@ -140,7 +139,7 @@ def contact(body, m, meets, near, bodies, walls, grid, outlines, spare, limit): 
     return least, whom
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def move_obstacles(bodies, start, velocity, n, time):  # type: ignore[no-untyped-def]
     """Puts the obstacles of world n to where they are `time` after the start of the period.
 
@@ -160,7 +159,7 @@ def move_obstacles(bodies, start, velocity, n, time):  # type: ignore[no-untyped
             bodies[n, k, 3], bodies[n, k, 4] = math.cos(heading), math.sin(heading)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def put_body(bodies, n, k, pose):  # type: ignore[no-untyped-def]
     """Puts body k of world n to a pose (3,)."""
     bodies[n, k, 0], bodies[n, k, 1], bodies[n, k, 2] = pose[0], pose[1], pose[2]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from numba import njit
+from nics_drl_bridge.kernels import kernel
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@kernel
 def propagate(covariance, before, after, added):  # type: ignore[no-untyped-def]
     """P = F P F^T + Q for each robot, in place; see `dead_reckoning.propagate`."""
     for m in range(len(covariance)):

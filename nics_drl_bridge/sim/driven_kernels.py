@@ -6,8 +6,7 @@ both are the same in a world whose robots another physics moves. Shapes are thos
 
 from __future__ import annotations
 
-from numba import njit
-
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.sim import cell_kernels as crowd
 from nics_drl_bridge.sim import sensing_kernels as sensing
 from nics_drl_bridge.sim import sight_kernels as sight
@@ -15,7 +14,7 @@ from nics_drl_bridge.sim.contact_kernels import put_body
 from nics_drl_bridge.sim.kernels import steer_world
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def begin_period(packed):  # type: ignore[no-untyped-def]
     """Sets the velocities of the obstacles for the period that begins.
 
@@ -37,7 +36,7 @@ def begin_period(packed):  # type: ignore[no-untyped-def]
                 sensing.begin(past, n, m, pose, odom, twist)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def end_period(packed, true, before, wheels, counted):  # type: ignore[no-untyped-def]
     """Measures what the robots sense at the end of a period.
 

@@ -21,8 +21,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.kinematics.kernels import move
 from nics_drl_bridge.sim.collision_kernels import map_bound, segment_distance2
 
@@ -40,7 +40,7 @@ MOST_LOOKS = 2000
 """After so many looks at one pair it counts as touching: only what spins absurdly needs more."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def pose_at(b, time, world, flights, first, series):  # type: ignore[no-untyped-def]
     """x, y [m], cosine and sine of the heading of a body at a time of the substep [s]."""
     if b < 0:
@@ -56,7 +56,7 @@ def pose_at(b, time, world, flights, first, series):  # type: ignore[no-untyped-
     return x + vx * time, y + vy * time, c, s
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def velocity_at(b, time, c, s, flights, first):  # type: ignore[no-untyped-def]
     """Velocity in the map, turn rate, and acceleration of the origin of a body at a time."""
     if b < 0 or time >= flights[b, STOP]:
@@ -68,7 +68,7 @@ def velocity_at(b, time, c, s, flights, first):  # type: ignore[no-untyped-def]
     return c * vx - s * vy, s * vx + c * vy, turn, bend
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def speed_at(b, time, flights):  # type: ignore[no-untyped-def]
     """Speed of the origin of a body from a time on [m/s]."""
     if b < 0 or time >= flights[b, STOP]:
@@ -76,7 +76,7 @@ def speed_at(b, time, flights):  # type: ignore[no-untyped-def]
     return math.sqrt(flights[b, VX] ** 2 + flights[b, VY] ** 2)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _from_segment(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
     """From the nearest point of a segment to (x, y)."""
     ex, ey, dx, dy = bx - ax, by - ay, x - ax, y - ay
@@ -87,7 +87,7 @@ def _from_segment(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
     return dx, dy
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _between(p, q):  # type: ignore[no-untyped-def]
     """From the nearest point of segment q to that of segment p; zeros where they cross."""
     ax, ay, bx, by = p
@@ -113,7 +113,7 @@ def _between(p, q):  # type: ignore[no-untyped-def]
     return nx, ny
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _root(gap, rate, bend):  # type: ignore[no-untyped-def]
     """When gap + rate t - bend t^2 / 2 is used up, of a gap > 0."""
     if bend == 0.0:
@@ -122,26 +122,26 @@ def _root(gap, rate, bend):  # type: ignore[no-untyped-def]
     return (rate + both) / bend if rate >= 0.0 else 2.0 * gap / (both - rate)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _placed(edge, x, y, c, s):  # type: ignore[no-untyped-def]
     """An edge (ax, ay, bx, by) of a body that stands at x, y with a heading."""
     ax, ay, bx, by = edge
     return x + c * ax - s * ay, y + s * ax + c * ay, x + c * bx - s * by, y + s * bx + c * by
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _reach(edge):  # type: ignore[no-untyped-def]
     ax, ay, bx, by = edge
     return math.sqrt(max(ax * ax + ay * ay, bx * bx + by * by))
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _next_stop(b, time, until, flights):  # type: ignore[no-untyped-def]
     """When a body stops, if it does between two times; else the later one."""
     return flights[b, STOP] if b >= 0 and time < flights[b, STOP] < until else until
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def touch(a, edge, round_a, b, other, round_b, begin, until, world, flights, first, series):  # type: ignore[no-untyped-def]  # fmt: skip
     """When an edge of one body first touches an edge of another.
 
@@ -202,7 +202,7 @@ def touch(a, edge, round_a, b, other, round_b, begin, until, world, flights, fir
     return time, -1.0, -1.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _edge_of(v, begin, end, corners):  # type: ignore[no-untyped-def]
     """Edge v of an outline, or the origin of a circle's, which has none."""
     if begin == end:
@@ -213,13 +213,13 @@ def _edge_of(v, begin, end, corners):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _edges(begin, end):  # type: ignore[no-untyped-def]
     """How many edges an outline has: a segment one, and a circle counts as one without extent."""
     return end - begin if end - begin > 2 else 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _touch_edge(event, a, b, other, round_b, begin, scene):  # type: ignore[no-untyped-def]
     """Makes `event` (EVENT,) the first touch of body a and an edge of body b, if it comes sooner.
 
@@ -249,7 +249,7 @@ def _touch_edge(event, a, b, other, round_b, begin, scene):  # type: ignore[no-u
             event[TIME], event[WITH], event[OWN], event[OTHERS] = time, b, own, others
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def touch_body(event, a, b, begin, scene):  # type: ignore[no-untyped-def]
     """As `_touch_edge`, of all of body b."""
     world, flights, first, (corners, corner), series = scene
@@ -265,7 +265,7 @@ def touch_body(event, a, b, begin, scene):  # type: ignore[no-untyped-def]
         _touch_edge(event, a, b, _edge_of(v, low, high, corners), round_b, begin, scene)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def touch_walls(event, a, walls, begin, scene):  # type: ignore[no-untyped-def]
     """As `_touch_edge`, of straight walls (W, 4)."""
     for w in range(walls.shape[0]):
@@ -273,13 +273,13 @@ def touch_walls(event, a, walls, begin, scene):  # type: ignore[no-untyped-def]
         _touch_edge(event, a, -1, wall, 0.0, begin, scene)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _solid(distances, i, j):  # type: ignore[no-untyped-def]
     inside = 0 <= i < distances.shape[0] and 0 <= j < distances.shape[1]
     return inside and distances[i, j] <= 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def touch_map(event, a, grid, begin, scene):  # type: ignore[no-untyped-def]
     """As `_touch_edge`, of the sides of the solid cells of a map, see `collision_kernels`."""
     world, flights, first, _, series = scene

@@ -13,9 +13,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.experimental import structref
 
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.sim import cell_kernels as crowd
 from nics_drl_bridge.sim import motion_kernels as obstacles
 from nics_drl_bridge.sim import robot_kernels as robots
@@ -37,13 +38,13 @@ class Packed(structref.StructRefProxy):  # type: ignore[misc]
 structref.define_proxy(Packed, PackedType, ["content"])
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def pack(content):  # type: ignore[no-untyped-def]
     """Makes one argument of nested tuples of arrays."""
     return Packed(content)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _send(history, commands, begin):  # type: ignore[no-untyped-def]
     """Puts the commands (n, M, C) of the worlds from `begin` on in front of those sent before."""
     for i in range(commands.shape[0]):
@@ -55,7 +56,7 @@ def _send(history, commands, begin):  # type: ignore[no-untyped-def]
                 history[begin + i, m, 0, c] = commands[i, m, c]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _note_ways(cells, before, skip, pose, n):  # type: ignore[no-untyped-def]
     """Tells the cells how far the robots of world n came, drift included."""
     for m in range(pose.shape[1]):
@@ -63,7 +64,7 @@ def _note_ways(cells, before, skip, pose, n):  # type: ignore[no-untyped-def]
         cells[3][crowd.MOVED] = max(cells[3][crowd.MOVED], math.sqrt(dx * dx + dy * dy))
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def step_worlds(packed, commands, begin):  # type: ignore[no-untyped-def]
     """One control period of the worlds of a part.
 
@@ -77,7 +78,7 @@ def step_worlds(packed, commands, begin):  # type: ignore[no-untyped-def]
     _step(fields, scene, view, motion, room, commands, begin)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[no-untyped-def]
     """See `step_worlds`; no counting of references, which took longer than the step."""
     (
@@ -115,7 +116,7 @@ def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[n
         sight.distort(low, high, ranges, faults, steps, seeds, view)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
+@kernel(inline=True)
 def _begin_period(low, high, fields, scene, motion, room):  # type: ignore[no-untyped-def]
     """Sets the velocities of the obstacles of the worlds [low, high), and notes the poses."""
     pose, bodies, odom, twist = fields[0], fields[3], fields[4], fields[5]
@@ -134,7 +135,7 @@ def _begin_period(low, high, fields, scene, motion, room):  # type: ignore[no-un
                 sensing.begin(past, n, m, pose, odom, twist)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
+@kernel(inline=True)
 def _measure(n, skip, fields, motion, single, before):  # type: ignore[no-untyped-def]
     """Puts the bodies of the robots of world n to where they are, and reads their wheels."""
     (
@@ -153,7 +154,7 @@ def _measure(n, skip, fields, motion, single, before):  # type: ignore[no-untype
         )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def steer_world(n, velocity, marks, bodies, pose, past, step, walls, movers, seed, period, speeds):  # type: ignore[no-untyped-def]
     """Sets the velocities of the obstacles of world n for the period that begins.
 
@@ -176,7 +177,7 @@ def steer_world(n, velocity, marks, bodies, pose, past, step, walls, movers, see
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def begin(packed, chosen):  # type: ignore[no-untyped-def]
     """Begins episodes in the worlds `chosen` (n,), whose robots and obstacles are in place.
 
@@ -191,7 +192,7 @@ def begin(packed, chosen):  # type: ignore[no-untyped-def]
     _look(fields, scene, view, room, chosen)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _look(fields, scene, view, room, chosen):  # type: ignore[no-untyped-def]
     """Scans as the episodes begin: all stands still, so that no scan is older or skewed."""
     pose, bodies, ranges, steps, seeds, faults, velocity = (

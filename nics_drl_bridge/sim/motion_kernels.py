@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from nics_drl_bridge import random_kernels as random
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.sim import motion_layout as at
 from nics_drl_bridge.sim.pedestrian_kernels import walk
 from nics_drl_bridge.sim.separation_kernels import clearance, restrain
@@ -31,17 +30,17 @@ MOST_CORNERS = 32
 """More waypoints than a patrol passes in a period."""
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _wrap(angle):  # type: ignore[no-untyped-def]
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _share(seed, counter):  # type: ignore[no-untyped-def]
     return random.uniform(seed, random.MOTION_STREAM, counter)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def begin(marks, n, bodies, plans, half, seed):  # type: ignore[no-untyped-def]
     """Begins an episode of world n: draws the speed and the first direction of each obstacle.
 
@@ -63,7 +62,7 @@ def begin(marks, n, bodies, plans, half, seed):  # type: ignore[no-untyped-def]
         mark[at.UNTIL], mark[at.WAY] = -1.0, 1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def steer(velocity, marks, n, bodies, first, speeds, plans, walls, half, seed, step, period, distances):  # type: ignore[no-untyped-def]  # fmt: skip  # noqa: E501
     """The velocities of the obstacles of world n for one control period.
 
@@ -111,7 +110,7 @@ def steer(velocity, marks, n, bodies, first, speeds, plans, walls, half, seed, s
             velocity[n, k, 2] = min(max(turn, -TURN), TURN)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _blocked(x, y, angle, reach, here, room, k, scene):  # type: ignore[no-untyped-def]
     """Whether something is near the way ahead, and nearer than at the outset."""
     for part in (0.5, 1.0):
@@ -122,7 +121,7 @@ def _blocked(x, y, angle, reach, here, room, k, scene):  # type: ignore[no-untyp
     return False
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _wander(mark, k, scene, seed, counter, period):  # type: ignore[no-untyped-def]
     """Displacement of a wandering obstacle: ahead, and turning to a free direction if need be."""
     body, speed = scene[0][k], mark[at.SPEED]
@@ -144,7 +143,7 @@ def _wander(mark, k, scene, seed, counter, period):  # type: ignore[no-untyped-d
     return way * math.cos(mark[at.DIRECTION]), way * math.sin(mark[at.DIRECTION])
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _follow(mark, body, row, waypoints, period, keep):  # type: ignore[no-untyped-def]
     """Displacement of a patrol along its path, by the arc length of a period.
 
@@ -170,7 +169,7 @@ def _follow(mark, body, row, waypoints, period, keep):  # type: ignore[no-untype
     return x - body[0], y - body[1]
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _after(index, way, row):  # type: ignore[no-untyped-def]
     """The waypoint after a waypoint, and the way along the list: 1, or -1 backwards."""
     count = int(row[at.COUNT])

@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from nics_drl_bridge import random_kernels as random
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.sim import motion_layout as at
 from nics_drl_bridge.sim.separation_kernels import clearance, map_direction, map_distance, on_wall
 
@@ -35,7 +34,7 @@ PATIENCE = 5.0
 TRIES = 16
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-untyped-def]
     """The force (3, 4) of another walker; 2 b = sqrt((|r| + |r - v dt|)^2 - (v dt)^2).
 
@@ -60,14 +59,14 @@ def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-un
     return size * (rx / one + qx / two), size * (ry / one + qy / two)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _sight(ex, ey, fx, fy, row):  # type: ignore[no-untyped-def]
     """The weight (8) of a force on a walker that looks along e: 1, or less from behind."""
     seen = -(ex * fx + ey * fy) >= row[at.VIEW] * math.sqrt(fx * fx + fy * fy)
     return 1.0 if seen else row[at.BEHIND]
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _from_bodies(k, ex, ey, bodies, marks, first, speeds, row):  # type: ignore[no-untyped-def]
     """The forces of all other bodies on walker k: walkers, obstacles, robots."""
     ax, ay = 0.0, 0.0
@@ -95,7 +94,7 @@ def _from_bodies(k, ex, ey, bodies, marks, first, speeds, row):  # type: ignore[
     return ax, ay
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _from_walls(x, y, radius, walls, distances, row):  # type: ignore[no-untyped-def]
     """The forces (5) of the nearest point of each wall, and of the static map."""
     ax, ay, reach = 0.0, 0.0, row[at.WALL_RANGE]
@@ -116,7 +115,7 @@ def _from_walls(x, y, radius, walls, distances, row):  # type: ignore[no-untyped
     return ax, ay
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _new_goal(mark, k, scene, seed, counter, step, period):  # type: ignore[no-untyped-def]
     """Draws where walker k goes next; the last draw stands if none is free."""
     bodies, _, half, _ = scene
@@ -134,7 +133,7 @@ def _new_goal(mark, k, scene, seed, counter, step, period):  # type: ignore[no-u
     mark[at.UNTIL] = step + (2.0 * way / mark[at.SPEED] + PATIENCE) / period
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def walk(marks, k, scene, first, speeds, row, seed, counter, step, period):  # type: ignore[no-untyped-def]
     """The velocity that walker k takes up, and its goal in its row of marks.
 

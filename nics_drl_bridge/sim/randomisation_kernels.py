@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from nics_drl_bridge import random_kernels as random
+from nics_drl_bridge.kernels import kernel
 
 KINEMATICS, LATENCY, ODOMETRY, LIDAR, CHOICES, OBSTACLES = range(6)
 PLACES = 1 << 20
@@ -20,20 +20,20 @@ PLACES = 1 << 20
 GROUPS = 8
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _share(seed, robot, group, place):  # type: ignore[no-untyped-def]
     """The draw in [0, 1) of one place."""
     counter = (robot * GROUPS + group) * PLACES + place
     return random.uniform(seed, random.RANDOMISATION_STREAM, counter)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _between(low, high, seed, robot, group, place):  # type: ignore[no-untyped-def]
     """A number between `low` and `high`; the very number where they are the same."""
     return low if high == low else low + _share(seed, robot, group, place) * (high - low)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def draw_between(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
     """Fills out (n, M, Q) evenly between low (Q,) and high (Q,)."""
     for n in range(out.shape[0]):
@@ -42,7 +42,7 @@ def draw_between(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
                 out[n, m, q] = _between(low[q], high[q], seeds[n], m, group, q)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def draw_whole(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
     """Fills out (n, M, Q) with whole numbers: evenly between low and high, cut down."""
     for n in range(out.shape[0]):
@@ -52,7 +52,7 @@ def draw_whole(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
                 out[n, m, q] = np.int64(math.floor(value))
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def draw_choice(out, column, values, seeds):  # type: ignore[no-untyped-def]
     """Fills one column of out (n, M, P) with one of the values (V,), each as likely."""
     for n in range(out.shape[0]):

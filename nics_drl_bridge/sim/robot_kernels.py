@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.kinematics.kernels import delayed, run, wrap
 from nics_drl_bridge.sim import cell_kernels as crowd
 from nics_drl_bridge.sim import contact_kernels as contacts
@@ -16,7 +15,7 @@ from nics_drl_bridge.sim.careful_kernels import drift_carefully, move_carefully
 from nics_drl_bridge.sim.sensing_kernels import most_drift
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def move_freely(begin, end, pose, state, history, coefficient, delay, lanes, motion):  # type: ignore[no-untyped-def]
     """Moves the robots of the worlds [begin, end) for one period as if nothing were in the way.
 
@@ -60,7 +59,7 @@ def move_freely(begin, end, pose, state, history, coefficient, delay, lanes, mot
         at = until
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def move_world(  # type: ignore[no-untyped-def]
     n, skip, pose, state, history, coefficient, delay, bodies, velocity, walls, grid, collided,
     crowded, outlines, lanes, motion, cells, found, robot, room, noise, seed, step,

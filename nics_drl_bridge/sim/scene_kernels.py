@@ -14,9 +14,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from nics_drl_bridge import random_kernels as random
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.sim.space_kernels import (
     area_of,
     clear_of_bodies,
@@ -36,12 +36,12 @@ LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING = range(7)
 """Columns of a group."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _uniform(seed, counter):  # type: ignore[no-untyped-def]
     return random.uniform(seed, random.SCENE_STREAM, counter)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _point(seed, counter, cells, static):  # type: ignore[no-untyped-def]
     """A point in one of the cells, which are numbered along the rows; takes 3 counters."""
     distance, frame = static[0], static[2]
@@ -50,14 +50,14 @@ def _point(seed, counter, cells, static):  # type: ignore[no-untyped-def]
     return place_in(i + _uniform(seed, counter + 1), j + _uniform(seed, counter + 2), frame)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _put(body, x, y, heading, shape, outlines):  # type: ignore[no-untyped-def]
     body[0], body[1], body[2] = x, y, heading
     body[3], body[4] = math.cos(heading), math.sin(heading)
     body[5], body[6] = outlines[2][shape], shape
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _choose(seed, counter, wanted, size, plan, bodies, active):  # type: ignore[no-untyped-def]
     """Which obstacles there are, marked in `active` (K,), and the shape of each."""
     groups, _, base, index, _ = plan
@@ -88,7 +88,7 @@ def _choose(seed, counter, wanted, size, plan, bodies, active):  # type: ignore[
     return counter
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _place_obstacles(  # type: ignore[no-untyped-def]
     seed, counter, plan, static, cells, outlines, bodies, active, gaps, trial, spare
 ):
@@ -122,7 +122,7 @@ def _place_obstacles(  # type: ignore[no-untyped-def]
     return counter, True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _spot(seed, counter, places, cells, static):  # type: ignore[no-untyped-def]
     """x, y, heading of a start or goal; takes 4 counters.
 
@@ -145,7 +145,7 @@ def _spot(seed, counter, places, cells, static):  # type: ignore[no-untyped-def]
     return x, y, places[p, 4] + turn * (places[p, 5] - places[p, 4])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _free(disc, x, y, rules, static, bodies, none, outlines, spare):  # type: ignore[no-untyped-def]
     """Whether a robot and the clearance around it have room at a point."""
     disc[0], disc[1] = x, y
@@ -154,7 +154,7 @@ def _free(disc, x, y, rules, static, bodies, none, outlines, spare):  # type: ig
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _apart(x, y, others, m, least):  # type: ignore[no-untyped-def]
     """Whether a point is farther than `least` [m] from the first m of others (M, 2 or more)."""
     for other in range(m):
@@ -164,7 +164,7 @@ def _apart(x, y, others, m, least):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _in_ring(seed, counter, x, y, least, greatest):  # type: ignore[no-untyped-def]
     """A point evenly in the ring of these distances [m] around another."""
     turn = 2.0 * math.pi * _uniform(seed, counter)
@@ -173,7 +173,7 @@ def _in_ring(seed, counter, x, y, least, greatest):  # type: ignore[no-untyped-d
     return x + far * math.cos(turn), y + far * math.sin(turn)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _place_robots(  # type: ignore[no-untyped-def]
     seed, counter, rules, where, still, static, outlines, bodies, none, starts, goals, disc,
     search, spare,
@@ -221,7 +221,7 @@ def _place_robots(  # type: ignore[no-untyped-def]
     return counter, True
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def draw_scenes(  # type: ignore[no-untyped-def]
     seeds, wanted, sizes, plan, static, outlines, rules, where, bodies, starts, goals, search
 ):

@@ -11,16 +11,15 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from nics_drl_bridge import random_kernels as random
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.kinematics.kernels import move, wrap
 
 POSE, TWIST, ODOM, MEASURED, PAST = 0, 3, 6, 9, 12
 """Columns of `past`."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def begin(past, n, m, pose, odom, twist):  # type: ignore[no-untyped-def]
     """Notes what is true of a robot at the beginning of an episode."""
     for i in range(3):
@@ -28,13 +27,13 @@ def begin(past, n, m, pose, odom, twist):  # type: ignore[no-untyped-def]
         past[n, m, 0, ODOM + i], past[n, m, 0, MEASURED + i] = odom[n, m, i], twist[n, m, i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def lag_of(age, steps, rows, substeps):  # type: ignore[no-untyped-def]
     """How old [substeps] that is which a robot is told: not from before the episode or the ring."""
     return max(min(age, min(steps, rows - 1) * substeps), 0)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def at_lag(past, n, m, column, lag, steps, substeps):  # type: ignore[no-untyped-def]
     """Three columns of `past` as they were `lag` substeps before the end of period `steps`."""
     rows = past.shape[2]
@@ -53,14 +52,14 @@ def at_lag(past, n, m, column, lag, steps, substeps):  # type: ignore[no-untyped
     return x, y, z
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def advanced(x, y, heading, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
     """The pose after the exact arc of a body twist; see `kinematics.kernels.move`."""
     x, y, _, _ = move(x, y, math.cos(heading), math.sin(heading), vx, vy, turn, dt, series)
     return x, y, wrap(heading + turn)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def measure(  # type: ignore[no-untyped-def]
     odom, twist, past, before, pose, n, m, now, std, steps, seed, counter, age, dt, substeps,
     series,
@@ -121,13 +120,13 @@ def measure(  # type: ignore[no-untyped-def]
     twist[n, m, 0], twist[n, m, 1], twist[n, m, 2] = x, y, heading
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def most_drift(std, n, m, period):  # type: ignore[no-untyped-def]
     """The greatest distance by which `drift_of` can move a robot in a period [m]."""
     return math.sqrt(3.0 * period) * (std[n, m, 2] + std[n, m, 3])
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def drift_of(state, std, n, m, seed, counter, period):  # type: ignore[no-untyped-def]
     """What moves a robot beside its model: it grows with the root of the time.
 

@@ -16,8 +16,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.sim import motion_layout as at
 
 SLACK = 1e-6
@@ -30,7 +30,7 @@ HALVINGS = 8
 """The last step of it is halved so often to find where the way ends."""
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def on_wall(x, y, wall):  # type: ignore[no-untyped-def]
     """The point of a straight wall (4,) that is nearest to a point."""
     ex, ey = wall[2] - wall[0], wall[3] - wall[1]
@@ -41,7 +41,7 @@ def on_wall(x, y, wall):  # type: ignore[no-untyped-def]
     return wall[0] + share * ex, wall[1] + share * ey
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def map_distance(x, y, distances):  # type: ignore[no-untyped-def]
     """Distance from a point to the static map [m], between the centres of cells bilinearly."""
     grid, frame = distances
@@ -61,7 +61,7 @@ def map_distance(x, y, distances):  # type: ignore[no-untyped-def]
     return low * (1.0 - v) + high * v
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def map_direction(x, y, distances):  # type: ignore[no-untyped-def]
     """Unit vector to the nearest point of the static map; zero where there is none."""
     step = 0.5 * distances[1][4]
@@ -73,7 +73,7 @@ def map_direction(x, y, distances):  # type: ignore[no-untyped-def]
     return gx / length, gy / length
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def clearance(x, y, k, scene):  # type: ignore[no-untyped-def]
     """Distance from a point to the nearest thing but body k, and the unit vector to it."""
     bodies, walls, half, distances = scene
@@ -101,7 +101,7 @@ def clearance(x, y, k, scene):  # type: ignore[no-untyped-def]
     return least, nx, ny
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
     """A displacement that leads no further than `room` along n.
 
@@ -116,7 +116,7 @@ def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
     return dx * (room / ahead), dy * (room / ahead)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _hold_bodies(dx, dy, k, bodies, first, speeds, rows, period, bend):  # type: ignore[no-untyped-def]
     """Holds the displacement of body k within the room that the other bodies leave it."""
     x, y, radius = bodies[k, 0], bodies[k, 1], bodies[k, 5]
@@ -144,7 +144,7 @@ def _hold_bodies(dx, dy, k, bodies, first, speeds, rows, period, bend):  # type:
     return dx, dy
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _hold_walls(dx, dy, x, y, radius, walls, half, bend):  # type: ignore[no-untyped-def]
     """Holds a displacement within the field and on this side of its walls."""
     reach = radius + math.sqrt(dx * dx + dy * dy) + 2.0 * SLACK
@@ -161,7 +161,7 @@ def _hold_walls(dx, dy, x, y, radius, walls, half, bend):  # type: ignore[no-unt
     return dx, dy
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _hold_map(dx, dy, x, y, radius, distances, bend):  # type: ignore[no-untyped-def]
     """Holds a displacement clear of the static map; it walks ahead by the room that it finds."""
     length = math.sqrt(dx * dx + dy * dy)
@@ -191,7 +191,7 @@ def _hold_map(dx, dy, x, y, radius, distances, bend):  # type: ignore[no-untyped
     return dx * free, dy * free
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def restrain(dx, dy, k, scene, first, speeds, rows, period, bends):  # type: ignore[no-untyped-def]
     """The part of a displacement [m] that body k can make within a period.
 

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import fault_kernels, scan_kernels
 from nics_drl_bridge.sim import cell_kernels as crowd
 from nics_drl_bridge.sim import sensing_kernels as sensing
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def needs_own(n, age, faults):  # type: ignore[no-untyped-def]
     """Whether a robot of world n needs a scan that is not of its pose at the moment."""
     for m in range(age.shape[1]):
@@ -24,7 +23,7 @@ def needs_own(n, age, faults):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def look_alone(  # type: ignore[no-untyped-def]
     n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, crowded, view, sensors,
     crowding, dt, substeps,
@@ -47,7 +46,7 @@ def look_alone(  # type: ignore[no-untyped-def]
         )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
+@kernel(inline=True)
 def look_or_wait(  # type: ignore[no-untyped-def]
     n, together, pose, bodies, ranges, steps, faults, age, velocity, past, walls, crowded, view,
     sensors, crowding, dt, substeps,
@@ -69,7 +68,7 @@ def look_or_wait(  # type: ignore[no-untyped-def]
     return together + 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def look_together(together, pose, bodies, ranges, first, walls, view, sensors):  # type: ignore[no-untyped-def]
     """Scans the first `together` worlds of the list in `sensors`, as they stand."""
     chosen, scan_room = sensors[1][:together], sensors[8]
@@ -79,7 +78,7 @@ def look_together(together, pose, bodies, ranges, first, walls, view, sensors): 
         scan_kernels.add_map(ranges, pose, chosen, sensor, map_arrays, exact, scan_room)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def distort(low, high, ranges, faults, steps, seeds, view):  # type: ignore[no-untyped-def]
     """Does to the scans of the worlds [low, high) what the device of each robot does to them."""
     limits, robots = view[4], ranges.shape[1]
@@ -89,7 +88,7 @@ def distort(low, high, ranges, faults, steps, seeds, view):  # type: ignore[no-u
             fault_kernels.distort(ranges[n, m], limits, faults[n, m], seeds[n], counter)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)
+@kernel(inline=True)
 def _look_alone(  # type: ignore[no-untyped-def]
     n, m, lag, pose, bodies, ranges, steps, skew, velocity, past, walls, crowded, view, sensors,
     crowding, dt, substeps,
@@ -131,7 +130,7 @@ def _look_alone(  # type: ignore[no-untyped-def]
             scan[0, 0, i] = part[0, 0, i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _gather(  # type: ignore[no-untyped-def]
     n, m, lag, spot, reach, bodies, velocity, past, steps, crowded, seen, crowding, dt, substeps
 ):

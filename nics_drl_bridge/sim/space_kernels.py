@@ -17,15 +17,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.sim.collision_kernels import body_gap, map_gap, wall_gap
 
 FLOAT32 = 1e-6
 """Distances of the grid are rounded to so many parts of themselves."""
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def wall_distance(x, y, walls):  # type: ignore[no-untyped-def]
     """Distance from a point to the nearest straight wall (W, 4); inf when there is none."""
     least = np.inf
@@ -40,7 +40,7 @@ def wall_distance(x, y, walls):  # type: ignore[no-untyped-def]
     return least
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def wall_distances(distance, frame, walls):  # type: ignore[no-untyped-def]
     """Lowers distances (rows, columns) of cells to those to the walls."""
     for i in range(distance.shape[0]):
@@ -49,14 +49,14 @@ def wall_distances(distance, frame, walls):  # type: ignore[no-untyped-def]
             distance[i, j] = min(distance[i, j], wall_distance(x, y, walls))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def place_in(row, column, frame):  # type: ignore[no-untyped-def]
     """x, y [m] of a place in the grid, in parts of cells."""
     u, v = column * frame[4], row * frame[4]
     return frame[0] + frame[2] * u - frame[3] * v, frame[1] + frame[3] * u + frame[2] * v
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def cell_of(x, y, frame):  # type: ignore[no-untyped-def]
     """Row and column of a point, and how far it is from the centre of that cell [m]."""
     dx, dy = x - frame[0], y - frame[1]
@@ -66,7 +66,7 @@ def cell_of(x, y, frame):  # type: ignore[no-untyped-def]
     return i, j, frame[4] * math.sqrt((u - j - 0.5) ** 2 + (v - i - 0.5) ** 2)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _within(x, y, static):  # type: ignore[no-untyped-def]
     """Whether a point lies in the field and in the grid; its distance to walls, less, and more."""
     distance, _, frame, bounds, _, _ = static
@@ -79,7 +79,7 @@ def _within(x, y, static):  # type: ignore[no-untyped-def]
     return True, middle * (1.0 - FLOAT32) - off, middle * (1.0 + FLOAT32) + off
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def clear_of_walls(body, room, static, outlines, spare):  # type: ignore[no-untyped-def]
     """Whether a body (7,) lies in the field and keeps `room` [m] to walls and map."""
     corners, corner, _ = outlines
@@ -101,7 +101,7 @@ def clear_of_walls(body, room, static, outlines, spare):  # type: ignore[no-unty
     return map_gap(body, static[5], corners, corner, room, spare) >= room
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def clear_of_bodies(body, room, bodies, gaps, outlines, spare):  # type: ignore[no-untyped-def]
     """Whether a body (7,) keeps `room` [m], or its gap if that is more, to each of (K, 7)."""
     corners, corner, _ = outlines
@@ -121,7 +121,7 @@ def clear_of_bodies(body, room, bodies, gaps, outlines, spare):  # type: ignore[
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def clear_of_still(disc, room, still, bodies, outlines, spare):  # type: ignore[no-untyped-def]
     """Whether a disc (7,) keeps `room` [m] to those of the bodies that count."""
     corners, corner, _ = outlines
@@ -138,7 +138,7 @@ def clear_of_still(disc, room, still, bodies, outlines, spare):  # type: ignore[
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def area_of(x, y, static):  # type: ignore[no-untyped-def]
     """The number of the area that a point lies in; 0 for none."""
     i, j, _ = cell_of(x, y, static[2])
@@ -148,7 +148,7 @@ def area_of(x, y, static):  # type: ignore[no-untyped-def]
     return 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def joined(x, y, gx, gy, disc, room, still, static, bodies, none, outlines, search, spare):  # type: ignore[no-untyped-def]
     """Whether a disc can move from one point to another among obstacles, from cell to cell.
 
