@@ -9,6 +9,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+NS_PER_S, S_PER_NS = 1_000_000_000, 1e-9
+
 
 @dataclass(frozen=True)
 class RobotView:

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from measuring.gates import NANO, Gate, Witness, gate_config
+from measuring.gates import Gate, Witness, gate_config
 from measuring.shield_places import SCAN_STEPS, STEP_S, Job, Outcome, Place
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.safety.inputs import Command, Input, Odometry, Scan
 from nics_drl_bridge.safety.limits import load_limits
 from nics_drl_bridge.safety.state import GateConfig
@@ -84,7 +85,7 @@ def _episode(place: Place, config: GateConfig, job: Job, witness: Witness | None
     while not place.ended:
         gate.now = begun + step * STEP_S
         if step % SCAN_STEPS == 0:
-            truth, stamp, seen = place.truth, round(gate.now * NANO), to_gate.arrival(step)
+            truth, stamp, seen = place.truth, round(gate.now * NS_PER_S), to_gate.arrival(step)
             scan = Scan(stamp, truth.ranges, (lidar.angle_min, lidar.angle_increment))
             coming += [(seen, Odometry(stamp, place.odom.copy(), truth.twist)), (seen, scan)]
             commands.append((behind.arrival(seen), Command(stamp, place.wish(truth))))

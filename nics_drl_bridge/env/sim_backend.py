@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import RobotView, Start, stacked
+from nics_drl_bridge.interface import NS_PER_S, RobotView, Start, stacked
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.middleware.view import Middleware
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
-NANO = 1_000_000_000
 
 
 class SimBackend:
@@ -47,7 +46,7 @@ class SimBackend:
         self._robot = model.robot
         self.simulator = FastSimulator(model, world, robots=robots, renderer=renderer, **simulation)
         self._middlewares = [Middleware(model) for _ in range(robots if estimator else 0)]
-        self._period_ns = round(model.control_period * NANO)
+        self._period_ns = round(model.control_period * NS_PER_S)
         self._row: Any = (0, 0) if robots == 1 else 0
         self._now_ns = 0
 

@@ -17,7 +17,6 @@ from nics_drl_bridge.env.actions import check_action, still, team_space
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
 from nics_drl_bridge.env.kernels import episode_seeds
 from nics_drl_bridge.env.reset_arguments import check_options, check_reset
-from nics_drl_bridge.env.sim_backend import NANO
 from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, give, override
 from nics_drl_bridge.env.tasks import make_task
 from nics_drl_bridge.env.vector_facts import EVERY, Rows, VectorFacts
@@ -30,7 +29,7 @@ from nics_drl_bridge.env.vector_parts import (
     over_robots,
 )
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.interface import NS_PER_S, RobotView
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.sim.randomisation import Randomisation
@@ -120,7 +119,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         )
         self._each = (num_envs, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
-        self._facts = VectorFacts(self.simulator, round(self.model.control_period * NANO))
+        self._facts = VectorFacts(self.simulator, round(self.model.control_period * NS_PER_S))
         self._allocate()
 
     def _allocate(self) -> None:

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.kinematics.bag_file import BagFile, Message, opened
 from nics_drl_bridge.kinematics.bag_messages import stamp
 from nics_drl_bridge.kinematics.stamping import MAX_WANDER_S, SAME_CLOCK_S
 
 Nanoseconds = NDArray[np.int64]
 
-NANO = 1e-9
 GAP = 3.0
 """A silence of so many usual periods is a gap."""
 NO_HEADER, UNSTAMPED, UNKNOWN = "no header", "never stamped", "unknown type"
@@ -91,7 +91,7 @@ def bag_info(path: str | Path) -> BagInfo:
         )
     files = [path] if path.is_file() else [file for file in path.iterdir() if file.is_file()]
     size = sum(file.stat().st_size for file in files)
-    return BagInfo(str(path), size, start, (end - start) * NANO, len(times), topics)
+    return BagInfo(str(path), size, start, (end - start) * S_PER_NS, len(times), topics)
 
 
 def _received(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]:
@@ -115,18 +115,18 @@ def _topic(topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str)
     """Facts of a topic, of times since the bag's start (T,) and delays (T,), both [ns]."""
     clock, delay, jitter, backwards = delays if isinstance(delays, str) else "", None, None, 0
     if not isinstance(delays, str):
-        low, middle, high = np.percentile(delays * NANO, (5.0, 50.0, 95.0))
+        low, middle, high = np.percentile(delays * S_PER_NS, (5.0, 50.0, 95.0))
         delay, jitter = float(middle), float(high - low)
         backwards = int((np.diff(since - delays) < 0).sum())
         clock = clock_of(delay, jitter)
     if not len(since):
         return BagTopic(topic, kind, 0, clock=clock)
-    apart = np.diff(since) * NANO
+    apart = np.diff(since) * S_PER_NS
     usual = float(np.median(apart)) if len(apart) else 0.0
     return BagTopic(
         topic, kind, len(since),
         rate_hz=1.0 / usual if usual > 0.0 else None,
-        first_s=float(since[0] * NANO), last_s=float(since[-1] * NANO),
+        first_s=float(since[0] * S_PER_NS), last_s=float(since[-1] * S_PER_NS),
         gaps=int((apart > GAP * usual).sum()) if usual > 0.0 else 0,
         longest_gap_s=float(apart.max()) if len(apart) else None,
         clock=clock, delay_s=delay, jitter_s=jitter, backwards=backwards,

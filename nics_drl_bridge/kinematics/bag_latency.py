@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.kinematics.bag_file import BagFile, Message
 from nics_drl_bridge.kinematics.bag_messages import stamp
 from nics_drl_bridge.kinematics.latency import Delay, Latency
@@ -15,7 +16,6 @@ from nics_drl_bridge.kinematics.topic_roles import ODOMETRY
 
 SCAN = "sensor_msgs/msg/LaserScan"
 LEAST_MESSAGES = 20
-NANO = 1e-9
 PERCENTILES = (5.0, 50.0, 95.0)
 SPANNED = 0.9
 """The share of an even distribution that lies between the first and the last of them."""
@@ -51,7 +51,7 @@ def _delay(messages: Sequence[Message]) -> Delay | None:
     if len(messages) < LEAST_MESSAGES:
         return None
     stamps = np.array([stamp(m.content) for m in messages], dtype=np.int64)
-    late = (np.array([m.receive_ns for m in messages], dtype=np.int64) - stamps) * NANO
+    late = (np.array([m.receive_ns for m in messages], dtype=np.int64) - stamps) * S_PER_NS
     late = late - np.array([_sweep(m) for m in messages])
     low, middle, high = np.percentile(late, PERCENTILES)
     if not stamps.all() or not SAME_CLOCK_S[0] <= middle <= SAME_CLOCK_S[1]:

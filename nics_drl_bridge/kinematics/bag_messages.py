@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kinematics import topic_roles
 
 if TYPE_CHECKING:
@@ -12,7 +13,6 @@ if TYPE_CHECKING:
 
 Row = tuple[float, float, float]
 
-NANO = 1_000_000_000
 ACKERMANN_DEFINITION = (
     "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
     "float32 acceleration\nfloat32 jerk\n"
@@ -38,7 +38,7 @@ def frames(transform: Any) -> tuple[str, str]:
 def stamp(message: Any) -> int:
     """The stamp of a message's header [ns]."""
     time = message.header.stamp
-    return int(time.sec) * NANO + int(time.nanosec)
+    return int(time.sec) * NS_PER_S + int(time.nanosec)
 
 
 def command_row(message: Any) -> Row:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kinematics import topic_roles
 from nics_drl_bridge.kinematics.bag_sink import Storage, bag_sink
 from nics_drl_bridge.kinematics.joints import POSITION_UNITS, WHEELS
@@ -21,8 +22,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Make = Callable[[Any, Array], Any]
 
-NANO = 1_000_000_000
-START_NS = 1_700_000_000 * NANO
+START_NS = 1_700_000_000 * NS_PER_S
 """What second 0 of the commands' clock becomes."""
 FRAMES = ("odom", "base_link")
 
@@ -54,7 +54,7 @@ def write_bag(
         store = get_typestore(Stores.ROS2_JAZZY)
         for topic, kind, stream, make in _topics(recording, spec, messages := _Messages(store)):
             sink.add_topic(topic, kind)
-            stamps = np.round(stream.t * NANO).astype(np.int64) + START_NS
+            stamps = np.round(stream.t * NS_PER_S).astype(np.int64) + START_NS
             receive = stamps + _to_commands_clock(recording, stream)
             for k, values in enumerate(stream.values):
                 message = make(messages.header(int(stamps[k])), values)
@@ -98,7 +98,7 @@ def _to_commands_clock(recording: Recording, stream: Stream) -> int:
     """What makes a time of receipt of a stamp [ns]: streams of another clock start together."""
     if stream.clock == recording.command.clock:
         return 0
-    return round(float(recording.command.t[0] - stream.t[0]) * NANO)
+    return round(float(recording.command.t[0] - stream.t[0]) * NS_PER_S)
 
 
 class _Messages:
@@ -112,7 +112,7 @@ class _Messages:
         return self._types[f"{package}/msg/{name}"](*values)
 
     def header(self, stamp_ns: int) -> Any:
-        stamp = self._new("builtin_interfaces/Time", stamp_ns // NANO, stamp_ns % NANO)
+        stamp = self._new("builtin_interfaces/Time", stamp_ns // NS_PER_S, stamp_ns % NS_PER_S)
         return self._new("std_msgs/Header", stamp, FRAMES[0])
 
     def _vector(self, x: float, y: float, z: float) -> Any:

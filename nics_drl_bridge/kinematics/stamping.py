@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.kinematics.recording import Stream
 from nics_drl_bridge.kinematics.topic_roles import Stamps
 
 Array = NDArray[np.float64]
 Nanoseconds = NDArray[np.int64]
 
-NANO = 1e-9
 RECEIVE, HEADER = "receive", "header"
 SAME_CLOCK_S = (-0.001, 0.05)
 """Headers this much before their receipt [s], in the median, are of the recorder's own clock."""
@@ -125,18 +125,19 @@ def _clocks(
         delay = part.receive_ns - ns
         median = int(np.median(delay))
         usual = np.percentile(delay, 100.0 - STALLED)
-        wander = max(usual - median, median - delay.min()) * NANO
-        if wander > MAX_WANDER_S or (delay.max() - median) * NANO > MAX_STALL_S:
+        wander = max(usual - median, median - delay.min()) * S_PER_NS
+        if wander > MAX_WANDER_S or (delay.max() - median) * S_PER_NS > MAX_STALL_S:
             raise RecordingError(
-                f"{place}: topic {part.topic!r}: its header stamps lie {delay.min() * NANO:.3f} to "
-                f"{delay.max() * NANO:.3f} s before their receipt, so they are of several clocks "
-                "or of a simulated time at another rate; write `stamps: receive` into the topics "
+                f"{place}: topic {part.topic!r}: its header stamps lie "
+                f"{delay.min() * S_PER_NS:.3f} to {delay.max() * S_PER_NS:.3f} s before their "
+                "receipt, so they are of several clocks or of a simulated time at another rate; "
+                "write `stamps: receive` into the topics "
                 "file, and record a simulation with `ros2 bag record --use-sim-time`."
             )
-        if SAME_CLOCK_S[0] <= median * NANO <= SAME_CLOCK_S[1]:
+        if SAME_CLOCK_S[0] <= median * S_PER_NS <= SAME_CLOCK_S[1]:
             clocks[name] = (RECEIVE, 0)
             continue
-        alike = (c for c, d in foreign.items() if abs(d - median) * NANO < SAME_CLOCK_S[1])
+        alike = (c for c, d in foreign.items() if abs(d - median) * S_PER_NS < SAME_CLOCK_S[1])
         clock = next(alike, f"{HEADER} of {part.topic}" if foreign else HEADER)
         clocks[name] = (clock, foreign.setdefault(clock, median))
     return clocks
@@ -172,11 +173,11 @@ def _in_order(part: TopicData, place: str) -> TopicData:
     if ns is None or not ns.all():
         return part
     late = np.maximum.accumulate(ns) - ns
-    if np.mean(late > 0) > MAX_LATE or late.max() * NANO > MAX_WANDER_S:
+    if np.mean(late > 0) > MAX_LATE or late.max() * S_PER_NS > MAX_WANDER_S:
         k = int(np.argmax(late > 0))
         raise RecordingError(
             f"{place}: topic {part.topic!r}: the header stamps run backwards at message {k}, by "
-            f"{late[k] * NANO:.3f} s; write `stamps: receive` into the topics file, or cut the "
+            f"{late[k] * S_PER_NS:.3f} s; write `stamps: receive` into the topics file, or cut the "
             "bag there."
         )
     return part.rows(np.argsort(ns, kind="stable"))
@@ -196,4 +197,4 @@ def _by_receipt(data: Mapping[str, TopicData], origin: int) -> dict[str, Stream]
 
 
 def _seconds(ns: Nanoseconds) -> Array:
-    return np.asarray(ns * NANO, dtype=np.float64)
+    return np.asarray(ns * S_PER_NS, dtype=np.float64)

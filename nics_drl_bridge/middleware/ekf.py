@@ -7,6 +7,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kinematics.kernels import SERIES, term_arrays
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.belief import Anchor, Belief, Foreseen, parted
@@ -49,7 +50,6 @@ ANYWHERE = (100.0, 100.0, np.pi)
 """How well odometry alone tells where a robot is in the map of a pose sensor [m, rad]."""
 LONGEST_GAP_S = 10.0
 """What the robot does in a longer silence is not predicted: it may have driven anywhere."""
-NANO = 1_000_000_000
 
 
 class Estimator:
@@ -66,8 +66,8 @@ class Estimator:
     def __init__(self, model: SimulatorModel) -> None:
         self._terms = term_arrays(model.kinematics)
         dt, _, delay = model.timing
-        self._timing = round(dt * NANO), round(LONGEST_GAP_S * NANO)
-        self._delay_ns = round(dt * delay * NANO)
+        self._timing = round(dt * NS_PER_S), round(LONGEST_GAP_S * NS_PER_S)
+        self._delay_ns = round(dt * delay * NS_PER_S)
         size = len(model.robot.state)
         reach = np.array([v.max - v.min for v in model.robot.state])
         least = np.concatenate([np.full(3, LEAST_POSE_DRIFT), LEAST_STATE_DRIFT * reach])
@@ -121,7 +121,7 @@ class Estimator:
         anchor = self._anchor or Anchor(0, np.zeros(3), self._filter.x, self._filter.P)
         covariance = self.unseen.doubted(anchor.covariance, seconds)
         known = self._anchor is not None and continuous
-        since = anchor._replace(time_ns=time_ns - round(seconds * NANO)) if known else None
+        since = anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S)) if known else None
         self.belief = Belief(time_ns, anchor.mean, covariance, (0, 0, 0), since, True)
         self._log.keep(np.minimum(np.maximum(command, self._least), self._most))
 
@@ -216,7 +216,7 @@ class Estimator:
             self._timing, log, self._terms, SERIES,
         )  # fmt: skip
         if time_ns - self.time_ns > self._timing[1]:
-            covariance = self.unseen.doubted(covariance, (time_ns - self.time_ns) / NANO)
+            covariance = self.unseen.doubted(covariance, (time_ns - self.time_ns) / NS_PER_S)
         expected = kernels.expect(mean, time_ns, log, self._terms)
         return Foreseen(time_ns, mean, covariance, expected)
 
@@ -259,7 +259,7 @@ class Estimator:
         anchor, self._lost = self._anchor, False
         if anchor is None:
             return
-        seconds = (self.time_ns - anchor.time_ns) / NANO
+        seconds = (self.time_ns - anchor.time_ns) / NS_PER_S
         bridged = self.unseen.bridged(anchor, odom, seconds)
         if bridged is not None:
             self._jump(*bridged)

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.kinematics.kernels import advance, rates, wrap
 
-NANO = 1_000_000_000
 RUNAWAY = 1e9
 """No pose or state is ever so far [m, rad, its unit], nor changes by so many times its cause."""
 LEAST_PIVOT = 1e-12
@@ -117,9 +117,9 @@ def carry(mean, transition, begin, end, timing, log, terms, series):  # type: ig
         if k + 1 < count and effective[k + 1] < end:
             until = effective[k + 1]
         steps, rest = (until - now) // step, (until - now) % step
-        predict(mean, transition, commands[k], step / NANO, steps, terms, series)
+        predict(mean, transition, commands[k], step / NS_PER_S, steps, terms, series)
         if rest > 0:
-            predict(mean, transition, commands[k], rest / NANO, 1, terms, series)
+            predict(mean, transition, commands[k], rest / NS_PER_S, 1, terms, series)
         now, k = until, k + 1
     if not (np.all(np.abs(mean) < RUNAWAY) and np.all(np.abs(transition) < RUNAWAY)):
         mean[:3], mean[3:] = before, 0.0
@@ -131,7 +131,7 @@ def forecast(mean, covariance, process, begin, end, timing, log, terms, series):
     """Mean and covariance at a later time; `process` (3 + S, 3 + S) grows with every second."""
     moved, transition = mean.copy(), np.eye(mean.shape[0])
     carry(moved, transition, begin, end, timing, log, terms, series)
-    spread = transition @ covariance @ transition.T + process * ((end - begin) / NANO)
+    spread = transition @ covariance @ transition.T + process * ((end - begin) / NS_PER_S)
     return moved, (spread + spread.T) * 0.5
 
 

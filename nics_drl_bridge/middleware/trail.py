@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.middleware.replay import HISTORY_NS
 from nics_drl_bridge.middleware.stamps import CLOCK_JUMP, FUTURE_NS
 from nics_drl_bridge.middleware.unseen import JITTER_S
 
 Array = NDArray[np.float64]
-NANO = 1_000_000_000
 
 CONTRADICTED_NS = 200_000_000
 """A stamp that is off by less [ns] can't be told from data that took longer."""
@@ -27,7 +27,7 @@ LEAST = 0.01
 """and may always differ by this [m, rad]."""
 STILL = 0.02
 """What moves less than this [m/s, rad/s] says nothing about time."""
-NEAR_NS = HISTORY_NS + 2 * NANO
+NEAR_NS = HISTORY_NS + 2 * NS_PER_S
 """A stamp farther back than this [ns] is refused so often that `Stamps` sees it."""
 
 
@@ -83,11 +83,15 @@ class Trail:
             return False
         if not all(self._in_step(*pair) for pair in pairwise(self._recent)):
             return False
-        seconds, stamped, arrived = self._time_of_way(last, told, 0.0), passed / NANO, waited / NANO
+        seconds, stamped, arrived = (
+            self._time_of_way(last, told, 0.0),
+            passed / NS_PER_S,
+            waited / NS_PER_S,
+        )
         return (
             seconds > 0.0
-            and abs(seconds - arrived) <= max(0.5 * arrived, 0.5 * CONTRADICTED_NS / NANO)
-            and abs(seconds - stamped) >= CONTRADICTED_NS / NANO
+            and abs(seconds - arrived) <= max(0.5 * arrived, 0.5 * CONTRADICTED_NS / NS_PER_S)
+            and abs(seconds - stamped) >= CONTRADICTED_NS / NS_PER_S
             and self._fits(last, told, seconds)
             and not self._fits(last, told, stamped)
         )
@@ -95,7 +99,7 @@ class Trail:
     def _in_step(self, before: Told, after: Told) -> bool:
         """Whether one came as long after the other as its stamp says, and so does its way."""
         passed, waited = after.stamp_ns - before.stamp_ns, after.arrival_ns - before.arrival_ns
-        return 2 * abs(waited - passed) <= passed and self._fits(before, after, passed / NANO)
+        return 2 * abs(waited - passed) <= passed and self._fits(before, after, passed / NS_PER_S)
 
     def seconds(self, now: Told) -> float:
         """How long ago the last used odometry was, by its arrival and by the stamps since [s]."""
@@ -105,7 +109,7 @@ class Trail:
         waited = max(now.arrival_ns - last.arrival_ns, 0)
         stamped = now.stamp_ns - (*self._refused, now)[0].stamp_ns
         # The first may have been a second late; then the arrivals show less time than has passed.
-        return max(waited, min(stamped, waited + HISTORY_NS)) / NANO
+        return max(waited, min(stamped, waited + HISTORY_NS)) / NS_PER_S
 
     def continuous(self, now: Told) -> bool:
         """Whether the poses since the last used odometry are those of one way, and tell of it."""
@@ -115,7 +119,7 @@ class Trail:
         unmoved = all(np.array_equal(each.pose, way[0].pose) for each in way)
         if unmoved and any((np.abs(each.twist) > STILL).any() for each in way):
             return False
-        times = [(b.stamp_ns - a.stamp_ns) / NANO for a, b in pairwise(way[1:])]
+        times = [(b.stamp_ns - a.stamp_ns) / NS_PER_S for a, b in pairwise(way[1:])]
         first = max(self.seconds(now) - sum(times), 0.0)
         spans = [(max(first - JITTER_S, 0.0), first + JITTER_S)]
         spans += [(0.5 * each, 1.5 * each) for each in times]

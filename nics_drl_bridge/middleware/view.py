@@ -9,15 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.interface import NS_PER_S, RobotView
 from nics_drl_bridge.middleware.cache import TopicCache
-from nics_drl_bridge.middleware.ekf import (
-    LEAST_POSE_STD,
-    LEAST_TWIST_STD,
-    NANO,
-    START_STD,
-    Estimator,
-)
+from nics_drl_bridge.middleware.ekf import LEAST_POSE_STD, LEAST_TWIST_STD, START_STD, Estimator
 from nics_drl_bridge.middleware.health import Health, TopicHealth
 from nics_drl_bridge.middleware.measurement import (
     CMD_VEL,
@@ -56,7 +50,7 @@ class Middleware:
         self.estimator = Estimator(model)
         self._timeline = Timeline(self.estimator)
         self._trail = Trail(self.estimator.unseen.walk)
-        self._stamps = Stamps(round(model.control_period * NANO))
+        self._stamps = Stamps(round(model.control_period * NS_PER_S))
         self._off_the_clock = (self._stamps.from_the_future, TOO_OLD, BEFORE_START)
         self.reset(0, np.zeros(3))
 

@@ -36,7 +36,6 @@ DISCOVERY_S = 1.0
 """Time for subscribers to find the topics before the first message [s];"""
 ALONE_S = 5.0
 """and time for a first one, after which it is played to nobody [s]."""
-NANO = 1_000_000_000
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
 from sensor_msgs.msg import Imu, JointState, LaserScan
 
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kinematics.joints import POSITION_UNITS
 from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.lidar.canonical import Reader, reader_beside
@@ -19,19 +20,18 @@ from nics_drl_bridge.lidar.rep117 import from_device, to_device
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader
 
 Array = NDArray[np.float64]
-NANO = 1_000_000_000
 QUATERNION_TOLERANCE = 0.1
 """By which the squared length of a rotation may differ from 1."""
 
 
 def stamp_to_ros(time_ns: int) -> Time:
     """Nanoseconds as a stamp."""
-    return Time(sec=time_ns // NANO, nanosec=time_ns % NANO)
+    return Time(sec=time_ns // NS_PER_S, nanosec=time_ns % NS_PER_S)
 
 
 def stamp_from_ros(stamp: Time) -> int:
     """A stamp as nanoseconds."""
-    return int(stamp.sec) * NANO + int(stamp.nanosec)
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
 def heading_to_ros(heading: float) -> Quaternion:

@@ -15,10 +15,10 @@ from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.errors import BackendError, StaleDataError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import RobotView, Start
+from nics_drl_bridge.interface import NS_PER_S, RobotView, Start
 from nics_drl_bridge.lidar.rep117 import from_device
 from nics_drl_bridge.middleware.view import Middleware
-from nics_drl_bridge.nodes import conversions, qos, wire
+from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.episodes import Episodes
 from nics_drl_bridge.nodes.executor import HANDED_OVER
 from nics_drl_bridge.nodes.link import Link
@@ -160,7 +160,7 @@ class DdsBackend:
     ) -> None:
         self._robot, self._lidar = model.robot, model.lidar
         self._middleware = Middleware(model)
-        self._period_ns = round(model.control_period * conversions.NANO)
+        self._period_ns = round(model.control_period * NS_PER_S)
         self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *((TRUTH,) if truth else ()))
         self._now_ns, self._mail = 0, _Mailbox(self._topics, _worker(self._middleware))
         self._link = Link(namespace, domain_id)
@@ -244,7 +244,7 @@ class DdsBackend:
         if off_ns:
             self._link.check_alone()
             raise BackendError(
-                f"topic {topic!r}: stamped {off_ns / conversions.NANO:+.3f} s off the step; start "
+                f"topic {topic!r}: stamped {off_ns / NS_PER_S:+.3f} s off the step; start "
                 "the simulator with mode:=lockstep, and move it from here alone."
             )
 

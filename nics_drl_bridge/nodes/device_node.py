@@ -19,7 +19,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import Simulator
+from nics_drl_bridge.interface import NS_PER_S, Simulator
 from nics_drl_bridge.nodes import conversions, device_parameters, qos
 from nics_drl_bridge.nodes.command_inlet import CommandInlet
 from nics_drl_bridge.nodes.device_parameters import declare_device
@@ -121,7 +121,7 @@ class DeviceNode(QosWatch):
         self._timer = None
         self._soon = self.create_guard_condition(self._on_time)
         if self._time.mode == "realtime":
-            period = step_ns / conversions.NANO / self._time.rate
+            period = step_ns / NS_PER_S / self._time.rate
             # A tick of which the step is a multiple.
             ticks = max(1.0, np.ceil(period / LONGEST_TICK_S)) if self._time.late else 1.0
             self._timer = self.create_timer(period / ticks, self._on_time, clock=steady)
@@ -150,7 +150,7 @@ class DeviceNode(QosWatch):
             "mode": self._time.mode,
             "rate": self._time.rate,
             "robots": len(self._names),
-            "simulated time [s]": f"{self._now_ns / conversions.NANO:.3f}",
+            "simulated time [s]": f"{self._now_ns / NS_PER_S:.3f}",
             "times it fell behind real time": self._lags,
             **self._identity,
         }
@@ -158,7 +158,7 @@ class DeviceNode(QosWatch):
         return Finding(message, False, facts, self._hardware)
 
     def _timeout_ns(self) -> int:
-        return int(float(self.get_parameter("command_timeout").value or 0.0) * conversions.NANO)
+        return int(float(self.get_parameter("command_timeout").value or 0.0) * NS_PER_S)
 
     def _too_old(self, stamp_ns: int) -> bool:
         return not self._time.lockstep and self._now_ns - stamp_ns > self._timeout_ns()

@@ -14,8 +14,9 @@ from rclpy.parameter import Parameter
 
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kinematics.latency import Delay
-from nics_drl_bridge.nodes.pace import NANO, common_step
+from nics_drl_bridge.nodes.pace import common_step
 from nics_drl_bridge.nodes.runner import declare
 
 LOCKSTEP = "lockstep"
@@ -124,13 +125,13 @@ def timing(node: Node, model: SimulatorModel) -> Timing:
         for name in ("rate", "odom_rate", "scan_rate")
     }
     if mode == LOCKSTEP:
-        period = round(model.control_period * NANO)
+        period = round(model.control_period * NS_PER_S)
         return Timing(mode, 1.0, period, period, period, (0, 0), (0, 0))
     odom = 1.0 / value["odom_rate"] if value["odom_rate"] else model.control_period
     scan = 1.0 / (value["scan_rate"] or model.lidar.rate)
     dt = model.timing[0]
     step = common_step(dt, (odom, scan)) * dt
-    step_ns, odom_ns, scan_ns = (round(seconds * NANO) for seconds in (step, odom, scan))
+    step_ns, odom_ns, scan_ns = (round(seconds * NS_PER_S) for seconds in (step, odom, scan))
     late = [_late_ns(node, topic, model) for topic in ("scan", "odom")]
     return Timing(mode, value["rate"], step_ns, odom_ns, scan_ns, *late)
 
@@ -146,7 +147,7 @@ def _late_ns(node: Node, topic: str, model: SimulatorModel) -> tuple[int, int]:
         given if given >= 0.0 else measured
         for given, measured in zip(asked, (own.least, own.jitter), strict=True)
     )
-    return round(least * NANO), round(jitter * NANO)
+    return round(least * NS_PER_S), round(jitter * NS_PER_S)
 
 
 def timed_model(node: Node, model: SimulatorModel, time: Timing) -> SimulatorModel:
@@ -158,7 +159,7 @@ def timed_model(node: Node, model: SimulatorModel, time: Timing) -> SimulatorMod
         calibration = replace(model.calibration, command_latency_s=latency)
         model = replace(model, calibration=calibration)
     dt = model.timing[0]
-    steps = round(time.step_ns / NANO / dt)
+    steps = round(time.step_ns / NS_PER_S / dt)
     return model if steps == model.timing[1] else replace(model, control_period=steps * dt)
 
 

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 
 from nics_drl_bridge.errors import BackendError, RecordingError
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kinematics.bag_messages import imu_row, pose_row, stamp, twist_row
 from nics_drl_bridge.kinematics.joints import JointMessage, Joints, gather, state_of, wheels_of
 from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.kinematics.stamping import TopicData, streams
 from nics_drl_bridge.kinematics.topic_roles import TopicRoles
-from nics_drl_bridge.nodes.conversions import NANO
 
 Array = NDArray[np.float64]
 PLACE = "recording"
@@ -92,7 +92,7 @@ class DriveLog:
     @property
     def seconds(self) -> float:
         """How long commands were sent [s]."""
-        return self._commands.spans[0] / NANO
+        return self._commands.spans[0] / NS_PER_S
 
     def command(self, command: Array) -> None:
         """Notes a command (C,) that is sent now."""
@@ -142,7 +142,7 @@ class DriveLog:
                 f"of robot {self._spec.name!r} has to be measured; start the joints' publisher, "
                 "or remap the topic."
             )
-        pace, heard = self._odom.pace, self._odom.spans[0] / NANO
+        pace, heard = self._odom.pace, self._odom.spans[0] / NS_PER_S
         if not SAME_PACE[0] <= pace <= SAME_PACE[1]:
             raise BackendError(
                 f"topic 'odom': its stamps went on by {pace * heard:.2f} s within "

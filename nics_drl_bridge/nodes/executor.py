@@ -21,7 +21,8 @@ from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.waitable import NumberOfEntities
 
-NANO = 1_000_000_000
+from nics_drl_bridge.interface import NS_PER_S
+
 PARTS_MISSING = (AttributeError, TypeError)
 """What Python raises where rclpy is another one than is known here."""
 Received = tuple[Callable[..., Any], tuple[Any, ...]]
@@ -88,7 +89,7 @@ class StandingExecutor(SingleThreadedExecutor):
         """Waits; what subscriptions received."""
         try:
             ends = self._gathered()
-            ends.wait(-1 if timeout_sec is None else int(timeout_sec * NANO))
+            ends.wait(-1 if timeout_sec is None else int(timeout_sec * NS_PER_S))
         except RuntimeError:  # of the library, whose context another thread may have shut down
             if self.context.ok():
                 raise

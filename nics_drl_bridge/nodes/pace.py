@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 
-NANO = 1_000_000_000
-
+from nics_drl_bridge.interface import NS_PER_S
 
 SLACK = 0.1
 """A step may be made earlier by this share of it, because a timer is no better."""
-PATIENCE_NS = NANO // 2
+PATIENCE_NS = NS_PER_S // 2
 """Steps that were missed for longer are not made up for."""
 
 

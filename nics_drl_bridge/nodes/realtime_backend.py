@@ -13,7 +13,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.config import validate
 from nics_drl_bridge.errors import BackendError, StaleDataError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import RobotView, Start
+from nics_drl_bridge.interface import NS_PER_S, RobotView, Start
 from nics_drl_bridge.middleware.measurement import SCAN
 from nics_drl_bridge.middleware.view import rehearse
 from nics_drl_bridge.nodes.episodes import Episodes
@@ -23,7 +23,6 @@ from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_
 from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
-NANO = 1_000_000_000
 POLL_S = 0.01
 SAY_EVERY_S = 2.0
 SERVICES_S = 0.5
@@ -59,7 +58,7 @@ class RealtimeBackend:
     def __init__(self, model: SimulatorModel, world: World, **options: Any) -> None:
         chosen = validate(options, RealtimeOptions, "backend_options")
         self._options, self._robot = chosen, model.robot
-        self._period_ns = round((chosen.period_s or model.control_period) * NANO)
+        self._period_ns = round((chosen.period_s or model.control_period) * NS_PER_S)
         self._deadline_ns = self._misses = 0
         rehearse(model)
         self._simulated = False
@@ -90,7 +89,7 @@ class RealtimeBackend:
             raise
 
     def _command_timeout_s(self) -> float:
-        return max(COMMAND_S, PERIODS * self._period_ns / NANO)
+        return max(COMMAND_S, PERIODS * self._period_ns / NS_PER_S)
 
     def reset(self, start: Start) -> RobotView:
         """Begins an episode: a simulator's service does, or a vehicle has to stand there.
@@ -182,7 +181,7 @@ class RealtimeBackend:
             newest, now = dict(self._topics.middleware.cache.newest), time.monotonic_ns()
         latest = max((datum.stamp_ns for datum in newest.values()), default=0)
         ages = {
-            topic: max(now - newest[topic].arrival_ns, latest - newest[topic].stamp_ns) / NANO
+            topic: max(now - newest[topic].arrival_ns, latest - newest[topic].stamp_ns) / NS_PER_S
             if topic in newest
             else math.inf
             for topic in self._topics.expected
@@ -218,7 +217,7 @@ class RealtimeBackend:
                 self._misses += missed
                 self._deadline_ns += missed * self._period_ns
             while (left_ns := self._deadline_ns - time.monotonic_ns()) > 0:
-                time.sleep(left_ns / NANO)
+                time.sleep(left_ns / NS_PER_S)
             self._deadline_ns += self._period_ns
             return self._fresh_view()
 

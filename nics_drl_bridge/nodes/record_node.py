@@ -19,6 +19,7 @@ from sensor_msgs.msg import Imu, JointState
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, BridgeError
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kinematics.drive_file import write_drive
 from nics_drl_bridge.kinematics.exploration import PERIOD_S, STILL_S
 from nics_drl_bridge.kinematics.recording import Recording
@@ -33,7 +34,7 @@ PATIENCE_S = 10.0
 POLL_S = 0.01
 HALT_S = 0.5
 """Zero is repeated for so long: a robot that listens best effort may miss one."""
-PERIOD_NS = round(PERIOD_S * conversions.NANO)
+PERIOD_NS = round(PERIOD_S * NS_PER_S)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from sensor_msgs.msg import JointState, LaserScan
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.lidar.rep117 import to_device
 from nics_drl_bridge.nodes import conversions, qos, transforms, wire
 from nics_drl_bridge.nodes.device_parameters import Frames, Timing
@@ -47,7 +48,7 @@ class RobotPort:
         scan, odom = scan_message(model, frames.laser, time), odometry_message(frames)
         # Beam 0 of a device that turns counter-clockwise was measured first.
         sweep_s = max(0.0, scan.time_increment) * (model.lidar.beams - 1)
-        self._sweep_ns = 0 if time.lockstep else round(sweep_s * conversions.NANO)
+        self._sweep_ns = 0 if time.lockstep else round(sweep_s * NS_PER_S)
         odom.twist.covariance[DIAGONAL[PLANAR]] = variances(model.noise.odometry)
         self._scan, self._odom = wire.ScanWriter(scan), wire.OdometryWriter(odom)
         self._truth = wire.OdometryWriter(truth_message(frames))
@@ -91,7 +92,7 @@ def scan_message(model: SimulatorModel, frame: str, time: Timing) -> LaserScan:
     """A scan whose ranges and stamp are still to be filled in."""
     free = np.full(model.lidar.beams, np.inf, np.float32)
     message = conversions.scan_to_ros(model.lidar, free, 0, frame)
-    message.scan_time = time.scan_ns / conversions.NANO
+    message.scan_time = time.scan_ns / NS_PER_S
     return message
 
 

@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import LaserScan
 
-from nics_drl_bridge.nodes.conversions import NANO, PLANAR, heading_of
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.nodes.conversions import PLANAR, heading_of
 
 Array = NDArray[np.float64]
 Bytes = bytes | bytearray
@@ -68,7 +69,7 @@ def _doubles(content: Bytes, order: str) -> int:
 def stamp_of(content: Bytes) -> int:
     """The stamp of a message that begins with a header [ns]. Raises `UNREADABLE`."""
     seconds, nanoseconds = struct.unpack_from(f"{_order(content)}iI", content, STAMP)
-    return int(seconds) * NANO + int(nanoseconds)
+    return int(seconds) * NS_PER_S + int(nanoseconds)
 
 
 def numbers_of(content: Bytes) -> Array:
@@ -150,7 +151,7 @@ class OdometryWriter:
         content, place = self._content, self._place
         x, y, heading = pose.tolist()
         vx, vy, wz = twist.tolist()
-        self._stamp.pack_into(content, STAMP, *divmod(stamp_ns, NANO))
+        self._stamp.pack_into(content, STAMP, *divmod(stamp_ns, NS_PER_S))
         self._two.pack_into(content, place, x, y)
         self._two.pack_into(
             content, place + 8 * 5, math.sin(heading / 2.0), math.cos(heading / 2.0)
@@ -176,7 +177,7 @@ class ScanWriter:
 
     def write(self, stamp_ns: int, ranges: NDArray[np.float32]) -> bytes:
         """One of ranges (B,), as the device reports them."""
-        self._stamp.pack_into(self._content, STAMP, *divmod(stamp_ns, NANO))
+        self._stamp.pack_into(self._content, STAMP, *divmod(stamp_ns, NS_PER_S))
         self._ranges[:] = ranges
         return bytes(self._content)
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.interface import S_PER_NS, RobotView
 from nics_drl_bridge.kinematics.bag_file import Message
 from nics_drl_bridge.kinematics.bag_messages import command_row
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, POSE, SCAN
@@ -21,7 +21,6 @@ from nics_drl_bridge.policy.pacing import Pace
 from nics_drl_bridge.policy.policies import open_policy
 
 Array = NDArray[np.float64]
-NANO = 1e-9
 JITTER = 0.25
 """So many periods may a scan be early."""
 HELD_S = 1.0
@@ -157,9 +156,9 @@ def _moments(
         scan_ns = newest[SCAN].stamp_ns
         if newest[ODOM].stamp_ns < scan_ns or scan_ns <= acted_ns:
             continue
-        if not pace.due(scan_ns * NANO + JITTER * model.control_period):
+        if not pace.due(scan_ns * S_PER_NS + JITTER * model.control_period):
             continue
-        pace.acted(scan_ns * NANO)
+        pace.acted(scan_ns * S_PER_NS)
         acted_ns = scan_ns
         _hold(moments, held)
         view = playback.middleware.view(playback.middleware.newest_ns or scan_ns)
@@ -171,7 +170,7 @@ def _moments(
 def _hold(moments: list[_Moment], held: tuple[int, Array] | None) -> None:
     """The newest moment's command is the one that held, if none came after it."""
     if moments and moments[-1].driven is None and held is not None:
-        age_s = (moments[-1].receive_ns - held[0]) * NANO
+        age_s = (moments[-1].receive_ns - held[0]) * S_PER_NS
         moments[-1].driven = held[1] if age_s <= HELD_S else None
 
 
@@ -179,7 +178,7 @@ def _goals(moments: list[_Moment], goal: ArrayLike | None, ahead_s: float) -> Ar
     """(T, 2) the goal of each moment."""
     if goal is not None:
         return np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
-    times = np.array([moment.stamp_ns for moment in moments]) * NANO
+    times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
     places = np.array([moment.view.pose[:2] for moment in moments])
     return np.stack([np.interp(times + ahead_s, times, place) for place in places.T], axis=-1)
 
@@ -208,7 +207,7 @@ def _answered(moments: list[_Moment], goals: Array, name: str, model: SimulatorM
     return Shadow(
         tuple(one.name for one in robot.command),
         tuple(one.unit for one in robot.command),
-        (stamps - stamps[0]) * NANO,
+        (stamps - stamps[0]) * S_PER_NS,
         poses, aims, wanted, driven,
         np.maximum(np.abs(robot.command_low), np.abs(robot.command_high)),
         skipped,

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.report.doctor_expected import Expected, Finding, seen
 from nics_drl_bridge.report.doctor_facts import (
     CLOCK,
@@ -24,7 +25,6 @@ from nics_drl_bridge.report.doctor_facts import (
 from nics_drl_bridge.report.doctor_motion import motion, scale
 from nics_drl_bridge.report.doctor_scan import layout, ranges
 
-NANO = 1e-9
 RATE_TOLERANCE = 0.2
 FUTURE_S, LATE_S, OFFSET_S = 0.005, 0.35, 5.0
 """Stamps more than this after their arrival are from the future; before it, too old for the gate of
@@ -146,7 +146,7 @@ def _rate(facts: Facts, role: str) -> float | None:
         return None
     stamps = np.array(heard.stamps_ns, dtype=np.int64)
     if facts.clock_ns and len(stamps) > 2 and stamps[-1] > stamps[0]:
-        return float((len(stamps) - 1) / ((stamps[-1] - stamps[0]) * NANO))
+        return float((len(stamps) - 1) / ((stamps[-1] - stamps[0]) * S_PER_NS))
     return heard.rate_hz
 
 
@@ -165,7 +165,7 @@ def latency(facts: Facts, _: Expected) -> Iterator[Finding]:
             what = f"{(np.diff(stamps) < 0).sum()} stamps are before the one before them"
             fix = "look for a second publisher, or for a clock that is set while it runs"
             yield Finding("error", "stamp", name, what, fix)
-        age = float(np.median(_here(facts, heard.arrivals_ns) - stamps)) * NANO
+        age = float(np.median(_here(facts, heard.arrivals_ns) - stamps)) * S_PER_NS
         if -FUTURE_S <= age <= LATE_S:
             continue
         side = "after" if age < 0 else "before"
@@ -198,7 +198,7 @@ def clock(facts: Facts, _: Expected) -> Iterator[Finding]:
     if heard is None:
         yield Finding("error", "clock", CLOCK, "has a publisher and says nothing", fix)
         return
-    silent = (facts.end_ns - heard.arrivals_ns[-1]) * NANO
+    silent = (facts.end_ns - heard.arrivals_ns[-1]) * S_PER_NS
     if silent > STALE_CLOCK_S:
         yield Finding("error", "clock", CLOCK, f"has been silent for {silent:.1f} s", fix)
     ticks = np.diff(facts.clock_ns)

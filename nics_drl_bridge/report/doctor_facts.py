@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kinematics.bag_file import opened
 from nics_drl_bridge.kinematics.bag_qos import Offer
 
@@ -23,7 +24,6 @@ TWIST_TYPE, TWIST_STAMPED_TYPE = "geometry_msgs/msg/Twist", "geometry_msgs/msg/T
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 MOST_SCANS = 200
 """Ranges are kept of so many scans; of the others only the time."""
-NANO = 1_000_000_000
 MOST_RAD = 7.0
 
 
@@ -61,7 +61,7 @@ class TopicFacts:
     @property
     def rate_hz(self) -> float | None:
         """Messages per second between the first and the last; None below three."""
-        span = (self.arrivals_ns[-1] - self.arrivals_ns[0]) / NANO if self.arrivals_ns else 0.0
+        span = (self.arrivals_ns[-1] - self.arrivals_ns[0]) / NS_PER_S if self.arrivals_ns else 0.0
         return (len(self.arrivals_ns) - 1) / span if len(self.arrivals_ns) > 2 and span else None
 
 
@@ -129,7 +129,7 @@ class Facts:
         heard.arrivals_ns.append(arrival_ns)
         if hasattr(message, "header"):
             time = message.header.stamp
-            heard.stamps_ns.append(int(time.sec) * NANO + int(time.nanosec))
+            heard.stamps_ns.append(int(time.sec) * NS_PER_S + int(time.nanosec))
             heard.frames.add(str(message.header.frame_id))
         if role == SCAN:
             self._scan(message)
@@ -139,7 +139,7 @@ class Facts:
         elif role == CMD_VEL:
             self.commands.append(_twist(getattr(message, "twist", message)))
         else:
-            self.clock_ns.append(int(message.clock.sec) * NANO + int(message.clock.nanosec))
+            self.clock_ns.append(int(message.clock.sec) * NS_PER_S + int(message.clock.nanosec))
 
     def _scan(self, message: Any) -> None:
         layout = Layout(

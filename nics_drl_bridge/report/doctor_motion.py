@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import wrap_angle
+from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.report.doctor_facts import CMD_VEL, ODOM, Facts
 
@@ -15,7 +16,6 @@ Array = NDArray[np.float64]
 Word = tuple[str, str, bool]
 """What is wrong, what to do, and whether it is severe."""
 
-NANO = 1e-9
 LEAST_PATH_M, LEAST_TURN_RAD = 0.3, 0.3
 """Below, a drive says nothing about scales."""
 TOLERANCE = 1.4
@@ -55,7 +55,7 @@ def motion(facts: Facts, robot: RobotSpec) -> Iterator[Word]:
 
 def _moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> Iterator[Word]:
     stamps = np.array(facts.heard[ODOM].stamps_ns, dtype=np.int64)
-    dt = np.diff(stamps) * NANO
+    dt = np.diff(stamps) * S_PER_NS
     going = dt > 0.0
     if going.sum() < LEAST_STEPS:
         return

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.safety.e_stop import e_stop_pressed, e_stop_silent
-from nics_drl_bridge.safety.freshness import AHEAD_S, NANO, creep, gap_free, rate
+from nics_drl_bridge.safety.freshness import AHEAD_S, creep, gap_free, rate
 from nics_drl_bridge.safety.frozen import stands_still
 from nics_drl_bridge.safety.inputs import Arm
 from nics_drl_bridge.safety.state import Arrivals, GateConfig, GateState
@@ -59,7 +60,7 @@ def clocks_agree(config: GateConfig, state: GateState, request: Arm, now: float)
     scans, odometries = state.scans, state.odometries
     if not (scans.times and odometries.times):
         return "scan and odom have not both come"
-    stamped = (scans.stamps_ns[-1] - odometries.stamps_ns[-1]) * NANO / config.clock_rate
+    stamped = (scans.stamps_ns[-1] - odometries.stamps_ns[-1]) * S_PER_NS / config.clock_rate
     apart = stamped - (scans.times[-1] - odometries.times[-1])
     if abs(apart) > config.clock_jump_s:
         return f"the stamps of scan are {apart:.3f} s ahead of those of odom"

@@ -9,6 +9,7 @@ neither the new present nor the new normal.
 
 from __future__ import annotations
 
+from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.safety.records import replace
 from nics_drl_bridge.safety.state import Arrivals, Cause, GateConfig, GateState, Mark
 
@@ -23,7 +24,6 @@ SIMULATED_LAG = 0.2
 """The share of real time that a simulator may lose."""
 AHEAD_S = 0.1
 """Data of an armed gate that are so much faster than the fastest before it are from the future."""
-NANO = 1e-9
 
 
 def arrived(
@@ -47,7 +47,7 @@ def arrived(
     )
     if not arrivals.times:
         return fresh, ""
-    step = (stamp_ns - arrivals.stamps_ns[-1]) * NANO
+    step = (stamp_ns - arrivals.stamps_ns[-1]) * S_PER_NS
     if step < -config.clock_jump_s:
         return fresh, "jumped"
     if step <= 0.0:
@@ -77,7 +77,7 @@ def arrived(
 
 def _lead(config: GateConfig, arrivals: Arrivals, stamp_ns: int, now: float) -> float:
     first_ns, first_s = arrivals.origin
-    return (stamp_ns - first_ns) * NANO / config.clock_rate - (now - first_s)
+    return (stamp_ns - first_ns) * S_PER_NS / config.clock_rate - (now - first_s)
 
 
 def _marked(
@@ -144,7 +144,7 @@ def rate(arrivals: Arrivals, now: float, settle_s: float) -> tuple[float, float]
         return 0.0, 0.0
     count = arrivals.count - first[2]
     passed = arrivals.times[-1] - first[0]
-    stamped = (arrivals.stamps_ns[-1] - first[1]) * NANO
+    stamped = (arrivals.stamps_ns[-1] - first[1]) * S_PER_NS
     return (count / passed if passed > 0.0 else float("inf")), count / stamped
 
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from nics_drl_bridge.geometry import between
+from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.safety import e_stop, frozen, moving, shield
-from nics_drl_bridge.safety.freshness import NANO, ODOM, SCAN, arrived
+from nics_drl_bridge.safety.freshness import ODOM, SCAN, arrived
 from nics_drl_bridge.safety.frozen import NOISE
 from nics_drl_bridge.safety.inputs import Command, Estimate, EStop, Input, Odometry, Press, Scan
 from nics_drl_bridge.safety.limits import greatest, implausible
@@ -185,7 +186,7 @@ def _leap(config: GateConfig, state: GateState, odometry: Odometry, now: float) 
     before, limits = state.odometry, config.limits
     if before is None or limits is None:
         return ""
-    stamped = (odometry.stamp_ns - before.stamp_ns) * NANO
+    stamped = (odometry.stamp_ns - before.stamp_ns) * S_PER_NS
     passed = max(stamped, now - state.odometries.times[-1])  # what little jitter there is in either
     slip, turned = (NOISE * std * passed for std in config.odom_std)
     turn = CAR_TURN if not limits.turn.any() else greatest(limits, limits.turn)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.safety import moving_kernels
 from nics_drl_bridge.safety.inputs import Scan
 from nics_drl_bridge.safety.state import GateConfig, GateState, ShieldConfig, View
@@ -18,20 +19,19 @@ MEMORY_S, SPACING_S = 0.45, 0.09
 """So old is a scan at most that the newest is compared with, and so far are they apart [s]."""
 TOLERANCE_M, DEVIATIONS = 0.03, 3.0
 """A place is free up to this, and so many standard deviations of the ranges, before its end [m]."""
-NANO = 1e-9
 
 
 def remember(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ...]:
     """The views of before that still count, oldest first, and that of a new scan at the end."""
     if config.shield is None or state.odometry is None:
         return ()
-    late = np.clip((scan.stamp_ns - state.odometry.stamp_ns) * NANO, -MEMORY_S, MEMORY_S)
+    late = np.clip((scan.stamp_ns - state.odometry.stamp_ns) * S_PER_NS, -MEMORY_S, MEMORY_S)
     pose = geometry.compose(state.odometry.pose, geometry.exp(late * state.odometry.twist))
     newest = View(scan.stamp_ns, pose, scan.ranges)
     kept: list[View] = []
     for view in state.views:
-        young = (scan.stamp_ns - view.stamp_ns) * NANO <= MEMORY_S
-        if young and (not kept or (view.stamp_ns - kept[-1].stamp_ns) * NANO >= SPACING_S):
+        young = (scan.stamp_ns - view.stamp_ns) * S_PER_NS <= MEMORY_S
+        if young and (not kept or (view.stamp_ns - kept[-1].stamp_ns) * S_PER_NS >= SPACING_S):
             kept.append(view)
     return (*kept, newest)
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.safety.gate import decide
@@ -15,8 +16,7 @@ from nics_drl_bridge.safety.state import GateConfig, begin
 
 LIDAR = load_lidar("paper")
 TICK_S, PERIOD_S = 0.02, 0.1
-NANO = 1_000_000_000
-START_STAMP = 1_700_000_000 * NANO
+START_STAMP = 1_700_000_000 * NS_PER_S
 
 
 def config(robot: str = "ackermann", **changes) -> GateConfig:
@@ -92,7 +92,7 @@ class Rig:
 
     def send(self, without: str = ""):
         """What arrives in a period."""
-        self.stamp += round(PERIOD_S * NANO)
+        self.stamp += round(PERIOD_S * NS_PER_S)
         if "odom" not in without:
             self.odom()
         if "scan" not in without:

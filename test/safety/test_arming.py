@@ -3,9 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.safety.arming import CHECKS
 from nics_drl_bridge.safety.inputs import Estimate, EStop, Reset
-from safety.rig import NANO, TICK_S, Rig, config
+from safety.rig import TICK_S, Rig, config
 
 
 def failed(rig, **how):
@@ -89,7 +90,7 @@ def test_a_simulation_that_runs_at_double_speed_keeps_its_declared_rates():
 def test_stamps_of_scan_and_odometry_that_are_far_apart_are_named(off_s):
     rig = Rig()
     scan = rig.scan
-    rig.scan = lambda: scan(stamp_ns=rig.stamp + round(off_s * NANO))
+    rig.scan = lambda: scan(stamp_ns=rig.stamp + round(off_s * NS_PER_S))
     rig.run(1.5)
     assert failed(rig) == {"clocks_agree"}
 
@@ -148,8 +149,8 @@ def test_a_latched_stop_is_named():
     rig = settled()
     assert rig.arm().granted
     rig.now += TICK_S
-    rig.scan(stamp_ns=rig.stamp + 60 * NANO)
-    rig.stamp += 60 * NANO
+    rig.scan(stamp_ns=rig.stamp + 60 * NS_PER_S)
+    rig.stamp += 60 * NS_PER_S
     rig.run(2.0)
     assert failed(rig) == {"nothing_latched"}
     assert rig.give(Reset()).granted

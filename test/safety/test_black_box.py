@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.safety.black_box import FORMAT, BlackBox, Entry, replay, write
 from nics_drl_bridge.safety.inputs import EStop
 from nics_drl_bridge.safety.plain import from_plain, to_plain
 from nics_drl_bridge.safety.state import ShieldConfig
-from safety.rig import NANO, TICK_S, Rig, config
+from safety.rig import TICK_S, Rig, config
 
 
 class Recorded(Rig):
@@ -34,7 +35,7 @@ def stopped(path, kept_s=30.0):
     rig.command([np.nan, 1.0, -0.0])
     rig.run(0.3)
     rig.now += TICK_S
-    rig.scan(stamp_ns=rig.stamp + 5 * NANO)
+    rig.scan(stamp_ns=rig.stamp + 5 * NS_PER_S)
     write(rig.config, rig.box.copy(), path)
     return rig
 

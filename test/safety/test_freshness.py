@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.safety.inputs import Reset
-from safety.rig import NANO, PERIOD_S, TICK_S, Rig, config, driving
+from safety.rig import PERIOD_S, TICK_S, Rig, config, driving
 
 
 class Stamped(Rig):
@@ -18,11 +19,11 @@ class Stamped(Rig):
     pace, delay_s = 1.0, 0.0
 
     def send(self, without=""):
-        self.stamp += round((self.pace - 1.0) * PERIOD_S * NANO)
+        self.stamp += round((self.pace - 1.0) * PERIOD_S * NS_PER_S)
         before = self.stamp
-        self.stamp -= round(self.delay_s * NANO)
+        self.stamp -= round(self.delay_s * NS_PER_S)
         super().send(without)
-        self.stamp = before + round(PERIOD_S * NANO)
+        self.stamp = before + round(PERIOD_S * NS_PER_S)
 
 
 def driven(pace=1.0, **changes):
@@ -49,7 +50,7 @@ def test_stamps_of_one_topic_that_run_ahead_are_named(topic):
 
     def ahead():
         lead[0] += 0.35
-        return send(stamp_ns=rig.stamp + round(lead[0] * NANO))
+        return send(stamp_ns=rig.stamp + round(lead[0] * NS_PER_S))
 
     setattr(rig, topic, ahead)
     assert rig.until_stopped(0.4) <= 0.4
@@ -107,7 +108,7 @@ def test_after_a_reset_the_present_is_the_normal_again():
 
 def test_a_simulator_that_falls_behind_real_time_goes_on_after_a_while():
     rig = driven(simulated=True)
-    rig.stamp -= round(0.45 * NANO)
+    rig.stamp -= round(0.45 * NS_PER_S)
     rig.until_stopped(1.0)
     rig.run(3.0)
     assert rig.moves
@@ -146,12 +147,12 @@ def test_odometry_of_any_rate_lets_the_gate_be_armed(hertz):
     step = 1.0 / hertz
     for k in range(round(1.5 * hertz)):
         rig.now += step
-        rig.odom(stamp_ns=rig.stamp + round(k * step * NANO))
+        rig.odom(stamp_ns=rig.stamp + round(k * step * NS_PER_S))
         if k % round(hertz * TICK_S) == 0:
             rig.tick()
         if k % round(hertz * PERIOD_S) == 0:
-            rig.scan(stamp_ns=rig.stamp + round(k * step * NANO))
+            rig.scan(stamp_ns=rig.stamp + round(k * step * NS_PER_S))
             rig.send("scan odom command")
-            rig.stamp -= round(PERIOD_S * NANO)
+            rig.stamp -= round(PERIOD_S * NS_PER_S)
     assert rig.arm().granted, rig.decision.answer
     assert len(rig.state.odometries.marks) < 40

@@ -3,9 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.safety.clocks import FROZEN_INPUTS
 from nics_drl_bridge.safety.inputs import Command, EStop, Odometry, Press, Reset, Scan, Tick
-from safety.rig import NANO, TICK_S, Rig, config, driving
+from safety.rig import TICK_S, Rig, config, driving
 
 EVERY_TOPIC = "scan odom estimate e_stop command"
 WITHIN_S = 0.40
@@ -105,7 +106,7 @@ def test_a_command_that_names_a_scan_that_never_came_stops_the_robot(off_s):
     rig = driving()
     for _ in range(4):
         rig.run(TICK_S, without="command")
-        rig.command(stamp=rig.stamp + round(off_s * NANO))
+        rig.command(stamp=rig.stamp + round(off_s * NS_PER_S))
     assert rig.rule == "scan_behind_unknown"
     assert not rig.published[-1][1].any()
 
@@ -196,9 +197,9 @@ def test_odometry_that_is_no_number_is_refused_and_feeds_no_watchdog(changes):
 def test_stamps_that_jump_latch_a_stop(jump_s, topic):
     rig = driving()
     rig.now += TICK_S
-    getattr(rig, topic)(stamp_ns=rig.stamp + round(jump_s * NANO))
+    getattr(rig, topic)(stamp_ns=rig.stamp + round(jump_s * NS_PER_S))
     assert (rig.rule, rig.decision.cause.topic) == ("stamps_jumped", topic)
-    rig.stamp += round(jump_s * NANO)
+    rig.stamp += round(jump_s * NS_PER_S)
     rig.run(2.0)
     assert not rig.moves
 
@@ -219,7 +220,7 @@ def test_stamps_that_freeze_are_no_new_data(topic):
 def test_a_scan_that_arrives_late_is_as_old_as_it_is():
     rig = driving()
     rig.run(0.3, without="scan command")
-    rig.scan(stamp_ns=rig.stamp - round(0.3 * NANO) + 1)  # held back for 0.3 s
+    rig.scan(stamp_ns=rig.stamp - round(0.3 * NS_PER_S) + 1)  # held back for 0.3 s
     rig.command(stamp=rig.state.scans.stamps_ns[-1])
     rig.run(0.08, without="scan command")
     assert rig.rule == "scan_silent"
@@ -242,7 +243,7 @@ def test_a_clock_that_stands_still_stops_the_robot():
 def test_a_gate_that_was_asleep_starts_with_a_stop():
     rig = driving()
     rig.now += 0.22
-    rig.stamp += round(0.22 * NANO)
+    rig.stamp += round(0.22 * NS_PER_S)
     for wake in (lambda: rig.give(EStop(False)), rig.odom, rig.scan, rig.command):
         wake()
     assert rig.tick().cause.rule == "own_clock"
@@ -253,7 +254,7 @@ def test_a_gate_that_was_asleep_starts_with_a_stop():
 def test_the_first_word_of_a_gate_that_was_asleep_is_a_zero_whatever_wakes_it(first):
     rig = driving()
     rig.now += 0.25
-    rig.stamp += round(0.05 * NANO)
+    rig.stamp += round(0.05 * NS_PER_S)
     known = len(rig.published)
     inputs = {
         "scan": rig.scan, "odom": rig.odom, "command": rig.command, "tick": rig.tick,
@@ -320,8 +321,8 @@ def test_a_reset_does_not_release_an_e_stop_that_is_held():
 def test_a_latched_stop_can_not_be_armed_away():
     rig = driving()
     rig.now += TICK_S
-    rig.scan(stamp_ns=rig.stamp + 10 * NANO)
-    rig.stamp += 10 * NANO
+    rig.scan(stamp_ns=rig.stamp + 10 * NS_PER_S)
+    rig.stamp += 10 * NS_PER_S
     rig.speed = 0.0
     rig.run(2.0)
     assert rig.rule == "stamps_jumped"

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.safety.inputs import Odometry, Scan
 from nics_drl_bridge.safety.moving import MEMORY_S, SPACING_S, movers, remember
 from nics_drl_bridge.safety.state import ShieldConfig, View, begin
@@ -13,7 +14,6 @@ from safety.rig import LIDAR, Rig, config
 
 SHIELD = ShieldConfig(0.2, 2.0, 0.05, 0.2, 0.15, 0.2, obstacle_speed=1.0, range_max=3.0)
 GIVEN = config(shield=SHIELD)
-NANO = 1_000_000_000
 WALL_Y = 1.5
 
 
@@ -39,7 +39,7 @@ def drive(twist, discs_at, times=(0.0, 0.1, 0.2, 0.3), **noise):
     """Views along an arc, of discs that are somewhere at each time."""
     poses = [geometry.exp(t * np.array(twist)) for t in times]
     return tuple(
-        View(round(t * NANO), pose, seen(pose, discs_at(t), **noise))
+        View(round(t * NS_PER_S), pose, seen(pose, discs_at(t), **noise))
         for t, pose in zip(times, poses, strict=True)
     )
 
@@ -110,22 +110,22 @@ def test_where_all_is_taken_to_stand_nothing_moves():
 
 
 def test_the_views_of_the_last_moments_are_kept_apart_from_each_other():
-    state, step = begin(GIVEN), NANO // 40
+    state, step = begin(GIVEN), NS_PER_S // 40
     for index in range(40):
         state = replace(state, odometry=Odometry(index * step, np.zeros(3), np.zeros(3)))
         scan = Scan(index * step, np.full(LIDAR.beams, 1.0, np.float32), (0.0, 0.01))
         state = replace(state, views=remember(GIVEN, state, scan))
     stamps = np.array([view.stamp_ns for view in state.views])
     assert stamps[-1] == 39 * step
-    assert (np.diff(stamps[:-1]) >= SPACING_S * NANO).all()
-    assert MEMORY_S / 2 < (stamps[-1] - stamps[0]) / NANO <= MEMORY_S
+    assert (np.diff(stamps[:-1]) >= SPACING_S * NS_PER_S).all()
+    assert MEMORY_S / 2 < (stamps[-1] - stamps[0]) / NS_PER_S <= MEMORY_S
     assert 4 <= len(stamps) <= 6
 
 
 def test_a_view_is_from_where_the_robot_was_when_it_was_scanned():
-    odometry = Odometry(5 * NANO, np.array([1.0, 2.0, np.pi / 2]), np.array([1.0, 0.0, 0.0]))
+    odometry = Odometry(5 * NS_PER_S, np.array([1.0, 2.0, np.pi / 2]), np.array([1.0, 0.0, 0.0]))
     state = replace(begin(GIVEN), odometry=odometry)
-    scan = Scan(5 * NANO + NANO // 10, np.ones(LIDAR.beams, np.float32), (0.0, 0.01))
+    scan = Scan(5 * NS_PER_S + NS_PER_S // 10, np.ones(LIDAR.beams, np.float32), (0.0, 0.01))
     assert remember(GIVEN, state, scan)[-1].pose == pytest.approx([1.0, 2.1, np.pi / 2])
     assert remember(config(), state, scan) == ()
 
