@@ -16,7 +16,7 @@ from measuring.rates import interleaved, medians, shortest
 from measuring.scenes import BATCH, SCENES, SPEC, random_batch
 from measuring.verdict import answer, parser_of
 
-from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.sensor_models import IncidenceDropout, Intensity, SensorModel
 from nics_drl_bridge.lidar.table import Density

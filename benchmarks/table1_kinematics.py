@@ -17,12 +17,12 @@ from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.kinematics import kernels
-from nics_drl_bridge.kinematics.fit import fit
-from nics_drl_bridge.kinematics.model import TaylorModel
-from nics_drl_bridge.kinematics.recording import Samples
-from nics_drl_bridge.kinematics.spec import CommandVariable, RobotSpec, load_robot
-from nics_drl_bridge.kinematics.textbook import textbook
+from nics_drl_bridge.identify.fit import fit
+from nics_drl_bridge.recording.recording import Samples
+from nics_drl_bridge.recording.textbook import textbook
+from nics_drl_bridge.robot import kernels
+from nics_drl_bridge.robot.spec import CommandVariable, RobotSpec, load_robot
+from nics_drl_bridge.robot.taylor import TaylorModel
 
 CONTROLS = {
     "rounded": "the coefficients of the fitted models have two digits",

@@ -19,7 +19,7 @@ except PackageNotFoundError:  # a source tree that was never installed
 __all__ = ["__version__"]
 
 if "gymnasium" in sys.modules:
-    import nics_drl_bridge.env.registration  # noqa: F401 - registers as it is imported
+    import nics_drl_bridge.env.registry  # noqa: F401 - registers as it is imported
 else:
     from nics_drl_bridge.discovery import register_on_import
 

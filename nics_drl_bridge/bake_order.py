@@ -11,13 +11,13 @@ from nics_drl_bridge.config import validate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_above, write_bytes
 from nics_drl_bridge.generator import footprint_shape
-from nics_drl_bridge.kinematics.spec import load_robot
-from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.budget import choose, expected_rmse, parse_size
 from nics_drl_bridge.lidar.sensor_models import load_sensor_models
 from nics_drl_bridge.lidar.shapes import Shape, describe, load_shapes
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import Density, LidarTable
+from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.world import load_world
 
 Told = Callable[[str, int, int], None]

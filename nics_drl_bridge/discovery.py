@@ -14,7 +14,7 @@ from importlib.machinery import ModuleSpec, PathFinder
 from types import ModuleType
 
 GYMNASIUM = "gymnasium"
-REGISTRATION = "nics_drl_bridge.env.registration"
+REGISTRATION = "nics_drl_bridge.env.registry"
 
 
 class _Registering(Loader):

@@ -11,24 +11,24 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from nics_drl_bridge.calibration.calibration import Calibration
-from nics_drl_bridge.calibration.fit_report import fit_report
-from nics_drl_bridge.calibration.identify import Identified, identify
-from nics_drl_bridge.calibration.noise_model import Noise
-from nics_drl_bridge.calibration.usefulness import why_useless
 from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError, FitError, ModelError
 from nics_drl_bridge.files import check_folder, sha256, whole_folder, write_bytes, write_text
-from nics_drl_bridge.kinematics import fit, textbook
-from nics_drl_bridge.kinematics.latency import Latency
-from nics_drl_bridge.kinematics.model import TaylorModel
-from nics_drl_bridge.kinematics.recording import Recording
-from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
-from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.identify import fit
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.identify import Identified, identify
+from nics_drl_bridge.identify.report import fit_report
+from nics_drl_bridge.identify.usefulness import why_useless
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.budget import choose
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
+from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.robot.noise import Latency, Noise
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
+from nics_drl_bridge.robot.taylor import TaylorModel
 
 __all__ = [
     "Noise",

@@ -10,8 +10,8 @@ import numpy as np
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.kinematics import topic_roles as kinds
-from nics_drl_bridge.kinematics.bag_messages import typestore
+from nics_drl_bridge.recording import topic_roles as kinds
+from nics_drl_bridge.recording.messages import typestore
 
 STORE = typestore()
 START_S = 1_700_000_000.0

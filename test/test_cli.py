@@ -13,15 +13,15 @@ import typer
 from nics_drl_bridge import __version__
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.generator import load_model
-from nics_drl_bridge.kinematics import textbook
-from nics_drl_bridge.kinematics.recording import save_recording
-from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.recording.recording import save_recording
+from nics_drl_bridge.robot.spec import load_robot
 
 MODEL_FILES = {"model.yaml", "lidar_table.npz", "report.txt"}
 
 
 def nics(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "nics_drl_bridge.cli", *map(str, words)]
+    command = [sys.executable, "-m", "nics_drl_bridge.commands.cli", *map(str, words)]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=100)
 
 

@@ -7,6 +7,8 @@ import pytest
 
 from nics_drl_bridge.config import load_yaml, read_text, share_folder
 from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.gate.black_box import replay
+from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import (
     TABLE_FILE,
     builtin_model,
@@ -15,13 +17,6 @@ from nics_drl_bridge.generator import (
     open_model,
     save_model,
 )
-from nics_drl_bridge.kinematics.csv_reader import load_csv_folder
-from nics_drl_bridge.kinematics.drive_file import check_out, write_drive
-from nics_drl_bridge.kinematics.readers import read_recording
-from nics_drl_bridge.kinematics.recording import load_npz, save_recording
-from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
-from nics_drl_bridge.kinematics.textbook import record
-from nics_drl_bridge.kinematics.topic_roles import topic_roles
 from nics_drl_bridge.lidar.maps import load_map
 from nics_drl_bridge.lidar.sensor_models import load_sensor_models
 from nics_drl_bridge.lidar.shapes import load_shapes
@@ -30,9 +25,13 @@ from nics_drl_bridge.lidar.table import LidarTable
 from nics_drl_bridge.middleware.playback import Estimate, write_estimate
 from nics_drl_bridge.policy.policy_file import load_policy, shipped
 from nics_drl_bridge.policy.training_settings import load_training
+from nics_drl_bridge.recording.readers import load_csv_folder, read_recording
+from nics_drl_bridge.recording.recording import load_npz, save_recording
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.recording.topic_roles import topic_roles
+from nics_drl_bridge.recording.write import check_out, write_drive
 from nics_drl_bridge.report.doctor_facts import facts_of_bag
-from nics_drl_bridge.safety.black_box import replay
-from nics_drl_bridge.safety.limits import load_limits
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.sim.randomisation import load_randomisation
 from nics_drl_bridge.sim.world import load_world
 
@@ -71,10 +70,10 @@ def test_a_recording_is_saved_and_loaded_at_either(tmp_path, kind):
 @KINDS
 def test_a_bag_is_saved_told_and_looked_through_at_either(tmp_path, kind):
     pytest.importorskip("rosbags")
-    from nics_drl_bridge.kinematics.bag_file import is_bag
-    from nics_drl_bridge.kinematics.bag_info import bag_info
-    from nics_drl_bridge.kinematics.bag_salvage import salvage
-    from nics_drl_bridge.kinematics.bag_writer import write_bag
+    from nics_drl_bridge.extras.bags.info import bag_info
+    from nics_drl_bridge.extras.bags.salvage import salvage
+    from nics_drl_bridge.recording.bag_file import is_bag
+    from nics_drl_bridge.recording.write import write_bag
 
     place, rest = kind(tmp_path / "drive"), kind(tmp_path / "rest")
     write_bag(record(CAR, np.random.default_rng(0), duration=5.0), place, CAR)

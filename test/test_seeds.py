@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from robots import direct_model
 
+from nics_drl_bridge.commands.episodes import Order, seeds_of
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.evaluate import Order, seeds_of
-from nics_drl_bridge.kinematics.drive_plan import DrivePlan
-from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.recording.drive_plan import DrivePlan
+from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.seeds import GREATEST_SEED, checked_seeds
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.simulator import FastSimulator

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.gate.gate import decide
+from nics_drl_bridge.gate.inputs import Arm, Command, Input, Odometry, Reset, Scan, Tick
+from nics_drl_bridge.gate.limits import load_limits
+from nics_drl_bridge.gate.state import Decision, GateConfig, begin
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.kinematics.spec import RobotSpec
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.safety.gate import decide
-from nics_drl_bridge.safety.inputs import Arm, Command, Input, Odometry, Reset, Scan, Tick
-from nics_drl_bridge.safety.limits import load_limits
-from nics_drl_bridge.safety.state import Decision, GateConfig, begin
+from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 Witness = Callable[[Decision, float], None]

@@ -12,14 +12,14 @@ import numpy as np
 
 from measuring.attempt import Attempt, nics
 from nics_drl_bridge.config import dump_yaml, parse_yaml, share_folder
-from nics_drl_bridge.kinematics.spec import load_robot
-from nics_drl_bridge.kinematics.topic_roles import topic_roles
+from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.lidar.maps import load_map
 from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.shapes import Circle, load_shapes
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.policy.training_settings import load_training
-from nics_drl_bridge.safety.limits import load_limits
+from nics_drl_bridge.recording.topic_roles import topic_roles
+from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.randomisation import load_randomisation
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import load_world

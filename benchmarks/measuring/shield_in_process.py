@@ -9,11 +9,11 @@ import numpy as np
 
 from measuring.gates import Gate, Witness, gate_config
 from measuring.shield_places import SCAN_STEPS, STEP_S, Job, Outcome, Place
+from nics_drl_bridge.gate.inputs import Command, Input, Odometry, Scan
+from nics_drl_bridge.gate.limits import load_limits
+from nics_drl_bridge.gate.state import GateConfig
+from nics_drl_bridge.gate.stopping import shield_config
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.safety.inputs import Command, Input, Odometry, Scan
-from nics_drl_bridge.safety.limits import load_limits
-from nics_drl_bridge.safety.state import GateConfig
-from nics_drl_bridge.safety.stopping import shield_config
 
 MOST_SCAN_LATE_S, MOST_TOLD_LATE_S = 0.29, 0.1
 """Greatest delay of a scan, or of the command behind it, to the gate; and of the gate's command to

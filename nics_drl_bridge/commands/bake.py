@@ -7,10 +7,7 @@ from typing import Annotated
 
 import typer
 
-from nics_drl_bridge.commands.console import (
-    one_sentence,
-    progress_bar,
-)
+from nics_drl_bridge.commands.console import one_sentence, progress_bar
 
 
 def bake(

@@ -7,11 +7,7 @@ from typing import Annotated
 
 import typer
 
-from nics_drl_bridge.commands.console import (
-    EXIT_INTERRUPTED,
-    RobotOption,
-    one_sentence,
-)
+from nics_drl_bridge.commands.console import EXIT_INTERRUPTED, RobotOption, one_sentence
 
 
 def record(

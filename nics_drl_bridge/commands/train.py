@@ -68,7 +68,7 @@ def train(
         if resume and out is None:
             raise ConfigError("--resume needs --out, the folder of the run to go on with.")
         try:
-            from nics_drl_bridge.policy import train_run
+            from nics_drl_bridge.policy import train as train_run
         except ModuleNotFoundError as error:
             raise ConfigError(
                 f"training needs the module {error.name!r}; pip install 'nics_drl_bridge[train]'."
@@ -91,7 +91,6 @@ def _learner(
 ) -> Iterator[Any]:
     """What trains one policy; while it is open, it is connected with its cluster."""
     from nics_drl_bridge.errors import ConfigError, nearest
-    from nics_drl_bridge.policy.train import train
 
     if engine not in ENGINES:
         raise ConfigError(f"unknown engine {engine!r}; {nearest(engine, ENGINES)}")
@@ -102,8 +101,8 @@ def _learner(
         yield train
         return
     try:
-        from nics_drl_bridge.policy.train_ray import train_on_ray
-        from nics_drl_bridge.policy.train_ray_cluster import connected
+        from nics_drl_bridge.extras.ray.cluster import connected
+        from nics_drl_bridge.extras.ray.engine import train_on_ray
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"--engine ray needs the module {error.name!r}; pip install "

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 Actions = Literal["continuous", "discrete"]

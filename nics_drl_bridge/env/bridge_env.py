@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.actions import check_action, check_command, still, team_space
-from nics_drl_bridge.env.backends import halting, make_backend
-from nics_drl_bridge.env.guard import halts_on_error
-from nics_drl_bridge.env.reset_arguments import check_options, check_reset
-from nics_drl_bridge.env.sim_backend import SimBackend
+from nics_drl_bridge.env.guard import check_options, check_reset, halts_on_error
+from nics_drl_bridge.env.registry import make_task
+from nics_drl_bridge.env.sim_backend import SimBackend, halting, make_backend
 from nics_drl_bridge.env.task import Episodes, Memory, Task, give, override
-from nics_drl_bridge.env.tasks import make_task
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend, RobotView, Start

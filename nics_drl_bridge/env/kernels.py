@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.canonical_kernels import resample
+from nics_drl_bridge.lidar.sector_kernels import resample
 from nics_drl_bridge.random_kernels import episode_seed
 
 LIMIT = 1000.0

@@ -12,7 +12,7 @@ from pettingzoo import ParallelEnv
 
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, BridgeEnv
 from nics_drl_bridge.env.guard import halts_on_error
-from nics_drl_bridge.env.registration import MAX_EPISODE_STEPS
+from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel

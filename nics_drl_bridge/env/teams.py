@@ -1,11 +1,23 @@
-"""What tasks of several robots share: who sees whom and what, (..., M, P)."""
+"""What tasks of several robots share: who sees whom and what, (..., M, P).
+
+Cooperative reaching: a team has to reach several goals, whoever reaches which.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
+from nics_drl_bridge.env.kernels import LIMIT
+from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Task, limited
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.interface import RobotView
 
 Array = NDArray[np.float64]
 
@@ -50,3 +62,134 @@ def total(values: Array) -> Array:
     for k in range(1, values.shape[-1]):
         summed += values[..., k]
     return np.asarray(summed)
+
+
+@dataclass(frozen=True)
+class CooperativeReaching(Task):
+    """M robots have to reach M goals; a goal is reached for all as soon as one robot was there.
+
+    ## Observation Space
+
+    Of one robot, `Box((B + 4 M + 3 (M - 1) + 3,), float32)`, B beams or
+    sectors. The robots tell each other where they are.
+
+    | Num | Observation | Min | Max | Unit |
+    |---|---|---|---|---|
+    | 0 to B - 1 | range in shares of the greatest; 1 free, 0 too close or unknown | 0 | 1 | - |
+    | 4 for each goal | distance | 0 | 1000 | m |
+    | | cosine, sine of the bearing | -1 | 1 | - |
+    | | whether it has been reached | 0 | 1 | - |
+    | 3 for each other robot, in order | distance | 0 | 1000 | m |
+    | | cosine, sine of the bearing | -1 | 1 | - |
+    | the last 3 | estimated velocity forward, left; turn rate | -1000 | 1000 | m/s, rad/s |
+
+    ## Action Space
+
+    Of one robot as in navigation: `Box(-1, 1, (C,), float32)`, or `Discrete`.
+
+    ## Rewards
+
+    Of each robot: `progress`, 1 per metre by which the open goals became nearer to the robot that
+    is nearest to each, shared by the team; `time`, -0.01 per step; `reached`, 10 for each goal
+    that is reached, shared by the team; `collision`, -10 for the robot that touches something.
+
+    ## Starting State
+
+    Obstacles, starts and goals are drawn by the world. Memory: `goal` (M, 2) [m], `reached` (M,).
+
+    ## Episode End
+
+    For a robot when it touches something, and it then stands still as one more obstacle; for all
+    when the last goal is reached.
+
+    Attributes:
+        robots: M.
+        goal_radius: how near is there [m].
+        reached_reward: of the team, for each goal.
+        collision_reward: of a robot, for a touch.
+        progress_reward: per metre of approach.
+        time_reward: per step.
+    """
+
+    keeps_last_scan: ClassVar[bool] = False
+    shown: ClassVar[tuple[str, ...]] = ("goal",)
+
+    robots: int = 3
+    goal_radius: float = 0.3
+    reached_reward: float = 10.0
+    collision_reward: float = -10.0
+    progress_reward: float = 1.0
+    time_reward: float = -0.01
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.robots < 2:
+            raise ConfigError(f"task option robots={self.robots}: a team has at least 2.")
+
+    @cached_property
+    def observation_space(self) -> gymnasium.spaces.Box:
+        """Box of one robot's observation."""
+        place, low = [LIMIT, 1.0, 1.0], [0.0, -1.0, -1.0]
+        mates = self.robots - 1
+        return self.box(
+            [*[*low, 0.0] * self.robots, *low * mates, *[-LIMIT] * 3],
+            [*[*place, 1.0] * self.robots, *place * mates, *[LIMIT] * 3],
+        )
+
+    def reset(self, episodes: Episodes) -> Memory:
+        """No goal has been reached; `newly` is what the last step added."""
+        goals = episodes.goals.copy()
+        none = np.zeros(goals.shape[:-1], np.bool_)
+        return {"goal": goals, "reached": none, "newly": none.copy()}
+
+    def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:
+        """Marks the goals that some robot is at."""
+        there = (distances(after.pose, memory["goal"]) < self.goal_radius).any(axis=-2)
+        memory["newly"][...] = there & ~memory["reached"]
+        memory["reached"] |= there
+
+    def observation(self, view: RobotView, memory: Memory) -> Observation:
+        """The observation (..., M, O) of views (..., M)."""
+        goals = seen(view.pose, memory["goal"])
+        reached = np.broadcast_to(memory["reached"][..., None, :, None], (*goals.shape[:-1], 1))
+        lead = view.pose.shape[:-1]
+        parts = [
+            self.free_share(view.ranges),
+            np.concatenate([goals, reached], axis=-1).reshape(*lead, -1),
+            others(seen(view.pose, view.pose[..., :2])).reshape(*lead, -1),
+            limited(view.twist),
+        ]
+        return np.concatenate(parts, axis=-1, dtype=np.float32, casting="same_kind")
+
+    def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
+        """The terms (..., M)."""
+        lead = after.pose.shape[:-1]
+        gaps = [distances(view.pose, memory["goal"]).min(axis=-2) for view in (before, after)]
+        # A goal just reached still pays its last approach.
+        open_goals = ~memory["reached"] | memory["newly"]
+        approach = np.where(open_goals, gaps[0] - gaps[1], 0.0)
+        share = 1.0 / self.robots
+        newly = total(memory["newly"].astype(np.float64))
+        return {
+            "progress": np.broadcast_to(
+                self.progress_reward * share * total(approach)[..., None], lead
+            ).copy(),
+            "time": np.full(lead, self.time_reward),
+            "reached": np.broadcast_to(self.reached_reward * share * newly[..., None], lead).copy(),
+            "collision": self.collision_reward * self.touches(after.ranges),
+        }
+
+    def end(self, view: RobotView, memory: Memory) -> Flags:
+        """Whether a robot touches something, or all goals are reached."""
+        done = np.asarray(memory["reached"].all(axis=-1))[..., None]
+        return np.asarray(self.touches(view.ranges) | done)
+
+    def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
+        """Success of the team, touches, and which goals have been reached (..., M)."""
+        all_reached = np.asarray(memory["reached"].all(axis=-1))[..., None]
+        done = np.broadcast_to(all_reached, view.pose.shape[:-1])
+        return {
+            "is_success": done.copy(),
+            "collision": self.touches(view.ranges),
+            "reached": memory["reached"].copy(),
+        }

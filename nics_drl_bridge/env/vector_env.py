@@ -12,15 +12,17 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env import vector_info
+from nics_drl_bridge.env import vector_rows
 from nics_drl_bridge.env.actions import check_action, still, team_space
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
+from nics_drl_bridge.env.guard import check_options, check_reset
 from nics_drl_bridge.env.kernels import episode_seeds
-from nics_drl_bridge.env.reset_arguments import check_options, check_reset
+from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, give, override
-from nics_drl_bridge.env.tasks import make_task
-from nics_drl_bridge.env.vector_facts import EVERY, Rows, VectorFacts
-from nics_drl_bridge.env.vector_parts import (
+from nics_drl_bridge.env.vector_rows import (
+    EVERY,
+    Rows,
+    VectorFacts,
     chosen_worlds,
     flat,
     joined,
@@ -173,7 +175,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._begin(rows, self._out, options)
         infos: dict[str, Any] = {}
         facts = self._known(rows) | self._facts.beginnings(self._starts, self._bodies, rows)
-        vector_info.put_rows(infos, facts, rows, self.num_envs)
+        vector_rows.put_rows(infos, facts, rows, self.num_envs)
         self.ready = True
         return flat(self._out.copy() if self.copy else self._out), infos
 
@@ -268,10 +270,10 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """SAME_STEP: the worlds that ended begin anew; what they ended with goes into `infos`."""
         rows = np.flatnonzero(over)
         if len(rows):
-            infos.update(vector_info.finals(flat(out), rows))
+            infos.update(vector_rows.finals(flat(out), rows))
             final: dict[str, Any] = {}
-            known = self._known(rows) | vector_info.rows_of(facts, rows)
-            vector_info.put_rows(final, known, rows, self.num_envs)
+            known = self._known(rows) | vector_rows.rows_of(facts, rows)
+            vector_rows.put_rows(final, known, rows, self.num_envs)
             infos["final_info"], infos["_final_info"] = final, over.copy()
             self.simulator.run_parts(
                 lambda part: self._begin(part.start + np.flatnonzero(over[part]), out)
@@ -280,13 +282,13 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
         """Puts into `infos` what is known of every world, and how those in `begun` began."""
-        vector_info.put_all(infos, self._known(), np.zeros_like(begun))
+        vector_rows.put_all(infos, self._known(), np.zeros_like(begun))
         rows = np.flatnonzero(begun)
         if len(rows) < self.num_envs:
-            vector_info.put_all(infos, facts, begun)
+            vector_rows.put_all(infos, facts, begun)
         if len(rows):
             beginnings = self._facts.beginnings(self._starts, self._bodies, rows)
-            vector_info.put_rows(infos, beginnings, rows, self.num_envs)
+            vector_rows.put_rows(infos, beginnings, rows, self.num_envs)
 
     def _known(self, rows: Rows = EVERY) -> dict[str, Any]:
         shown = {name: self.memory[name] for name in self.task.shown}

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar import kernels
+from nics_drl_bridge.lidar import exact_kernels
 
 EDGE = 1e-6
 """So far within an edge, as a part of the whole width, is its range taken."""
@@ -33,11 +33,11 @@ def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[n
                 edges[t, d, 0], edges[t, d, 1] = -half, half
                 hints[t, d] = 0
                 continue
-            rx, ry = kernels.turned(distances[d], 0.0, c, s, hull[0])
+            rx, ry = exact_kernels.turned(distances[d], 0.0, c, s, hull[0])
             lx, ly = rx, ry
             right = left = 0
             for v in range(1, hull.shape[0]):
-                x, y = kernels.turned(distances[d], 0.0, c, s, hull[v])
+                x, y = exact_kernels.turned(distances[d], 0.0, c, s, hull[v])
                 if rx * y - ry * x < 0.0:
                     rx, ry, right = x, y, v
                 if lx * y - ly * x > 0.0:
@@ -53,12 +53,12 @@ def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untype
     ray[0, 0], ray[0, 1] = math.cos(angle), math.sin(angle)
     beams = (angle, 1.0, 0.0)
     if corners.shape[0] == 0:
-        kernels.circle(out, ray, beams, distance, 0.0, radius, np.inf)
+        exact_kernels.circle(out, ray, beams, distance, 0.0, radius, np.inf)
     else:
-        kernels.polygon(out, ray, beams, distance, 0.0, cos, sin, corners)
+        exact_kernels.polygon(out, ray, beams, distance, 0.0, cos, sin, corners)
         if not np.isfinite(out[0]):  # a wall seen edge-on
             for v in range(corners.shape[0]):
-                x, y = kernels.turned(distance, 0.0, cos, sin, corners[v])
+                x, y = exact_kernels.turned(distance, 0.0, cos, sin, corners[v])
                 out[0] = min(out[0], math.hypot(x, y))
     return out[0]
 
@@ -78,9 +78,9 @@ def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # 
     """
     fine[:] = np.inf
     if corners.shape[0] == 0:
-        kernels.circle(fine, directions, beams, distance, 0.0, radius, np.inf)
+        exact_kernels.circle(fine, directions, beams, distance, 0.0, radius, np.inf)
     else:
-        kernels.polygon(fine, directions, beams, distance, 0.0, cos, sin, corners)
+        exact_kernels.polygon(fine, directions, beams, distance, 0.0, cos, sin, corners)
     count = fine.shape[0]
     first = min(max(math.ceil((edge[0] - beams[0]) / beams[1]), 0), count - 1)
     last = max(min(math.floor((edge[1] - beams[0]) / beams[1]), count - 1), 0)

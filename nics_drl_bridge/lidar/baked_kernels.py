@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.map_memory_kernels import get, peek, put
+from nics_drl_bridge.lidar.map_kernels import get, peek, put
 
 LANES = 144
 """So many bodies go through the passes together: a multiple of `BLOCK`, and few enough that the

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.lidar.baking import MOST_NUMBERS, bake, grid_of
+from nics_drl_bridge.lidar.bake import MOST_NUMBERS, bake, grid_of
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.sensor_models import intensity_of
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape

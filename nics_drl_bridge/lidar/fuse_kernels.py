@@ -45,7 +45,7 @@ from nics_drl_bridge.lidar.baked_kernels import (
     silhouettes,
 )
 from nics_drl_bridge.lidar.block_kernels import BLOCK, lower_beam, lower_block, prefetch
-from nics_drl_bridge.lidar.map_memory_kernels import get, peek, put
+from nics_drl_bridge.lidar.map_kernels import get, peek, put
 
 SOON = 8
 """The rows of the body so many places on are asked for."""

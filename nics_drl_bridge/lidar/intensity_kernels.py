@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar import bake_kernels, kernels, map_kernels, scan_kernels
+from nics_drl_bridge.lidar import bake_kernels, exact_kernels, map_kernels, scan_kernels
 from nics_drl_bridge.lidar import baked_kernels as baking
 from nics_drl_bridge.lidar.sensor_models import NEAREST
 
@@ -46,7 +46,7 @@ def circle(scan, directions, beams, x, y, radius, surface, range_max):  # type: 
     """
     nearest, light, before = scan
     keep(before, nearest)
-    kernels.circle(nearest, directions, beams, x, y, radius, range_max)
+    exact_kernels.circle(nearest, directions, beams, x, y, radius, range_max)
     for i in range(nearest.shape[0]):
         if nearest[i] < before[i]:
             along = directions[i, 0] * x + directions[i, 1] * y
@@ -58,7 +58,7 @@ def segment(scan, directions, beams, x1, y1, x2, y2, surface):  # type: ignore[n
     """As `kernels.segment`: cos(incidence) is the distance of its line over the range."""
     nearest, light, before = scan
     keep(before, nearest)
-    kernels.segment(nearest, directions, beams, x1, y1, x2, y2)
+    exact_kernels.segment(nearest, directions, beams, x1, y1, x2, y2)
     ex, ey = x2 - x1, y2 - y1
     away = np.float32(abs(x1 * ey - y1 * ex) / math.sqrt(ex * ex + ey * ey))
     if surface[0] == 1.0:  # without a power, many at a time
@@ -79,9 +79,9 @@ def outline(scan, directions, beams, x, y, c, s, corners, radius, surface, range
     if corners.shape[0] == 0:
         circle(scan, directions, beams, x, y, radius, surface, range_max)
         return
-    ax, ay = kernels.turned(x, y, c, s, corners[corners.shape[0] - 1])
+    ax, ay = exact_kernels.turned(x, y, c, s, corners[corners.shape[0] - 1])
     for v in range(corners.shape[0]):
-        bx, by = kernels.turned(x, y, c, s, corners[v])
+        bx, by = exact_kernels.turned(x, y, c, s, corners[v])
         segment(scan, directions, beams, ax, ay, bx, by, surface)
         ax, ay = bx, by
 
@@ -147,8 +147,8 @@ def fuse(scan, beams, bearing, half, ranges, reflectance):  # type: ignore[no-un
     nearest, light, _ = scan
     count, turns = nearest.shape[0], 1 if beams[2] > 0.0 else 3
     for turn in range(turns):
-        middle = bearing + (0.0 if turns == 1 else (turn - 1) * kernels.TWO_PI)
-        first, hits = kernels.beam_span(middle - half, middle + half, beams, count)
+        middle = bearing + (0.0 if turns == 1 else (turn - 1) * exact_kernels.TWO_PI)
+        first, hits = exact_kernels.beam_span(middle - half, middle + half, beams, count)
         for k in range(hits):
             i = first + k
             i -= count if i >= count else 0
@@ -223,7 +223,7 @@ def intensities_of_worlds(  # type: ignore[no-untyped-def]
     for n in chosen:
         for m in range(poses.shape[1]):
             me = first + m if first >= 0 else -1
-            sx, sy, _, c, s = kernels.to_sensor(poses, n, m, mount)
+            sx, sy, _, c, s = exact_kernels.to_sensor(poses, n, m, mount)
             place = (sx, sy, c, s)
             set_apart(apart, poses[n, m], bodies, n, me, sx, sy, high, baked)
             scan_kernels.scan_worlds(near, apart[0], every, apart[1], -1, none, sensor, room)
@@ -234,7 +234,7 @@ def intensities_of_worlds(  # type: ignore[no-untyped-def]
                 if radius > 0.0:
                     dx, dy = bodies[n, k, 0] - sx, bodies[n, k, 1] - sy
                     half = math.asin(min(radius / math.hypot(dx, dy), 1.0)) + beams[1]
-                    bearing = kernels.arctan2(c * dy - s * dx, c * dx + s * dy)
+                    bearing = exact_kernels.arctan2(c * dy - s * dx, c * dx + s * dy)
                     fuse(scan, beams, bearing, half, near[k, 0], light[k, 0])
                 elif baking.left_out(bodies, n, k, me, sx, sy, high, baked):
                     surface = (device[EXPONENT], surfaces[int(bodies[n, k, 6])])

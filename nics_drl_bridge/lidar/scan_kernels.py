@@ -6,7 +6,7 @@ import math
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import baked_kernels as baking
-from nics_drl_bridge.lidar import fuse_kernels, kernels, map_kernels
+from nics_drl_bridge.lidar import exact_kernels, fuse_kernels, map_kernels
 
 
 @kernel
@@ -34,9 +34,9 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
     of_world, of_robot = ranges.strides[0] // 4, ranges.strides[1] // 4
     for n in chosen:
         for m in range(poses.shape[1]):
-            kernels.clear(ranges, n, m)
+            exact_kernels.clear(ranges, n, m)
             me = first + m if first >= 0 else -1
-            sx, sy, heading = kernels.sensor_pose(poses, n, m, mount)
+            sx, sy, heading = exact_kernels.sensor_pose(poses, n, m, mount)
             scan = sx, sy, heading + beams[0], float(n * of_world + m * of_robot)
             begin, missed = 0, 0
             while begin < count:
@@ -53,13 +53,13 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
                 c, s = math.cos(heading), math.sin(heading)
                 for k in range(count if missed > 0 else 0):
                     if baking.left_out(bodies, n, k, me, sx, sy, high, baked):
-                        kernels.body_into(
+                        exact_kernels.body_into(
                             out, directions, beams, sx, sy, c, s, bodies[n, k], corners, corner,
                             high,
                         )  # fmt: skip
-                near = kernels.walls_into(out, directions, beams, sx, sy, c, s, walls, high)
+                near = exact_kernels.walls_into(out, directions, beams, sx, sy, c, s, walls, high)
                 if near > 0 or missed > 0:
-                    kernels.finish(out, limits[0], high)
+                    exact_kernels.finish(out, limits[0], high)
     fuse_kernels.look_up(found, ranges, beams, limits, lookup, room)
 
 
@@ -79,7 +79,7 @@ def add_map(ranges, poses, chosen, sensor, map_arrays, exact, room):  # type: ig
     mount, directions, beams, limits = sensor[0], sensor[1], sensor[2], sensor[3]
     for n in chosen:
         for m in range(poses.shape[1]):
-            sx, sy, _, c, s = kernels.to_sensor(poses, n, m, mount)
+            sx, sy, _, c, s = exact_kernels.to_sensor(poses, n, m, mount)
             out = ranges[n, m]
             if exact:
                 map_kernels.exact_map_into(
@@ -89,4 +89,4 @@ def add_map(ranges, poses, chosen, sensor, map_arrays, exact, room):  # type: ig
                 map_kernels.map_into(
                     out, directions, beams, sx, sy, c, s, limits[1], map_arrays, room
                 )
-            kernels.finish(out, limits[0], limits[1])
+            exact_kernels.finish(out, limits[0], limits[1])

@@ -31,11 +31,7 @@ from nics_drl_bridge.lidar.baked_kernels import (
     ROUND_RADIUS,
 )
 from nics_drl_bridge.lidar.block_kernels import BLOCK
-from nics_drl_bridge.lidar.sensor_models import (
-    SENSOR_MODELS,
-    SensorModel,
-    intensity_of,
-)
+from nics_drl_bridge.lidar.sensor_models import SENSOR_MODELS, SensorModel, intensity_of
 from nics_drl_bridge.lidar.shapes import SHAPES, Circle, Outlines, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.npz import npz_bytes, npz_mapped, read_file

@@ -8,9 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.kinematics.kernels import SERIES, term_arrays
 from nics_drl_bridge.middleware import kernels
-from nics_drl_bridge.middleware.belief import Anchor, Belief, Foreseen, parted
+from nics_drl_bridge.middleware.belief import Anchor, Belief, Foreseen, Unseen, parted
 from nics_drl_bridge.middleware.command_log import CommandLog
 from nics_drl_bridge.middleware.measurement import (
     Kind,
@@ -19,7 +18,7 @@ from nics_drl_bridge.middleware.measurement import (
     Verdict,
     pose_residual,
 )
-from nics_drl_bridge.middleware.unseen import Unseen
+from nics_drl_bridge.robot.kernels import SERIES, term_arrays
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.kinematics.kernels import advance, rates, wrap
+from nics_drl_bridge.robot.kernels import advance, rates, wrap
 
 RUNAWAY = 1e9
 """No pose or state is ever so far [m, rad, its unit], nor changes by so many times its cause."""

@@ -18,16 +18,15 @@ from numpy.typing import NDArray
 from nics_drl_bridge.errors import RecordingError, nearest
 from nics_drl_bridge.files import sha256, write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kinematics import topic_roles
-from nics_drl_bridge.kinematics.bag_file import BagFile, Message, opened
-from nics_drl_bridge.kinematics.bag_messages import command_row, pose_row, stamp, twist_row
-from nics_drl_bridge.lidar.canonical import Reader, reader_beside
-from nics_drl_bridge.lidar.rep117 import from_device
-from nics_drl_bridge.lidar.spec import ScanHeader
+from nics_drl_bridge.lidar.sectors import Reader, reader_beside
+from nics_drl_bridge.lidar.spec import ScanHeader, from_device
 from nics_drl_bridge.middleware.ekf import ANYWHERE
 from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.npz import npz_bytes
+from nics_drl_bridge.recording import topic_roles
+from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
+from nics_drl_bridge.recording.messages import command_row, pose_row, stamp, twist_row
 
 Array = NDArray[np.float64]
 

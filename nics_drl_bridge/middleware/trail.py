@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.middleware.replay import HISTORY_NS
-from nics_drl_bridge.middleware.stamps import CLOCK_JUMP, FUTURE_NS
-from nics_drl_bridge.middleware.unseen import JITTER_S
+from nics_drl_bridge.middleware.belief import JITTER_S
+from nics_drl_bridge.middleware.cache import CLOCK_JUMP, FUTURE_NS
+from nics_drl_bridge.middleware.timeline import HISTORY_NS
 
 Array = NDArray[np.float64]
 

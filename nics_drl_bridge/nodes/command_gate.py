@@ -1,7 +1,16 @@
-"""command_gate: passes the policy's commands on while there is reason to trust them."""
+"""command_gate: passes the policy's commands on while there is reason to trust them.
+
+What the gate's topics say, read from the bytes that travel (`wire`) into inputs of `safety`.
+
+rclpy would make a Python object of each field first, which at 50 Hz costs the gate more than to
+decide.
+
+Real-time priority of a process, where the system allows it.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import time
@@ -17,20 +26,32 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.nodes import gate_inputs, qos
+from nics_drl_bridge.gate import shield
+from nics_drl_bridge.gate.black_box import Entry
+from nics_drl_bridge.gate.gate import decide
+from nics_drl_bridge.gate.inputs import (
+    Arm,
+    Command,
+    Estimate,
+    EStop,
+    Input,
+    Odometry,
+    Press,
+    Reset,
+    Scan,
+    Tick,
+)
+from nics_drl_bridge.gate.limits import PERIOD_S
+from nics_drl_bridge.gate.state import Decision, begin
+from nics_drl_bridge.lidar.spec import LidarSpec, from_device
+from nics_drl_bridge.nodes import qos, wire
+from nics_drl_bridge.nodes.conversions import is_rotation
 from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
 from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.gate_parameters import declare_gate
-from nics_drl_bridge.nodes.priority import HIGHEST, take_priority
-from nics_drl_bridge.nodes.qos_watch import QosWatch
+from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import declare, last_word, run_node
 from nics_drl_bridge.nodes.wire import UNREADABLE, TwistWriter
-from nics_drl_bridge.safety import shield
-from nics_drl_bridge.safety.black_box import Entry
-from nics_drl_bridge.safety.gate import decide
-from nics_drl_bridge.safety.inputs import Arm, Input, Press, Reset, Tick
-from nics_drl_bridge.safety.limits import PERIOD_S
-from nics_drl_bridge.safety.state import Decision, begin
 
 STALE_S = 0.05
 """A motion that was decided on longer ago is decided on anew [s]."""
@@ -78,11 +99,11 @@ class CommandGate(QosWatch):
 
     def _listen(self) -> None:
         for kind, topic, read, profile in (
-            (LaserScan, "scan", partial(gate_inputs.scan, self._lidar), qos.SENSOR),
-            (OdometryMessage, "odom", gate_inputs.odometry, qos.SENSOR),
-            (OdometryMessage, "odometry/filtered", gate_inputs.estimate, qos.SENSOR),
-            (TwistStamped, "cmd_vel_raw", gate_inputs.command, qos.COMMAND),
-            (Bool, "e_stop", gate_inputs.e_stop, qos.EVERY_COMMAND),
+            (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),
+            (OdometryMessage, "odom", odometry, qos.SENSOR),
+            (OdometryMessage, "odometry/filtered", estimate, qos.SENSOR),
+            (TwistStamped, "cmd_vel_raw", command, qos.COMMAND),
+            (Bool, "e_stop", e_stop, qos.EVERY_COMMAND),
         ):
             taker = partial(self._take, topic, read)
             self.create_subscription(kind, topic, taker, profile, raw=True)
@@ -174,3 +195,74 @@ def main(args: list[str] | None = None) -> None:
 
 if __name__ == "__main__":
     main()
+
+
+ROTATION = slice(3, 7)
+"""Where an odometry's quaternion stands among its numbers."""
+VARIANCES = wire.POSE_COVARIANCE, wire.POSE_COVARIANCE + 7, wire.POSE_COVARIANCE + 35
+"""Where those of x, y and heading stand."""
+
+
+def scan(lidar: LidarSpec, content: bytes) -> Scan:
+    """A serialised LaserScan. Raises `wire.UNREADABLE`."""
+    ranges = from_device(wire.ranges_of(content), lidar)
+    return Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
+
+
+def odometry(content: bytes) -> Odometry:
+    """A serialised Odometry; its pose is NaN without a rotation. Raises `wire.UNREADABLE`."""
+    pose, twist = wire.odometry_of(content)
+    if not is_rotation(*wire.numbers_of(content)[ROTATION].tolist()):
+        pose = np.full(3, np.nan)
+    return Odometry(wire.stamp_of(content), pose, twist)
+
+
+def estimate(content: bytes) -> Estimate:
+    """A serialised Odometry of an estimator. Raises `wire.UNREADABLE`."""
+    x, y, heading = (wire.numbers_of(content)[place] for place in VARIANCES)
+    with np.errstate(invalid="ignore"):  # a variance below 0 is no number, either
+        std = np.sqrt([np.maximum(x, y), heading])
+    return Estimate(wire.odometry_of(content)[1], std)
+
+
+def command(content: bytes) -> Command:
+    """A serialised TwistStamped. Raises `wire.UNREADABLE`."""
+    return Command(wire.stamp_of(content), np.array(wire.stamped_twist_of(content)))
+
+
+def e_stop(content: bytes) -> EStop:
+    """A serialised Bool. Raises `wire.UNREADABLE`."""
+    return EStop(wire.truth_of(content))
+
+
+HIGHEST = 99
+REFUSED = (
+    "parameter 'priority': the system does not allow a real-time priority of {priority} ({error}); "
+    "allow it by `ulimit -r {priority}`, `LimitRTPRIO={priority}` in its systemd unit or the "
+    "capability CAP_SYS_NICE, or set 0. It goes on without."
+)
+
+
+def take_priority(priority: int) -> str:
+    """Lets all threads of this process go before every ordinary one (SCHED_FIFO).
+
+    The threads of the middleware too: a gate that waits for them gains nothing by its own. Those
+    that are made later have the priority of the thread that makes them.
+
+    Args:
+        priority: 1 to 99; 0 leaves everything as it is.
+
+    Returns:
+        A sentence that says why not, with the fix; empty when all is well.
+    """
+    if priority == 0:
+        return ""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        for thread in os.listdir("/proc/self/task"):
+            with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
+                os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(priority))
+    except (OSError, AttributeError) as error:  # the latter where there is no such thing
+        reason = str(getattr(error, "strerror", None) or "it has none").lower()
+        return REFUSED.format(priority=priority, error=reason)
+    return ""

@@ -13,11 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from sensor_msgs.msg import Imu, JointState, LaserScan
 
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.kinematics.joints import POSITION_UNITS
-from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.lidar.canonical import Reader, reader_beside
-from nics_drl_bridge.lidar.rep117 import from_device, to_device
-from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader
+from nics_drl_bridge.lidar.sectors import Reader, reader_beside
+from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, from_device, to_device
+from nics_drl_bridge.recording.joints import POSITION_UNITS
+from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 QUATERNION_TOLERANCE = 0.1

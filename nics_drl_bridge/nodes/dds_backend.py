@@ -1,8 +1,14 @@
-"""DdsBackend: the robot behind ROS 2 topics, as the same synchronous backend."""
+"""DdsBackend: the robot behind ROS 2 topics, as the same synchronous backend.
+
+Two threads that take turns, on one core.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import math
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -16,13 +22,12 @@ from sensor_msgs.msg import LaserScan
 from nics_drl_bridge.errors import BackendError, StaleDataError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, RobotView, Start
-from nics_drl_bridge.lidar.rep117 import from_device
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.lidar.spec import from_device
+from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
-from nics_drl_bridge.nodes.episodes import Episodes
 from nics_drl_bridge.nodes.executor import HANDED_OVER
 from nics_drl_bridge.nodes.link import Link
-from nics_drl_bridge.nodes.one_core import OneCore
+from nics_drl_bridge.nodes.observer import Episodes
 from nics_drl_bridge.nodes.robot_topics import data_facts
 from nics_drl_bridge.sim.world import World
 
@@ -300,3 +305,51 @@ def _read(topic: str, read: Callable[[bytes], T], message: bytes) -> T:
 
 def _putter(mail: _Mailbox, topic: str) -> Callable[[bytes], object]:
     return lambda message: mail.put(topic, message)
+
+
+try:
+    _core_now = ctypes.PyDLL(None).sched_getcpu
+    _allowed, _allow = os.sched_getaffinity, os.sched_setaffinity
+    CAN_CHOOSE = True
+except (AttributeError, TypeError):  # no Linux with glibc
+    CAN_CHOOSE = False
+
+
+class OneCore:
+    """Keeps a thread that waits, and the helper that it waits for, on one core while it waits.
+
+    Then nobody has to be woken on another core that sleeps, which on a virtual machine takes about
+    a tenth of a lock-step step, for each of the two. The helper follows the waiting thread wherever
+    the system moves that. That one may run anywhere again as soon as it waits no more, so that
+    threads that it starts do not inherit anything.
+
+    Where the system does not let threads choose, this only waits.
+    """
+
+    def __init__(self) -> None:
+        self._helper, self._place = 0, (0, -1)
+
+    def help(self) -> None:
+        """Says that the calling thread is the helper."""
+        self._helper = threading.get_native_id()
+
+    def wait(self, event: threading.Event, timeout_s: float) -> bool:
+        """Waits for an event; whether it came within a time [s]."""
+        cores = _allowed(0) if CAN_CHOOSE and self._helper else set()
+        if len(cores) < 2:
+            return event.wait(timeout_s)
+        try:
+            self._share()
+            return event.wait(timeout_s)
+        finally:  # also of whoever is interrupted in the middle of it
+            with contextlib.suppress(OSError):
+                _allow(0, cores)
+
+    def _share(self) -> None:
+        # The helper may have ended, and somebody else may decide about cores.
+        with contextlib.suppress(OSError, ValueError):
+            core = _core_now()
+            if self._place != (self._helper, core):
+                _allow(self._helper, {core})
+                self._place = self._helper, core
+            _allow(0, {core})

@@ -21,17 +21,12 @@ from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Simulator
 from nics_drl_bridge.nodes import conversions, device_parameters, qos
-from nics_drl_bridge.nodes.command_inlet import CommandInlet
-from nics_drl_bridge.nodes.device_parameters import declare_device
+from nics_drl_bridge.nodes.device_parameters import Pace, RealTime, declare_device
+from nics_drl_bridge.nodes.device_robot import CommandInlet, Outbox, RobotPort, Transforms
 from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
-from nics_drl_bridge.nodes.graph import owner
-from nics_drl_bridge.nodes.outbox import Outbox
-from nics_drl_bridge.nodes.pace import Pace, RealTime
-from nics_drl_bridge.nodes.qos_watch import QosWatch
-from nics_drl_bridge.nodes.robot_port import RobotPort
+from nics_drl_bridge.nodes.qos import QosWatch, owner
 from nics_drl_bridge.nodes.runner import declare_model
-from nics_drl_bridge.nodes.transforms import Transforms
-from nics_drl_bridge.sim.device_world import DeviceWorld
+from nics_drl_bridge.sim.device import DeviceWorld
 from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]

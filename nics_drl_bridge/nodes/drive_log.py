@@ -12,12 +12,12 @@ from sensor_msgs.msg import JointState
 
 from nics_drl_bridge.errors import BackendError, RecordingError
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.kinematics.bag_messages import imu_row, pose_row, stamp, twist_row
-from nics_drl_bridge.kinematics.joints import JointMessage, Joints, gather, state_of, wheels_of
-from nics_drl_bridge.kinematics.recording import Recording
-from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.kinematics.stamping import TopicData, streams
-from nics_drl_bridge.kinematics.topic_roles import TopicRoles
+from nics_drl_bridge.recording.joints import JointMessage, Joints, gather, state_of, wheels_of
+from nics_drl_bridge.recording.messages import imu_row, pose_row, stamp, twist_row
+from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.recording.stamping import TopicData, streams
+from nics_drl_bridge.recording.topic_roles import TopicRoles
+from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 PLACE = "recording"

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
+from nics_drl_bridge.gate.black_box import BlackBox, Entry, write
+from nics_drl_bridge.gate.state import Cause, GateState
 from nics_drl_bridge.nodes.box_writer import BoxWriter
 from nics_drl_bridge.nodes.diagnostics import Finding
 from nics_drl_bridge.nodes.gate_parameters import GateParameters
-from nics_drl_bridge.safety.black_box import BlackBox, Entry, write
-from nics_drl_bridge.safety.state import Cause, GateState
 
 FILES_KEPT = 20
 BURST_S = 3.0

@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 from rclpy.node import Node
 
+from nics_drl_bridge.gate.limits import Limits, load_limits
+from nics_drl_bridge.gate.state import GateConfig, ShieldConfig
+from nics_drl_bridge.gate.stopping import doubtful, require_possible, shield_config
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes.runner import declare, declare_model
-from nics_drl_bridge.safety.limits import Limits, load_limits
-from nics_drl_bridge.safety.settings import doubtful, require_possible
-from nics_drl_bridge.safety.state import GateConfig, ShieldConfig
-from nics_drl_bridge.safety.stopping import shield_config
 
 SCAN_PERIODS = 1.75
 """A command's scan is no older by default than so many of the lidar's periods, if it is slow."""

@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 
 from nics_drl_bridge.errors import BridgeError
-from nics_drl_bridge.nodes.qos_watch import QosWatch
+from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import declare
 
 UNCONFIGURED, INACTIVE, ACTIVE = "unconfigured", "inactive", "active"

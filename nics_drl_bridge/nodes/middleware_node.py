@@ -10,8 +10,8 @@ from rclpy.context import Context
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.middleware.health import Health
-from nics_drl_bridge.middleware.view import rehearse
+from nics_drl_bridge.middleware.measurement import Health
+from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode

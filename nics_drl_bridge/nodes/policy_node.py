@@ -18,7 +18,7 @@ from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
-from nics_drl_bridge.middleware.view import rehearse
+from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors

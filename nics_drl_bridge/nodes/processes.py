@@ -15,7 +15,7 @@ from typing import Any
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.nodes.udp import domains_in_use
+from nics_drl_bridge.nodes.transport import domains_in_use
 
 LAST_DOMAIN_ID, GREATEST_DOMAIN_ID = 101, 232
 """Above the first, DDS ports may collide with those that Linux hands out; above the other there

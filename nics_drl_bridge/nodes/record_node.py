@@ -1,4 +1,7 @@
-"""record_node: drives a robot so that it shows its whole motion, and records it."""
+"""record_node: drives a robot so that it shows its whole motion, and records it.
+
+The parameters of `record_node`.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,8 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,20 +19,23 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Imu, JointState
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, BridgeError
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.kinematics.drive_file import write_drive
-from nics_drl_bridge.kinematics.exploration import PERIOD_S, STILL_S
-from nics_drl_bridge.kinematics.recording import Recording
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.drive_log import DriveLog
-from nics_drl_bridge.nodes.drive_parameters import declare_drive
-from nics_drl_bridge.nodes.qos_watch import QosWatch
-from nics_drl_bridge.nodes.runner import EXIT_BAD_INPUT, last_word, run_node
+from nics_drl_bridge.nodes.qos import QosWatch
+from nics_drl_bridge.nodes.runner import EXIT_BAD_INPUT, declare, last_word, run_node
+from nics_drl_bridge.recording.drive_plan import DrivePlan
+from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S
+from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.recording.topic_roles import TopicRoles, topic_roles
+from nics_drl_bridge.recording.write import check_out, write_drive
+from nics_drl_bridge.robot.spec import load_robot
 
 Array = NDArray[np.float64]
 PATIENCE_S = 10.0
@@ -260,3 +268,51 @@ def main(args: list[str] | None = None) -> None:
 
 if __name__ == "__main__":
     main()
+
+
+@dataclass(frozen=True)
+class DriveParameters:
+    """What `record_node` is to do.
+
+    Attributes:
+        plan: of the drive.
+        out: where the recording goes.
+        odom_timeout: silence of odometry that stops the robot [s].
+        stamped: whether `cmd_vel` is a TwistStamped.
+        roles: may name the joints of state and wheels.
+    """
+
+    plan: DrivePlan
+    out: Path
+    odom_timeout: float
+    stamped: bool
+    roles: TopicRoles
+
+
+def declare_drive(node: Node) -> DriveParameters:
+    """Declares the parameters of a drive, and reads them.
+
+    Raises:
+        ConfigError: a value can't be used.
+    """
+    get = partial(declare, node, read_only=True)
+    robot = load_robot(get("robot", "ackermann", "A shipped robot, or its YAML file."))
+    out = check_out(
+        Path(get("out", "drive.npz", "File *.npz of the recording, or folder of a rosbag2."))
+    )
+    plan = DrivePlan(
+        robot,
+        bound=get("bound", 2.0, "Radius of the circle around the start to keep within [m]."),
+        duration=get("duration", 60.0, "Of the drive [s]."),
+        speed=get("speed", 1.0, "Share of the greatest speeds to use."),
+        seed=get("seed", 0, "Of the pattern."),
+    )
+    topics = get("topics", "", "YAML file that names joints; none if empty.")
+    silence = "Stops after this silence of odom [s]."
+    return DriveParameters(
+        plan,
+        out,
+        odom_timeout=get("odom_timeout", 0.5, silence, low=0.05, high=10.0),
+        stamped=get("stamped", False, "Whether cmd_vel is a TwistStamped."),
+        roles=topic_roles(Path(topics) if topics else None),
+    )

@@ -14,13 +14,13 @@ import numpy as np
 
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError
 from nics_drl_bridge.files import write_bytes
-from nics_drl_bridge.kinematics.coverage import coverage
-from nics_drl_bridge.kinematics.drive_file import check_out
-from nics_drl_bridge.kinematics.drive_plan import DrivePlan
-from nics_drl_bridge.kinematics.recording import Recording
-from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
-from nics_drl_bridge.kinematics.topic_roles import topic_roles
-from nics_drl_bridge.report.drive_picture import drive_picture
+from nics_drl_bridge.identify.excitation import coverage
+from nics_drl_bridge.recording.drive_plan import DrivePlan
+from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.recording.topic_roles import topic_roles
+from nics_drl_bridge.recording.write import check_out
+from nics_drl_bridge.report.pictures import drive_picture
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 NODE = "nics_drl_bridge.nodes.record_node"
 

@@ -15,12 +15,11 @@ from sensor_msgs.msg import Imu, LaserScan
 from nics_drl_bridge.errors import BridgeError, ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.lidar.canonical import Reader
-from nics_drl_bridge.lidar.rep117 import from_device
-from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.lidar.sectors import Reader
+from nics_drl_bridge.lidar.spec import LidarSpec, from_device
 from nics_drl_bridge.middleware.ekf import ANYWHERE
 from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.runner import declare
 

@@ -1,4 +1,7 @@
-"""How every node of the package starts, spins, and ends."""
+"""How every node of the package starts, spins, and ends.
+
+The values that a node was started with, from the command line and from YAML files.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +18,13 @@ from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 
-from nics_drl_bridge.errors import BackendError, BridgeError
+from nics_drl_bridge.errors import BackendError, BridgeError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes.executor import StandingExecutor
-from nics_drl_bridge.nodes.overrides import warn_of_unknown, widen
-from nics_drl_bridge.nodes.sole import sole
+from nics_drl_bridge.nodes.single_instance import sole
 from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
 
 SPIN_S = 0.1
@@ -163,3 +166,59 @@ def declare(node: Node, name: str, default: Any, description: str, **limits: Any
         setattr(descriptor, field, [span])
     widen(node, name, default)
     return node.declare_parameter(name, default, descriptor).value
+
+
+WIDENED: dict[Parameter.Type, tuple[Parameter.Type, Callable[[Any], Any]]] = {
+    Parameter.Type.INTEGER: (Parameter.Type.DOUBLE, float),
+    Parameter.Type.INTEGER_ARRAY: (
+        Parameter.Type.DOUBLE_ARRAY,
+        lambda values: list(map(float, values)),
+    ),
+}
+QOS = "qos_overrides."
+"""Names that rclpy reads itself, where a publisher or subscription asks for it."""
+
+SHARED = "model"
+"""A file gives it to all nodes at once, also to those that have no model."""
+
+
+def widen(node: Node, name: str, default: Any) -> None:
+    """Lets `rate:=2` be given for a floating-point parameter: rclpy itself refuses an integer.
+
+    Args:
+        node: whose parameter it is; not yet declared.
+        name: of the parameter.
+        default: a float or a list of floats; others are left alone.
+    """
+    given = given_values(node)
+    first = default[0] if isinstance(default, list) and default else default
+    parameter = given.get(name)
+    if isinstance(first, float) and parameter is not None and parameter.type_ in WIDENED:
+        kind, convert = WIDENED[parameter.type_]
+        given[name] = Parameter(name, kind, convert(parameter.value))
+
+
+def given_values(node: Node) -> dict[str, Parameter]:
+    """What the node was started with, by name; the node's own dictionary.
+
+    rclpy has no public way to it but to accept undeclared parameters, which would accept misspelt
+    ones for ever.
+    """
+    found: dict[str, Parameter] = getattr(node, "_parameter_overrides", {})
+    return found
+
+
+def unknown(node: Node) -> list[str]:
+    """A sentence for each value whose parameter the node does not have."""
+    known = [name for name in node._parameters if not name.startswith(QOS)]
+    return [
+        f"there is no parameter {name!r}, its value is ignored; {nearest(name, known)}"
+        for name in sorted(given_values(node))
+        if name not in (*known, SHARED) and not name.startswith(QOS)
+    ]
+
+
+def warn_of_unknown(node: Node) -> None:
+    """Warns of values for parameters that the node does not have: rclpy ignores them silently."""
+    for sentence in unknown(node):
+        node.get_logger().warning(sentence)

@@ -12,6 +12,8 @@ node, so it is looked at what came of it; the environment is left as it was foun
 somebody makes in the process afterwards does not listen to multicast, and may have shared memory.
 
 Where discovery goes further, a variable is enough. It is read with each node, and stays.
+
+Who has bound which ports of UDP over IPv4, as Linux tells it; elsewhere nobody is seen.
 """
 
 from __future__ import annotations
@@ -30,7 +32,6 @@ from rclpy.parameter import Parameter
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.nodes.udp import multicast_port, ports_of
 
 RANGE, LOCAL, ONLY_LOCAL = "ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST", "ROS_LOCALHOST_ONLY"
 SELF_MADE = "SYSTEM_DEFAULT"
@@ -179,3 +180,38 @@ def _is_in_force(context: Context) -> bool:
 
 
 OF_THIS_PROCESS = Transport()
+
+
+TABLE = Path("/proc/net/udp")
+FIRST_PORT, PORTS_OF_A_DOMAIN = 7400, 250
+"""Of RTPS: the first port of a domain is that of its multicast."""
+
+
+def multicast_port(domain_id: int) -> int:
+    """Which port those of a domain bind who look for others beyond this machine."""
+    return FIRST_PORT + PORTS_OF_A_DOMAIN * domain_id
+
+
+def ports_of(process: int | str = "self") -> set[int]:
+    """The ports that a process has bound."""
+    names = set()
+    for file in Path(f"/proc/{process}/fd").iterdir():
+        with contextlib.suppress(OSError):  # another thread has closed it
+            names.add(os.readlink(file))
+    return {port for inode, port in _sockets() if f"socket:[{inode}]" in names}
+
+
+def domains_in_use() -> set[int]:
+    """The DDS domains that somebody takes part in who is on this machine."""
+    first = (port - FIRST_PORT for _, port in _sockets())
+    return {offset // PORTS_OF_A_DOMAIN for offset in first if offset >= 0}
+
+
+def _sockets() -> list[tuple[str, int]]:
+    """Inode and port of each socket."""
+    try:
+        lines = TABLE.read_text(encoding="ascii").splitlines()[1:]
+    except OSError:
+        return []
+    rows = [line.split() for line in lines]
+    return [(row[9], int(row[1].split(":")[1], 16)) for row in rows]

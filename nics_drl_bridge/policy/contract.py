@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from nics_drl_bridge.config import Schema, validate
+from nics_drl_bridge.env.registry import TASKS
 from nics_drl_bridge.env.task import Task
-from nics_drl_bridge.env.tasks import TASKS
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.lidar.canonical import ScanLayout
+from nics_drl_bridge.lidar.sectors import ScanLayout
 from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.robot.spec import RobotSpec
 
 FORMAT = "nics_drl_bridge/policy/1"
 GOLDEN = 16

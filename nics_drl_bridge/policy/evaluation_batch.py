@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.policy.evaluation import truly_near
-from nics_drl_bridge.policy.evaluation_intervals import Estimate, mean, rate
+from nics_drl_bridge.policy.statistics import Estimate, mean, rate
 from nics_drl_bridge.seeds import checked_seeds
 
 Array = NDArray[np.float64]

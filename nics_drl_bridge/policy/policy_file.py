@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.config import share_folder
+from nics_drl_bridge.env.registry import TASKS, make_task
 from nics_drl_bridge.env.task import Task
-from nics_drl_bridge.env.tasks import TASKS, make_task
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.lidar.canonical import plan_of
+from nics_drl_bridge.lidar.sectors import plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.policy import onnx_graph, onnx_sizes
 from nics_drl_bridge.policy.contract import (
@@ -30,6 +29,7 @@ from nics_drl_bridge.policy.contract import (
     read_contract,
     task_entry,
 )
+from nics_drl_bridge.robot.spec import RobotSpec
 
 SUFFIX = ".onnx"
 GOLDEN_TOLERANCE = 1e-5

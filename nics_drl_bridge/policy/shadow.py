@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, RobotView
-from nics_drl_bridge.kinematics.bag_file import Message
-from nics_drl_bridge.kinematics.bag_messages import command_row
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.playback import Playback, in_order, played
 from nics_drl_bridge.policy.pacing import Pace
 from nics_drl_bridge.policy.policies import open_policy
+from nics_drl_bridge.recording.bag_file import Message
+from nics_drl_bridge.recording.messages import command_row
 
 Array = NDArray[np.float64]
 JITTER = 0.25

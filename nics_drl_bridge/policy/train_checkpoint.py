@@ -3,6 +3,10 @@
 A checkpoint is the trainer's own and is never deployed. It holds tensors, numbers and text only
 and is read by PyTorch's `weights_only` reader, which makes no other objects: nothing in it can
 run code.
+
+How a training gets on: told to the user and to TensorBoard, and kept in checkpoints.
+
+The state of a vector env: all that changes while it runs, taken out and put back.
 """
 
 from __future__ import annotations
@@ -10,8 +14,11 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import time
 import zipfile
 from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +26,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 
-from nics_drl_bridge.env.vector_state import restore, snapshot
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_sealed, sealed, write_bytes
+from nics_drl_bridge.policy.train_algorithms import RECENT
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 
 FORMAT = "nics_drl_bridge/checkpoint/2"
@@ -181,3 +190,148 @@ def _set_random_state(algorithm: BaseAlgorithm, content: dict[str, Any]) -> None
     shared["state"]["key"] = np.array(shared["state"]["key"], np.uint32)
     np.random.set_state(shared)  # noqa: NPY002 - as above
     algorithm.action_space.np_random.bit_generator.state = json.loads(content["actions"])
+
+
+TOLD_S = 0.2
+"""Progress is told at most so often [s]."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a training stands.
+
+    Attributes:
+        seed: of the training.
+        steps: environment steps done.
+        total: of all.
+        success, collision: shares of the last 1000 episodes; NaN before the first has ended.
+        steps_per_s: since this process took it up.
+        env_share: share of the wall time that went to the simulator.
+    """
+
+    seed: int
+    steps: int
+    total: int
+    success: float
+    collision: float
+    steps_per_s: float
+    env_share: float
+
+
+class Companion(BaseCallback):
+    """Looks after each step and rollout of a training.
+
+    Args:
+        env: that is learned on.
+        seed: of the training.
+        total: environment steps of all.
+        checkpoint_every: environment steps between two calls of `save`.
+        save: keeps all that there is; called between two rollouts only.
+        tell: is told of the progress.
+    """
+
+    def __init__(
+        self,
+        env: TrainVecEnv,
+        seed: int,
+        total: int,
+        checkpoint_every: int,
+        save: Callable[[], None],
+        tell: Callable[[Progress], None],
+    ) -> None:
+        super().__init__()
+        self._env, self._seed, self._total = env, seed, total
+        self._every, self._save, self._tell = checkpoint_every, save, tell
+        self._collisions: deque[bool] = deque(maxlen=RECENT)
+        self._begin = self._told = time.perf_counter()
+        self._first = self._saved = 0
+        self._busy = env.stepping_s
+
+    def _on_training_start(self) -> None:
+        self._begin, self._busy = time.perf_counter(), self._env.stepping_s
+        self._first = self._saved = self.num_timesteps
+
+    def _on_rollout_start(self) -> None:
+        """Between two rollouts nothing is half done: the place for a checkpoint."""
+        if self.model.num_timesteps // self._every > self._saved // self._every:
+            self._save()
+            self._saved = self.model.num_timesteps
+
+    def _on_step(self) -> bool:
+        for n in np.flatnonzero(self.locals["dones"]):
+            self._collisions.append(bool(self.locals["infos"][n].get("collision", False)))
+        return True
+
+    def _on_rollout_end(self) -> None:
+        now = time.perf_counter()
+        if now - self._told < TOLD_S and self.num_timesteps < self._total:
+            return
+        self._told = now
+        progress = self.progress()
+        self.logger.record("rollout/collision_rate", progress.collision)
+        self.logger.record("time/env_share", progress.env_share)
+        self._tell(progress)
+
+    def progress(self) -> Progress:
+        """Where the training stands now."""
+        taken = max(time.perf_counter() - self._begin, 1e-9)
+        successes = self.model.ep_success_buffer
+        return Progress(
+            self._seed,
+            self.num_timesteps,
+            self._total,
+            float(np.mean(successes)) if successes else np.nan,
+            float(np.mean(self._collisions)) if self._collisions else np.nan,
+            (self.num_timesteps - self._first) / taken,
+            (self._env.stepping_s - self._busy) / taken,
+        )
+
+
+Arrays = dict[str, NDArray[Any]]
+MEMORY, DRAWN = "memory.", "drawn."
+"""What the names begin with whose number only the running episodes tell."""
+
+
+def snapshot(env: BridgeVectorEnv) -> Arrays:
+    """All that changes in a vector env, copied, by name.
+
+    An env of the same arguments that is given it by `restore` goes on with the same bits.
+    """
+    found = dict(env.changing)
+    found |= {MEMORY + name: rows for name, rows in env.memory.items()}
+    found |= {DRAWN + name: rows for name, rows in env.simulator.drawn.items()}
+    return {name: rows.copy() for name, rows in found.items()}
+
+
+def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
+    """Puts a snapshot into a vector env of the same arguments.
+
+    Raises:
+        ConfigError: it is of an env with other worlds, robots, lidar or task.
+    """
+    targets = env.changing
+    known = {name for name in state if not name.startswith((MEMORY, DRAWN))}
+    for name in sorted(known ^ set(targets)):
+        raise ConfigError(f"state of a vector env: {name!r} is in one of both only; {_SAME}")
+    for name, target in targets.items():
+        if state[name].shape != target.shape or state[name].dtype != target.dtype:
+            raise ConfigError(
+                f"state of a vector env: {name!r} is of shape {state[name].shape}, this env's of "
+                f"{target.shape}; {_SAME}"
+            )
+    for name, target in targets.items():
+        target[...] = state[name]  # in place: the compiled steps hold these arrays
+    env.memory = _below(MEMORY, state)
+    env.simulator.drawn = _below(DRAWN, state)
+    env.ready = bool((targets["episode"] >= 0).all())
+
+
+_SAME = "make the env with the arguments that it had."
+
+
+def _below(prefix: str, state: Mapping[str, NDArray[Any]]) -> Arrays:
+    return {
+        name.removeprefix(prefix): np.array(rows)
+        for name, rows in state.items()
+        if name.startswith(prefix)
+    }

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.interface import S_PER_NS
-from nics_drl_bridge.report.doctor_expected import Expected, Finding, seen
+from nics_drl_bridge.report.doctor_checks import layout, motion, ranges, scale
 from nics_drl_bridge.report.doctor_facts import (
     CLOCK,
     CMD_VEL,
@@ -20,10 +20,11 @@ from nics_drl_bridge.report.doctor_facts import (
     ODOM,
     SCAN,
     TWIST_STAMPED_TYPE,
+    Expected,
     Facts,
+    Finding,
+    seen,
 )
-from nics_drl_bridge.report.doctor_motion import motion, scale
-from nics_drl_bridge.report.doctor_scan import layout, ranges
 
 RATE_TOLERANCE = 0.2
 FUTURE_S, LATE_S, OFFSET_S = 0.005, 0.35, 5.0

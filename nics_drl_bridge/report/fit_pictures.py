@@ -12,14 +12,14 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from nics_drl_bridge.calibration.identify import Identified
-from nics_drl_bridge.calibration.open_loop import HORIZON_S, Windows, predict, windows
-from nics_drl_bridge.calibration.signals import held
 from nics_drl_bridge.files import write_bytes
-from nics_drl_bridge.kinematics.recording import Samples
-from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.identify.identify import Identified
+from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, predict, windows
+from nics_drl_bridge.identify.signals import held
+from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.report.calibration_pictures import calibration_pictures
-from nics_drl_bridge.report.drawing import MEASURED, MODEL, OTHER, png
+from nics_drl_bridge.report.page import MEASURED, MODEL, OTHER, png
+from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 

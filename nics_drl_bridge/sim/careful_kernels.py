@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.kinematics.kernels import delayed, move, rates, wrap
+from nics_drl_bridge.robot.kernels import delayed, move, rates, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import impact_kernels as impact
 from nics_drl_bridge.sim.impact_kernels import (

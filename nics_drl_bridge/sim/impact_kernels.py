@@ -23,7 +23,7 @@ import math
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.kinematics.kernels import move
+from nics_drl_bridge.robot.kernels import move
 from nics_drl_bridge.sim.collision_kernels import map_bound, segment_distance2
 
 VX, VY, TURN, STOP, FLIGHT = range(5)

@@ -1,7 +1,15 @@
-"""Domain randomisation: which robot, sensors and scene an episode gets, within YAML's ranges."""
+"""Domain randomisation: which robot, sensors and scene an episode gets, within YAML's ranges.
+
+Compiled draws of domain randomisation, each fixed by seed, robot and place alone.
+
+Shared arguments: `seeds` (n,) of the episodes; `group` is what the numbers are for, one of the
+constants below. A place whose bounds are equal takes that value and draws nothing, and a group
+never shifts the draws of another.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +17,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.config import find_config, load_yaml
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import fault_kernels
 from nics_drl_bridge.seeds import checked_seeds
-from nics_drl_bridge.sim import randomisation_bounds as bounds
-from nics_drl_bridge.sim import randomisation_kernels as kernels
+from nics_drl_bridge.sim import randomisation_ranges as bounds
 from nics_drl_bridge.sim.randomisation_ranges import Randomisation
 
 __all__ = ["Draws", "Label", "Randomisation", "Sampler", "load_randomisation"]
@@ -131,14 +140,14 @@ class Sampler:
         faults = np.empty((*shape, len(self._faults[0])))
         timing = np.empty((2, *shape), np.int64)
         scene = np.empty((2, len(chosen), 1), np.int64)
-        kernels.draw_between(coefficient, *self._coefficient, chosen, kernels.KINEMATICS)
-        kernels.draw_between(noise, *self._noise, chosen, kernels.ODOMETRY)
-        kernels.draw_between(faults, *self._faults, chosen, kernels.LIDAR)
-        kernels.draw_whole(timing.transpose(1, 2, 0), *self._timing, chosen, kernels.LATENCY)
-        kernels.draw_whole(scene.transpose(1, 2, 0), *self._scene, chosen, kernels.OBSTACLES)
+        draw_between(coefficient, *self._coefficient, chosen, KINEMATICS)
+        draw_between(noise, *self._noise, chosen, ODOMETRY)
+        draw_between(faults, *self._faults, chosen, LIDAR)
+        draw_whole(timing.transpose(1, 2, 0), *self._timing, chosen, LATENCY)
+        draw_whole(scene.transpose(1, 2, 0), *self._scene, chosen, OBSTACLES)
         noise[..., 3] = noise[..., 2]
         for column, values in self._choices:
-            kernels.draw_choice(faults, column, values, chosen)
+            draw_choice(faults, column, values, chosen)
         counts = self.randomisation.obstacles.count is not None
         return Draws(
             coefficient, timing[0], timing[1], noise, faults,
@@ -173,3 +182,50 @@ class Sampler:
 
 def _varies(ends: bounds.Bounds, column: int) -> bool:
     return bool(ends[0][column] != ends[1][column])
+
+
+KINEMATICS, LATENCY, ODOMETRY, LIDAR, CHOICES, OBSTACLES = range(6)
+PLACES = 1 << 20
+"""More than a group has places; the counters of two groups never meet."""
+GROUPS = 8
+
+
+@kernel(allocates=True)
+def _share(seed, robot, group, place):  # type: ignore[no-untyped-def]
+    """The draw in [0, 1) of one place."""
+    counter = (robot * GROUPS + group) * PLACES + place
+    return random.uniform(seed, random.RANDOMISATION_STREAM, counter)
+
+
+@kernel(allocates=True)
+def _between(low, high, seed, robot, group, place):  # type: ignore[no-untyped-def]
+    """A number between `low` and `high`; the very number where they are the same."""
+    return low if high == low else low + _share(seed, robot, group, place) * (high - low)
+
+
+@kernel(allocates=True)
+def draw_between(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
+    """Fills out (n, M, Q) evenly between low (Q,) and high (Q,)."""
+    for n in range(out.shape[0]):
+        for m in range(out.shape[1]):
+            for q in range(out.shape[2]):
+                out[n, m, q] = _between(low[q], high[q], seeds[n], m, group, q)
+
+
+@kernel(allocates=True)
+def draw_whole(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
+    """Fills out (n, M, Q) with whole numbers: evenly between low and high, cut down."""
+    for n in range(out.shape[0]):
+        for m in range(out.shape[1]):
+            for q in range(out.shape[2]):
+                value = _between(low[q], high[q], seeds[n], m, group, q)
+                out[n, m, q] = np.int64(math.floor(value))
+
+
+@kernel(allocates=True)
+def draw_choice(out, column, values, seeds):  # type: ignore[no-untyped-def]
+    """Fills one column of out (n, M, P) with one of the values (V,), each as likely."""
+    for n in range(out.shape[0]):
+        for m in range(out.shape[1]):
+            share = _share(seeds[n], m, CHOICES, column)
+            out[n, m, column] = values[int(share * values.shape[0])]

@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.kinematics.kernels import delayed, run, wrap
-from nics_drl_bridge.sim import cell_kernels as crowd
+from nics_drl_bridge.robot.kernels import delayed, run, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
+from nics_drl_bridge.sim import contact_kernels as crowd
 from nics_drl_bridge.sim.careful_kernels import drift_carefully, move_carefully
 from nics_drl_bridge.sim.sensing_kernels import most_drift
 

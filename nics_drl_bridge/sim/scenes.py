@@ -27,8 +27,8 @@ from nics_drl_bridge.lidar.shapes import (
 )
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim import scene_kernels as kernels
-from nics_drl_bridge.sim.areas import Areas, areas_of
-from nics_drl_bridge.sim.motion import Motion
+from nics_drl_bridge.sim.free_space import Areas, areas_of
+from nics_drl_bridge.sim.obstacles import Motion
 from nics_drl_bridge.sim.world import Goals, Starts, World
 
 __all__ = ["Scene", "SceneSampler", "Scenes", "sample_scene", "scaled"]

@@ -18,7 +18,7 @@ import math
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.sim import motion_layout as at
+from nics_drl_bridge.sim import obstacles as at
 
 SLACK = 1e-6
 """Room that is never used, in metres: rounding must not make two bodies touch."""

@@ -11,13 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
-from nics_drl_bridge.lidar.baking import with_shapes
+from nics_drl_bridge.lidar.bake import with_shapes
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
 from nics_drl_bridge.lidar.shapes import SHAPE, place
-from nics_drl_bridge.sim import kernels
-from nics_drl_bridge.sim.motion import distance_arrays, plan_arrays
+from nics_drl_bridge.sim import step_kernels
+from nics_drl_bridge.sim.obstacles import distance_arrays, plan_arrays
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
+from nics_drl_bridge.sim.state import SLICES, Sizes, Worlds, allocate, arguments, split
 from nics_drl_bridge.sim.validity import (
     CommandBox,
     OutsideValidityWarning,
@@ -25,7 +26,6 @@ from nics_drl_bridge.sim.validity import (
     warn,
 )
 from nics_drl_bridge.sim.world import World
-from nics_drl_bridge.sim.worlds import SLICES, Sizes, Worlds, allocate, arguments, split
 from nics_drl_bridge.threads import Crew
 
 __all__ = ["SLICES", "FastSimulator", "OutsideValidityWarning", "Worlds"]
@@ -141,7 +141,7 @@ class FastSimulator:
         half = np.array([max(-low_x, high_x), max(-low_y, high_y)])
         movers = (moves, plan_arrays(motions), half, distance_arrays(self.world.grid))
         of = (self.data, self.model, self._scanner, walls, movers, self._sizes)
-        return {part.start: kernels.pack(arguments(*of, part)) for part in self.parts}
+        return {part.start: step_kernels.pack(arguments(*of, part)) for part in self.parts}
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what a copy has to make anew."""
@@ -181,7 +181,7 @@ class FastSimulator:
             of_part = chosen[(chosen >= part.start) & (chosen < part.stop)]
             if len(of_part):
                 self._boxes[part.start].begin()
-                kernels.begin(self.packed[part.start], of_part)
+                step_kernels.begin(self.packed[part.start], of_part)
         return scenes
 
     def scenes(self, seeds: ArrayLike) -> Scenes:
@@ -239,10 +239,10 @@ class FastSimulator:
         self._check_shape(commands, len(self.data.steps))
         self._boxes[0].check(commands)
         if len(self.parts) == 1:
-            kernels.step_worlds(self.packed[0], commands, 0)
+            step_kernels.step_worlds(self.packed[0], commands, 0)
         else:
             self.run_parts(
-                lambda part: kernels.step_worlds(
+                lambda part: step_kernels.step_worlds(
                     self.packed[part.start], commands[part], part.start
                 )
             )
@@ -261,7 +261,7 @@ class FastSimulator:
         commands = np.ascontiguousarray(commands, dtype=np.float64)
         self._check_shape(commands, part.stop - part.start)
         self._boxes[part.start].check(commands)
-        kernels.step_worlds(self.packed[part.start], commands, part.start)
+        step_kernels.step_worlds(self.packed[part.start], commands, part.start)
 
     def _check_shape(self, commands: Array, worlds: int) -> None:
         """Raises ConfigError where the kernels would read beyond the commands."""

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.kinematics import features
-from nics_drl_bridge.kinematics.model import TaylorModel
-from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.taylor import TaylorModel
 
 Array = NDArray[np.float64]
 
@@ -105,5 +105,5 @@ def require_sane_speed(model: TaylorModel, robot: RobotSpec, extent: tuple[float
 
 def _assumed(model: TaylorModel) -> set[str]:
     """Names of the variables in assumed terms."""
-    powers = [features.parse_term(term, model.variables) for _, term in model.assumed]
+    powers = [taylor.parse_term(term, model.variables) for _, term in model.assumed]
     return {model.variables[v] for row in powers for v in np.flatnonzero(row)}

@@ -14,10 +14,9 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
-from nics_drl_bridge.lidar.maps import load_map
-from nics_drl_bridge.lidar.maps_grid import GridMap
+from nics_drl_bridge.lidar.maps import GridMap, load_map
 from nics_drl_bridge.lidar.shapes import LARGEST, MOST_SHAPES, Coordinate, Heading, Shape
-from nics_drl_bridge.sim.motion import Motion, Patrol
+from nics_drl_bridge.sim.obstacles import Motion, Patrol
 from nics_drl_bridge.sim.space_kernels import wall_distance
 
 Array = NDArray[np.float64]

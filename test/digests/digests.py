@@ -77,7 +77,7 @@ def table_1() -> Found:
     """What Table I fits: coefficients, terms kept and errors of the textbook robots."""
     import table1_kinematics as table
 
-    from nics_drl_bridge.kinematics.fit import fit
+    from nics_drl_bridge.identify.fit import fit
 
     found = {}
     for name in ROBOTS:
@@ -105,10 +105,10 @@ def table_2() -> Found:
 
 def identified() -> Found:
     """Models, calibrations and noise identified from recordings with known defects."""
-    from calibration.drives import drive
+    from identify.drives import drive
 
-    from nics_drl_bridge.calibration.identify import identify
-    from nics_drl_bridge.kinematics.spec import load_robot
+    from nics_drl_bridge.identify.identify import identify
+    from nics_drl_bridge.robot.spec import load_robot
 
     found = {}
     for name, disturbed in {

@@ -5,7 +5,7 @@ import pytest
 from robots import lidar
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.budget import (
     SEED,
     choose,

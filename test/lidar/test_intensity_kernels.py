@@ -7,8 +7,8 @@ from robots import lidar
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError, ModelError
-from nics_drl_bridge.lidar.baking import bake
-from nics_drl_bridge.lidar.maps_grid import GridMap
+from nics_drl_bridge.lidar.bake import bake
+from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.scanner import RENDERERS, Scanner
 from nics_drl_bridge.lidar.sensor_models import IncidenceDropout, Intensity
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle, Segment

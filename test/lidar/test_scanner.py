@@ -6,10 +6,10 @@ from lidar_scenes import POLYGONS, Scene, by_plane_geometry, random_scene, rando
 from robots import lidar
 
 from nics_drl_bridge.errors import ConfigError, ModelError
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.baked_kernels import LANES
-from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.budget import expected_rmse
-from nics_drl_bridge.lidar.maps_grid import GridMap
+from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.scanner import RENDERERS, Scanner, make_scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle, Polygon, Rectangle
 from nics_drl_bridge.lidar.table import Density

@@ -6,7 +6,7 @@ from robots import lidar
 
 from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.files import write_bytes
-from nics_drl_bridge.lidar.baking import bake, with_shapes
+from nics_drl_bridge.lidar.bake import bake, with_shapes
 from nics_drl_bridge.lidar.budget import choose, expected_rmse, table_bytes
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.sensor_models import IncidenceDropout, Intensity

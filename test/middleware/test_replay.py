@@ -11,8 +11,14 @@ from robots import direct_model
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.measurement import Kind, Measurement, Outcome
-from nics_drl_bridge.middleware.replay import BEFORE_START, DUPLICATE, HISTORY_NS, TOO_OLD, Timeline
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.middleware.middleware import Middleware
+from nics_drl_bridge.middleware.timeline import (
+    BEFORE_START,
+    DUPLICATE,
+    HISTORY_NS,
+    TOO_OLD,
+    Timeline,
+)
 
 SECOND = 1_000_000_000
 MILLISECOND = 1_000_000

@@ -23,12 +23,12 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.gate.black_box import replay
+from nics_drl_bridge.gate.inputs import Press, Tick
 from nics_drl_bridge.generator import save_model
 from nics_drl_bridge.nodes import command_gate, conversions, qos
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.nodes.wire import TwistWriter
-from nics_drl_bridge.safety.black_box import replay
-from nics_drl_bridge.safety.inputs import Press, Tick
 from nodes.peer import DEADLINE_S
 
 pytestmark = pytest.mark.ros
@@ -171,7 +171,7 @@ def test_it_does_not_listen_before_its_shield_is_compiled(domain_id):
     code = f"""
 from nics_drl_bridge.nodes.command_gate import CommandGate
 from nics_drl_bridge.nodes.runner import open_context
-from nics_drl_bridge.safety.shield_kernels import free
+from nics_drl_bridge.gate.shield_kernels import free
 CommandGate._listen = lambda _: print(len(free.signatures))
 node = CommandGate(open_context([], domain_id={domain_id}))
 node.destroy_node()

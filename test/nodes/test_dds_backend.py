@@ -225,7 +225,7 @@ def test_a_lost_asking_is_made_again(connect, monkeypatch):
             return Future()
         return ask(request)
 
-    monkeypatch.setattr("nics_drl_bridge.nodes.episodes.LOST_S", 0.1)
+    monkeypatch.setattr("nics_drl_bridge.nodes.observer.LOST_S", 0.1)
     monkeypatch.setattr(backend._mail, "put", lossy)
     monkeypatch.setattr(backend._episodes._repeat, "call_async", deaf)
     view, facts = backend.step(np.array([0.5, 0.1]))

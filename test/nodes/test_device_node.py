@@ -20,10 +20,10 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.kinematics.latency import Delay, Latency
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.device_parameters import declare_device, timing
 from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.robot.noise import Delay, Latency
 from nodes.peer import stamp_ns
 
 pytestmark = pytest.mark.ros

@@ -13,11 +13,11 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import Imu
 
 from nics_drl_bridge.errors import BackendError, RecordingError
-from nics_drl_bridge.kinematics.recording import check
-from nics_drl_bridge.kinematics.spec import load_robot
-from nics_drl_bridge.kinematics.topic_roles import TopicRoles
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.drive_log import DriveLog
+from nics_drl_bridge.recording.recording import check
+from nics_drl_bridge.recording.topic_roles import TopicRoles
+from nics_drl_bridge.robot.spec import load_robot
 
 pytestmark = pytest.mark.ros
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.nodes.pace import Pace, RealTime, common_step
+from nics_drl_bridge.nodes.device_parameters import Pace, RealTime, common_step
 
 STEP = NS_PER_S // 50
 

@@ -15,11 +15,11 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import SetBool
 
-from nics_drl_bridge.env.registration import NAVIGATION
+from nics_drl_bridge.env.registry import NAVIGATION
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import conversions, qos, realtime_backend
-from nics_drl_bridge.nodes.episodes import Episodes
+from nics_drl_bridge.nodes.observer import Episodes
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.sim.world import load_world
 

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.kinematics.spec import load_robot
-from nics_drl_bridge.kinematics.textbook import record
 from nics_drl_bridge.nodes import recorder
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.robot.spec import load_robot
 
 CAR = load_robot("ackermann")
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def nics(*words, cwd, **environment):
-    command = [sys.executable, "-m", "nics_drl_bridge.cli", "record", *map(str, words)]
+    command = [sys.executable, "-m", "nics_drl_bridge.commands.cli", "record", *map(str, words)]
     return subprocess.run(
         command, cwd=cwd, env=os.environ | environment, capture_output=True, text=True,
         timeout=100, input="n\n",

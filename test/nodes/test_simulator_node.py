@@ -23,9 +23,9 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool, Trigger
 
-from nics_drl_bridge.calibration.noise_model import Noise
 from nics_drl_bridge.generator import save_model
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.sim.world import load_world
 from nodes.peer import stamp_ns
 

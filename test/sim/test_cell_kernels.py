@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nics_drl_bridge.sim import cell_kernels as kernels
+from nics_drl_bridge.sim import contact_kernels as kernels
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 60, 300])

@@ -9,7 +9,7 @@ import pytest
 from robots import direct_model, field, lidar
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.sim import worlds as sizes
+from nics_drl_bridge.sim import state as sizes
 from nics_drl_bridge.sim.simulator import FastSimulator
 
 STEPS = 500

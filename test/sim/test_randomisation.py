@@ -7,13 +7,13 @@ import pytest
 from robots import direct_model, lidar
 from scipy import stats
 
-from nics_drl_bridge.calibration.noise_model import MEASURED, Level, Noise
 from nics_drl_bridge.config import validate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.kinematics.kernels import term_arrays
 from nics_drl_bridge.lidar import fault_kernels
 from nics_drl_bridge.lidar.faults import SKEW, LidarFaults
+from nics_drl_bridge.robot.kernels import term_arrays
+from nics_drl_bridge.robot.noise import MEASURED, Level, Noise
 from nics_drl_bridge.sim.randomisation import Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.randomisation_ranges import LidarRanges
 

@@ -5,10 +5,10 @@ import pytest
 from moving import PERIOD, scattered, sides
 from shapely import LineString, MultiLineString, Point
 
-from nics_drl_bridge.lidar.maps_grid import GridMap
+from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import place
-from nics_drl_bridge.sim import motion_layout as at
-from nics_drl_bridge.sim.motion import NO_DISTANCES, PLAN, distance_arrays
+from nics_drl_bridge.sim import obstacles as at
+from nics_drl_bridge.sim.obstacles import NO_DISTANCES, PLAN, distance_arrays
 from nics_drl_bridge.sim.separation_kernels import clearance, map_distance, on_wall, restrain
 
 HALF = np.array([1.5, 1.0])

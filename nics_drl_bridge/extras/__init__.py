@@ -1,0 +1,1 @@
+"""What needs an optional library or serves few; reached by entry points only."""

@@ -1,0 +1,162 @@
+"""How a robot stops: from the file of its limits, or with care from its model.
+
+Settings with which the robot could never move: to be said at the start, not in the field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from nics_drl_bridge.config import find_config, load_yaml
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.gate.limits import SPEED, TURN, Limits, LimitsFile, Stopping
+from nics_drl_bridge.gate.state import GateConfig, ShieldConfig
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.taylor import TaylorModel, term_name
+
+ANGLE = "rad"
+UNKNOWN_LAG_S = 0.5
+"""Of a robot whose model shows none [s]."""
+SLOWEST_LAG_S = 5.0
+"""What settles more slowly is no lag but a combination that no command moves [s]."""
+UNKNOWN_DECELERATION = 0.5
+"""Of a robot whose limits are not known [m/s^2]."""
+HOLD_S = GateConfig.gap_s
+
+
+def shield_config(
+    model: SimulatorModel,
+    limits: Limits | None,
+    file: str | Path = "",
+    given: Mapping[str, float] | None = None,
+) -> tuple[ShieldConfig, str]:
+    """The shield of a robot, and a sentence that tells its values and where they are from.
+
+    Args:
+        model: of the robot.
+        limits: of it, if any.
+        file: of the limits, as `load_limits` takes it; its `shield` holds what was measured.
+        given: values that go before those of the file, by their names there.
+
+    Raises:
+        ConfigError: a value can't be used, or the robot's commands tell no motion.
+    """
+    path = find_config(file, "limits") if file else None
+    told = None if path is None else load_yaml(path, LimitsFile).shield
+    values = told or _derived(model, limits)
+    values = values.model_copy(update=dict(given or {}))
+    for name, value in values.model_dump().items():
+        least = "greater than 0" if name == "deceleration" else "at least 0"
+        if not (np.isfinite(value) and value >= 0.0) or (value == 0.0 and name == "deceleration"):
+            raise ConfigError(f"parameter 'shield_{name}' is {value:g}; it must be {least}.")
+    lidar = model.lidar
+    config = ShieldConfig(
+        latency_s=values.latency,
+        deceleration=values.deceleration,
+        margin=values.margin,
+        hold_s=HOLD_S,
+        footprint_radius=model.robot.footprint_radius,
+        wheelbase=wheelbase(model.robot),
+        obstacle_speed=values.obstacle_speed,
+        range_max=lidar.range_max,
+        range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
+    )
+    source = f"measured, by {path}" if told is not None else "derived from model and limits"
+    if given:
+        source += f", but {', '.join(sorted(given))} by parameter"
+    told_s = ", ".join(f"{name} {value:g}" for name, value in values.model_dump().items())
+    return config, f"the shield is on: {told_s} ({source})"
+
+
+def _derived(model: SimulatorModel, limits: Limits | None) -> Stopping:
+    """A base takes a command up once in its period, and brakes no harder than its limits."""
+    deceleration = UNKNOWN_DECELERATION
+    if limits is not None and limits.linear.any():
+        deceleration = float(limits.rate[limits.linear].min())
+    latency = model.calibration.command_latency_s + lag(model.kinematics) + model.control_period
+    return Stopping(latency=max(0.0, latency), deceleration=deceleration)
+
+
+def lag(kinematics: TaylorModel) -> float:
+    """The slowest time constant [s] with which a state settles; a guess where none shows.
+
+    By the eigenvalues of what the state's rates owe to the state itself, at rest.
+    """
+    states = kinematics.variables[: kinematics.state_size]
+    names = [term_name(row, kinematics.variables) for row in kinematics.powers]
+    own = np.zeros((len(states), len(states)))
+    for column, state in enumerate(states):
+        if state in names:
+            own[:, column] = kinematics.coefficients[3:, names.index(state)]
+    decays = -np.linalg.eigvals(own).real if states else np.zeros(0)
+    settling = decays[decays > 1.0 / SLOWEST_LAG_S]
+    return float(1.0 / settling.min()) if len(settling) else UNKNOWN_LAG_S
+
+
+def wheelbase(robot: RobotSpec) -> float:
+    """Of a robot that is told a steering angle [m]; 0 for one that is told a turn rate.
+
+    Raises:
+        ConfigError: its file does not tell, or it is told what is neither speed nor angle.
+    """
+    for variable in robot.command:
+        if variable.unit not in (SPEED, TURN, ANGLE):
+            raise ConfigError(
+                f"robot {robot.name!r}: the shield knows commands in m/s, rad/s and rad, and "
+                f"{variable.name!r} is in {variable.unit!r}; without it, set `shield: false`."
+            )
+    if all(variable.unit != ANGLE for variable in robot.command):
+        return 0.0
+    if not robot.parameters.get("wheelbase", 0.0) > 0.0:
+        raise ConfigError(
+            f"robot {robot.name!r}: the shield needs the parameter 'wheelbase' of a car; add it "
+            "under `parameters:` of the robot, or drive without a shield by `shield: false`."
+        )
+    return robot.parameters["wheelbase"]
+
+
+LEAST_DATA = 2
+"""So many data have to come while the gate settles, for their rate to be known."""
+
+
+def require_possible(config: GateConfig) -> None:
+    """Looks for settings with which the gate could never be armed.
+
+    Raises:
+        ConfigError: there is one, with the parameter, its value and what it needs.
+    """
+    for topic, rate, age in (
+        ("scan", config.scan_rate, config.scan_age_s),
+        ("odom", config.odom_rate, config.odom_age_s),
+    ):
+        declared = f"{topic} comes every {1.0 / rate:.3g} s ({rate:g} Hz are declared)"
+        if age <= 1.0 / rate:
+            raise ConfigError(
+                f"parameter '{topic}_age': {age:g} s: {declared}, so the robot could never move; "
+                f"give more than {1.0 / rate:.3g}."
+            )
+        if rate * config.settle_s < LEAST_DATA:
+            raise ConfigError(
+                f"{declared}, too seldom to be judged within {config.settle_s:g} s, so the robot "
+                f"could never move; the gate needs {LEAST_DATA / config.settle_s:g} Hz or more."
+            )
+
+
+def doubtful(config: GateConfig, control_period_s: float) -> str:
+    """A sentence about a setting with which only an unusual policy moves the robot, or nothing.
+
+    Args:
+        config: of the gate.
+        control_period_s: of the model, at which a policy commands unless it is told otherwise [s].
+    """
+    if config.command_age_s > control_period_s:
+        return ""
+    return (
+        f"parameter 'command_age': {config.command_age_s:g} s: a policy commands every "
+        f"{control_period_s:g} s unless it is told otherwise, and the robot would stop between any "
+        f"two commands; give more than {control_period_s:g}."
+    )
