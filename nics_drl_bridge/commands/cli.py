@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from nics_drl_bridge import __version__
+from nics_drl_bridge import __version__, extensions
 from nics_drl_bridge.commands.bake import bake
 from nics_drl_bridge.commands.console import EXIT_BAD_INPUT
 from nics_drl_bridge.commands.demo import demo
@@ -20,7 +20,6 @@ from nics_drl_bridge.commands.record import record
 from nics_drl_bridge.commands.replay import replay
 from nics_drl_bridge.commands.train import train
 from nics_drl_bridge.errors import LONGEST, shortened
-from nics_drl_bridge.extras.bags.command import bag
 
 app = typer.Typer(
     help="From a recording of a robot to a fast simulator, and back to the robot over ROS 2.",
@@ -50,8 +49,9 @@ def _options(
 
 for command in (generate, bake, record, replay, doctor, urdf, train, evaluate, demo):
     app.command()(command)
-app.add_typer(bag, name="bag")
 app.add_typer(policy, name="policy")
+for name, extension in extensions.known("commands").items():
+    app.add_typer(extension.load(), name=name)
 
 
 def main() -> None:

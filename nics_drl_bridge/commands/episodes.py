@@ -15,9 +15,9 @@ from typing import Any
 
 import gymnasium
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, nearest
-from nics_drl_bridge.extras.mujoco.machine import load_mujoco
 from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy.evaluation import Episode, drive_all
@@ -135,7 +135,7 @@ def check_place(place: str) -> None:
     if place != FAST and find_spec("rclpy") is None:
         raise ConfigError(f"the world {place!r} {MISSING_ROS.format(module='rclpy')}")
     if place == MUJOCO:
-        load_mujoco()
+        extensions.load("nodes", NODES[MUJOCO])
 
 
 def robot_of(policy: str) -> str:

@@ -5,12 +5,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.console import (
     RobotOption,
     TopicOption,
@@ -59,7 +62,6 @@ def generate(
 ) -> None:
     """Generates a simulator from a recording and writes it as a folder."""
     with one_sentence():
-        from nics_drl_bridge.extras.bags.salvage import salvaged
         from nics_drl_bridge.generator import check_place, save_model
         from nics_drl_bridge.generator import generate as generate_model
         from nics_drl_bridge.identify.dof import parse_alpha
@@ -74,9 +76,7 @@ def generate(
         spec, sensor, threshold = load_robot(robot), load_lidar(lidar), parse_alpha(alpha)
         shapes = load_world(world).shapes
         size = None if budget is None else parse_size(budget)
-        with salvaged(recording, salvage) as (whole, lines):
-            for line in lines:
-                typer.echo(line, err=True)
+        with _intact(recording, salvage) as whole:
             drive = read_recording(whole, spec, topic_roles(topics, topic or ()))
         drive = replace(drive, source=str(recording))
         model, identified = generate_model(
@@ -90,6 +90,18 @@ def generate(
             write_pictures(spec, identified, out / "pictures")
         typer.echo(model.report.rstrip())
         typer.echo(f"model written to {out}")
+
+
+@contextmanager
+def _intact(recording: Path, salvage: bool) -> Iterator[Path]:
+    """The recording; or what is intact of a damaged bag, if that is wanted."""
+    if not salvage:
+        yield recording
+        return
+    with extensions.load("salvage", "bag")(recording, True) as (whole, lines):
+        for line in lines:
+            typer.echo(line, err=True)
+        yield whole
 
 
 def urdf(

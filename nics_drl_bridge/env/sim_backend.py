@@ -5,13 +5,13 @@ The backends that an env drives: those by name, and a user's own.
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
+from nics_drl_bridge import extensions
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Backend, RobotView, Start, stacked
 from nics_drl_bridge.lidar.scanner import Renderer
@@ -105,11 +105,6 @@ class SimBackend:
         """Nothing has to be freed."""
 
 
-BACKENDS = {
-    "sim": "nics_drl_bridge.env.sim_backend:SimBackend",
-    "dds": "nics_drl_bridge.nodes.backends:dds_backend",
-}
-"""Where each backend lives. Named as text, so that an env in process never imports ROS 2."""
 NEEDED = ("reset", "step", "close")
 
 
@@ -166,16 +161,10 @@ def halting(backend: Any, still: NDArray[np.float64]) -> Backend:
 
 
 def make_backend(name: str, model: SimulatorModel, world: World, **options: Any) -> Backend:
-    """A backend by name.
+    """A backend by the name under which it is registered, see `extensions`.
 
     Raises:
         ConfigError: unknown name, or its library is missing.
     """
-    if name not in BACKENDS:
-        raise ConfigError(f"unknown backend {name!r}; {nearest(name, BACKENDS)}")
-    module, _, factory = BACKENDS[name].partition(":")
-    try:
-        made: Backend = getattr(import_module(module), factory)(model, world, **options)
-    except ModuleNotFoundError as error:
-        raise ConfigError(f"backend {name!r} {MISSING_ROS.format(module=error.name)}") from None
+    made: Backend = extensions.load("backends", name)(model, world, **options)
     return made

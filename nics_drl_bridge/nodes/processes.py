@@ -69,7 +69,7 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
     On Linux the node also ends when the thread that started it does.
 
     Args:
-        node: module below `nics_drl_bridge.nodes`, which is also the executable's name.
+        node: name of its executable.
         folder: for its log and its parameter file.
         parameters: of the node.
         domain_id: DDS domain.
@@ -93,7 +93,7 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
         self.log = folder / f"{node}.log"
         file = folder / f"{node}.yaml"
         file.write_text(dump_yaml({"/**": {"ros__parameters": dict(parameters)}}), encoding="utf-8")
-        command = [sys.executable, "-m", f"nics_drl_bridge.nodes.{node}", "--ros-args"]
+        command = [sys.executable, "-m", "nics_drl_bridge.nodes.start", node, "--ros-args"]
         command += ["--params-file", str(file)]
         if namespace:
             command += ["-r", f"__ns:=/{namespace.strip('/')}"]

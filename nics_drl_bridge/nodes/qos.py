@@ -28,6 +28,8 @@ from rclpy.qos import (
 from rclpy.qos import QoSCompatibility as Compatibility
 from rclpy.subscription import Subscription
 
+from nics_drl_bridge.recording.messages import Offer
+
 
 def _keep_last(depth: int, reliability: ReliabilityPolicy) -> QoSProfile:
     return QoSProfile(
@@ -160,3 +162,12 @@ def owner(end: Any) -> str | None:
     """
     name = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
     return None if UNKNOWN in name else name
+
+
+def offer_of(profile: QoSProfile) -> Offer:
+    """What a publisher offers, or a subscriber asks for."""
+    return Offer(
+        max(profile.depth, 1),
+        profile.reliability != ReliabilityPolicy.BEST_EFFORT,
+        profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+    )

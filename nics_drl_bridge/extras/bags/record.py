@@ -16,9 +16,8 @@ from rclpy.subscription import Subscription
 
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes.message_types import message_texts, message_type
-from nics_drl_bridge.nodes.qos import QosWatch
+from nics_drl_bridge.nodes.qos import QosWatch, offer_of
 from nics_drl_bridge.nodes.runner import run_node
-from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.recording.write import BagSink, Storage, bag_sink
 
 ROBOT = (
@@ -171,15 +170,6 @@ class BagRecorder(QosWatch):
         if self._order.use_sim_time:
             return int(self.get_clock().now().nanoseconds)
         return int(info.get("received_timestamp") or time.time_ns())
-
-
-def offer_of(profile: QoSProfile) -> Offer:
-    """What a publisher offers, or a subscriber asks for."""
-    return Offer(
-        max(profile.depth, 1),
-        profile.reliability != ReliabilityPolicy.BEST_EFFORT,
-        profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
-    )
 
 
 def _quality(reliable: bool, transient_local: bool) -> QoSProfile:

@@ -9,7 +9,8 @@ import functools
 import json
 import time
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
 from stable_baselines3.common.logger import configure
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extras.ray.cluster import connected
 from nics_drl_bridge.extras.ray.runner import (
     COLLISION,
     ENDED,
@@ -57,6 +59,21 @@ SILENCE_S = 600.0
 """Without a step from any env runner for so long [s], a run ends; it can be resumed."""
 PROBE_S = 1.0
 """How long a rollout waits for an env runner that was lost [s]; later ones ask again."""
+
+
+@contextmanager
+def learner(
+    address: str | None, env_runners: int | None, worlds: int
+) -> Iterator[Callable[..., Trained]]:
+    """What trains one policy on a cluster, which is connected as long as this is open.
+
+    Args:
+        address: of the cluster, see `cluster.connected`.
+        env_runners: processes that share the worlds.
+        worlds: how many.
+    """
+    with connected(address, env_runners, worlds) as runners:
+        yield functools.partial(train_on_ray, runners=runners)
 
 
 def train_on_ray(
