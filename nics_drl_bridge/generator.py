@@ -20,7 +20,6 @@ from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.report import fit_report
 from nics_drl_bridge.identify.usefulness import why_useless
 from nics_drl_bridge.lidar.bake import bake
-from nics_drl_bridge.lidar.budget import choose
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
@@ -151,7 +150,6 @@ def generate(
     alpha: fit.Alpha = "auto",
     assume: bool = False,
     strict: bool = False,
-    budget: int | None = None,
     anyway: bool = False,
 ) -> tuple[SimulatorModel, Identified]:
     """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
@@ -165,8 +163,6 @@ def generate(
         alpha: pruning threshold of Eq. 2, or `auto`.
         assume: fill in from the textbook what the drive did not show, marked as assumed.
         strict: refuse a drive that did not move every input on its own.
-        budget: greatest size of the lidar table [bytes], see `lidar.budget`; by default a table
-            of the paper's density.
         anyway: give a model also if it predicts unseen data hardly better than that the robot
             stands still.
 
@@ -182,7 +178,7 @@ def generate(
     if reason and not anyway:
         raise FitError(reason)
     shapes = (*shapes, footprint_shape(robot))
-    table = bake(lidar, shapes) if budget is None else choose(lidar, shapes, budget).table
+    table = bake(lidar, shapes)
     model = SimulatorModel(
         robot, identified.model, identified.calibration, lidar, table,
         identified.noise,

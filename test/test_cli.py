@@ -188,34 +188,6 @@ def test_a_recording_of_another_robot_is_refused(drive, tmp_path):
     assert names(tmp_path) == set()
 
 
-def test_bake_writes_a_table_within_a_budget_and_no_bar_into_a_pipe(tmp_path):
-    done = nics("bake", "--world", "arena", "--budget", "200kB", "--out", "t.npz", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    assert done.stdout.endswith("table written to t.npz\n")
-    assert {"density", "expected", "size", "time"} <= set(done.stdout.split())
-    assert names(tmp_path) == {"t.npz"}
-    assert 0 < (tmp_path / "t.npz").stat().st_size <= 200_000
-
-
-def test_bake_takes_a_sensor_model(tmp_path):
-    (tmp_path / "dull.yaml").write_text("sensor_model: [{kind: intensity}]\n")
-    words = ("bake", "--world", "arena", "--distances", "5", "--sensor-model")
-    done = nics(*words, "dull.yaml", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "sensor model    intensity 1 at 1 m, reflectivity 0.5" in done.stdout
-    (tmp_path / "dull.yaml").write_text("sensor_model: [{kind: intense}]\n")
-    told = refused(nics(*words, "dull.yaml", cwd=tmp_path))
-    assert "dull.yaml: key 'sensor_model.0': unknown kind 'intense'; did you mean" in told
-
-
-def test_bake_without_shapes_or_with_nonsense_is_refused(tmp_path):
-    assert "nothing to bake" in refused(nics("bake", cwd=tmp_path))
-    wrong = ("bake", "--world", "arena", "--budget", "much")
-    assert "'much': is no size" in refused(nics(*wrong, cwd=tmp_path))
-    assert names(tmp_path) == set()
-
-
 def test_ctrl_c_in_a_compiled_function_is_an_interruption_and_another_fault_is_not():
     with pytest.raises(typer.Exit) as caught, console.one_sentence():
         raise SystemError("returned a result with an exception set") from KeyboardInterrupt()

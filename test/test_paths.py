@@ -26,7 +26,7 @@ from nics_drl_bridge.middleware.playback import Estimate, write_estimate
 from nics_drl_bridge.policy.policy_file import load_policy, shipped
 from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.recording.readers import load_csv_folder, read_recording
-from nics_drl_bridge.recording.recording import load_npz, save_recording
+from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.recording.topic_roles import topic_roles
 from nics_drl_bridge.recording.write import check_out, write_drive
@@ -64,7 +64,7 @@ def test_a_drive_is_written_and_read_at_either(tmp_path, kind, name):
 def test_a_recording_is_saved_and_loaded_at_either(tmp_path, kind):
     place, drive = kind(tmp_path / "drive.npz"), record(CAR, np.random.default_rng(0), duration=5.0)
     save_recording(drive, place)
-    assert np.array_equal(load_npz(place).pose.values, drive.pose.values)
+    assert np.array_equal(load_recording(place).pose.values, drive.pose.values)
 
 
 @KINDS
@@ -119,7 +119,7 @@ def test_a_policy_is_loaded_from_either(kind):
 
 @KINDS
 @pytest.mark.parametrize(
-    "load", [load_csv_folder, load_npz, load_sensor_models, load_shapes, replay, topic_roles]
+    "load", [load_csv_folder, load_recording, load_sensor_models, load_shapes, replay, topic_roles]
 )
 def test_what_is_not_there_is_one_sentence_for_either(tmp_path, kind, load):
     with pytest.raises(BridgeError, match=r"gone: no such f"):

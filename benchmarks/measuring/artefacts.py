@@ -34,7 +34,7 @@ from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
 from nics_drl_bridge.policy.train_export import export_policy
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.recording import textbook
-from nics_drl_bridge.recording.recording import load_npz, save_recording
+from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.robot.spec import load_robot
 
 LONGEST_S = 0.05
@@ -82,7 +82,7 @@ def _recording() -> Artefact:
     drives = [textbook.record(robot, np.random.default_rng(seed)) for seed in (0, 1)]
 
     def version(path: Path) -> int:
-        return _which(load_npz(path).pose.values, [drive.pose.values for drive in drives])
+        return _which(load_recording(path).pose.values, [drive.pose.values for drive in drives])
 
     def write(path: Path, n: int) -> None:
         save_recording(drives[n], path)

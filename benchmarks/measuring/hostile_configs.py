@@ -91,7 +91,7 @@ def attempts(rng: Rng, folder: Path) -> Iterator[Attempt]:
         elif draw < 0.6:
             told, bad = _WORLDS[int(rng.integers(len(_WORLDS)))](rng)
             path.write_text(bad, encoding="utf-8")
-            act = nics("bake", "--world", path, "--out", folder / "t.npz")
+            act = nics("train", "--world", path, "--steps", "1", "--out", folder / "run")
             use = _used(_world, path) if rng.random() < 0.7 else act
             fits = told != "more than fit" or use is not act  # which nobody finds by baking
             yield Attempt("world", told, use, "bad" if fits else "any")

@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 from nics_drl_bridge import __version__, extensions
-from nics_drl_bridge.commands.bake import bake
 from nics_drl_bridge.commands.console import EXIT_BAD_INPUT
 from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.doctor import doctor
@@ -47,7 +46,7 @@ def _options(
     """Options of every command."""
 
 
-for command in (generate, bake, record, replay, doctor, urdf, train, evaluate, demo):
+for command in (generate, record, replay, doctor, urdf, train, evaluate, demo):
     app.command()(command)
 app.add_typer(policy, name="policy")
 for name, extension in extensions.known("commands").items():

@@ -43,9 +43,6 @@ def generate(
     strict: Annotated[
         bool, typer.Option(help="Refuse a drive that did not move every input on its own.")
     ] = False,
-    budget: Annotated[
-        str | None, typer.Option(help="Greatest size of the lidar table, as 8MB; see nics bake.")
-    ] = None,
     salvage: Annotated[
         bool,
         typer.Option("--salvage", help="Take what is intact of a damaged bag; tell the rest."),
@@ -65,7 +62,6 @@ def generate(
         from nics_drl_bridge.generator import check_place, save_model
         from nics_drl_bridge.generator import generate as generate_model
         from nics_drl_bridge.identify.dof import parse_alpha
-        from nics_drl_bridge.lidar.budget import parse_size
         from nics_drl_bridge.lidar.spec import load_lidar
         from nics_drl_bridge.recording.readers import read_recording
         from nics_drl_bridge.recording.topic_roles import topic_roles
@@ -75,13 +71,12 @@ def generate(
         check_place(out)
         spec, sensor, threshold = load_robot(robot), load_lidar(lidar), parse_alpha(alpha)
         shapes = load_world(world).shapes
-        size = None if budget is None else parse_size(budget)
         with _intact(recording, salvage) as whole:
             drive = read_recording(whole, spec, topic_roles(topics, topic or ()))
         drive = replace(drive, source=str(recording))
         model, identified = generate_model(
             drive, spec, sensor, shapes, order, threshold,
-            assume=assume_textbook, strict=strict, budget=size, anyway=anyway,
+            assume=assume_textbook, strict=strict, anyway=anyway,
         )  # fmt: skip
         save_model(model, out)
         if pictures:

@@ -199,3 +199,35 @@ def register_envs() -> None:
 
 
 register_envs()
+
+
+def make(task: str = "navigation", **arguments: Any) -> gymnasium.Env[Any, Any]:
+    """An env of a task, with Gymnasium's own wrappers around it.
+
+    Args:
+        task: a name, or `path/to/file.py:ClassName`.
+        arguments: of `BridgeEnv`, as `model`, `world` and `backend`.
+
+    Raises:
+        ConfigError, ModelError: an unknown name or a wrong file.
+    """
+    made: gymnasium.Env[Any, Any] = gymnasium.make(TASK, task=task, **arguments)
+    return made
+
+
+def make_vec(num_envs: int, task: str = "navigation", **arguments: Any) -> Any:
+    """A task in many worlds at once, for training.
+
+    Args:
+        num_envs: N.
+        task: a name, or `path/to/file.py:ClassName`.
+        arguments: of `BridgeVectorEnv`, as `model`, `world` and `threads`.
+
+    Returns:
+        A `BridgeVectorEnv`.
+
+    Raises:
+        ConfigError, ModelError: an unknown name or a wrong file.
+    """
+    vectors = import_module("nics_drl_bridge.env.vector_env")  # which imports this module
+    return vectors.BridgeVectorEnv(num_envs, task=task, **arguments)

@@ -15,7 +15,12 @@ from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.bag_file import is_bag
 from nics_drl_bridge.recording.bag_reader import load_bag
-from nics_drl_bridge.recording.recording import SLOWEST_SAMPLING_S, Recording, Stream, load_npz
+from nics_drl_bridge.recording.recording import (
+    SLOWEST_SAMPLING_S,
+    Recording,
+    Stream,
+    load_recording,
+)
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -50,7 +55,7 @@ def read_recording(
     if path.is_dir():
         return load_csv_folder(path)
     if path.suffix == ".npz":
-        return load_npz(path)
+        return load_recording(path)
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder; check the path.")
     if path.suffix == ROS_1:

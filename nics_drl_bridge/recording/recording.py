@@ -242,7 +242,7 @@ def save_recording(recording: Recording, path: str | Path) -> None:
     write_bytes(path, npz_bytes({"meta": np.array(json.dumps(meta)), **arrays}))
 
 
-def load_npz(path: str | Path) -> Recording:
+def load_recording(path: str | Path) -> Recording:
     """Reads a recording that `save_recording` wrote.
 
     Raises:

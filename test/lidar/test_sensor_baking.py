@@ -7,7 +7,6 @@ from robots import lidar
 from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.lidar.bake import bake, with_shapes
-from nics_drl_bridge.lidar.budget import choose, expected_rmse, table_bytes
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.sensor_models import IncidenceDropout, Intensity
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle
@@ -131,16 +130,3 @@ def test_a_table_without_a_sensor_model_is_written_as_before():
     assert list(npz_arrays(table.dump())) == ["about", "grid", "start", "cell", "rows"]
     assert "sensor_model" not in table._about()
     assert "reflectivity" not in table._about()
-
-
-def test_a_budget_counts_intensities_and_the_error_is_that_of_the_geometry():
-    losing = (IncidenceDropout(greatest_incidence=0.5), BRIGHT)
-    spec = SPEC.model_copy(update={"sensor_model": losing})
-    assert table_bytes(spec, [SQUARE], SMALL) == bake(spec, [SQUARE], SMALL).memory
-    assert expected_rmse(spec, bake(spec, [SQUARE], SMALL)) == expected_rmse(
-        SPEC, bake(SPEC, [SQUARE], SMALL)
-    )
-    choice = choose(spec, [SQUARE], 300_000)
-    assert len(choice.table.dump()) <= 300_000
-    assert choice.table.sensor_model == losing
-    assert choice.rmse < 0.02

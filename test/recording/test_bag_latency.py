@@ -10,7 +10,7 @@ import bags
 from nics_drl_bridge.recording.bag_file import opened
 from nics_drl_bridge.recording.bag_reader import latency_of
 from nics_drl_bridge.recording.readers import read_recording
-from nics_drl_bridge.recording.recording import load_npz, save_recording
+from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.robot.spec import load_robot
 
 LEAST_S, JITTER_S = 0.012, 0.010
@@ -61,5 +61,5 @@ def test_stamps_of_another_clock_and_a_few_messages_tell_nothing(tmp_path, chang
 def test_a_recording_keeps_its_latency_in_a_file(tmp_path):
     recording = read_recording(drive(tmp_path / "bag"), load_robot("differential"))
     save_recording(recording, tmp_path / "drive.npz")
-    assert load_npz(tmp_path / "drive.npz").latency == recording.latency
+    assert load_recording(tmp_path / "drive.npz").latency == recording.latency
     assert set(recording.latency.measured) == {"scan", "odom"}

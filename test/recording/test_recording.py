@@ -14,7 +14,7 @@ from nics_drl_bridge.recording.recording import (
     Recording,
     Stream,
     check,
-    load_npz,
+    load_recording,
     samples_on_one_clock,
     save_recording,
 )
@@ -127,7 +127,7 @@ def test_headings_in_degrees_are_refused(recording, car):
 def test_a_saved_recording_reads_back_to_the_same_bits(recording, tmp_path):
     path = tmp_path / "drive.npz"
     save_recording(recording, path)
-    back = load_npz(path)
+    back = load_recording(path)
     assert back.source == str(path)
     assert set(back.streams) == set(recording.streams)
     for name, stream in recording.streams.items():
@@ -144,7 +144,7 @@ def test_another_format_is_named(tmp_path):
     path = tmp_path / "a.npz"
     path.write_bytes(npz_bytes({"meta": np.array(json.dumps(meta))}))
     with pytest.raises(RecordingError, match="format 'other/1' is not"):
-        load_npz(path)
+        load_recording(path)
 
 
 @pytest.mark.parametrize(
@@ -163,19 +163,19 @@ def test_a_file_that_lacks_a_part_is_refused(tmp_path, meta):
     arrays = {"meta": np.array(json.dumps(meta)), "command": np.zeros((2, 2))}
     path.write_bytes(npz_bytes({**arrays, "command_t": np.zeros(2)}))
     with pytest.raises(RecordingError, match="is not a recording of this package"):
-        load_npz(path)
+        load_recording(path)
 
 
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(RecordingError, match=r"nowhere.npz: no such file"):
-        load_npz(tmp_path / "nowhere.npz")
+        load_recording(tmp_path / "nowhere.npz")
 
 
 def test_a_recording_is_never_unpickled(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, meta=np.array([{"format": FORMAT}], dtype=object))
     with pytest.raises(RecordingError, match=r"can't be read as \.npz"):
-        load_npz(path)
+        load_recording(path)
 
 
 def test_a_damaged_file_is_refused_or_reads_as_it_was(recording, tmp_path):
@@ -192,7 +192,7 @@ def test_a_damaged_file_is_refused_or_reads_as_it_was(recording, tmp_path):
             damaged[rng.integers(len(content))] ^= 1 << rng.integers(8)
         path.write_bytes(damaged)
         try:
-            back = load_npz(path)
+            back = load_recording(path)
         except RecordingError:
             refused += 1
         else:
