@@ -1,4 +1,4 @@
-"""Entry points of the nodes: one sentence, not a traceback, where ROS 2 is missing."""
+"""Entry points of the nodes: one sentence instead of a traceback if ROS 2 is missing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ EXIT_BAD_INPUT = 2
 
 
 def _start(node: str) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM):  # to import takes seconds
+    for number in (signal.SIGINT, signal.SIGTERM):  # importing takes seconds
         signal.signal(number, lambda *_: sys.exit(0))
     try:
         module = import_module(f"nics_drl_bridge.nodes.{node}")
