@@ -49,7 +49,7 @@ BUILTIN_SEED = 0
 
 @dataclass(frozen=True)
 class SimulatorModel:
-    """All that a fast simulator needs to know of a robot.
+    """All that a fast simulator needs to know about a robot.
 
     Attributes:
         robot: names, units, order and limits of state and command.
@@ -59,7 +59,7 @@ class SimulatorModel:
         table: baked ranges of the obstacles' shapes and of the robot itself.
         noise: of sensors and motion, see `Noise`.
         control_period: time between commands [s]; a whole number of `kinematics.dt`.
-        report: how the model came about, as text for people.
+        report: how the model was made, as readable text.
         latency: of scan and odometry, where the recording showed it.
     """
 
@@ -121,7 +121,7 @@ class SimulatorModel:
 
     @property
     def fingerprint(self) -> str:
-        """Tells two models apart: the first 16 digits of a SHA-256 over all of it."""
+        """Identifies the model: the first 16 digits of the SHA-256 of `text`."""
         return sha256(self.text.encode())[:16]
 
 
@@ -156,22 +156,22 @@ def generate(
 
     Args:
         recording: a drive of the robot.
-        robot: what state and command are.
+        robot: defines state and command.
         lidar: the sensor to simulate.
         shapes: of the obstacles to bake; the robot's own footprint is added.
         order: of the Taylor model.
         alpha: pruning threshold of Eq. 2, or `auto`.
         assume: fill in from the textbook what the drive did not show, marked as assumed.
-        strict: refuse a drive that did not move every input on its own.
-        anyway: give a model also if it predicts unseen data hardly better than that the robot
-            stands still.
+        strict: refuse a drive that did not excite every input on its own.
+        anyway: return a model even if it predicts unseen data hardly better than a standing
+            robot would.
 
     Returns:
-        The model, and all that was found out on the way.
+        The model, and everything that was identified on the way.
 
     Raises:
         RecordingError: the recording can't be used for this robot.
-        FitError: the drive does not hold enough to fit a model, or the model is of no use.
+        FitError: the drive does not contain enough to fit a model, or the model is useless.
     """
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
     reason = why_useless(identified, robot, order)
@@ -188,7 +188,7 @@ def generate(
 
 
 def footprint_shape(robot: RobotSpec) -> Circle | Polygon:
-    """What the robot fills, around its `base_link`."""
+    """Shape of the robot's footprint around its `base_link`."""
     if robot.footprint is None:
         return Circle(radius=robot.footprint_radius)
     return Polygon(points=robot.footprint)
@@ -203,7 +203,7 @@ def builtin_model(robot: str) -> SimulatorModel:
 
 
 def open_model(name: str | Path) -> SimulatorModel:
-    """A model by its folder, or by the name of a shipped robot (`ackermann`)."""
+    """Opens a model by its folder, or by the name of a shipped robot (`ackermann`)."""
     name = str(name)
     if Path(name).is_dir():
         return load_model(name)
@@ -217,19 +217,19 @@ def open_model(name: str | Path) -> SimulatorModel:
 
 
 def check_place(folder: str | Path) -> None:
-    """Makes sure, before the work of a fit, that `save_model` can write to a folder.
+    """Checks, before the work of a fit, that `save_model` can write to a folder.
 
     Raises:
-        ConfigError: the folder holds something else, or nothing can be written there.
+        ConfigError: the folder contains something else, or is not writable.
     """
     check_folder(folder, MODEL_FILE)
 
 
 def save_model(model: SimulatorModel, folder: str | Path) -> None:
-    """Writes a model as a folder, whole or not at all.
+    """Writes a model as a folder, completely or not at all.
 
     Raises:
-        ConfigError: the folder holds something else.
+        ConfigError: the folder contains something else.
     """
     with whole_folder(folder, MODEL_FILE) as temporary:
         text = f"{model.text}report_sha256: {sha256(model.report.encode())}\n"

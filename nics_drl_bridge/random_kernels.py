@@ -33,7 +33,7 @@ def _mix(z):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def uniform(seed, stream, counter):  # type: ignore[no-untyped-def]
-    """A number in [0, 1)."""
+    """A draw from the uniform distribution over [0, 1)."""
     step = np.uint64(0x9E3779B97F4A7C15)
     z = _mix(np.uint64(seed) * step + step)
     z = _mix(z + (np.uint64(stream) + np.uint64(1)) * step)
@@ -50,7 +50,7 @@ def normal(seed, stream, counter):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def episode_seed(seed, number):  # type: ignore[no-untyped-def]
-    """The seed of an env's episode: the first is the env's own seed, the others below 2**53."""
+    """Seed of an env's episode: the first is the env's own seed, the others are below 2**53."""
     if number == 0:
         return np.int64(seed)
     return np.int64(uniform(seed, EPISODE_STREAM, number) * 9007199254740992.0)

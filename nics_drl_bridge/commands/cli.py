@@ -54,17 +54,17 @@ for name, extension in extensions.known("commands").items():
 
 
 def main() -> None:
-    """Entry point of the executable; a wrong option too is one sentence and exit code 2."""
+    """Entry point of the executable; a wrong option also gives one sentence and exit code 2."""
     try:
         code = app(prog_name="nics", standalone_mode=False)
     except typer.Abort:
         typer.echo("Aborted.", err=True)
         raise SystemExit(1) from None
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # it is flushed at the end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # stdout is flushed at exit
         raise SystemExit(1) from None
     except Exception as error:
-        if not hasattr(error, "format_message"):  # of the options, whichever release has it
+        if not hasattr(error, "format_message"):  # no option error of click or typer
             raise
         if told := error.format_message().strip():  # otherwise its help has been shown
             told = shortened(told.rstrip(".?"), LONGEST)

@@ -1,6 +1,6 @@
 """`nics demo`.
 
-The demo's parts, one after the other.
+Runs the parts of the demo in sequence.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.sim.world import load_world
 
 QUICK_TO_LEARN, RECORDED = "differential", "ackermann"
-"""The robot of a demo that names none: without and with a recording."""
+"""Default robot of the demo, without and with a recording."""
 
 
 def demo(
@@ -83,14 +83,14 @@ MANY = 500
 
 @dataclass
 class Clock:
-    """Tells how long each part of the demo took."""
+    """Measures and reports the duration of each part of the demo."""
 
     say: Say
     took: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Times what is done within."""
+        """Times the block."""
         begin = time.perf_counter()
         yield
         self.took[name] = time.perf_counter() - begin
@@ -98,16 +98,16 @@ class Clock:
 
 
 def run(plan: Plan, say: Say) -> Outcome:
-    """Generates a simulator, learns to drive in it, drives the same over DDS, and reports.
+    """Generates a simulator, trains a policy in it, drives it over DDS, and writes the report.
 
-    Every process that it starts has ended when it returns or raises.
+    Every process that this starts has ended when it returns or raises.
 
     Args:
-        plan: what to do.
-        say: takes each line of progress.
+        plan: the plan.
+        say: called with each line of progress.
 
     Raises:
-        BridgeError: a bad recording or name, or a node that does not come up.
+        BridgeError: a bad recording or name, or a node that does not start.
     """
     if find_spec("rclpy") is None:
         raise ConfigError(f"the demo {MISSING_ROS.format(module='rclpy')}")
@@ -136,7 +136,7 @@ def _generate(plan: Plan, say: Say) -> tuple[SimulatorModel, Identified]:
     source = plan.recording or _record(robot, plan.out / "recording.npz", say)
     say(f"generating a simulator of the robot {robot.name!r} from {source}")
     recording = read_recording(source, robot)
-    # A demo has to steer, even if the drive never did; the report names what is assumed.
+    # The demo has to steer even if the drive never did; the report names the assumptions.
     model, identified = generate(recording, robot, load_lidar("paper"), world.shapes, assume=True)
     save_model(model, plan.model)
     say(model.report.rstrip())
@@ -150,7 +150,7 @@ def _record(robot: RobotSpec, path: Path, say: Say) -> Path:
 
 
 def _evaluate(plan: Plan, model: SimulatorModel, name: str, say: Say) -> Summary:
-    """Many unseen episodes side by side, without the estimator."""
+    """Drives many unseen episodes at once, without the estimator."""
     say(f"evaluating {name} in {MANY} unseen episodes, all at once")
     policy, task = open_policy(name, model)
     env = BridgeVectorEnv(MANY, model, plan.world, task)
@@ -163,7 +163,7 @@ def _evaluate(plan: Plan, model: SimulatorModel, name: str, say: Say) -> Summary
 
 
 def _drive(place: str, what: str, plan: Plan, policy: str, say: Say) -> list[Episode]:
-    """The plan's episodes in one of `trial.PLACES`, told of one by one."""
+    """Drives the plan's episodes in one of `trial.PLACES` and reports each."""
     say(f"{what} {'in process' if place == FAST else 'over DDS in lock-step'}")
     return drive_in(
         place,

@@ -1,4 +1,4 @@
-"""What the demo is to show, and what it showed."""
+"""Plan of the demo, and its outcome."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Plan:
-    """What to demonstrate.
+    """Plan of a demo.
 
     Attributes:
-        out: folder of everything that the demo writes.
+        out: output folder.
         robot: name or YAML file of the robot.
         world: name or YAML file of the world.
         recording: of a drive; None makes one with the robot's textbook kinematics.
-        episodes: how many, in process and over DDS.
+        episodes: number of episodes, in process and again over DDS.
         policy: a policy file or a name, to drive with instead of training one.
-        train_steps: environment steps of the training; None takes those of `demo.yaml`.
+        train_steps: environment steps of the training; None uses those of `demo.yaml`.
     """
 
     out: Path
@@ -38,13 +38,13 @@ class Plan:
 
     @property
     def policy_file(self) -> Path:
-        """Of the policy that is trained."""
+        """Path of the trained policy."""
         return self.out / "policy.onnx"
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the demo showed: successes in process and over DDS, and where the report is."""
+    """Outcome of the demo: successes in process and over DDS, and the path of the report."""
 
     in_process: int
     over_dds: int

@@ -1,6 +1,6 @@
-"""The demo's policy: trained in the generated simulator, or one that is there already.
+"""The demo's policy: trained in the generated simulator, or an existing one.
 
-The demo's last part: the nodes of a robot in real time, each a process, nobody stepping them.
+The demo's last part: the nodes of a robot in real time, each in its own process.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ SETTINGS, SEED = "demo", 0
 NEEDED = ("torch", "stable_baselines3", "tensorboard", "onnx", "onnxruntime")
 BASELINE = "go_to_goal"
 LINES = 10
-"""How often a training tells how it gets on."""
+"""Number of progress reports of a training."""
 
 
 @dataclass(frozen=True)
 class Learned:
-    """The policy that the demo drives with.
+    """The policy of the demo.
 
     Attributes:
         policy: a policy file or a name, see `policies.open_policy`.
-        how: it came about, in a sentence.
-        curve: of the training; empty where there was none.
+        how: origin of the policy, in a sentence.
+        curve: of the training; empty without one.
     """
 
     policy: str
@@ -49,15 +49,15 @@ class Learned:
 
 
 def learn(plan: Plan, model: SimulatorModel, say: Say) -> Learned:
-    """Trains a policy, unless the plan names one or what a training needs is not installed.
+    """Trains a policy, unless the plan names one or a module for training is not installed.
 
     Args:
-        plan: what to do; the training writes into its folder.
-        model: the generated simulator, which is in `plan.model` too.
-        say: takes each line of progress.
+        plan: the plan; the training writes into its folder.
+        model: the generated simulator, also saved in `plan.model`.
+        say: called with each line of progress.
 
     Raises:
-        BridgeError: the named policy can't be used, or settings do not fit.
+        BridgeError: the named policy can't be used, or the settings do not fit.
     """
     if plan.policy is not None:
         open_policy(plan.policy, model)
@@ -74,7 +74,7 @@ def learn(plan: Plan, model: SimulatorModel, say: Say) -> Learned:
 
 
 def settings_of(plan: Plan) -> TrainingSettings:
-    """The demo's training, in the plan's simulator and world."""
+    """Settings of the demo's training, in the plan's simulator and world."""
     chosen = load_training(SETTINGS)
     changes = {
         "robot": str(plan.model),
@@ -113,7 +113,7 @@ def _trained(plan: Plan, say: Say) -> Learned:
 
 
 def _ready_made(model: SimulatorModel) -> str:
-    """The shipped policy of the robot, where it fits, or a baseline."""
+    """The shipped policy of the robot if it fits, else a baseline."""
     name = model.robot.name
     if name in shipped_policies() and find_spec("onnxruntime") and find_spec("onnx"):
         try:
@@ -125,37 +125,37 @@ def _ready_made(model: SimulatorModel) -> str:
 
 
 START_S, ARRIVE_S = 60.0, 40.0
-"""How long a node may take to come up, and the robot to arrive."""
+"""Time that a node may take to start, and the robot to arrive."""
 FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05
-"""The gate's limits in the demo: from zero to the greatest command, and to its greatest change."""
+"""Limits of the demo's gate: time from zero to the maximum command, and to its maximum rate."""
 
 
 @dataclass(frozen=True)
 class Live:
-    """A drive of the deployed nodes, and whether it arrived."""
+    """A drive of the deployed nodes, with its path; `arrived` is True if it reached the goal."""
 
     arrived: bool
     path: Episode
 
 
 def deploy(plan: Plan, model: SimulatorModel, policy: str, seed: int, say: Say) -> Live:
-    """Lets simulator, middleware, policy and gate drive one scene in real time.
+    """Runs simulator, middleware, policy and gate in one scene in real time.
 
     Args:
         plan: gives the world and the folder for logs.
-        model: of the robot, which is in `plan.model` too.
-        policy: that `policy_node` drives with.
+        model: of the robot, also saved in `plan.model`.
+        policy: the policy of `policy_node`.
         seed: of the scene.
-        say: takes each line of progress.
+        say: called with each line of progress.
 
     Raises:
-        BackendError: a node does not come up, or ends.
+        BackendError: a node does not start, or ends.
     """
     scene = sample_scene(load_world(plan.world), model.robot.footprint_radius, seed)
     goal = [float(value) for value in scene.goals[0]]
     nodes = _nodes(plan, model.robot, policy, seed, goal)
     say(f"deploying {', '.join(nodes)} in real time")
-    # The policy stops where it believes to be there; its odometry drifts.
+    # The policy stops where it believes the goal is; its odometry drifts.
     near = Navigation(model.robot, model.lidar).goal_radius + 0.1
     arrived, path = _watched(nodes, plan.out / "logs" / "realtime", goal, near, say)
     say(f"  the deployed nodes {'reached' if arrived else 'did not reach'} the goal of seed {seed}")
@@ -166,7 +166,7 @@ def deploy(plan: Plan, model: SimulatorModel, policy: str, seed: int, say: Say) 
 def _nodes(
     plan: Plan, robot: RobotSpec, policy: str, seed: int, goal: list[float]
 ) -> dict[str, dict[str, Any]]:
-    """Node -> parameters."""
+    """Parameters of each node, by name."""
     folder = str(plan.model)
     return {
         "simulator_node": {"model": folder, "world": plan.world, "episode_seed": seed},
@@ -185,7 +185,7 @@ def _nodes(
 def _watched(
     nodes: dict[str, dict[str, Any]], logs: Path, goal: list[float], near: float, say: Say
 ) -> tuple[bool, Any]:
-    """Starts the nodes, arms the gate and waits; whether the robot arrived, and its path (T, 3)."""
+    """Starts the nodes, arms the gate, waits; returns arrival and the robot's path (T, 3)."""
     from nics_drl_bridge.nodes.observer import Witness
     from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
@@ -214,7 +214,7 @@ def _watched(
 
 
 def _write_limits(robot: RobotSpec, path: Path) -> Path:
-    """Limits that let a simulated robot do all it can, within a time to get there."""
+    """Writes limits that allow a simulated robot all its commands, with limited rate and jerk."""
     commands = {}
     for variable in robot.command:
         low, high = min(variable.min, 0.0), max(variable.max, 0.0)

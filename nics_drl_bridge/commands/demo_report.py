@@ -1,4 +1,4 @@
-"""The demo's report: one page with all that it showed."""
+"""The demo's report: one page with all results."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from nics_drl_bridge.sim.world import load_world
 
 IN_PROCESS, OVER_DDS = LABELS[FAST], LABELS[DDS]
 PANELS = 9
-"""So many episodes are drawn."""
+"""Maximum number of episodes that are drawn."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """All that the demo showed.
+    """All results of the demo.
 
     Attributes:
-        model, identified: what was generated, and from what.
+        model, identified: the generated model, and the identification that it is based on.
         learned: the policy.
-        summary: of its many episodes in the fast simulator.
+        summary: of the policy's many episodes in the fast simulator.
         here, there: the same episodes in process and over DDS.
-        live: of the deployed nodes.
+        live: drive of the deployed nodes.
         took: part of the demo -> wall time [s].
     """
 
@@ -48,7 +48,7 @@ class Shown:
 
 
 def report(plan: Plan, shown: Shown) -> str:
-    """The page, as HTML."""
+    """Builds the page, as HTML."""
     sections: list[tuple[str, Sequence[Block]]] = [
         ("The model", _model(plan, shown)),
         ("The policy", _policy(plan, shown)),

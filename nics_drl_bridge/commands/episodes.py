@@ -38,21 +38,21 @@ LABELS = {
 }
 DEFAULT_ROBOT = "ackermann"
 START_S = 180.0
-"""How long a node may take to come up; its kernels may have to be compiled."""
+"""Time that a node may take to start [s]; its kernels may have to be compiled."""
 Told = Callable[[Episode], None]
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Which episodes to drive.
+    """Episodes to drive.
 
     Attributes:
-        policy: a policy file, or the name of a shipped one or of a baseline.
+        policy: a policy file, or the name of a shipped policy or of a baseline.
         model: folder of a model, or a shipped robot.
         world: YAML file or name of the world.
-        seeds: of the episodes: each fixes obstacles, start, goal and noise.
-        logs: folder for those of the nodes.
+        seeds: of the episodes; each fixes obstacles, start, goal and noise.
+        logs: folder for the logs of the nodes.
     """
 
     policy: str
@@ -65,17 +65,17 @@ class Trial:
 def drive_in(place: str, trial: Trial, told: Told, say: Say = lambda _: None) -> list[Episode]:
     """Drives the episodes of a trial in one of `PLACES`.
 
-    The node that a place needs runs in a process of its own, in lock-step, and has ended when this
+    The node that a place needs runs in its own process, in lock-step, and has ended when this
     returns or raises.
 
     Args:
-        place: where.
-        trial: what.
-        told: of each episode as it ends.
-        say: takes a line of progress.
+        place: one of `PLACES`.
+        trial: the episodes.
+        told: called with each episode as it ends.
+        say: called with each line of progress.
 
     Raises:
-        BridgeError: a bad name or file, or a node that does not come up.
+        BridgeError: a bad name or file, or a node that does not start.
     """
     check_place(place)
     if place == FAST:
@@ -97,7 +97,7 @@ def drive(
     told: Told,
     touched: Callable[[], bool] | None = None,
 ) -> list[Episode]:
-    """Drives the episodes of a trial in an env of a backend, with further arguments of the env."""
+    """Drives the episodes of a trial in an env with this backend and further arguments."""
     register_envs()
     model = open_model(trial.model)
     policy, task = open_policy(trial.policy, model)
@@ -112,7 +112,7 @@ def drive(
 
 @contextmanager
 def _node(name: str, trial: Trial, say: Say) -> Iterator[dict[str, Any]]:
-    """Starts a simulator's node; gives the options of the backend that drives it."""
+    """Starts a simulator node; yields the options of the backend that drives it."""
     from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
     domain_id = free_domain_id()
@@ -124,12 +124,12 @@ def _node(name: str, trial: Trial, say: Say) -> Iterator[dict[str, Any]]:
                 "truth": True, "domain_id": domain_id, "simulator": name, "timeout_s": START_S,
             }  # fmt: skip
         except BackendError:
-            process.check()  # a node that has ended says why better
+            process.check()  # if the node has ended, its own error is more useful
             raise
 
 
 def check_place(place: str) -> None:
-    """Raises ConfigError where there is no such place, or what it needs is not installed."""
+    """Raises ConfigError if there is no such place, or what it needs is not installed."""
     if place not in PLACES:
         raise ConfigError(f"--in {place!r}: there is no such world; {nearest(place, PLACES)}")
     if place != FAST and find_spec("rclpy") is None:
@@ -139,7 +139,7 @@ def check_place(place: str) -> None:
 
 
 def robot_of(policy: str) -> str:
-    """The robot that a policy file was trained for; of a baseline the first shipped one."""
+    """The robot that a policy file was trained for; for a baseline the default robot."""
     if not policy.endswith(SUFFIX) and policy not in shipped_policies():
         return DEFAULT_ROBOT
     from nics_drl_bridge.policy.policy_file import load_policy  # needs onnx, baselines do not
@@ -159,16 +159,16 @@ Tell = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Order:
-    """What to evaluate.
+    """An order to evaluate policies.
 
     Attributes:
-        policies: files, or names of shipped ones or of baselines.
-        out: folder for everything that is written.
-        model: folder of a model or a shipped robot; None takes the policies' own robot.
+        policies: files, or names of shipped policies or of baselines.
+        out: output folder.
+        model: folder of a model or a shipped robot; None uses the policies' own robot.
         world: YAML file or name of the world.
-        episodes: how many.
-        seed: of the first one.
-        places: of `trial.PLACES`, the first is what the others are compared with.
+        episodes: number of episodes.
+        seed: of the first episode.
+        places: some of `trial.PLACES`; the others are compared with the first.
     """
 
     policies: Sequence[str]
@@ -182,7 +182,7 @@ class Order:
 
 @dataclass(frozen=True)
 class Evaluated:
-    """What one policy came to: its episodes and figures in each place."""
+    """Results of one policy: its episodes and figures in each place."""
 
     policy: str
     runs: Mapping[str, Sequence[Episode]]
@@ -190,18 +190,18 @@ class Evaluated:
 
 
 def evaluate(order: Order, say: Say, tell: Tell) -> list[Evaluated]:
-    """Drives every policy through the same episodes in every place, and writes what came out.
+    """Drives every policy through the same episodes in every place, and writes the results.
 
     Args:
-        order: what.
-        say: takes a line of progress.
-        tell: takes what is being driven, how many episodes are done, and of how many.
+        order: what to evaluate.
+        say: called with each line of progress.
+        tell: called with what is being driven, the number of episodes done, and the total.
 
     Returns:
-        One for each policy; `evaluation.json` and a picture for each policy are in `order.out`.
+        The results of each policy; `evaluation.json` and a picture per policy are in `order.out`.
 
     Raises:
-        BridgeError: a bad name or file, or a node that does not come up.
+        BridgeError: a bad name or file, or a node that does not start.
     """
     name = model_name(order)
     seeds_of(order)  # before anything is driven
@@ -252,21 +252,21 @@ def _drive(
 
 
 def seeds_of(order: Order) -> range:
-    """Of its episodes. Raises ConfigError when one of them is no seed."""
+    """Seeds of the episodes. Raises ConfigError if one is not a valid seed."""
     seeds = range(order.seed, order.seed + order.episodes)
     checked_seeds([seeds.start, seeds.stop - 1])
     return seeds
 
 
 def picture_of(out: Path, policy: str) -> Path:
-    """Where the picture of a policy lies."""
+    """Path of the picture of a policy."""
     return out / f"trajectories_{Path(policy).stem}.png"
 
 
 def told_of(
     order: Order, name: str, model: SimulatorModel, evaluated: Sequence[Evaluated]
 ) -> dict[str, Any]:
-    """Everything as plain data."""
+    """The evaluation as plain data, for JSON."""
     return {
         "model": name,
         "model_fingerprint": model.fingerprint,
@@ -287,7 +287,7 @@ def told_of(
 
 
 def rows_of(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
-    """The table below `HEADS`, for people."""
+    """Rows of the table with the columns `HEADS`, as text."""
     return [
         (one.policy, LABELS[place], *_cells(tally))
         for one in evaluated
@@ -312,7 +312,7 @@ def _cells(tally: Tally) -> tuple[str, ...]:
 
 
 def percent(share: float) -> str:
-    """A share for people."""
+    """Formats a share as a percentage."""
     return f"{100 * share:.4g} %"
 
 
@@ -321,6 +321,6 @@ def _figure(estimate: Estimate) -> str:
 
 
 def line_of(one: Evaluated) -> str:
-    """A policy in one line."""
+    """Summarises a policy in one line."""
     each = ", ".join(f"{LABELS[p]} {percent(t.success.value)}" for p, t in one.tallies.items())
     return f"{one.policy}: success {each}"

@@ -44,7 +44,7 @@ def record(
             stamped, use_sim_time,
         )  # fmt: skip
         if not preview:
-            recorder.require_ros()  # first: where ROS 2 comes from wheels it begins Python anew
+            recorder.require_ros()  # first: with ROS 2 from wheels it restarts Python
         for line in recorder.preview(order):
             typer.echo(line)
         if preview:

@@ -31,12 +31,12 @@ def evaluate_shadow(
 
     Args:
         bag: the drive.
-        policy: a file, or the name of a shipped one or of a baseline.
-        model: folder of a model or a shipped robot; None takes the policy's own.
+        policy: a file, or the name of a shipped policy or of a baseline.
+        model: folder of a model or a shipped robot; None uses the policy's own robot.
         topics: role -> topic.
-        goal: in `map` [m]; None takes where the robot was `ahead_s` later.
-        ahead_s: see there [s].
-        out: folder.
+        goal: in `map` [m]; None uses the robot's position `ahead_s` later.
+        ahead_s: see `goal` [s].
+        out: output folder.
 
     Raises:
         BridgeError: see `policy.shadow.shadow`.
@@ -60,7 +60,7 @@ def evaluate_shadow(
 
 
 def rows_of(made: Mapping[str, Shadow]) -> list[tuple[str, ...]]:
-    """The table below `HEADS`, for people."""
+    """Rows of the table with the columns `HEADS`, as text."""
     return [
         (policy, name, unit, *(f"{figures[key]:.3g}" for key in figures if key != "opposite"),
          f"{100 * figures['opposite']:.1f} %")

@@ -89,7 +89,7 @@ def train(
 def _learner(
     engine: str, address: str | None, env_runners: int | None, worlds: int
 ) -> Iterator[Any]:
-    """What trains one policy; while it is open, it is connected with its cluster."""
+    """Yields the function that trains one policy; on Ray while connected to its cluster."""
     from nics_drl_bridge.errors import ConfigError, nearest
 
     engines = (SB3, *extensions.known("engines"))

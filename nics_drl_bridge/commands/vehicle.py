@@ -40,20 +40,20 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class VehicleOrder:
-    """What to drive.
+    """An order to drive episodes on the vehicle.
 
     Attributes:
-        policy: a file, or the name of a shipped one or of a baseline.
-        out: folder for everything that is written.
-        model: folder of the vehicle's model, or a shipped robot; None takes the policy's own.
-        world: that stands around the vehicle.
-        episodes, seed: how many, and of the first.
-        start: `wait` until it stands where the episode starts, or take the `present` place.
+        policy: a file, or the name of a shipped policy or of a baseline.
+        out: output folder.
+        model: folder of the vehicle's model, or a shipped robot; None uses the policy's own.
+        world: the world around the vehicle.
+        episodes, seed: number of episodes, and seed of the first.
+        start: `wait` until the vehicle stands at the start, or begin at the `present` pose.
         goal: in `map` [m] instead of the world's.
         namespace: of its topics.
         pose_type: type of `pose`, a pose sensor in `map`, or `none`.
-        arm: whether to arm the gate before each episode; else somebody does.
-        stale_after_s: an episode ends with an error when data are older [s].
+        arm: True arms the gate before each episode; otherwise the user does.
+        stale_after_s: an episode ends with an error if data are older [s].
     """
 
     policy: str
@@ -71,26 +71,26 @@ class VehicleOrder:
 
 
 def drive_vehicle(order: VehicleOrder, say: Say, ask: Say) -> Evaluated:
-    """Looks whether the vehicle fits its model, drives the episodes, and compares.
+    """Checks that the vehicle fits its model, drives the episodes, and compares them.
 
     Commands go to `cmd_vel_raw`, so that only an armed `command_gate` lets them pass. Afterwards
-    the fast simulator drives the same episodes from where the vehicle really began.
+    the fast simulator drives the same episodes from the vehicle's actual starting poses.
 
     Args:
-        order: what.
-        say: takes a line of progress.
-        ask: is told where to place the vehicle before each episode, and returns when it may begin.
+        order: what to drive.
+        say: called with each line of progress.
+        ask: called before each episode with where to place the vehicle; returns when it may begin.
 
     Returns:
         The episodes of both; `evaluation.json` and a picture are in `order.out`.
 
     Raises:
-        BackendError: the vehicle does not fit its model, or nobody is there.
+        BackendError: the vehicle does not fit its model, or does not answer.
         BridgeError: a bad name or file.
     """
     name = order.model or robot_of(order.policy)
     model, world = open_model(name), load_world(order.world)
-    open_policy(order.policy, model)  # what does not fit is told before anything moves
+    open_policy(order.policy, model)  # a misfit is an error before anything moves
     _examine(order, model, say)
     episodes = _drive(order, model, say, ask)
     runs = {VEHICLE: episodes, FAST: _drive_again(order, model, episodes)}
@@ -107,7 +107,7 @@ def drive_vehicle(order: VehicleOrder, say: Say, ask: Say) -> Evaluated:
 
 
 def _examine(order: VehicleOrder, model: SimulatorModel, say: Say) -> None:
-    """What `nics doctor` does. Raises BackendError when it finds an error."""
+    """Runs the checks of `nics doctor`. Raises BackendError if they find an error."""
     from nics_drl_bridge.nodes.listen import listen
 
     say(f"listening to the vehicle for {LISTEN_S:g} s, as nics doctor does")
@@ -147,7 +147,7 @@ def _drive(order: VehicleOrder, model: SimulatorModel, say: Say, ask: Say) -> li
             scene = sample_scene(world, model.robot.footprint_radius, seed)
             ask(f"episode {count + 1} of {order.episodes}: {_placed(order, scene)}")
             driven = drive(env, policy, seed, asked, lambda: _arm(order, say))
-            # What the vehicle believes is all that is known of where it went.
+            # The vehicle's own estimate is all that is known of its path.
             episodes.append(replace(driven, path=driven.estimate))
             say(f"  {driven.result}, {driven.steps} steps, {episodes[-1].length:.2f} m")
     finally:
@@ -156,7 +156,7 @@ def _drive(order: VehicleOrder, model: SimulatorModel, say: Say, ask: Say) -> li
 
 
 def _placed(order: VehicleOrder, scene: Scene) -> str:
-    """What to do before an episode, and where it goes."""
+    """Instruction before an episode: where to place the vehicle, and where it will drive."""
     x, y = scene.goals[0] if order.goal is None else order.goal
     where = f"it will drive to ({x:.2f} m, {y:.2f} m)"
     armed = "" if order.arm else f"; arm {GATE}"
@@ -182,7 +182,7 @@ def _arm(order: VehicleOrder, say: Say) -> None:
 def _drive_again(
     order: VehicleOrder, model: SimulatorModel, episodes: Sequence[Episode]
 ) -> list[Episode]:
-    """The same episodes in the fast simulator."""
+    """Drives the same episodes in the fast simulator."""
     env = _env(order, model, "sim", estimator=True)
     policy, _ = open_policy(order.policy, model)
     try:

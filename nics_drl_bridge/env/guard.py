@@ -1,6 +1,6 @@
-"""The guard around an env's methods: whatever ends one by an exception stops the robot.
+"""Guard around an env's methods: any exception that leaves one stops the robot.
 
-Seeds and options that a reset can't use, told before anything begins.
+Checks of the seeds and options of a reset, before anything begins.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from nics_drl_bridge.errors import ConfigError, nearest
 
 
 class Halting(Protocol):
-    """Anything with a robot that can be told to stop."""
+    """Anything with a robot that can be stopped."""
 
     def halt(self) -> None:
-        """Leaves the robot with a zero command."""
+        """Stops the robot with a zero command."""
         ...
 
 
@@ -33,7 +33,7 @@ T = TypeVar("T")
 def halts_on_error(
     method: Callable[Concatenate[H, P], T],
 ) -> Callable[Concatenate[H, P], T]:
-    """Makes a method halt its object's robot when any exception leaves it, Ctrl-C included.
+    """Makes a method halt its object's robot if any exception leaves it, including Ctrl-C.
 
     An error of `halt` itself is raised with the first one as its context.
     """
@@ -52,7 +52,7 @@ def halts_on_error(
 
 @contextlib.contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Lets no Ctrl-C cut short what leaves a robot standing still: it is answered afterwards."""
+    """Defers Ctrl-C to the end of the block, so that stopping a robot is not interrupted."""
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread is interrupted
         return
@@ -67,23 +67,23 @@ def uninterrupted() -> Iterator[None]:
 
 
 SEEDS = 2**63
-"""A seed is below it: it is a signed 64-bit integer over ROS 2 and in the kernels."""
+"""Exclusive upper bound of seeds: signed 64-bit integers over ROS 2 and in the kernels."""
 START = "start"
-"""The option that any task takes, beside the names of its memory."""
+"""The option that every task takes in addition to the names of its memory."""
 
 
 def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
-    """Refuses what can be refused before the task is asked.
+    """Checks what can be checked without the task.
 
-    Gymnasium itself refuses a seed that is negative.
+    Gymnasium itself refuses negative seeds.
 
     Args:
-        seed: of the first world, or one for each; those of the next worlds count on.
+        seed: of the first world, from which the others count up, or one for each.
         options: as given to `reset`.
-        worlds: how many.
+        worlds: number of worlds.
 
     Raises:
-        ConfigError: a seed that is no integer or too great, or options that are no dict.
+        ConfigError: a seed is not an integer or too large, or the options are not a dict.
     """
     last = SEEDS - worlds if isinstance(seed, int | np.integer) else SEEDS - 1
     for one in seed if isinstance(seed, list | tuple | np.ndarray) else [seed]:
@@ -99,18 +99,18 @@ def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
 
 
 def _shown(seed: int) -> str:
-    """A number as long as a line can hold it."""
+    """A seed as text; of an overlong one its number of bits."""
     return str(seed) if seed < SEEDS**2 else f"of {seed.bit_length()} bits"
 
 
 def check_options(
     options: Mapping[str, Any] | None, memory: Iterable[str], more: tuple[str, ...] = ()
 ) -> None:
-    """Raises ConfigError for a reset option that nothing takes.
+    """Raises ConfigError for an unknown reset option.
 
     Args:
         options: as given to `reset`.
-        memory: names of what the task remembers.
+        memory: names of the task's memory.
         more: further names that the env takes.
     """
     valid = {START, *memory, *more}

@@ -1,4 +1,4 @@
-"""Tasks by name, and a user's own by the path of its file.
+"""Tasks by name, and user-defined ones by the path of their file.
 
 Makes the environments known to `gymnasium.make` and `gymnasium.make_vec`.
 """
@@ -27,23 +27,23 @@ TASKS = {
     "cooperative_reaching": "nics_drl_bridge.env.teams:CooperativeReaching",
     "pursuit_evasion": "nics_drl_bridge.env.pursuit_evasion:PursuitEvasion",
 }
-"""Where each shipped task lives."""
+"""Module and class of each shipped task."""
 
 
 def make_task(
     task: str | type[Task] | Task, model: SimulatorModel, options: dict[str, Any] | None = None
 ) -> Task:
-    """A task for the robot of a model.
+    """Makes a task for the robot of a model.
 
     Args:
         task: the name of a shipped one (`navigation`), `path/to/file.py:ClassName`, a class, or a
-            Task that is already made.
+            Task.
         model: gives the robot and the lidar.
         options: further arguments of the class; `scan` may also be a number of sectors, the name
             of a layout or its fields, see `canonical.layout_of`.
 
     Raises:
-        ConfigError: no such task, an argument it does not know, or a Task for another robot.
+        ConfigError: no such task, an unknown argument, or a Task for another robot.
     """
     if isinstance(task, Task):
         return _checked(task, model, options)
@@ -60,7 +60,7 @@ def make_task(
 
 
 def _check_options(found: type[Task], options: dict[str, Any]) -> None:
-    """Raises ConfigError for an option that the class has no field for, or not of its kind."""
+    """Raises ConfigError for an option that the class does not have, or of the wrong type."""
     known = signature(found).parameters
     free = any(one.kind is Parameter.VAR_KEYWORD for one in known.values())
     for name, value in options.items():
@@ -91,7 +91,7 @@ KINDS = {
     "int": (_is_whole, "a whole number"),
     "float": (_is_finite, "a finite number"),
 }
-"""Annotation of an option -> what fits it, and how errors call that."""
+"""Annotation of an option -> its check, and its name in errors."""
 
 
 def _checked(task: Task, model: SimulatorModel, options: dict[str, Any] | None) -> Task:
@@ -136,10 +136,10 @@ def _import(name: str) -> Any:
 
 
 def _load(path: Path) -> Any:
-    """The module of a file, loaded anew only when the file has changed.
+    """Loads the module of a file, again only if the file has changed.
 
     Raises:
-        ConfigError: it is missing, or is no Python that runs; the line is named.
+        ConfigError: the file is missing, or fails to run as Python; names the line.
     """
     if not path.is_file():
         raise ConfigError(f"task {str(path)!r}: no such file; give path/to/file.py:ClassName.")
@@ -162,7 +162,7 @@ def _load(path: Path) -> Any:
 
 
 def _unfit(path: Path, error: Exception) -> str:
-    """Why a user's file can't be imported, and at which of its lines."""
+    """Error message for a user's file that can't be imported, with the line."""
     frames = extract_tb(error.__traceback__)
     lines = [frame.lineno for frame in frames if Path(frame.filename) == path.absolute()]
     line = error.lineno if isinstance(error, SyntaxError) else (lines or [None])[-1]
@@ -181,12 +181,12 @@ ENVIRONMENTS = {
     PURSUIT_EVASION: {"task": "pursuit_evasion"},
     TASK: {},
 }
-"""Id -> arguments that make it what it is."""
+"""Id -> arguments that define the environment."""
 MAX_EPISODE_STEPS = 300
 
 
 def register_envs() -> None:
-    """Registers every environment; importing this module does it too."""
+    """Registers every environment; importing this module does so too."""
     for name, arguments in ENVIRONMENTS.items():
         if name not in gymnasium.registry:
             gymnasium.register(

@@ -1,6 +1,6 @@
-"""What tasks of several robots share: who sees whom and what, (..., M, P).
+"""Helpers for tasks of several robots: bearings and distances of all pairs, (..., M, P).
 
-Cooperative reaching: a team has to reach several goals, whoever reaches which.
+Cooperative reaching: a team has to reach several goals, each with any of its robots.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 def seen(pose: Array, points: Array) -> Array:
-    """Points (..., P, 2) as each robot (..., M, 3) sees them, (..., M, P, 3); see `bearing`."""
+    """Bearings (..., M, P, 3) of points (..., P, 2) from each robot (..., M, 3); see `bearing`."""
     robots, places, shape = _batched(pose, points)
     out = np.empty((len(robots), robots.shape[1], places.shape[1], 3))
     kernels.pair_bearings(out, robots, places)
@@ -31,7 +31,7 @@ def seen(pose: Array, points: Array) -> Array:
 
 
 def distances(pose: Array, points: Array) -> Array:
-    """From each robot (..., M, 3) to each point (..., P, 2): (..., M, P) [m]."""
+    """Distances (..., M, P) [m] from each robot (..., M, 3) to each point (..., P, 2)."""
     robots, places, shape = _batched(pose, points)
     out = np.empty((len(robots), robots.shape[1], places.shape[1]))
     kernels.pair_distances(out, robots, places)
@@ -47,17 +47,17 @@ def _batched(pose: Array, points: Array) -> tuple[Array, Array, tuple[int, ...]]
 
 
 def others(of_all: Array) -> Array:
-    """Each robot's row of the others, (..., M, M - 1, F) of (..., M, M, F): no diagonal."""
+    """Drops the diagonal of (..., M, M, F): each robot's row of the others, (..., M, M - 1, F)."""
     count = of_all.shape[-2]
     lead, width = of_all.shape[:-3], of_all.shape[-1]
-    # Without its first, a row of all pairs has a diagonal entry after every `count` others.
+    # Without its first entry, the flat row of pairs has a diagonal one after every `count` others.
     flat = of_all.reshape(*lead, count * count, width)[..., 1:, :]
     kept = flat.reshape(*lead, count - 1, count + 1, width)[..., :-1, :]
     return np.asarray(kept.reshape(*lead, count, count - 1, width))
 
 
 def total(values: Array) -> Array:
-    """Sums (...) over the last axis, one after the other: the same bits for every batch."""
+    """Sums over the last axis to (...), in order: bit-identical for every batch size."""
     summed = values[..., 0].copy()
     for k in range(1, values.shape[-1]):
         summed += values[..., k]
@@ -66,19 +66,19 @@ def total(values: Array) -> Array:
 
 @dataclass(frozen=True)
 class CooperativeReaching(Task):
-    """M robots have to reach M goals; a goal is reached for all as soon as one robot was there.
+    """M robots have to reach M goals; a goal counts for all as soon as one robot was there.
 
     ## Observation Space
 
     Of one robot, `Box((B + 4 M + 3 (M - 1) + 3,), float32)`, B beams or
-    sectors. The robots tell each other where they are.
+    sectors. The robots share their positions.
 
     | Num | Observation | Min | Max | Unit |
     |---|---|---|---|---|
-    | 0 to B - 1 | range in shares of the greatest; 1 free, 0 too close or unknown | 0 | 1 | - |
+    | 0 to B - 1 | range as a share of the maximum; 1 free, 0 too close or unknown | 0 | 1 | - |
     | 4 for each goal | distance | 0 | 1000 | m |
     | | cosine, sine of the bearing | -1 | 1 | - |
-    | | whether it has been reached | 0 | 1 | - |
+    | | 1 if it has been reached | 0 | 1 | - |
     | 3 for each other robot, in order | distance | 0 | 1000 | m |
     | | cosine, sine of the bearing | -1 | 1 | - |
     | the last 3 | estimated velocity forward, left; turn rate | -1000 | 1000 | m/s, rad/s |
@@ -89,9 +89,9 @@ class CooperativeReaching(Task):
 
     ## Rewards
 
-    Of each robot: `progress`, 1 per metre by which the open goals became nearer to the robot that
-    is nearest to each, shared by the team; `time`, -0.01 per step; `reached`, 10 for each goal
-    that is reached, shared by the team; `collision`, -10 for the robot that touches something.
+    For each robot: `progress`, 1 per metre of decrease in the distance from each open goal to its
+    nearest robot, shared by the team; `time`, -0.01 per step; `reached`, 10 for each goal that is
+    reached, shared by the team; `collision`, -10 for the robot that touches something.
 
     ## Starting State
 
@@ -99,14 +99,14 @@ class CooperativeReaching(Task):
 
     ## Episode End
 
-    For a robot when it touches something, and it then stands still as one more obstacle; for all
+    For a robot when it touches something; it then stands still as another obstacle. For all
     when the last goal is reached.
 
     Attributes:
         robots: M.
-        goal_radius: how near is there [m].
+        goal_radius: distance at which a goal is reached [m].
         reached_reward: of the team, for each goal.
-        collision_reward: of a robot, for a touch.
+        collision_reward: of a robot, for a contact.
         progress_reward: per metre of approach.
         time_reward: per step.
     """
@@ -137,13 +137,13 @@ class CooperativeReaching(Task):
         )
 
     def reset(self, episodes: Episodes) -> Memory:
-        """No goal has been reached; `newly` is what the last step added."""
+        """Returns a memory with no goal reached; `newly` marks those reached in the last step."""
         goals = episodes.goals.copy()
         none = np.zeros(goals.shape[:-1], np.bool_)
         return {"goal": goals, "reached": none, "newly": none.copy()}
 
     def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:
-        """Marks the goals that some robot is at."""
+        """Marks the goals that a robot is at."""
         there = (distances(after.pose, memory["goal"]) < self.goal_radius).any(axis=-2)
         memory["newly"][...] = there & ~memory["reached"]
         memory["reached"] |= there
@@ -180,12 +180,12 @@ class CooperativeReaching(Task):
         }
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
-        """Whether a robot touches something, or all goals are reached."""
+        """Returns True where a robot touches something, or all goals are reached."""
         done = np.asarray(memory["reached"].all(axis=-1))[..., None]
         return np.asarray(self.touches(view.ranges) | done)
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
-        """Success of the team, touches, and which goals have been reached (..., M)."""
+        """Success of the team, contacts, and the goals that have been reached (..., M)."""
         all_reached = np.asarray(memory["reached"].all(axis=-1))[..., None]
         done = np.broadcast_to(all_reached, view.pose.shape[:-1])
         return {

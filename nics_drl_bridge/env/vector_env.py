@@ -49,15 +49,15 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     ## Description
 
     Task, spaces, rewards and ends are those of `BridgeEnv` with `backend="sim"`, and so are the
-    numbers: world i of `reset(seed=s)` goes through the same bits as the single env of
-    `reset(seed=s + i)`, in its later episodes too, at any `num_envs` and number of threads.
+    numbers: world i of `reset(seed=s)` is bit-identical to the single env of `reset(seed=s + i)`,
+    in later episodes too, for any `num_envs` and number of threads.
 
     ## Spaces, Rewards, Starting State, Episode End
 
     Those of `BridgeEnv` with a leading (N,). `info` is what Gymnasium's `SyncVectorEnv` makes of
-    the single envs: each entry an array (N, ...) beside its mask `_name`. `reset` takes
+    the single envs: each entry an array (N, ...) with its mask `_name`. `reset` takes
     `options={"start": ..., "goal": ...}` for all worlds that it resets, and with
-    `options={"reset_mask": (N,) bool}` it resets those only.
+    `options={"reset_mask": (N,) bool}` it resets only those.
 
     ## Arguments
 
@@ -67,14 +67,14 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         world: a World, its YAML file, or the name of a shipped one.
         task: a name, `path/to/file.py:ClassName`, a class, or a Task.
         task_options: further arguments of the task's class.
-        max_episode_steps: after so many steps an episode is truncated.
-        autoreset_mode: `NextStep` (an ended world begins anew in the next step, whose action it
+        max_episode_steps: an episode is truncated after this many steps.
+        autoreset_mode: `NextStep` (an ended world is reset in the next step, whose action it
             ignores) or `SameStep` (at once; the last observation is in `info["final_obs"]`).
-        copy: whether what `step` returns is the caller's own. False reuses the observation's
-            array in the next step.
+        copy: True if the caller may keep what `step` returns. False reuses the array of the
+            observation in the next step.
         renderer: `baked` or `exact` lidar.
         threads: of the simulator; the numbers do not depend on it.
-        randomisation: what each episode draws anew, see `BridgeEnv`.
+        randomisation: quantities drawn in each episode, see `BridgeEnv`.
         render_mode: `rgb_array`, of every world, or None.
 
     Raises:
@@ -102,7 +102,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         randomisation: str | Randomisation | None = None,
         render_mode: str | None = None,
     ) -> None:
-        self._pictures: list[Any] = []  # what `close` needs, also where something below is refused
+        self._pictures: list[Any] = []  # `close` needs it even if the rest raises
         check_render_mode(render_mode, self.metadata)
         self.num_envs, self.render_mode = num_envs, render_mode
         self._limit, self.copy = max_episode_steps, copy
@@ -136,7 +136,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._starts: Array = np.zeros((count, robots, 3))
         self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
         self.memory: Memory = {}
-        self.ready = False  # not after an exception either, which leaves worlds between two steps
+        self.ready = False  # False after an exception too, which leaves worlds between two steps
 
     @property
     def changing(self) -> dict[str, NDArray[Any]]:
@@ -157,9 +157,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """Begins an episode in every world; world i takes its seeds from `seed + i`.
 
         Raises:
-            ConfigError: wrong number of seeds, one that is negative or too great, a wrong mask, or
+            ConfigError: wrong number of seeds, one that is negative or too large, a wrong mask, or
                 an option that the task does not have.
-            ResetNeeded: some worlds alone, where all need it: at first and after an exception.
+            ResetNeeded: some worlds are reset where all need it: at first and after an exception.
         """
         check_reset(seed, options, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
@@ -169,7 +169,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         seeds, fresh = named_seeds(seed, chosen, self._episode < 0, self.np_random)
         self.ready = False
         self._first[fresh], self._episode[fresh] = seeds[fresh], -1
-        if not chosen.all():  # the others see what they saw
+        if not chosen.all():  # the others keep their observation
             self.task.observe_into(self._out, self._view(slice(None)), self.memory)
         rows = np.flatnonzero(chosen)
         self._begin(rows, self._out, options)
@@ -182,7 +182,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def _begin(
         self, worlds: NDArray[np.intp], out: Observation, options: dict[str, Any] | None = None
     ) -> None:
-        """Begins the next episode in some worlds and writes what they see into their rows."""
+        """Begins the next episode in some worlds and writes their observations into their rows."""
         if not len(worlds):
             return
         self._episode[worlds] += 1
@@ -206,7 +206,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         out[worlds] = self.task.observation(self._view(worlds), fresh)
 
     def _view(self, rows: Rows) -> RobotView:
-        """The robots (n, M) of some worlds as their odometry knows them."""
+        """View of the robots (n, M) of some worlds, with poses by odometry."""
         data = self.simulator.data
         return RobotView(data.odom[rows], data.twist[rows], data.ranges[rows], 0.0, 0.0, 0.0)
 
@@ -219,7 +219,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         given = check_action(actions, self.action_space, "actions").reshape(self._each)
         self.ready = False
         out = np.empty_like(self._out) if self.copy else self._out
-        begun = self._over.copy()  # these ignore their action and begin anew
+        begun = self._over.copy()  # these ignore their action and are reset
         outcome = joined(
             self.simulator.run_parts(lambda part: self._advance(part, given[part], out, begun))
         )
@@ -240,9 +240,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def _advance(
         self, part: slice, actions: NDArray[Any], out: Observation, begun: Flags
     ) -> Outcome:
-        """One control period of the worlds of a part; what they see goes into their rows.
+        """Advances the worlds of a part by one control period and writes their observations.
 
-        Those in `begun` (N,) begin anew instead.
+        Those in `begun` (N,) are reset instead.
         """
         data, ended = self.simulator.data, self.ended[part]
         command = self.task.command(actions)
@@ -267,7 +267,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def _end_at_once(
         self, out: Observation, over: Flags, facts: dict[str, Any], infos: dict[str, Any]
     ) -> None:
-        """SAME_STEP: the worlds that ended begin anew; what they ended with goes into `infos`."""
+        """SAME_STEP: resets the worlds that ended; `infos` gets their last observation and info."""
         rows = np.flatnonzero(over)
         if len(rows):
             infos.update(vector_rows.finals(flat(out), rows))
@@ -281,7 +281,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._tell(infos, facts, over)
 
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
-        """Puts into `infos` what is known of every world, and how those in `begun` began."""
+        """Adds to `infos` the facts of every world, and the beginnings of those in `begun`."""
         vector_rows.put_all(infos, self._known(), np.zeros_like(begun))
         rows = np.flatnonzero(begun)
         if len(rows) < self.num_envs:
@@ -295,7 +295,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         return self._facts.known(shown, rows)
 
     def render(self) -> tuple[Any, ...] | None:
-        """A picture of every world; see Gymnasium."""
+        """Draws every world; see Gymnasium."""
         if self.render_mode is None:
             return None
         if not self._pictures:

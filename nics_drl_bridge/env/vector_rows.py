@@ -1,8 +1,8 @@
-"""What the vector env is asked for, and how what its parts came to is put together.
+"""Arguments of the vector env, and joining of the results of its parts.
 
-What the `info` of a vector env is made of: facts of its worlds, by name.
+Contents of a vector env's `info`: facts of its worlds, by name.
 
-The `info` of a vector env, as Gymnasium's SyncVectorEnv gives it, from arrays of worlds.
+Builds the `info` of Gymnasium's SyncVectorEnv from arrays over the worlds.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ MODES = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SA
 
 
 def flat(observations: Observation) -> Observation:
-    """(N, M O) what the robots of each world see, one after the other; no copy."""
+    """Concatenates the observations of each world's robots to (N, M O), without a copy."""
     return observations.reshape(len(observations), -1)
 
 
 def over_robots(rewards: Array) -> Array:
-    """(N,) sums of rewards (N, M), robot by robot as a single env does."""
+    """Sums rewards (N, M) to (N,), robot by robot as a single env does."""
     total = rewards[:, 0].copy()
     for m in range(1, rewards.shape[1]):
         total += rewards[:, m]
@@ -38,7 +38,7 @@ def over_robots(rewards: Array) -> Array:
 
 
 def joined(parts: Sequence[Outcome]) -> Outcome:
-    """What worlds came to, of parts that follow each other."""
+    """Joins the outcomes of consecutive parts of the worlds."""
     if len(parts) == 1:
         return parts[0]
 
@@ -50,7 +50,7 @@ def joined(parts: Sequence[Outcome]) -> Outcome:
 
 
 def mode_of(mode: str | AutoresetMode) -> AutoresetMode:
-    """An autoreset mode by its value. Raises ConfigError for one that there is not."""
+    """An autoreset mode by its value. Raises ConfigError for an unsupported one."""
     value = mode.value if isinstance(mode, AutoresetMode) else mode
     if value not in MODES:
         raise ConfigError(f"autoreset_mode {value!r}: must be one of {', '.join(MODES)}.")
@@ -58,7 +58,7 @@ def mode_of(mode: str | AutoresetMode) -> AutoresetMode:
 
 
 def chosen_worlds(options: dict[str, Any] | None, count: int) -> Flags:
-    """(N,) which worlds a reset is for. Raises ConfigError for a wrong `reset_mask`."""
+    """Mask (N,) of the worlds to reset. Raises ConfigError for a wrong `reset_mask`."""
     if not options or "reset_mask" not in options:
         return np.ones(count, np.bool_)
     mask: ArrayLike = options["reset_mask"]
@@ -74,16 +74,16 @@ def chosen_worlds(options: dict[str, Any] | None, count: int) -> Flags:
 def named_seeds(
     seed: int | Sequence[int | None] | None, chosen: Flags, unnamed: Flags, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Flags]:
-    """The seeds that a reset gives to worlds.
+    """Seeds that a reset gives to worlds.
 
     Args:
-        seed: of the first world, or of each (None keeps what it has), or None for all.
+        seed: of the first world, or of each (None keeps its present one), or None for all.
         chosen: (N,) worlds that are reset.
-        unnamed: (N,) worlds that never had a seed; they draw one if they are given none.
-        rng: to draw by.
+        unnamed: (N,) worlds that never had a seed; one is drawn if none is given.
+        rng: generator of drawn seeds.
 
     Returns:
-        Seeds (N,), and (N,) which worlds begin a series of episodes by them.
+        Seeds (N,), and a mask (N,) of the worlds that begin a series of episodes with them.
 
     Raises:
         ConfigError: wrong number of seeds, or a negative one.
@@ -111,7 +111,7 @@ EVERY = slice(None)
 
 
 class VectorFacts:
-    """Gives facts as arrays (N, ...) of worlds of one robot, or (N, M, ...) of teams.
+    """Provides facts as arrays (N, ...) for worlds of one robot, or (N, M, ...) for teams.
 
     Args:
         simulator: of the worlds.
@@ -123,11 +123,11 @@ class VectorFacts:
         self._alone = simulator.data.pose.shape[1] == 1
 
     def known(self, shown: Mapping[str, NDArray[Any]], rows: Rows = EVERY) -> dict[str, Any]:
-        """What is known at any time, of some worlds, in arrays of its own.
+        """Facts of some worlds that are known at any time, in new arrays.
 
         Args:
-            shown: what the task shows of its memory (N, M, ...).
-            rows: which worlds.
+            shown: memory arrays that the task shows (N, M, ...).
+            rows: indices of the worlds.
         """
         pose = self._own(self._simulator.data.odom[rows])
         told = {name: self._own(values[rows]) for name, values in shown.items()}
@@ -135,12 +135,12 @@ class VectorFacts:
         return {**told, "pose": pose, "scan_age_s": ages, "odom_age_s": ages.copy()}
 
     def beginnings(self, starts: Array, bodies: Array, rows: Rows) -> dict[str, Any]:
-        """What is told of episodes that begin, with what the randomisation drew for them.
+        """Facts of episodes that begin, with the values that the randomisation drew.
 
         Args:
             starts: (N, M, 3) poses of the robots.
             bodies: (N, K, 7) the obstacles.
-            rows: which worlds.
+            rows: indices of the worlds.
         """
         drawn = {
             name: self._row(values[rows]) if values.ndim > 1 else values[rows]
@@ -154,7 +154,7 @@ class VectorFacts:
         }
 
     def of_step(self, outcome: Outcome) -> dict[str, Any]:
-        """What is told of a step, of every world, in arrays of its own."""
+        """Facts of a step, for every world, in new arrays."""
         data = self._simulator.data
         return {
             "stamp_ns": data.steps * self._period_ns,
@@ -173,16 +173,16 @@ class VectorFacts:
 
 RowIndices = NDArray[np.intp]
 Facts = Mapping[str, Any]
-"""name -> array with a leading world, or again such a mapping."""
+"""Name -> array whose first dimension is the world, or another such mapping."""
 
 
 def put_all(infos: dict[str, Any], facts: Facts, without: Flags) -> None:
     """Adds facts of all worlds (N, ...), each paired with its mask `_name`.
 
     Args:
-        infos: takes the arrays for its own.
+        infos: takes ownership of the arrays.
         facts: of every world.
-        without: (N,) worlds that have none; their rows become zero, as Gymnasium has it.
+        without: (N,) worlds without facts; their rows become zero, as in Gymnasium.
     """
     gone = np.flatnonzero(without)
     for name, values in facts.items():
@@ -197,7 +197,7 @@ def put_all(infos: dict[str, Any], facts: Facts, without: Flags) -> None:
 
 
 def put_rows(infos: dict[str, Any], facts: Facts, rows: RowIndices, count: int) -> None:
-    """Adds facts (n, ...) of the worlds `rows` (n,) of N, with masks, among zeros."""
+    """Adds facts (n, ...) of the worlds `rows` (n,) of N, with masks; other rows are zero."""
     for name, values in facts.items():
         if isinstance(values, Mapping):
             infos[name] = {}
@@ -220,7 +220,7 @@ def rows_of(facts: Facts, rows: RowIndices) -> dict[str, Any]:
 def finals(observation: NDArray[Any], rows: RowIndices) -> dict[str, Any]:
     """`final_obs` of the worlds `rows`: an object array with None elsewhere."""
     shown, mask = np.full(len(observation), None, dtype=object), np.zeros(len(observation), bool)
-    for n in rows:  # only those that ended: each must be an object of its own
+    for n in rows:  # only those that ended: each needs its own object
         shown[n] = observation[n].copy()
     mask[rows] = True
     return {"final_obs": shown, "_final_obs": mask}

@@ -1,4 +1,4 @@
-"""Arming: the gate lets commands pass only after every one of these checks."""
+"""Arming: the gate lets commands pass only after all of these checks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from nics_drl_bridge.gate.stops import AHEAD_S, creep, e_stop_pressed, e_stop_si
 from nics_drl_bridge.interface import S_PER_NS
 
 BEHIND_S = 0.2
-"""Stamps may fall behind by so much while the gate settles, for want of regularity [s]."""
+"""Stamps may fall behind by this much while the gate settles, because they are irregular [s]."""
 Check = Callable[[GateConfig, GateState, Arm, float], str]
 
 
@@ -22,7 +22,7 @@ def _fresh(topic: str, arrivals: Arrivals, config: GateConfig, now: float, limit
 
 
 def _rate(topic: str, arrivals: Arrivals, config: GateConfig, now: float, declared: float) -> str:
-    """By stamps both too few and too many are wrong; by arrival only too few are."""
+    """Judges a rate: by stamps too few and too many data are wrong, by arrival only too few."""
     arriving, stamped = rate(arrivals, now, config.settle_s)
     low = declared * (1.0 - config.rate_tolerance)
     high = declared * (1.0 + config.rate_tolerance)
@@ -35,27 +35,27 @@ def _rate(topic: str, arrivals: Arrivals, config: GateConfig, now: float, declar
 
 
 def scan_fresh(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
-    """Scans have come without a gap."""
+    """Scans have arrived without a gap."""
     return _fresh("scan", state.scans, config, now, config.scan_age_s)
 
 
 def odom_fresh(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
-    """Odometry has come without a gap."""
+    """Odometry has arrived without a gap."""
     return _fresh("odom", state.odometries, config, now, config.odom_age_s)
 
 
 def scan_rate(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
-    """Scans come as often as the lidar is said to scan."""
+    """Scans arrive at the declared rate of the lidar."""
     return _rate("scan", state.scans, config, now, config.scan_rate)
 
 
 def odom_rate(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
-    """Odometry comes as often as declared."""
+    """Odometry arrives at the declared rate."""
     return _rate("odom", state.odometries, config, now, config.odom_rate)
 
 
 def clocks_agree(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
-    """Scan and odometry are stamped by clocks that tell the same time, and run as this one does."""
+    """The clocks that stamp scan and odometry agree, and keep pace with this machine's clock."""
     scans, odometries = state.scans, state.odometries
     if not (scans.times and odometries.times):
         return "scan and odom have not both come"
@@ -75,7 +75,7 @@ def clocks_agree(config: GateConfig, state: GateState, request: Arm, now: float)
 
 
 def estimator_converged(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
-    """The middleware knows where the robot is, and that it stands."""
+    """The middleware knows where the robot is, and that it stands still."""
     if not config.estimate_required:
         return ""
     if state.estimate is None or now - state.estimate_s > config.estimate_silence_s:
@@ -87,7 +87,7 @@ def estimator_converged(config: GateConfig, state: GateState, request: Arm, now:
 
 
 def one_publisher(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
-    """Nobody else moves the robot."""
+    """The gate is the only publisher of `cmd_vel`."""
     if request.publishers == 1:
         return ""
     return f"cmd_vel has {request.publishers} publishers, not this gate alone"
@@ -101,18 +101,18 @@ def standing_still(config: GateConfig, state: GateState, request: Arm, now: floa
 
 
 def limits_set(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
-    """Somebody has said what the robot may be told."""
+    """The limits of the commands are known."""
     return "" if config.limits is not None else "no limits are set, name their file in `limits`"
 
 
 def e_stop_released(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
-    """The emergency stop is there and not pressed."""
+    """The emergency stop is not pressed and not silent."""
     cause = e_stop_pressed(config, state, now) or e_stop_silent(config, state, now)
     return "" if cause is None else cause.line
 
 
 def nothing_latched(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
-    """No stop waits for a reset."""
+    """No latched stop waits for a reset."""
     return "" if state.latched is None else f"call ~/reset first: {state.latched.line}"
 
 
@@ -132,6 +132,6 @@ CHECKS: tuple[Check, ...] = (
 
 
 def failures(config: GateConfig, state: GateState, request: Arm, now: float) -> list[str]:
-    """A sentence for each check that fails, with its name in front."""
+    """Returns a sentence for each failed check, with the check's name in front."""
     answers = ((check.__name__, check(config, state, request, now)) for check in CHECKS)
     return [f"{name}: {answer}" for name, answer in answers if answer]

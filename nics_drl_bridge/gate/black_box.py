@@ -1,6 +1,6 @@
-"""The black box: the last half minute of the gate, written at each stop, replayable.
+"""The black box: the last half minute of the gate, written at each stop, for replay.
 
-The gate's records as plain data for JSON, and back to the same bits.
+Conversion of the gate's records to plain data for JSON and back, bit-identical.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ FORMAT = "nics_drl_bridge/black_box/3"
 KEPT_S = 30.0
 LATEST_S = 1e12
 MOST_BYTES = 64 * 2**20
-"""Of a file that is replayed."""
+"""Greatest size of a file that is replayed."""
 MOST_VALUES = 1_000_000
-"""In such a file; 30 s of a gate have some 100,000."""
+"""Greatest number of values in such a file; 30 s of a gate have some 100,000."""
 MOST_INPUTS = 20_000
-"""That are decided on anew; each takes some 30 us."""
+"""Greatest number of inputs that are decided on again; each takes some 30 us."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Entry:
     Attributes:
         now: steady time [s].
         given: the input.
-        before: the state that it met.
-        decision: the answer.
+        before: the state before the input.
+        decision: the gate's answer.
     """
 
     now: float
@@ -53,11 +53,11 @@ class Entry:
 
 
 class BlackBox:
-    """Keeps the entries of the last time; states share what they hold, so it stays small.
+    """Keeps the latest entries; their states share data, so memory stays small.
 
     Args:
         config: of the gate.
-        kept_s: how much is kept [s].
+        kept_s: time span that is kept [s].
     """
 
     def __init__(self, config: GateConfig, kept_s: float = KEPT_S) -> None:
@@ -65,23 +65,23 @@ class BlackBox:
         self._entries: deque[Entry] = deque()
 
     def note(self, entry: Entry) -> None:
-        """Adds an entry and forgets those that are too old."""
+        """Adds an entry and drops those that are too old."""
         self._entries.append(entry)
         while entry.now - self._entries[0].now > self._kept_s:
             self._entries.popleft()
 
     def copy(self) -> tuple[Entry, ...]:
-        """The entries now, oldest first."""
+        """Returns the present entries, oldest first."""
         return tuple(self._entries)
 
 
 def write(config: GateConfig, entries: tuple[Entry, ...], path: str | Path) -> None:
-    """Writes entries (at least one) to a file, whole or not at all."""
+    """Writes entries (at least one) to a file, completely or not at all."""
     write_parts(path, _sealed(_records(config, entries)))
 
 
 def _records(config: GateConfig, entries: tuple[Entry, ...]) -> Iterator[dict[str, Any]]:
-    """The lines of a file, one after the other: the gate must not grow at each stop."""
+    """Yields the lines of a file one by one, so that the gate's memory does not grow at a stop."""
     yield {"format": FORMAT, "config": to_plain(config), "state": to_plain(entries[0].before)}
     for entry in entries:
         parts = {"now": entry.now, "given": entry.given, "decision": entry.decision}
@@ -89,7 +89,7 @@ def _records(config: GateConfig, entries: tuple[Entry, ...]) -> Iterator[dict[st
 
 
 def _sealed(records: Iterable[dict[str, Any]]) -> Iterator[bytes]:
-    """Lines, and a last one with their checksum."""
+    """Yields the lines, and a last one with their checksum."""
     digest = hashlib.sha256()
     for record in records:
         line = (json.dumps(record) + "\n").encode()
@@ -99,17 +99,17 @@ def _sealed(records: Iterable[dict[str, Any]]) -> Iterator[bytes]:
 
 
 def _seal(digest: str) -> str:
-    """The last line of a file."""
+    """Returns the last line of a file."""
     return json.dumps({"sha256": digest}) + "\n"
 
 
 @dataclass(frozen=True)
 class Replay:
-    """What a black box holds, and what the gate of today makes of it.
+    """Content of a black box, and its difference from the decisions of the present gate.
 
     Attributes:
-        entries: times and inputs, with the decisions that were recorded.
-        differing: indices of the entries that are decided otherwise now.
+        entries: times and inputs, with the recorded decisions.
+        differing: indices of the entries that are now decided differently.
     """
 
     entries: tuple[Entry, ...]
@@ -117,7 +117,7 @@ class Replay:
 
     @property
     def story(self) -> list[str]:
-        """A line for each change between passing and stopping, and one about the replay."""
+        """One line for each change between passing and stopping, and one about the replay."""
         if not self.entries:
             return ["no inputs"]
         end, lines, before = self.entries[-1].now, [], "nothing"
@@ -135,10 +135,10 @@ class Replay:
 
 
 def replay(path: str | Path) -> Replay:
-    """Decides on everything in a file anew.
+    """Decides again on every input in a file.
 
     Raises:
-        ConfigError: the file is missing, damaged, or no black box.
+        ConfigError: the file is missing, damaged, or not a black box.
     """
     head, *lines = _lines(path)
     try:
@@ -166,7 +166,7 @@ def _damaged(path: str | Path, error: Exception) -> ConfigError:
 
 
 def _check_kinds(config: Any, state: Any, given: list[Any], recorded: list[Any]) -> None:
-    """Raises TypeError or ValueError unless everything read is what stands in a black box."""
+    """Raises TypeError or ValueError unless everything that was read belongs in a black box."""
     if len(given) > MOST_INPUTS:
         raise ValueError(f"{len(given)} inputs, where at most {MOST_INPUTS} are replayed")
     kinds = ((config, GateConfig), (state, GateState), *((one, Decision) for one in recorded))
@@ -210,9 +210,9 @@ KINDS: dict[str, type] = {
 
 
 def to_plain(value: Any) -> Any:
-    """A record of the gate as dictionaries, lists, numbers and text.
+    """Returns a record of the gate as dictionaries, lists, numbers and text.
 
-    Arrays keep their bits; a float in JSON reads back to the same one.
+    Arrays keep their bits; a float survives JSON unchanged.
     """
     if is_dataclass(value) and not isinstance(value, type):
         content = {each.name: to_plain(getattr(value, each.name)) for each in fields(value)}
@@ -228,7 +228,7 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(value: Any) -> Any:
-    """The record that `to_plain` was given. Raises ValueError when it is damaged."""
+    """Returns the record that `to_plain` was given. Raises ValueError if it is damaged."""
     if isinstance(value, list):
         return tuple(from_plain(each) for each in value)
     if not isinstance(value, dict):

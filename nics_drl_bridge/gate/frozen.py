@@ -1,10 +1,10 @@
-"""Data that arrive and yet are dead: the same scan again and again, or no motion when told.
+"""Data that arrive but are dead: repeated scans, jumps of odometry, no motion when commanded.
 
-Pictures that a lidar shows: is one shown again, although the robot moved and must see another?
+Detection of old scans that a lidar shows again although the robot has moved.
 
-A lidar without noise may well show the same between two long walls, or from the middle of a round
-room. So an old scan is moved by what odometry tells, and only those of its beams speak that must be
-of another length by now, however wrong the heading is.
+A lidar without noise may well show the same between two long walls, or in the middle of a round
+room. So an old scan is moved by the motion from odometry, and only those of its beams count whose
+length must have changed by now, whatever the error of the heading.
 """
 
 from __future__ import annotations
@@ -20,37 +20,37 @@ from nics_drl_bridge.geometry import between, compose
 Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
 IDENTICAL = 3
-"""So many scans must show one picture."""
+"""Least number of scans that show a frozen picture."""
 PICTURES = 16
-"""So many pictures are remembered: a lidar may repeat several in turn."""
+"""Number of remembered pictures: a lidar may repeat several in turn."""
 RESPONSE = 0.1
-"""A robot covers at least this share of the way that it is told,"""
+"""Least share of the commanded distance or angle that a robot covers."""
 LEAST_PATH, LEAST_TURN = 0.03, 0.25
-"""if it is told more than this within the window [m, rad],"""
+"""Least motion commanded within the window for the robot to be judged [m, rad]."""
 WINDOW = 0.75
-"""which is this share of `stuck_s`: what is left is for odometry to come."""
+"""Length of the window as a share of `stuck_s`; the rest is for the delay of odometry."""
 MARK_S = 0.05
 PAUSE_S = 0.2
-"""Between two marks, and for how long at least no motion is told between two pushes [s]."""
+"""Time between two marks, and least time without commanded motion between two pushes [s]."""
 STILL_LINEAR, STILL_TURN = 0.05, 0.1
-"""A robot that moves less stands still [m/s, rad/s],"""
+"""A robot slower than this, plus the noise of its odometry, stands still [m/s, rad/s]."""
 NOISE = 3.0
-"""or less than that and so many standard deviations of its odometry."""
+"""Noise of odometry that is allowed for, in standard deviations."""
 
 
 def look(
     config: GateConfig, seen: tuple[Sameness, ...], ranges: Ranges, pose: Array | None
 ) -> tuple[tuple[Sameness, ...], str]:
-    """Compares a scan with the last pictures, bit for bit. One without a return says nothing.
+    """Compares a scan with the last pictures, bit for bit. A scan without returns is ignored.
 
     Args:
         config: of the gate.
-        seen: pictures so far, the newest last.
+        seen: pictures so far, newest last.
         ranges: (B,) of the scan [m].
-        pose: (3,) by odometry now; None when there was none yet.
+        pose: (3,) present pose by odometry; None if there is none yet.
 
     Returns:
-        The pictures, and why the scan is none of now; nothing when it may be.
+        The pictures, and the reason why the scan is an old one; empty if it may be new.
     """
     if not np.isfinite(ranges).any():
         return seen, ""
@@ -71,18 +71,18 @@ def look(
         return (*others, known), (
             f"{known.count} scans are the same over a motion of {path:.2f} m or rad"
         )
-    return (*others, Sameness(ranges, 1, pose)), ""  # what does not change here may be so
+    return (*others, Sameness(ranges, 1, pose)), ""  # the scene may really look the same
 
 
 def stands_still(config: GateConfig, twist: NDArray[np.float64]) -> bool:
-    """Whether a body twist (3,) is that of a robot at rest, as far as its noise lets one tell."""
+    """True if a body twist (3,) is that of a robot at rest, within the noise of odometry."""
     linear, turn = (NOISE * std for std in config.odom_std)
     slow = np.hypot(twist[0], twist[1]) < STILL_LINEAR + linear
     return bool(slow and abs(twist[2]) < STILL_TURN + turn)
 
 
 def watch_motion(config: GateConfig, state: GateState, now: float) -> GateState:
-    """Sums up what the robot was told, and marks where it was."""
+    """Integrates the commanded motion and marks the robot's poses."""
     if state.odometry is None or config.limits is None:
         return state
     moving = np.zeros(3)
@@ -98,7 +98,7 @@ def watch_motion(config: GateConfig, state: GateState, now: float) -> GateState:
     marks = push.marks
     if now - marks[-1][0] >= MARK_S:
         start = now - WINDOW * config.stuck_s
-        # The first that is left began before the window, or with it.
+        # The first mark that is kept lies at or before the start of the window.
         first = next((k for k, one in enumerate(marks[1:]) if one[0] > start), len(marks) - 1)
         marks = (*marks[first:], (now, told, state.odometry.pose))
     moved_s = now if moving.any() else push.moving_s
@@ -106,17 +106,17 @@ def watch_motion(config: GateConfig, state: GateState, now: float) -> GateState:
 
 
 def odom_jumped(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """Odometry shows the robot where it can't have driven to."""
+    """Odometry reports a pose that the robot can't have driven to."""
     return Cause("odom_jumped", ODOM, state.leap) if state.leap else None
 
 
 def scan_frozen(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The same scans again and again although odometry shows motion."""
+    """The same scan repeats although odometry shows motion."""
     return Cause("scan_frozen", SCAN, state.frozen) if state.frozen else None
 
 
 def no_motion(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The robot is told to move and odometry shows none: stuck, unpowered, or frozen data."""
+    """The robot is commanded to move but odometry shows none: stuck, unpowered, or frozen data."""
     push = state.push
     if push is None or state.odometry is None or now - push.since_s <= config.stuck_s:
         return None
@@ -125,7 +125,7 @@ def no_motion(config: GateConfig, state: GateState, now: float) -> Cause | None:
     path, turn = float(np.hypot(told[0], told[1])), abs(float(told[2]))
     if path < LEAST_PATH and turn < LEAST_TURN:
         return None
-    for _, _, pose in push.marks:  # there and back again is a motion, too
+    for _, _, pose in push.marks:  # there and back again is motion, too
         moved = between(pose, state.odometry.pose)
         drove = path >= LEAST_PATH and np.hypot(moved[0], moved[1]) >= RESPONSE * path
         turned = turn >= LEAST_TURN and abs(moved[2]) >= RESPONSE * turn
@@ -136,22 +136,22 @@ def no_motion(config: GateConfig, state: GateState, now: float) -> Cause | None:
 
 
 SAME_SHARE = 0.99
-"""Of the beams, from which on two scans are the same picture; of few beams one may flicker, too."""
+"""Two scans with this share of equal beams are the same; of few beams, one may differ."""
 TELLING_SHARE = 0.9
-"""Of those that must have changed, from which on it is none of now; a lidar that lives has none."""
+"""A scan with this share unchanged, of the beams that must have changed, is an old one."""
 CHANGE = 0.02
-"""A beam that must have changed did so by more than this [m],"""
+"""Least change of a beam that must have changed [m]."""
 HEADINGS = (-0.03, 0.0, 0.03)
-"""by whichever of these errors odometry's heading is wrong [rad]."""
+"""Errors of odometry's heading for all of which the beam must have changed [rad]."""
 NEIGHBOURS = 1.5
-"""So many beams away at most lies what an old beam is compared with."""
+"""An old beam is compared with beams at most this many beam spacings away."""
 LEAST_BEAMS = 3
 
 
 def same(one: Ranges, other: Ranges) -> bool:
-    """Whether two scans (B,) show the same picture bit for bit, but for a few beams.
+    """True if two scans (B,) are bit-identical, but for a few beams.
 
-    Only beams that return in one of them count.
+    Only beams that return in at least one of them count.
     """
     returned = np.isfinite(one) | np.isfinite(other)
     count = int(np.count_nonzero(returned))
@@ -160,7 +160,7 @@ def same(one: Ranges, other: Ranges) -> bool:
 
 
 def shown_again(config: GateConfig, old: Ranges, ranges: Ranges, moved: Array) -> bool:
-    """Whether a scan (B,) is an old one (B,), although the robot has moved (3,) [m, m, rad]."""
+    """True if a scan (B,) repeats an old one (B,) although the robot has moved (3,) [m, m, rad]."""
     telling = must_differ(config, old, moved)
     count = int(np.count_nonzero(telling))
     equal = int(np.count_nonzero((old == ranges) & telling))
@@ -168,17 +168,17 @@ def shown_again(config: GateConfig, old: Ranges, ranges: Ranges, moved: Array) -
 
 
 def _but_for_one(equal: int, count: int, share: float) -> bool:
-    """Whether such a share of some beams is equal, or all but one of them."""
+    """True if this share of the beams is equal, or all but one of them."""
     return equal > 0 and equal >= min(share * count, count - 1)
 
 
 def must_differ(config: GateConfig, ranges: Ranges, moved: Array) -> NDArray[np.bool_]:
-    """(B,) beams of a scan that must be of another length after a motion.
+    """Returns which beams (B,) of a scan must have changed their length after a motion.
 
     Args:
         config: of the gate, for its lidar.
-        ranges: (B,) [m], before.
-        moved: (3,) relative pose of `base_link` since [m, m, rad].
+        ranges: (B,) before the motion [m].
+        moved: (3,) relative pose of `base_link` since then [m, m, rad].
     """
     mount = np.array(config.mount)
     moved = between(mount, compose(moved, mount))
@@ -198,9 +198,9 @@ def must_differ(config: GateConfig, ranges: Ranges, moved: Array) -> NDArray[np.
 def _changed(
     angles: Array, ranges: Ranges, seen: Array, open_: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """(B,) which beams differ from where the ends of the old ones (K, 2 or more) are seen now.
+    """Returns which beams (B,) differ from the moved end points (K, 2 or more) of the old ones.
 
-    An open beam tells only that nothing is nearer.
+    An open beam only shows that nothing is nearer.
     """
     bearing = np.arctan2(seen[:, 1], seen[:, 0])
     order = np.argsort(bearing)

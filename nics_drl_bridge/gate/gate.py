@@ -1,9 +1,9 @@
 """The gate: one pure function from (time, state, input) to (state, decision).
 
-It reads no clock, draws nothing at random and touches nothing outside, so that a recording of its
-inputs replays to the same decisions, bit for bit.
+It reads no clock, uses no random numbers and has no side effects, so that a recording of its
+inputs replays to bit-identical decisions.
 
-The tables of all rules. What a table does not hold, the gate does not do.
+Tables of all rules; the gate does nothing that is not in them.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ Array = NDArray[np.float64]
 def decide(
     config: GateConfig, state: GateState, given: Input, now: float
 ) -> tuple[GateState, Decision]:
-    """What to do after an input.
+    """Decides on an input.
 
-    Only a tick publishes a motion; a stop is published at whatever input brings it about, and at
-    every tick while it lasts. A stop is zero at once: limits of rate and jerk hold for motion.
+    Only a tick publishes a motion; a stop is published at the input that causes it, and at every
+    tick while it lasts. A stop is an immediate zero: limits of rate and jerk apply to motion.
 
     Args:
         config: of the gate.
-        state: before.
-        given: what happened.
+        state: before the input.
+        given: the input.
         now: steady time [s].
 
     Returns:
@@ -48,7 +48,7 @@ def decide(
     """
     state = take_time(config, state, given, now)
     if state.clock_fault:
-        now = state.now_s  # the last that could be believed
+        now = state.now_s  # the last plausible time
     state, refused = take(config, state, given, now)
     state, answer = _serve(config, state, given, now)
     was_moving = bool(state.value.any())
@@ -80,7 +80,7 @@ class _Answer:
 def _serve(
     config: GateConfig, state: GateState, given: Input, now: float
 ) -> tuple[GateState, _Answer]:
-    """Arms or resets, if asked to."""
+    """Arms or resets, if requested."""
     if isinstance(given, Arm):
         failed = arming.failures(config, state, given, now)
         if failed:
@@ -111,17 +111,20 @@ def _stopped(config: GateConfig, state: GateState, moved_s: float, disarm: bool)
 def _recent(
     config: GateConfig, state: GateState, value: Array, now: float
 ) -> tuple[tuple[float, Array], ...]:
-    """What the newest scan may not show yet: told since, or a latency before; now a value, too."""
+    """Returns the commands that the newest scan may not show yet, and a new one.
+
+    Those are the ones since the scan was taken, or within the latency before.
+    """
     if config.shield is None:
         return ()
     since = now - config.shield.latency_s - config.scan_age_s
     told = (*state.recent, (now, value))
-    # That of before `since` was in force until the next one.
+    # A command from before `since` was in force until the next one.
     return tuple(one for one, after in pairwise((*told, told[-1])) if after[0] >= since)
 
 
 def _shaped(config: GateConfig, state: GateState, now: float) -> motion.Motion:
-    """The next motion towards the newest command."""
+    """Returns the next motion towards the newest command."""
     moved = motion.asked(config, state)
     for shape in SHAPERS:
         moved = shape(config, state, moved, now)
@@ -129,7 +132,7 @@ def _shaped(config: GateConfig, state: GateState, now: float) -> motion.Motion:
 
 
 def _move(config: GateConfig, state: GateState, moved: motion.Motion, now: float) -> GateState:
-    """The state after a motion is published."""
+    """Returns the state after a motion is published."""
     state = replace(
         state, value=moved.value, slope=moved.slope, moved_s=now,
         recent=_recent(config, state, moved.value, now),
@@ -155,7 +158,7 @@ class Rule:
     """A reason to stop.
 
     Attributes:
-        judge: gives the cause of a stop, or None; its name is the rule's.
+        judge: returns the cause of a stop, or None; its name is that of the rule.
         latches: whether the stop stays until a reset.
     """
 
@@ -164,12 +167,12 @@ class Rule:
 
 
 def latched(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """A stop of before waits for a reset."""
+    """An earlier stop waits for a reset."""
     return state.latched
 
 
 def disarmed(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """Nobody has armed the gate."""
+    """The gate has not been armed."""
     return None if state.armed else Cause("disarmed", "", "call ~/arm to let commands pass")
 
 
@@ -191,15 +194,15 @@ STOPS: tuple[Rule, ...] = (
     Rule(stops.scan_behind_unknown),
     Rule(stops.scan_behind_old),
 )
-"""In the order in which they are asked; the first that speaks names the stop."""
+"""In order of evaluation; the first rule that returns a cause names the stop."""
 
 Shaper = Callable[[GateConfig, GateState, Motion, float], Motion]
 SHAPERS: tuple[Shaper, ...] = (motion.saturate, motion.follow, shield, motion.bounded)
-"""What a command that passes goes through."""
+"""Stages that a passing command goes through."""
 
 
 def first_cause(config: GateConfig, state: GateState, now: float) -> tuple[Cause | None, bool]:
-    """The first rule that stops the robot, and whether it latches."""
+    """Returns the first cause to stop the robot, and whether it latches."""
     for rule in STOPS:
         cause = rule.judge(config, state, now)
         if cause is not None:

@@ -1,4 +1,4 @@
-"""What can happen to the gate: one frozen record for each message, call and tick of its clock."""
+"""Inputs of the gate: one frozen record for each message, call and tick of its clock."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Scan:
     """A scan arrived.
 
     Attributes:
-        stamp_ns: of its header [ns].
+        stamp_ns: time stamp of its header [ns].
         ranges: (B,) [m], float32, REP-117.
         angles: angle_min and angle_increment of its header [rad].
     """
@@ -30,7 +30,7 @@ class Odometry:
     """An odometry arrived.
 
     Attributes:
-        stamp_ns: of its header [ns].
+        stamp_ns: time stamp of its header [ns].
         pose: (3,) x [m], y [m], heading [rad] in `odom`.
         twist: (3,) vx [m/s], vy [m/s], wz [rad/s] in `base_link`.
     """
@@ -58,7 +58,7 @@ class Command:
     """A command of the policy arrived.
 
     Attributes:
-        stamp_ns: of the scan it was computed from [ns].
+        stamp_ns: time stamp of the scan it was computed from [ns].
         twist: (3,) linear.x, linear.y, angular.z of `cmd_vel`.
     """
 
@@ -68,22 +68,22 @@ class Command:
 
 @dataclass(frozen=True)
 class EStop:
-    """The emergency stop said whether it is pressed; each word is its heartbeat, too."""
+    """The emergency stop reported whether it is pressed; each message is also a heartbeat."""
 
     pressed: bool
 
 
 @dataclass(frozen=True)
 class Press:
-    """Somebody pressed the emergency stop by a call."""
+    """The emergency stop was pressed by a service call."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """Somebody asks for motion.
+    """A request to arm the gate.
 
     Attributes:
-        publishers: how many there are on `cmd_vel`, the gate included.
+        publishers: number of publishers on `cmd_vel`, the gate included.
     """
 
     publishers: int
@@ -91,12 +91,12 @@ class Arm:
 
 @dataclass(frozen=True)
 class Reset:
-    """Somebody asks to forget a latched stop."""
+    """A request to clear a latched stop."""
 
 
 @dataclass(frozen=True)
 class Tick:
-    """The gate's own clock ticked: the one moment at which a motion is published."""
+    """The gate's own clock ticked: the only input at which a motion is published."""
 
 
 Input = Scan | Odometry | Estimate | Command | EStop | Press | Arm | Reset | Tick

@@ -1,4 +1,4 @@
-"""What the gate takes in. Data that are no data are refused, and feed no watchdog."""
+"""Intake of the gate. Malformed data are refused, and feed no watchdog."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from nics_drl_bridge.geometry import between
 from nics_drl_bridge.interface import S_PER_NS
 
 GREATEST_SPEED = 100.0
-"""No odometry of a mobile robot shows more [m/s, rad/s]."""
+"""Greatest speed that the odometry of a mobile robot can show [m/s, rad/s]."""
 SLIP = 2.0
-"""A robot may be faster than its limits by this factor, downhill or pushed,"""
+"""Factor by which a robot may exceed its limits, downhill or pushed."""
 SLIP_SPEED, SLIP_TURN = 0.5, 1.0
-"""and by so much more [m/s, rad/s]."""
+"""Further excess on top of that factor [m/s, rad/s]."""
 CAR_TURN = 4.0
-"""How fast a robot may turn that is told a steering angle [rad/s]."""
+"""Greatest turn rate of a robot that is commanded by steering angle [rad/s]."""
 LEAP, LEAP_TURN = 0.1, 0.2
-"""A pose by odometry may jump by so much, for want of precision [m, rad]."""
+"""Jump of an odometry pose that may come from imprecision [m, rad]."""
 ANGLE_TOLERANCE = 1e-3
-"""By which the last beam may point elsewhere than declared [rad]."""
+"""Greatest deviation of the last beam from its declared angle [rad]."""
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """A reason not to take an input.
+    """A rule that refuses inputs.
 
     Attributes:
         name: of the rule.
-        kind: of the inputs that it judges.
-        judge: says what is wrong, or nothing.
+        kind: type of the inputs that it judges.
+        judge: returns what is wrong; empty if nothing is.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Refusal:
 
 
 def scan_malformed(config: GateConfig, state: GateState, scan: Input) -> str:
-    """A scan of another lidar than the declared one, or that knows nothing."""
+    """The scan is from another lidar than the declared one, or every range is NaN."""
     if not isinstance(scan, Scan):
         return ""
     beams, angles = len(config.beam_angles), config.beam_angles
@@ -64,7 +64,7 @@ def scan_malformed(config: GateConfig, state: GateState, scan: Input) -> str:
 
 
 def odom_malformed(config: GateConfig, state: GateState, odometry: Input) -> str:
-    """An odometry that is no number, or of no mobile robot."""
+    """The odometry is not finite, or too fast for a mobile robot."""
     if not isinstance(odometry, Odometry):
         return ""
     if not (np.isfinite(odometry.pose).all() and np.isfinite(odometry.twist).all()):
@@ -75,7 +75,7 @@ def odom_malformed(config: GateConfig, state: GateState, odometry: Input) -> str
 
 
 def estimate_malformed(config: GateConfig, state: GateState, estimate: Input) -> str:
-    """An estimate that is no number."""
+    """The estimate is not finite."""
     if not isinstance(estimate, Estimate):
         return ""
     finite = np.isfinite(estimate.twist).all() and np.isfinite(estimate.std).all()
@@ -83,14 +83,14 @@ def estimate_malformed(config: GateConfig, state: GateState, estimate: Input) ->
 
 
 def command_not_finite(config: GateConfig, state: GateState, command: Input) -> str:
-    """A command that is no number."""
+    """The command is not finite."""
     if not isinstance(command, Command) or np.isfinite(command.twist).all():
         return ""
     return "cmd_vel_raw: NaN or inf"
 
 
 def command_implausible(config: GateConfig, state: GateState, command: Input) -> str:
-    """A command so far out of range that the policy must be broken."""
+    """The command is so far out of range that the policy must be broken."""
     if not isinstance(command, Command) or config.limits is None:
         return ""
     if implausible(command.twist[list(config.fields)], config.limits):
@@ -108,7 +108,7 @@ REFUSALS: tuple[Refusal, ...] = (
 
 
 def take(config: GateConfig, state: GateState, given: Input, now: float) -> tuple[GateState, str]:
-    """Takes an input into the state, or says why not."""
+    """Takes an input into the state, or returns the reason why not."""
     state = replace(state, jumped="", leap="")
     for refusal in REFUSALS:
         reason = refusal.judge(config, state, given) if isinstance(given, refusal.kind) else ""
@@ -132,7 +132,7 @@ def take(config: GateConfig, state: GateState, given: Input, now: float) -> tupl
 
 
 def _take_command(state: GateState, command: Command, now: float) -> GateState:
-    """A command counts once the scan behind it is here, too; the one before holds until then."""
+    """Takes a command once its scan has arrived; until then the previous one stays in force."""
     scans = state.scans
     if command.stamp_ns not in scans.stamps_ns:
         since = now if state.pending_s is None else state.pending_s
@@ -175,19 +175,19 @@ def _take_odometry(
         jumped = ODOM if fault == "jumped" else ""
         return replace(state, odometries=arrivals, jumped=jumped), f"odom: its stamp {fault}"
     leap = _leap(config, state, odometry, now)
-    if leap:  # what comes after it is judged from there
+    if leap:  # later poses are judged relative to this one
         return replace(state, odometry=odometry, leap=leap, push=None, seen=()), f"odom: {leap}"
     restless = state.restless_s if frozen.stands_still(config, odometry.twist) else now
     return replace(state, odometries=arrivals, odometry=odometry, restless_s=restless), ""
 
 
 def _leap(config: GateConfig, state: GateState, odometry: Odometry, now: float) -> str:
-    """What is wrong with a pose that the robot can't have come to; nothing is with most."""
+    """Returns what is wrong with a pose that the robot can't have reached; empty if nothing is."""
     before, limits = state.odometry, config.limits
     if before is None or limits is None:
         return ""
     stamped = (odometry.stamp_ns - before.stamp_ns) * S_PER_NS
-    passed = max(stamped, now - state.odometries.times[-1])  # what little jitter there is in either
+    passed = max(stamped, now - state.odometries.times[-1])  # either of them may jitter
     slip, turned = (NOISE * std * passed for std in config.odom_std)
     turn = CAR_TURN if not limits.turn.any() else greatest(limits, limits.turn)
     speed = float(np.hypot.reduce(np.maximum(-limits.low, limits.high)[limits.linear]))

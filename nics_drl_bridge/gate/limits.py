@@ -16,20 +16,20 @@ from nics_drl_bridge.robot.spec import CommandVariable, RobotSpec
 
 Array = NDArray[np.float64]
 IMPLAUSIBLE = 10.0
-"""A command beyond this many times its limit is no wish but a fault, and refused."""
+"""A command beyond this multiple of its limit is a fault, and refused."""
 LEAST_STEP_S = 1e-3
 """Motions closer in time than this are not published: their derivatives would be noise."""
 PERIOD_S = 0.02
-"""Between two ticks of the gate. What crosses its whole range within one is no limit but a typo."""
+"""Period of the gate's ticks [s]. A limit that allows the whole range within one is a typo."""
 SNAP = 1e-12
-"""A value this near to its target is there, as a share of the greatest one."""
+"""A value this close to its target, as a share of the greatest value, has reached it."""
 GREATEST = 1e300
-"""What is 0 after a multiplication by 0."""
+"""Numbers are clipped to this before a multiplication: inf times 0 would be NaN."""
 STILL = 1e-9
 LEAST_MOTION = 0.01
-"""A robot none of whose speeds may be greater can't be driven [m/s or rad/s]."""
+"""If no speed may exceed this, the robot can't be driven [m/s or rad/s]."""
 LONGEST_START_S, STARTED = 10.0, 0.01
-"""A command has to come to this share of its greatest value within that time."""
+"""Within the first [s] a command must be able to reach the second (share of its greatest value)."""
 SPEED, TURN = "m/s", "rad/s"
 
 
@@ -37,9 +37,9 @@ class CommandLimit(Schema):
     """Limits of one command, in its unit; an angle's rate is the steering rate.
 
     Attributes:
-        min, max: of its value; zero lies between them.
+        min, max: bounds of its value; zero lies between them.
         rate: greatest change per second, in both directions.
-        jerk: greatest change of that per second.
+        jerk: greatest change of the rate per second.
     """
 
     min: float = Field(le=0.0)
@@ -55,13 +55,13 @@ class CommandLimit(Schema):
 
 
 class Stopping(Schema):
-    """How the robot stops, for the shield: distance = v latency + v^2 / (2 deceleration).
+    """Stopping behaviour, for the shield: distance = v latency + v^2 / (2 deceleration).
 
     Attributes:
-        latency: from a command until the robot has taken it up, lags included [s].
-        deceleration: with which it then brakes [m/s^2].
-        margin: kept free around the footprint [m].
-        obstacle_speed: at which what moves may come on; 0 to take everything to stand [m/s].
+        latency: time from a command until the robot follows it, lags included [s].
+        deceleration: of the braking that follows [m/s^2].
+        margin: clearance kept around the footprint [m].
+        obstacle_speed: at which moving obstacles may approach; 0 treats all as static [m/s].
     """
 
     latency: float = Field(ge=0.0)
@@ -76,7 +76,7 @@ class LimitsFile(Schema):
     Attributes:
         robot: name of the robot it is for.
         commands: limits by the name of the command in the RobotSpec.
-        shield: how the robot stops, measured.
+        shield: measured stopping behaviour.
     """
 
     robot: str
@@ -86,14 +86,14 @@ class LimitsFile(Schema):
 
 @dataclass(frozen=True)
 class Limits:
-    """What a robot may be told, in the order of its commands.
+    """Limits of a robot's commands, in the order of the commands.
 
     Attributes:
         low, high: (C,) least and greatest value.
         rate: (C,) greatest change per second.
-        jerk: (C,) greatest change of that per second.
-        linear: (C,) whether it is a speed [m/s].
-        turn: (C,) whether it is a turn rate [rad/s]. The rest are angles.
+        jerk: (C,) greatest change of the rate per second.
+        linear: (C,) True for a speed [m/s].
+        turn: (C,) True for a turn rate [rad/s]. The rest are angles.
     """
 
     low: Array
@@ -108,12 +108,12 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     """Reads the limits of a robot.
 
     Args:
-        name: of a shipped file in `config/limits`, or the path of a YAML file.
-        robot: whose commands they limit.
+        name: of a shipped file in `config/limits`, or path of a YAML file.
+        robot: whose commands are limited.
 
     Raises:
-        ConfigError: a key is missing, unknown, or belongs to another robot; a limit is beyond what
-            the robot or a period of the gate can do, or would never let the robot move.
+        ConfigError: a key is missing or unknown; the file is for another robot; a limit exceeds
+            what the robot or a period of the gate allows, or would never let the robot move.
     """
     path = find_config(name, "limits")
     file = load_yaml(path, LimitsFile)
@@ -150,7 +150,7 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
 
 
 def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
-    """Raises ConfigError for limits beyond what the robot or a period can do, or that hold it."""
+    """Raises ConfigError for limits beyond the robot or a period, or too low for any motion."""
     unit, low, high = variable.unit, min(variable.min, 0.0), max(variable.max, 0.0)
     if limit.min < low:
         raise ConfigError(
@@ -184,28 +184,28 @@ def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
 
 
 def greatest(limits: Limits, which: NDArray[np.bool_]) -> float:
-    """The greatest value, in either direction, of some commands (C,); 0 when there are none."""
+    """Returns the greatest magnitude allowed for some commands (C,); 0 if there are none."""
     return float(np.maximum(-limits.low, limits.high)[which].max(initial=0.0))
 
 
 def implausible(command: Array, limits: Limits) -> bool:
-    """Whether a command (C,) is so far out of range that it must be a fault."""
+    """True if a command (C,) is so far out of range that it must be a fault."""
     return bool((np.abs(command) / IMPLAUSIBLE > np.maximum(-limits.low, limits.high)).any())
 
 
 def within(value: Array, limits: Limits) -> bool:
-    """Whether each value (C,) is a number between its limits."""
+    """True if every value (C,) is a number within its limits."""
     return bool(((value >= limits.low) & (value <= limits.high)).all())  # False for NaN
 
 
 def saturate(command: Array, limits: Limits) -> Array:
-    """The command (C,) brought within its limits, its path kept.
+    """Returns the command (C,) within its limits, on the same path.
 
-    Speeds and turn rates shrink by one factor, so that the curvature of the path and the
-    direction of the motion stay. What a robot can't do at all (a limit of 0) is dropped.
+    Speeds and turn rates are scaled by one common factor, which keeps the curvature of the path
+    and the direction of motion. A value whose limit is 0 is dropped.
     """
     speeds, factor = limits.linear | limits.turn, 1.0
-    out = np.clip(command, -GREATEST, GREATEST)  # 0 times inf is no number
+    out = np.clip(command, -GREATEST, GREATEST)  # 0 times inf is NaN
     for i, value in enumerate(out):
         bound = limits.high[i] if value > 0.0 else limits.low[i]
         if bound == 0.0:
@@ -221,13 +221,13 @@ def follow(
 ) -> tuple[Array, Array]:
     """Moves a command towards its target as fast as rate and jerk allow.
 
-    The turn waits for the speed, so that a robot that speeds up is on its path from the start.
+    The turn waits for the speed, so that an accelerating robot is on its path from the start.
 
     Args:
-        value: (C,) published last.
-        slope: (C,) its change per second over the interval before.
-        target: (C,) within the limits.
-        dt: since the last [s].
+        value: (C,) last published command.
+        slope: (C,) its change per second over the previous interval.
+        target: (C,) target within the limits.
+        dt: time since the last command [s].
         limits: of the robot.
 
     Returns:
@@ -247,11 +247,11 @@ def follow(
 
 
 def _progress(speed: Array, wanted: Array) -> float:
-    """Which part of the wanted speed is reached, along its direction, in [0, 1]."""
+    """Returns the share of the wanted speed that is reached, along its direction, in [0, 1]."""
     most = float(np.abs(wanted).max(initial=0.0))
     if most < STILL:
         return 1.0
-    along = wanted / most  # so that no square is too great for a float
+    along = wanted / most  # keeps the squares from overflowing
     return min(1.0, max(0.0, float((speed / most) @ along) / float(along @ along)))
 
 
@@ -264,19 +264,19 @@ def _follow_one(
     rate: float,
     jerk: float,
 ) -> tuple[float, float]:
-    """One command, see `follow`.
+    """Moves one command; see `follow`.
 
-    A slope a can be taken back within a change of a^2 / (2 jerk), whatever the intervals to come:
-    the sum over them lies below the integral. So a value with value + a^2 / (2 jerk) within the
-    bounds stays within them for ever.
+    A slope a can be brought back to zero within a change of a^2 / (2 jerk) whatever the coming
+    intervals, because the sum over them lies below the integral. So a value with
+    value + a^2 / (2 jerk) within the bounds stays within them.
 
-    It is reckoned in shares of the greatest value and in steps of this interval. There no slope is
-    greater than what one interval can do, the whole range, and no limit makes a number overflow.
+    The calculation uses shares of the greatest value and steps of this interval. No slope then
+    exceeds what one interval can do, the whole range, and no limit causes an overflow.
     """
     scale = max(-bounds[0], bounds[1])
     low, high = bounds[0] / scale, bounds[1] / scale
     here, there = value / scale, target / scale
-    step = min(dt / scale, GREATEST)  # of a slope
+    step = min(dt / scale, GREATEST)  # per unit of slope
     least, most = -(high - low), high - low
     rate_step, before = min(rate * step, most), min(max(slope * step, least), most)
     jerk_step = min(jerk * dt * step, 2.0 * most)
@@ -292,9 +292,9 @@ def _follow_one(
 
 
 def _step_towards(gap: float, jerk: float) -> float:
-    """The greatest step a that can still end at a gap: a + a^2 / (2 jerk) = gap."""
+    """Returns the greatest step a that can still end at a gap: a + a^2 / (2 jerk) = gap."""
     reach = 2.0 * jerk * abs(gap)
     if reach == 0.0:
         return 0.0
-    # Not the difference of root and jerk, which for small gaps would be mere rounding.
+    # Not as root minus jerk, which cancels to rounding error for small gaps.
     return math.copysign(reach / (math.sqrt(jerk * jerk + reach) + jerk), gap)

@@ -22,8 +22,8 @@ class Motion:
     Attributes:
         value: (C,) of the command.
         slope: (C,) its change per second.
-        shielded: whether the shield cut it down.
-        fault: why it must not be published; empty for most.
+        shielded: whether the shield reduced it.
+        fault: why it must not be published; usually empty.
     """
 
     value: Array
@@ -33,7 +33,7 @@ class Motion:
 
 
 def asked(config: GateConfig, state: GateState) -> Motion:
-    """What the policy wants."""
+    """Returns the motion that the policy requests."""
     size = len(config.fields)
     wish = np.zeros(size) if state.command is None else state.command.twist[list(config.fields)]
     return Motion(wish.astype(np.float64), np.zeros(size))
@@ -56,7 +56,7 @@ def follow(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
 
 
 def bounded(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
-    """Lets nothing pass that is no number or beyond its limits, whatever came before."""
+    """Replaces a motion that is not finite or beyond its limits by zero, whatever came before."""
     good = config.limits is None or limits.within(motion.value, config.limits)
     if good and np.isfinite(motion.value).all() and np.isfinite(motion.slope).all():
         return motion

@@ -1,7 +1,8 @@
-"""What of a scan moves: it stands where, a moment ago, the robot looked through.
+"""Detection of motion in a scan: objects where the robot saw free space a moment ago.
 
-The newest scan is laid over some older ones, by odometry. So it is known of each beam whether the
-place where it ends was seen to be free before; what is there now has come there, and comes on.
+The newest scan is compared with some older ones by odometry. So for each beam it is known whether
+the place where it ends was seen to be free before; what is there now has moved there, and may
+approach.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ from nics_drl_bridge.gate.state import GateConfig, GateState, ShieldConfig, View
 from nics_drl_bridge.interface import S_PER_NS
 
 MEMORY_S, SPACING_S = 0.45, 0.09
-"""So old is a scan at most that the newest is compared with, and so far are they apart [s]."""
+"""Greatest age of a scan that the newest is compared with, and least time between them [s]."""
 TOLERANCE_M, DEVIATIONS = 0.03, 3.0
-"""A place is free up to this, and so many standard deviations of the ranges, before its end [m]."""
+"""Margin before the end of an old beam [m], plus this many standard deviations of its range."""
 
 
 def remember(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ...]:
-    """The views of before that still count, oldest first, and that of a new scan at the end."""
+    """Returns the earlier views that still count, oldest first, then that of a new scan."""
     if config.shield is None or state.odometry is None:
         return ()
     late = np.clip((scan.stamp_ns - state.odometry.stamp_ns) * S_PER_NS, -MEMORY_S, MEMORY_S)
@@ -37,9 +38,9 @@ def remember(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ..
 
 
 def movers(config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]) -> NDArray[np.bool_]:
-    """(B,) which beams of the newest view end on something that moves.
+    """Returns which beams (B,) of the newest view end on something that moves.
 
-    One beam alone is noise: a neighbour has to say the same.
+    A single beam is noise: a neighbour has to agree.
     """
     newest = views[-1]
     marked = np.zeros(len(newest.ranges), np.bool_)
@@ -61,6 +62,6 @@ def movers(config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]) ->
 
 
 def rehearse() -> None:
-    """Compiles what `movers` calls."""
+    """Compiles the kernel that `movers` calls."""
     lidar, scan = (0.0, 0.1, 0.0, 0.0, 0.0), np.ones(1, np.float32)
     moving_kernels.entered(np.zeros(1, np.bool_), scan, scan, lidar, np.zeros(3), 1.0, (0.0, 0.0))

@@ -1,4 +1,4 @@
-"""Compiled comparison of two scans: what stands where the way was free before?"""
+"""Compiled comparison of two scans: obstacles where the view was free before."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ import numpy as np
 from nics_drl_bridge.kernels import kernel
 
 WIDTH = 0.02
-"""The old beams within so much of a bearing are asked [rad]."""
+"""Old beams within this angle of a bearing are compared [rad]."""
 
 
 @kernel(allocates=True)
 def entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-untyped-def]
-    """Marks the beams that end where an older scan saw through, as far as it could see.
+    """Marks the beams that end where an older scan saw free space.
 
-    The robot's own motion in between is taken out. What was hidden then, or unknown, is not marked.
+    The robot's own motion in between is compensated. Places hidden or unknown then are not marked.
 
     Args:
-        out: (B,) bool, set where so; else left.
+        out: (B,) bool, set where a beam is marked; otherwise left as it is.
         ranges, old: (B,) the newer and the older scan, REP-117 [m].
         lidar: angle_min, angle_increment [rad], mount x, y [m] and heading [rad].
-        moved: (3,) pose of the robot now, seen from where it was.
+        moved: (3,) present pose of the robot relative to that of the older scan.
         far: greatest range [m].
-        tolerance: what may be noise, in metres and in parts of the range.
+        tolerance: for noise, in metres and as a share of the range.
     """
     first, increment, mount_x, mount_y, mount_turn = lidar
     beams, circle = len(ranges), 2.0 * math.pi / abs(increment)
@@ -43,7 +43,7 @@ def entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-
         for i in range(middle - wide, middle + wide + 1):
             index = i % whole
             beyond = old[index] if index < beams else np.nan
-            # Not `min`: NaN, and what was too close, must let the beam go unmarked.
+            # Not `min`: with NaN, or an old beam that was too close, the beam must stay unmarked.
             seen = beyond if not beyond >= seen else seen
         if away < seen - tolerance[0] - tolerance[1] * away:
             out[b] = True

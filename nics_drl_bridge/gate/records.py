@@ -1,4 +1,4 @@
-"""Frozen records, changed in some fields."""
+"""Copies of frozen records with some fields changed."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ Record = TypeVar("Record")
 
 
 def replace(record: Record, **changes: Any) -> Record:
-    """A frozen record with other values in some fields, as `dataclasses.replace` makes it.
+    """Returns a copy of a frozen record with some fields changed, like `dataclasses.replace`.
 
-    That one goes through all fields in Python, for a state of thirty several times a decision. The
-    record must have no `__post_init__` and no slots.
+    That function walks through all fields in Python, for a state of thirty several times per
+    decision. The record must have no `__post_init__` and no slots.
 
     Args:
-        record: that stays as it is.
-        changes: field -> its other value.
+        record: the original; stays unchanged.
+        changes: field -> its new value.
 
     Raises:
         TypeError: there is no such field.

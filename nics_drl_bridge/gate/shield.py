@@ -1,11 +1,11 @@
-"""The shield: no command that the robot could not stop from before the nearest obstacle.
+"""The shield: passes only commands from which the robot can stop before the nearest obstacle.
 
-The robot is taken to do anything between what it was told lately, what it does by odometry and
-what it is told now, for as long as the scan is old, the next decision takes, the robot needs to
-react, and then to brake; and a new command must also leave room to brake calmly, so that an
-approach ends slowly instead of in one full stop after the other. Its footprint is swept along the
-arcs of that whole family; a command is scaled down, on its path, until nothing that the scan shows
-lies in it. The dynamic window of Fox, Burgard and Thrun (1997) asks the same of one arc.
+The robot is assumed to do anything between its recent commands, its motion by odometry and the
+present command, for as long as the scan is old, the next decision takes and the robot needs to
+react, and then to brake. A new command must also leave room to brake calmly, so that an approach
+ends slowly instead of in a series of full stops. The footprint is swept along the arcs of that
+whole family; a command is scaled down, on its path, until no obstacle in the scan lies in the swept
+area. The dynamic window of Fox, Burgard and Thrun (1997) tests the same for one arc.
 """
 
 from __future__ import annotations
@@ -27,32 +27,32 @@ Flags = NDArray[np.bool_]
 FINEST = 6
 """Bisections of the scale."""
 SPEEDS, TURNS = 3, 9
-"""Arcs of the family: so many speeds along each axis, and so many turn rates."""
+"""Arcs of the family: number of speeds along each axis, and number of turn rates."""
 MOVING = 0.1
-"""Above this speed the ratio of turn rate to speed tells the curvature [m/s]."""
+"""Above this speed the ratio of turn rate to speed gives the curvature [m/s]."""
 CALM = 0.5
-"""With this share of its deceleration the robot is to come to a stop when nothing is sudden."""
+"""Share of its deceleration with which the robot should stop when nothing is sudden."""
 STEP = 0.02
-"""Between two places of the footprint on an arc [m]."""
+"""Distance between two checked places of the footprint on an arc [m]."""
 
 
 def returns(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
-    """(P, 3) where the beams ended [m], and how fast what they met may come on [m/s]."""
+    """Returns end points (P, 3) of the beams [m], and how fast each may approach [m/s]."""
     hit = np.isfinite(ranges)
     speeds = np.where(moves[hit], shield.obstacle_speed, 0.0)
     return _ends(config, config.beam_angles[hit], ranges[hit].astype(np.float64), speeds)
 
 
 def too_close(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
-    """(P, 3) something nearer than the lidar can measure (`-inf`): at its least range [m]."""
+    """Returns points (P, 3) at the least range for beams too close to measure (`-inf`) [m]."""
     near = np.isneginf(ranges)
     return _ends(config, config.beam_angles[near], np.full(near.sum(), config.range_min), 0.0)
 
 
 def unknown(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
-    """(P, 3) a wall on the footprint wherever too many beams, or all for want of any, are unknown.
+    """Returns a wall (P, 3) on the footprint wherever too many beams, or all, are unknown.
 
-    So the robot does not drive into what it can't see; away from it, it does.
+    So the robot does not drive into what it can't see, but can drive away from it.
     """
     grid = np.linspace(-np.pi, np.pi, len(ranges), endpoint=False)
     angles = config.beam_angles[~np.isnan(ranges)] + config.mount[2]
@@ -81,12 +81,12 @@ def _ends(config: GateConfig, angles: Array, ranges: Array, speeds: Array | floa
 
 
 def obstacles(config: GateConfig, ranges: Ranges, views: tuple[View, ...]) -> Array | None:
-    """(P, 3) all that a scan (B,) tells not to drive into, and how fast each may come on.
+    """Returns all obstacles (P, 3) in a scan (B,), and how fast each may approach.
 
     Args:
         config: of the gate.
         ranges: of the scan.
-        views: it and those before, see `moving`; empty where no odometry has come yet.
+        views: that of the scan and earlier ones, see `moving`; empty before the first odometry.
 
     Returns:
         x, y in `base_link` [m], speed [m/s]; None without shield.
@@ -99,15 +99,15 @@ def obstacles(config: GateConfig, ranges: Ranges, views: tuple[View, ...]) -> Ar
 
 
 def rehearse() -> None:
-    """Compiles what `shield` calls: that takes seconds, which no robot in motion has."""
+    """Compiles what `shield` calls: that takes seconds, which a moving robot does not have."""
     shield_kernels.free(np.zeros((1, 3)), np.zeros((1, 3)), 0.0, 1.0, 0.0, STEP)
     moving.rehearse()
 
 
 def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
-    """The greatest part of a motion from which the robot can still stop in time.
+    """Returns the greatest part of a motion from which the robot can still stop in time.
 
-    It brakes harder than the limits of rate and jerk if it has to.
+    If necessary, it brakes harder than the limits of rate and jerk allow.
     """
     if config.shield is None or config.limits is None or state.obstacles is None:
         return motion
@@ -129,20 +129,20 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
 
 
 def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> bool:
-    """Whether the robot could still stop, and whether it would do so without a jolt."""
+    """True if the robot could still stop, and could do so without a jolt."""
     given, points = config.shield, state.obstacles
     if given is None or points is None:
         return True
     room = given.footprint_radius + given.margin
     odometry = np.zeros(3) if state.odometry is None else state.odometry.twist
     old = max(0.0, age(state.scans, now))
-    # What the scan does not show yet: told since it was made, or within the latency before.
+    # Commands that the scan does not show yet: since it was taken, or within the latency before.
     since, ends = now - old - given.latency_s, [told for told, _ in state.recent[1:]]
     past = [told[1] for told, end in zip(state.recent, [*ends, now], strict=False) if end >= since]
     react = given.hold_s + given.latency_s
     calm = 1.0 / config.scan_rate + react + given.latency_s
     hard = old + react
-    standing = points * (1.0, 1.0, 0.0)  # none may move so fast that a calm stop is any use
+    standing = points * (1.0, 1.0, 0.0)  # static: against fast obstacles a calm stop is no use
     for seen, commands, twist, blind, deceleration in (
         (standing, [value], None, calm, CALM * given.deceleration),
         (points, [*past, state.value, value], odometry, hard, given.deceleration),
@@ -156,7 +156,7 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
 def _family(
     config: GateConfig, given: ShieldConfig, commands: Array, odometry: Array | None
 ) -> Array:
-    """(K, 3) body twists between those of commands (n, C) and that of odometry (3,), if any."""
+    """Returns body twists (K, 3) between those of commands (n, C) and of odometry (3,), if any."""
     told = np.zeros((len(commands), 3))
     told[:, list(config.fields)] = commands
     if given.wheelbase > 0.0:
@@ -170,7 +170,7 @@ def _family(
 
 
 def _car_family(wheelbase: float, told: Array, odometry: Array | None) -> Array:
-    """A car keeps to its curvature at any speed; when it brakes, the gate steers straight."""
+    """Returns a car's twists: curvature does not depend on speed; braking steers it straight."""
     bends, speeds = [0.0, *np.tan(told[:, 2]) / wheelbase], list(told[:, 0])
     if odometry is not None:
         speeds.append(odometry[0])

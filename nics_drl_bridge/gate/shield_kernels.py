@@ -11,7 +11,7 @@ from nics_drl_bridge.kernels import kernel
 
 @kernel(allocates=True)
 def place(twist, time):  # type: ignore[no-untyped-def]
-    """Where the exact arc of a body twist (3,) leads to in a time: x, y."""
+    """Returns the position x, y after a time on the exact arc of a body twist (3,)."""
     turn = twist[2] * time
     if abs(turn) < 1e-6:
         a, b = 1.0, turn / 2.0
@@ -22,18 +22,18 @@ def place(twist, time):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def free(points, twists, blind, deceleration, room, step):  # type: ignore[no-untyped-def]
-    """Whether no point comes within `room` of any of the arcs before the robot is at rest on it.
+    """True if no point comes within `room` of any of the arcs before the robot rests on it.
 
-    One that is as near already must not come nearer; so the robot can leave it. A point that moves
-    may be nearer by then by all that it can have moved, also one that the robot drives away from.
+    A point that is already that near must not come nearer, so that the robot can leave it. A moving
+    point may be nearer by all that it can have moved, even one that the robot drives away from.
 
     Args:
-        points: (P, 3) x, y [m], and how fast each moves at most [m/s].
-        twists: (K, 3).
-        blind: for so long the robot keeps its twist; then it brakes [s].
-        deceleration: with which it does [m/s^2].
-        room: [m].
-        step: between places that are looked at [m].
+        points: (P, 3) x, y [m], and greatest speed of each [m/s].
+        twists: (K, 3) body twists of the arcs.
+        blind: time for which the robot keeps its twist before it brakes [s].
+        deceleration: of the braking [m/s^2].
+        room: distance to keep [m].
+        step: distance between the places that are checked [m].
     """
     longest, rest = 0.0, 0.0
     for k in range(twists.shape[0]):
@@ -68,7 +68,7 @@ def free(points, twists, blind, deceleration, room, step):  # type: ignore[no-un
 
 @kernel(allocates=True)
 def _reached(part, speed, blind, deceleration):  # type: ignore[no-untyped-def]
-    """When a robot that brakes is where, at its first speed, it would be after a time [s]."""
+    """Returns when a braking robot is where it would be at `part` at its initial speed [s]."""
     if part <= blind:
         return part
     left = speed * speed - 2.0 * deceleration * speed * (part - blind)

@@ -1,4 +1,4 @@
-"""What the gate knows, what it was told once, and what it says."""
+"""Configuration, state and decisions of the gate."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ShieldConfig:
-    """How the robot stops, measured, and how much room it is to keep.
+    """Stopping behaviour of the robot, and the clearance it keeps.
 
     Attributes:
-        latency_s: from a command until the robot has taken it up, lags included [s].
-        deceleration: with which it then brakes [m/s^2].
-        margin: kept free around the footprint [m].
-        hold_s: until the next decision at the latest [s].
+        latency_s: time from a command until the robot follows it, lags included [s].
+        deceleration: of the braking that follows [m/s^2].
+        margin: clearance kept around the footprint [m].
+        hold_s: longest time until the next decision [s].
         footprint_radius: of the robot [m].
-        wheelbase: of a car, whose command holds a steering angle [m]; 0 for the others.
-        obstacle_speed: at which what was seen to move may come on [m/s]; 0 to take all to stand.
+        wheelbase: of a car, which is commanded by steering angle [m]; 0 for others.
+        obstacle_speed: at which moving obstacles may approach [m/s]; 0 treats all as static.
         range_max: of the lidar [m].
-        range_noise: standard deviation of its ranges, in metres and in parts of the range.
-        unknown_share: of unknown beams in a direction, from which on it counts as blocked.
-        unknown_width: over which that share is taken [rad].
+        range_noise: standard deviation of its ranges, in metres and as a share of the range.
+        unknown_share: share of unknown beams from which a direction counts as blocked.
+        unknown_width: angle over which that share is taken [rad].
     """
 
     latency_s: float
@@ -46,38 +46,38 @@ class ShieldConfig:
 
 @dataclass(frozen=True)
 class GateConfig:
-    """What a gate is told when it starts.
+    """Fixed configuration of a gate.
 
     Attributes:
-        fields: (C,) place of each command in linear.x, linear.y, angular.z of `cmd_vel`.
+        fields: (C,) index of each command in linear.x, linear.y, angular.z of `cmd_vel`.
         limits: of the commands; None lets nothing pass.
         beam_angles: (B,) of the lidar [rad].
-        mount: (3,) x [m], y [m], heading [rad] of the lidar in `base_link`.
+        mount: (3,) pose of the lidar in `base_link`: x [m], y [m], heading [rad].
         range_min: of the lidar [m].
-        scan_rate, odom_rate: as declared [Hz].
-        range_max: of the lidar [m]; 0 when it is not known.
-        scan_age_s: of the newest scan, and of the scan behind a command, at most [s].
-        odom_age_s: of the newest odometry, at most [s].
-        command_age_s: of the newest command, at most [s].
-        race_s: by how much a command may overtake its scan on the way here [s].
-        settle_s: how long data must be fresh and the robot stand still before it is armed [s].
-        rate_tolerance: share by which a rate may differ from the declared one.
-        clock_jump_s: a stamp this far back, or before arming this far ahead, is a jump [s]; for
-            one armed see `freshness`.
-        clock_rate: seconds of the stamps' clock per second of the steady one; not 1 only in a
-            simulation that does not run in real time.
+        scan_rate, odom_rate: declared rates [Hz].
+        range_max: of the lidar [m]; 0 if unknown.
+        scan_age_s: greatest age of the newest scan, and of the scan behind a command [s].
+        odom_age_s: greatest age of the newest odometry [s].
+        command_age_s: greatest age of the newest command [s].
+        race_s: time by which a command may overtake its scan [s].
+        settle_s: time for which data must be fresh and the robot at rest before arming [s].
+        rate_tolerance: relative deviation of a rate from the declared one.
+        clock_jump_s: a stamp this far back, or before arming this far ahead, is a jump [s]; for an
+            armed gate see `freshness`.
+        clock_rate: seconds of the stamps' clock per steady second; not 1 only in a simulation that
+            does not run in real time.
         simulated: whether the stamps are those of a simulator, which may fall behind real time.
-        gap_s: the longest time between two ticks, and how long it stops after a longer one [s].
+        gap_s: longest time between two ticks, and duration of the stop after a longer one [s].
         e_stop_required: whether an emergency stop that was never heard counts as pressed; one that
             was heard and falls silent always does.
-        e_stop_silence_s: such a silence [s].
+        e_stop_silence_s: silence after which it counts as pressed [s].
         estimate_required: whether arming needs an estimator that has converged.
         estimate_std: greatest standard deviation of position [m] and heading [rad] for that.
         estimate_silence_s: greatest age of the estimate for that [s].
-        frozen_distance: identical scans over such a path are frozen [m, or rad of turning].
-        stuck_s: no motion within such a time while commanded is a stop [s].
-        odom_std: noise of a twist by odometry, linear [m/s] and angular [rad/s].
-        shield: see there; None for none.
+        frozen_distance: path over which identical scans are frozen [m, or rad of turning].
+        stuck_s: time without motion while commanded that causes a stop [s].
+        odom_std: noise of the odometry's twist, linear [m/s] and angular [rad/s].
+        shield: see `ShieldConfig`; None for no shield.
     """
 
     fields: tuple[int, ...]
@@ -111,13 +111,13 @@ class GateConfig:
 
 @dataclass(frozen=True)
 class Cause:
-    """Why the gate stops.
+    """Cause of a stop.
 
     Attributes:
-        rule: its name.
-        topic: that it is about; empty for the gate itself.
+        rule: name of the rule.
+        topic: topic concerned; empty for the gate itself.
         detail: what is wrong.
-        age_s, limit_s: of data that are too old, else NaN [s].
+        age_s, limit_s: of data that are too old, otherwise NaN [s].
     """
 
     rule: str
@@ -141,20 +141,20 @@ Mark = tuple[float, int, int, float]
 
 @dataclass(frozen=True)
 class Arrivals:
-    """When the data of a topic arrived, oldest first.
+    """Arrivals of the data of a topic, oldest first.
 
     The lead of a datum is how far its stamp is ahead of the steady clock, counted from the first
-    datum: the offset of two clocks, less the time that it took to get here.
+    datum: the offset of the two clocks minus the time the datum took to arrive.
 
     Attributes:
-        stamps_ns: of the headers of the last ones [ns].
-        times: of those on the steady clock [s].
-        late: by how much each of those came later than it could have [s].
+        stamps_ns: of the latest headers [ns].
+        times: their arrivals on the steady clock [s].
+        late: their delays beyond the least possible one [s].
         origin: stamp [ns] and arrival [s] of the first.
-        count: of all since the first.
-        envelope: the lead of data that come as fast as they can [s].
-        unbroken_s: since when there was no gap that is too long [s].
-        marks: one in a while, as far back as arming asks.
+        count: number of data since the first.
+        envelope: lead of the fastest data [s].
+        unbroken_s: time since which no gap was too long [s].
+        marks: taken at intervals, as far back as arming needs.
     """
 
     stamps_ns: tuple[int, ...] = ()
@@ -169,12 +169,12 @@ class Arrivals:
 
 @dataclass(frozen=True)
 class Sameness:
-    """A picture that the lidar has shown, and how far the robot moved while it stayed the same.
+    """A picture that the lidar has shown, and where the robot first saw it.
 
     Attributes:
-        ranges: (B,) of the scan that showed it first [m].
-        count: of scans that showed it.
-        first: (3,) pose by odometry when it was seen first; None when there was no odometry yet.
+        ranges: (B,) of the first scan that showed it [m].
+        count: number of scans that showed it.
+        first: (3,) odometry pose when it was first seen; None if there was no odometry yet.
     """
 
     ranges: NDArray[np.float32]
@@ -184,11 +184,11 @@ class Sameness:
 
 @dataclass(frozen=True)
 class View:
-    """A scan, and from where it was made.
+    """A scan, and the pose it was taken from.
 
     Attributes:
-        stamp_ns: of its header [ns].
-        pose: (3,) of the robot then, by odometry.
+        stamp_ns: time stamp of its header [ns].
+        pose: (3,) of the robot at that time, by odometry.
         ranges: (B,) [m], REP-117.
     """
 
@@ -199,14 +199,14 @@ class View:
 
 @dataclass(frozen=True)
 class Push:
-    """What the robot was told without a pause.
+    """Motion commanded without a pause.
 
     Attributes:
-        since_s, last_s, moving_s: when it began, when it was summed up last, and when the robot
-            was last told to move [s].
-        told: (3,) the way that it was told, the sum of its body twists x time [m, m, rad]; what
-            goes there and back again adds up to nothing.
-        marks: times [s], `told` then, and poses (3,) by odometry, oldest first.
+        since_s, last_s, moving_s: its start, its last integration, and the last time that motion
+            was commanded [s].
+        told: (3,) commanded motion, the sum of its body twists x time [m, m, rad]; there and back
+            again cancels out.
+        marks: times [s], `told` at those times, and poses (3,) by odometry, oldest first.
     """
 
     since_s: float
@@ -218,12 +218,12 @@ class Push:
 
 @dataclass(frozen=True)
 class EStopState:
-    """What is known of the emergency stop.
+    """Known state of the emergency stop.
 
     Attributes:
         latched: it was pressed, and not reset since.
-        held: it is pressed now, by what its topic said last.
-        heard_s: when its topic spoke last [s]; None when it never did.
+        held: its topic last reported it as pressed.
+        heard_s: time of the last message on its topic [s]; None if there was none.
     """
 
     latched: bool = False
@@ -233,37 +233,37 @@ class EStopState:
 
 @dataclass(frozen=True)
 class GateState:
-    """All that the gate remembers. It starts disarmed.
+    """Memory of the gate. It starts disarmed.
 
     Attributes:
-        value: (C,) command published last.
+        value: (C,) last published command.
         slope: (C,) its change per second.
-        moved_s: when it was published [s].
+        moved_s: time of that publication [s].
         now_s: greatest time seen [s].
         tick_s: time of the last tick [s].
-        awake_s: when it last went on after it had been asleep [s].
+        awake_s: time of the last wake-up after a gap in the ticks [s].
         still_ticks: inputs in a row at which the clock stood still.
         clock_fault: what is wrong with the clock at this input.
         armed: whether commands pass.
         latched: the stop that only a reset clears.
         scans, odometries: arrivals of accepted data.
-        jumped: the topic whose stamps have just jumped, or ran ahead.
-        leap: what is wrong with the newest pose by odometry; empty when nothing is.
-        scan, odometry, estimate, command: the newest accepted of each.
-        estimate_s, command_s: when those arrived [s].
-        pending: a command whose scan has not arrived here yet.
-        pending_s: since when commands have named such scans [s]; None when the newest does not.
-        views: of the last moments, for what moves; empty without shield.
-        obstacles: (P, 3) what the newest scan shows: x, y in `base_link` [m], and how fast each
-            may move [m/s].
-        behind_s: when the scan behind the newest command was as new as can be [s].
-        malformed: what is wrong with the newest command; empty when nothing is.
-        seen: what the lidar has shown last, the newest last.
-        frozen: why the newest scan is no new one; empty when it is.
-        restless_s: when odometry last showed motion [s].
-        push: what the robot was told lately; None when it was stopped.
+        jumped: the topic whose stamps have just jumped, or run ahead.
+        leap: what is wrong with the newest odometry pose; empty if nothing is.
+        scan, odometry, estimate, command: the newest accepted one of each.
+        estimate_s, command_s: their arrivals [s].
+        pending: a command whose scan has not arrived yet.
+        pending_s: time since which commands have named such scans [s]; None if the newest does not.
+        views: recent views, for the detection of motion; empty without shield.
+        obstacles: (P, 3) obstacles in the newest scan: x, y in `base_link` [m], and greatest speed
+            of each [m/s].
+        behind_s: arrival of the scan behind the newest command, less its delay [s].
+        malformed: what is wrong with the newest command; empty if nothing is.
+        seen: pictures that the lidar has shown, newest last.
+        frozen: why the newest scan is an old one; empty if it is not.
+        restless_s: last time that odometry showed motion [s].
+        push: recent commanded motion; None if the robot was stopped.
         recent: times and values of the commands that the newest scan may not show yet.
-        e_stop: see there.
+        e_stop: see `EStopState`.
     """
 
     value: Array
@@ -301,23 +301,23 @@ class GateState:
 
 
 def begin(config: GateConfig) -> GateState:
-    """The state of a gate that knows nothing."""
+    """Returns the state of a gate that has no data yet."""
     size = len(config.fields)
     return GateState(value=np.zeros(size), slope=np.zeros(size))
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What the gate does after an input.
+    """Response of the gate to an input.
 
     Attributes:
-        twist: (3,) of `cmd_vel`.
+        twist: (3,) for `cmd_vel`.
         publish: whether to publish it now.
         cause: of the stop; None when commands pass.
-        refused: why the input was not used; empty when it was.
-        answer: to Arm and Reset.
-        granted: whether they got what they asked for.
-        shielded: whether the shield cut the command down.
+        refused: why the input was not used; empty if it was.
+        answer: reply to Arm and Reset.
+        granted: whether these requests were granted.
+        shielded: whether the shield reduced the command.
     """
 
     twist: Array

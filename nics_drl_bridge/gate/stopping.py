@@ -1,6 +1,6 @@
-"""How a robot stops: from the file of its limits, or with care from its model.
+"""Stopping behaviour of a robot: from its limits file, or derived with caution from its model.
 
-Settings with which the robot could never move: to be said at the start, not in the field.
+Check for settings with which the robot could never move, reported at the start.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from nics_drl_bridge.robot.taylor import TaylorModel, term_name
 
 ANGLE = "rad"
 UNKNOWN_LAG_S = 0.5
-"""Of a robot whose model shows none [s]."""
+"""Lag of a robot whose model shows none [s]."""
 SLOWEST_LAG_S = 5.0
-"""What settles more slowly is no lag but a combination that no command moves [s]."""
+"""Slower modes are not lags but combinations that no command moves [s]."""
 UNKNOWN_DECELERATION = 0.5
-"""Of a robot whose limits are not known [m/s^2]."""
+"""Deceleration of a robot whose limits are not known [m/s^2]."""
 HOLD_S = GateConfig.gap_s
 
 
@@ -34,16 +34,16 @@ def shield_config(
     file: str | Path = "",
     given: Mapping[str, float] | None = None,
 ) -> tuple[ShieldConfig, str]:
-    """The shield of a robot, and a sentence that tells its values and where they are from.
+    """Returns a robot's shield configuration, and a sentence with its values and their source.
 
     Args:
         model: of the robot.
-        limits: of it, if any.
-        file: of the limits, as `load_limits` takes it; its `shield` holds what was measured.
-        given: values that go before those of the file, by their names there.
+        limits: of the robot, if any.
+        file: of the limits, as in `load_limits`; its `shield` gives the measured values.
+        given: values that override those of the file, by their names there.
 
     Raises:
-        ConfigError: a value can't be used, or the robot's commands tell no motion.
+        ConfigError: a value can't be used, or the shield does not know the robot's commands.
     """
     path = find_config(file, "limits") if file else None
     told = None if path is None else load_yaml(path, LimitsFile).shield
@@ -73,7 +73,7 @@ def shield_config(
 
 
 def _derived(model: SimulatorModel, limits: Limits | None) -> Stopping:
-    """A base takes a command up once in its period, and brakes no harder than its limits."""
+    """Assumes that a base takes up one command per period, and brakes no harder than its limits."""
     deceleration = UNKNOWN_DECELERATION
     if limits is not None and limits.linear.any():
         deceleration = float(limits.rate[limits.linear].min())
@@ -82,9 +82,9 @@ def _derived(model: SimulatorModel, limits: Limits | None) -> Stopping:
 
 
 def lag(kinematics: TaylorModel) -> float:
-    """The slowest time constant [s] with which a state settles; a guess where none shows.
+    """Returns the slowest time constant [s] of the model's states; a guess if none shows.
 
-    By the eigenvalues of what the state's rates owe to the state itself, at rest.
+    It comes from the eigenvalues, at rest, of the Jacobian of the state's rates by the state.
     """
     states = kinematics.variables[: kinematics.state_size]
     names = [term_name(row, kinematics.variables) for row in kinematics.powers]
@@ -98,10 +98,10 @@ def lag(kinematics: TaylorModel) -> float:
 
 
 def wheelbase(robot: RobotSpec) -> float:
-    """Of a robot that is told a steering angle [m]; 0 for one that is told a turn rate.
+    """Returns the wheelbase of a robot commanded by steering angle [m]; 0 for other robots.
 
     Raises:
-        ConfigError: its file does not tell, or it is told what is neither speed nor angle.
+        ConfigError: the robot's file lacks it, or a command is no speed, turn rate or angle.
     """
     for variable in robot.command:
         if variable.unit not in (SPEED, TURN, ANGLE):
@@ -120,14 +120,14 @@ def wheelbase(robot: RobotSpec) -> float:
 
 
 LEAST_DATA = 2
-"""So many data have to come while the gate settles, for their rate to be known."""
+"""Least number of data that must arrive while the gate settles, for their rate to be known."""
 
 
 def require_possible(config: GateConfig) -> None:
-    """Looks for settings with which the gate could never be armed.
+    """Checks that the gate can be armed with its settings.
 
     Raises:
-        ConfigError: there is one, with the parameter, its value and what it needs.
+        ConfigError: it can't be armed; names the parameter, its value and what it needs.
     """
     for topic, rate, age in (
         ("scan", config.scan_rate, config.scan_age_s),
@@ -147,11 +147,11 @@ def require_possible(config: GateConfig) -> None:
 
 
 def doubtful(config: GateConfig, control_period_s: float) -> str:
-    """A sentence about a setting with which only an unusual policy moves the robot, or nothing.
+    """Returns a warning about a setting that only suits an unusual policy; empty if there is none.
 
     Args:
         config: of the gate.
-        control_period_s: of the model, at which a policy commands unless it is told otherwise [s].
+        control_period_s: of the model; by default a policy commands at this period [s].
     """
     if config.command_age_s > control_period_s:
         return ""

@@ -1,16 +1,16 @@
-"""Age of data: by arrival on the steady clock, and by how late they came.
+"""Age of data: from their arrival on the steady clock, and from their delay.
 
-How far a stamp is ahead of the steady clock tells the offset of the two clocks, less the time that
-the datum took; the greatest such lead, the envelope, that of the fastest data (the idea of one-way
-delay estimation by the lower envelope). It is found before the gate is armed, and fixed from then
-on: it follows at most the drift of real clocks. So stamps that creep ahead, or fall behind, become
-neither the new present nor the new normal.
+The lead of a stamp over the steady clock is the offset of the two clocks minus the delay of the
+datum; the greatest lead, the envelope, is that of the fastest data (the idea of one-way delay
+estimation by the lower envelope). It is found before the gate is armed and then fixed: it follows
+at most the drift of real clocks. So stamps that creep ahead, or fall behind, become neither the new
+present nor the new normal.
 
-The gate's own clock: a time that jumps, freezes or was slept through stops the robot.
+The gate's own clock: time that jumps, freezes or was slept through stops the robot.
 
-The policy's commands: are there any, are they numbers, and of what age is the scan behind?
+Watchdogs of the policy's commands: presence, validity, and age of the scan behind them.
 
-The emergency stop: latched when pressed, and taken for pressed when silent.
+The emergency stop: latched when pressed, and treated as pressed when silent.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ from nics_drl_bridge.interface import S_PER_NS
 
 SCAN, ODOM = "scan", "odom"
 KEPT = 64
-"""Data whose stamps are known; a command on the scan before those is on an unknown one."""
+"""Number of remembered stamps; a command on an older scan is on an unknown one."""
 MARK_S = 0.05
-"""Between two marks."""
+"""Time between two marks [s]."""
 DRIFT = 1e-3
-"""Seconds per second by which two clocks may drift apart; those of real machines do by 1e-4."""
+"""Greatest drift between two clocks [s/s]; that of real machines is 1e-4."""
 SIMULATED_LAG = 0.2
-"""The share of real time that a simulator may lose."""
+"""Share of real time that a simulator may lose."""
 AHEAD_S = 0.1
-"""Data of an armed gate that are so much faster than the fastest before it are from the future."""
+"""Data of an armed gate whose lead exceeds the envelope by this are from the future [s]."""
 
 
 def arrived(
     config: GateConfig, arrivals: Arrivals, stamp_ns: int, now: float, gap_s: float, armed: bool
 ) -> tuple[Arrivals, str]:
-    """Takes a datum into account, or says why not.
+    """Accounts for a datum, or returns why it is not used.
 
     Args:
         config: of the gate.
-        arrivals: so far.
+        arrivals: known so far.
         stamp_ns: of the datum [ns].
         now: steady time [s].
-        gap_s: the longest gap between two of them [s].
+        gap_s: longest gap between two of them [s].
         armed: whether the envelope is fixed.
 
     Returns:
-        The arrivals, and `repeated`, `jumped` or nothing. After a jump only the new datum counts.
+        The arrivals, and `repeated`, `jumped` or "". After a jump only the new datum counts.
     """
     fresh = Arrivals(
         (stamp_ns,), (now,), (0.0,), (stamp_ns, now), 1, 0.0, now, ((now, stamp_ns, 1, 0.0),)
@@ -92,7 +92,7 @@ def _lead(config: GateConfig, arrivals: Arrivals, stamp_ns: int, now: float) -> 
 def _marked(
     arrivals: Arrivals, stamp_ns: int, now: float, lead: float, settle_s: float
 ) -> tuple[Mark, ...]:
-    """The marks, with a datum in the last of them or one of its own."""
+    """Returns the marks, with a datum merged into the last of them or as a new one."""
     *before, (time, stamp, number, greatest) = arrivals.marks
     if now - time < MARK_S:
         if lead <= greatest:
@@ -104,14 +104,14 @@ def _marked(
 
 
 def settled(arrivals: Arrivals) -> Arrivals:
-    """With the envelope of the data of the last time, whatever it was before."""
+    """Returns the arrivals with the envelope of the marked data alone, whatever it was before."""
     if not arrivals.marks:
         return arrivals
     return replace(arrivals, envelope=max(mark[3] for mark in arrivals.marks))
 
 
 def age(arrivals: Arrivals, now: float, index: int = -1) -> float:
-    """Seconds since a datum (the newest) was as new as can be; inf when there is none."""
+    """Returns the age of a datum (the newest) with its delay [s]; inf if there is none."""
     if not arrivals.times:
         return float("inf")
     return now - arrivals.times[index] + arrivals.late[index]
@@ -123,12 +123,12 @@ def _silence(rule: str, topic: str, arrivals: Arrivals, now: float, limit: float
 
 
 def scan_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The lidar has stopped."""
+    """The newest scan is too old: the lidar has stopped."""
     return _silence("scan_silent", SCAN, state.scans, now, config.scan_age_s)
 
 
 def odom_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """Odometry has stopped."""
+    """The newest odometry is too old: it has stopped."""
     return _silence("odom_silent", ODOM, state.odometries, now, config.odom_age_s)
 
 
@@ -140,14 +140,14 @@ def stamps_jumped(config: GateConfig, state: GateState, now: float) -> Cause | N
 
 
 def gap_free(arrivals: Arrivals, now: float, settle_s: float, limit: float) -> bool:
-    """Whether data have come for a time without a gap longer than a limit."""
+    """True if data have arrived for the settling time without a gap longer than a limit."""
     if not arrivals.times:
         return False
     return now - arrivals.unbroken_s >= settle_s and now - arrivals.times[-1] <= limit
 
 
 def rate(arrivals: Arrivals, now: float, settle_s: float) -> tuple[float, float]:
-    """Data per second by arrival, and by their stamps, over the last time; 0 when unknown."""
+    """Returns the rate by arrival and by stamps over the settling time [Hz]; 0 if unknown."""
     first = next((mark for mark in arrivals.marks if mark[0] >= now - settle_s), None)
     if first is None or arrivals.count <= first[2]:
         return 0.0, 0.0
@@ -158,7 +158,7 @@ def rate(arrivals: Arrivals, now: float, settle_s: float) -> tuple[float, float]
 
 
 def creep(arrivals: Arrivals) -> float:
-    """How much further ahead of the steady clock the later half of the marks is [s]."""
+    """Returns by how much the later half of the marks is further ahead of the steady clock [s]."""
     half = len(arrivals.marks) // 2
     if half == 0:
         return 0.0
@@ -167,11 +167,11 @@ def creep(arrivals: Arrivals) -> float:
 
 
 FROZEN_INPUTS = 20
-"""So many inputs in a row at one and the same time do not happen with a clock that runs."""
+"""A running clock does not give this many inputs in a row the same time."""
 
 
 def take_time(config: GateConfig, state: GateState, given: Input, now: float) -> GateState:
-    """Notes the time of an input, and what is wrong with it."""
+    """Records the time of an input, and what is wrong with it."""
     if not math.isfinite(now) or now < state.now_s:
         return replace(state, clock_fault=f"the steady clock went from {state.now_s} to {now} s")
     still = state.still_ticks + 1 if now == state.now_s else 0
@@ -179,9 +179,9 @@ def take_time(config: GateConfig, state: GateState, given: Input, now: float) ->
     if still >= FROZEN_INPUTS:
         fault = f"the steady clock stands still at {now} s"
     ticked, awake = state.tick_s, state.awake_s
-    if ticked is not None and now - ticked > config.gap_s:  # whatever wakes it up first
+    if ticked is not None and now - ticked > config.gap_s:  # at whatever input wakes it up
         fault, awake = f"no decision for {now - ticked:.3f} s, the limit is {config.gap_s} s", now
-    elif now - awake <= config.gap_s:  # one zero alone may be lost, the newest command counts
+    elif now - awake <= config.gap_s:  # a single zero may be lost: only the newest command counts
         fault = f"awake again for only {now - awake:.3f} s"
     if isinstance(given, Tick):
         ticked = now
@@ -191,7 +191,7 @@ def take_time(config: GateConfig, state: GateState, given: Input, now: float) ->
 
 
 def own_clock(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The gate can't tell the time, or was asleep."""
+    """The gate's clock is not to be trusted, or the gate was asleep."""
     return Cause("own_clock", "", state.clock_fault) if state.clock_fault else None
 
 
@@ -199,12 +199,12 @@ RAW = "cmd_vel_raw"
 
 
 def command_malformed(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The newest command is no command."""
+    """The newest command is malformed."""
     return Cause("command_malformed", RAW, state.malformed) if state.malformed else None
 
 
 def command_missing(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """The policy has not spoken yet."""
+    """No command has arrived yet."""
     if state.command is not None or state.pending is not None:
         return None
     return Cause("command_missing", RAW, "no command yet")
@@ -219,7 +219,7 @@ def command_silent(config: GateConfig, state: GateState, now: float) -> Cause | 
 
 
 def scan_behind_unknown(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """Commands name scans that do not arrive; from the future, perhaps. One may be on its way."""
+    """Commands name scans that do not arrive, perhaps from the future. One may be in transit."""
     if state.pending is None or state.pending_s is None:
         return None
     if now - state.pending_s <= config.race_s and state.command is not None:
@@ -243,24 +243,24 @@ TOPIC = "e_stop"
 
 
 def hear(state: EStopState, pressed: bool, now: float) -> EStopState:
-    """Notes what its topic said."""
+    """Returns the state after a message on its topic."""
     return EStopState(latched=state.latched or pressed, held=pressed, heard_s=now)
 
 
 def reset(state: EStopState) -> EStopState:
-    """Forgets that it was pressed, unless it still is."""
+    """Clears the latch, unless the emergency stop is still pressed."""
     return replace(state, latched=state.held)
 
 
 def e_stop_pressed(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """Somebody pressed it."""
+    """The emergency stop was pressed."""
     if not state.e_stop.latched:
         return None
     return Cause("e_stop_pressed", TOPIC, "pressed" if state.e_stop.held else "was pressed")
 
 
 def e_stop_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
-    """Its cable may be cut. Where none is required, only one that was heard can fall silent."""
+    """The emergency stop is silent: a cut cable? An optional one must have been heard before."""
     heard = state.e_stop.heard_s
     if heard is None and not config.e_stop_required:
         return None

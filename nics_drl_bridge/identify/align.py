@@ -1,4 +1,4 @@
-"""Aligns a calibrated recording: all streams on one time axis, at `base_link`."""
+"""Alignment of a calibrated recording: all streams on one time axis, at `base_link`."""
 
 from __future__ import annotations
 
@@ -17,23 +17,22 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Array = NDArray[np.float64]
 
 STEP_S = 0.01
-"""Step of the samples where the pose's own is not usable."""
+"""Step of the samples where the pose's own step is not usable."""
 STEP_RANGE_S = (0.002, 0.02)
 SMOOTHING_S = 0.1
 SMOOTHING_BURSTS = 1.5
 UNIFORM = 1e-6
 SHARED = 0.5
-"""Share of the rows that must have been taken at once, for the others to be left out."""
+"""Minimum share of rows with common stamps; only then are the other rows dropped."""
 STATE_GAP = 2.5
-"""Between states this many usual steps apart nothing is known of the rates."""
+"""Rates are unknown between states that are this many median steps apart."""
 
 
 def align(recording: Recording, calibration: Calibration, spec: RobotSpec) -> Samples:
     """Puts a recording on one time axis.
 
-    A recording that needs no correction is taken as it is, digit by digit. Otherwise the pose
-    is smoothed by local parabolas as far as its noise asks for, and rows in gaps of the pose
-    are left out.
+    A recording that needs no correction is used bit for bit. Otherwise the pose is smoothed by
+    local parabolas as far as its noise requires, and rows in gaps of the pose are dropped.
 
     Args:
         recording: the drive.
@@ -69,7 +68,7 @@ def align(recording: Recording, calibration: Calibration, spec: RobotSpec) -> Sa
 def states_at(
     recording: Recording, calibration: Calibration, spec: RobotSpec, grid: Array
 ) -> Array:
-    """States (T, S) at uniform times (T,) on the commands' clock: measured, or inferred."""
+    """Returns states (T, S), measured or inferred, at uniform times (T,) on the commands' clock."""
     if recording.state is not None:
         columns = recording.state.values.T
         return np.stack([np.interp(grid, recording.state.t, c) for c in columns], axis=1)
@@ -83,10 +82,10 @@ def states_at(
 
 
 def _shared_stamps(recording: Recording) -> tuple[Array, Array, Array, Array] | None:
-    """Stamps (T,), poses, states and commands where all of them were taken at once.
+    """Returns stamps (T,), poses, states and commands of the rows with common stamps.
 
-    None if the state was not measured, or if the stamps are not those of one uniform clock, of
-    which rows may be missing.
+    None if the state was not measured, or if the stamps do not lie on one uniform grid; rows may
+    be missing from the grid.
     """
     pose, state, command = recording.pose, recording.state, recording.command
     if state is None:
@@ -115,7 +114,7 @@ def _shared_stamps(recording: Recording) -> tuple[Array, Array, Array, Array] | 
 
 
 def _grid(recording: Recording, calibration: Calibration) -> Array:
-    """Uniform times (T,) that pose, commands and state cover, on the commands' clock."""
+    """Returns uniform times (T,) covered by pose, commands and state, on the commands' clock."""
     pose = recording.pose.t + calibration.clock_offset_s
     step = float(np.median(np.diff(pose)))
     if calibration.burst_period_s > 0.0 or not STEP_RANGE_S[0] <= step <= STEP_RANGE_S[1]:
@@ -143,9 +142,9 @@ def _half_width(calibration: Calibration) -> float:
 def _outside_gaps(
     t: Array, samples: Array, step: float, usual: float = 3.0, least: float = MAX_GAP_S
 ) -> NDArray[np.bool_]:
-    """Which steps (T,) have samples around them that are not far apart.
+    """Selects the steps (T,) whose neighbouring samples are close together.
 
-    Not far is less than `least` [s] or `usual` times the usual time between samples.
+    Close means less than the larger of `least` [s] and `usual` times the median sample interval.
     """
     after = np.clip(np.searchsorted(samples, t + step / 2.0), 1, len(samples) - 1)
     gap = samples[after] - samples[after - 1]

@@ -1,4 +1,4 @@
-"""Completes a model by the textbook where the drive did not move an input. Opt-in only."""
+"""Textbook terms for inputs that a drive did not move. Opt-in only."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def assume_textbook(
 ) -> tuple[TaylorModel, tuple[str, ...]]:
     """Adds terms for inputs that never moved, from the structure of the textbook kinematics.
 
-    What was learnt at a constant input is a section through the whole model: `wz = c speed`,
-    measured at the steering angle s0, becomes `wz = (c/s0) speed*steering`. At s0 = 0 the
-    section shows nothing of the input's effect, so it comes from the spec's parameters.
+    A fit at a constant input is a section through the whole model: `wz = c speed`, measured at
+    the steering angle s0, becomes `wz = (c/s0) speed*steering`. At s0 = 0 the section shows
+    nothing of the input's effect, so the coefficient comes from the spec's parameters.
 
     Args:
         model: fitted to a drive.
@@ -33,7 +33,7 @@ def assume_textbook(
         unmoved: variables of X that the drive never moved.
 
     Returns:
-        The model, its new terms listed in `assumed`, and a sentence for each row changed.
+        The model, with the new terms listed in `assumed`, and a sentence per change.
 
     Raises:
         ConfigError: the spec names no textbook kinematics.
@@ -52,7 +52,7 @@ def assume_textbook(
 
 
 def _rows(model: TaylorModel) -> dict[str, dict[str, float]]:
-    """The kept terms of each degree of freedom, by name."""
+    """Returns the kept terms of each degree of freedom, by name."""
     return {
         dof: {
             taylor.term_name(model.powers[k], model.variables): float(model.coefficients[d, k])
@@ -84,7 +84,7 @@ def _twist_of_state(
     i: int,
     point: dict[str, float],
 ) -> list[str]:
-    """Gives the products that hold state variable `i` back to the body twist."""
+    """Restores the products with state variable `i` in the body twist."""
     name, notes = spec.state[i].name, []
     for d, dof in enumerate(("vx", "vy", "wz")):
         for product in book.structure[dof]:
@@ -111,7 +111,7 @@ def _twist_of_state(
 
 
 def _slope(book: Textbook, spec: RobotSpec, d: int, product: str) -> float:
-    """Coefficient of a product of state variables in the textbook twist, around zero."""
+    """Returns the coefficient of a product of state variables in the textbook twist, at zero."""
     index = [i for i, v in enumerate(spec.state) if v.name in product.split("*")]
     value = 0.0
     for signs in np.ndindex(*(2,) * len(index)):
@@ -130,7 +130,7 @@ def _rates_of_state(
     unmoved: tuple[str, ...],
     point: dict[str, float],
 ) -> list[str]:
-    """Lets states follow the commands that never moved, with their lag (learnt or nominal)."""
+    """Makes states follow the commands that never moved, with their lag (learnt or nominal)."""
     notes = []
     here = np.array([point[c.name] for c in spec.command])
     for i, variable in enumerate(spec.state):

@@ -1,4 +1,4 @@
-"""Calibrates a recording: clocks, latency, mounting, lags and noise, found in the data."""
+"""Calibration of a recording: clocks, latency, mounting, lags and noise, estimated from data."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ MIN_LENGTH = 1e-4  # m, rad
 
 @one_blas_thread
 def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
-    """Estimates what the streams of a recording need before a fit.
+    """Estimates the corrections that the streams of a recording need before a fit.
 
     Args:
         recording: of a drive in which the robot moved.
-        spec: the robot. Where the recording has no measured state, each of its state
-            variables must follow a command.
+        spec: the robot. If the recording has no measured state, each state variable must
+            follow a command.
 
     Returns:
         The calibration; the identity for a recording that needs no correction.
@@ -61,7 +61,7 @@ def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
 
 
 def examine(recording: Recording, spec: RobotSpec) -> tuple[Calibration, Findings]:
-    """As `calibrate`, with the findings that its notes are made of."""
+    """Does the same as `calibrate` without the notes, and returns the findings behind them."""
     check(recording, spec)
     _require_state(recording, spec)
     bursts = repair.find_bursts(recording.pose.t)
@@ -101,7 +101,7 @@ def examine(recording: Recording, spec: RobotSpec) -> tuple[Calibration, Finding
 
 
 def tracked_twists(recording: Recording) -> Motion:
-    """Body twists of the tracked body over intervals as long as their noise asks for."""
+    """Returns twists of the tracked body over intervals as long as the pose noise requires."""
     t, pose = recording.pose.t, recording.pose.values
     bursts = repair.find_bursts(t)
     best = repair.newest(t, bursts)
@@ -123,7 +123,7 @@ def _unmoved(recording: Recording, spec: RobotSpec) -> tuple[str, ...]:
 
 
 def _expected(recording: Recording, spec: RobotSpec, twists: Motion, timing: Timing) -> Array:
-    """Mean state (n, S) over the intervals of the twists, at gain one where inferred."""
+    """Returns the mean state (n, S) over the intervals of the twists; inferred ones at gain 1."""
     start, end = twists.start + timing.offset, twists.end + timing.offset
     if recording.state is not None:
         return interval_means(recording.state.t, recording.state.values, start, end)
@@ -160,7 +160,7 @@ def _mounting(
 def _by_commands(
     recording: Recording, spec: RobotSpec, twists: Motion, timing: Timing
 ) -> Mounting | None:
-    """Mounting on a robot that moves in every direction."""
+    """Estimates the mounting on an omnidirectional robot."""
     if spec.state:
         expected = _expected(recording, spec, twists, timing)
         command = _as_commands(expected, recording, spec, timing.latency)
@@ -171,7 +171,7 @@ def _by_commands(
 
 
 def _as_commands(states: Array, recording: Recording, spec: RobotSpec, latency: float) -> Array:
-    """Measured states (n, S) as the commands (n, C) that would hold them."""
+    """Converts states (n, S) to the commands (n, C) that would sustain them."""
     stream = recording.state
     if stream is None:
         return states[:, np.argsort(followed(spec))]
@@ -182,7 +182,7 @@ def _as_commands(states: Array, recording: Recording, spec: RobotSpec, latency: 
     before = stream.values[:-1][keep]
     begin = stream.t - latency
     u = held(recording.command, spec, begin[:-1][keep], begin[1:][keep])
-    # More wheels than ways to move differ by slip alone, which says nothing of the commands.
+    # With more wheels than degrees of freedom, the rest of their speeds is slip, not commands.
     ways = np.linalg.svd(before, full_matrices=False)[2][: u.shape[1]].T
     chi = np.concatenate([before @ ways, u, np.ones((len(u), 1))], axis=1)
     beta = np.linalg.lstsq(chi, rates @ ways, rcond=1e-9)[0]
@@ -192,13 +192,13 @@ def _as_commands(states: Array, recording: Recording, spec: RobotSpec, latency: 
 
 
 def _speed_index(spec: RobotSpec) -> int | None:
-    """The state variable that is the speed along the direction of travel."""
+    """Returns the index of the speed along the direction of travel; None if not unique."""
     speeds = [i for i, v in enumerate(spec.state) if v.unit == "m/s"]
     return speeds[0] if len(speeds) == 1 else None
 
 
 def _mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
-    """Adds the parts of a mounting that are certain."""
+    """Adds those parts of a mounting that are significant, and all uncertainties."""
     if mounting is None:
         return calibration
     rotation = if_certain(mounting.rotation, mounting.rotation_sigma, MIN_LENGTH)
@@ -224,7 +224,7 @@ def _mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration
 def _responses(
     recording: Recording, spec: RobotSpec, twists: Motion, calibration: Calibration, timing: Timing
 ) -> tuple[Response, ...]:
-    """The inferred states; a speed is scaled so that it is the speed along the travel."""
+    """Returns the inferred states; a speed is scaled to the speed along the direction of travel."""
     if recording.state is not None:
         return ()
     gains = np.ones(len(spec.state))

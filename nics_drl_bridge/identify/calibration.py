@@ -1,4 +1,4 @@
-"""Calibration: how the streams of a recording hang together in time and space."""
+"""Calibration: the relations of a recording's streams in time and space."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Response:
-    """A state variable that was not measured: it follows a command as a first-order lag.
+    """A state variable that was not measured and follows a command with a first-order lag.
 
     Attributes:
         state, command: names in the RobotSpec.
@@ -32,22 +32,22 @@ class Response:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What was found about a recording's clocks, mounting and noise.
+    """Estimates of a recording's clocks, mounting and noise.
 
     Attributes:
-        clock_offset_s: to add to the pose's stamps to get the clock of the commands [s].
+        clock_offset_s: added to the pose's stamps, gives the commands' clock [s].
         command_latency_s: from a command's stamp to its effect [s].
-        rotation_rad: heading of `base_link` less the heading of the tracked body.
-        lever_arm_m: (x, y) of the tracked point, seen from `base_link` [m].
-        responses: of the state variables, empty where the state was measured.
+        rotation_rad: heading of `base_link` minus the heading of the tracked body.
+        lever_arm_m: (x, y) of the tracked point in `base_link` [m].
+        responses: of the state variables; empty if the state was measured.
         burst_period_s: between the bursts in which poses arrived [s]; 0 without bursts.
         position_noise_m: standard deviation of x and y of the pose [m].
         heading_noise_rad: standard deviation of its heading [rad].
-        wheel_scale: speed per unit of the mean of both wheels [m/s]; None if not known.
-        turn_scale: yaw rate per unit of right wheel less left [rad/s]; None if not known.
-        wheels_swapped: whether left and right wheel are interchanged; None if not known.
-        uncertainty: standard uncertainty by the names above, for what was estimated.
-        notes: what was found and what could not be learnt, one sentence each.
+        wheel_scale: speed per unit of the mean of both wheels [m/s]; None if unknown.
+        turn_scale: yaw rate per unit of right wheel minus left [rad/s]; None if unknown.
+        wheels_swapped: True if left and right wheel are interchanged; None if unknown.
+        uncertainty: standard uncertainty of each estimated value, by the names above.
+        notes: one sentence on each finding and on each value that could not be learnt.
     """
 
     clock_offset_s: float = 0.0
@@ -66,7 +66,7 @@ class Calibration:
 
     @property
     def is_identity(self) -> bool:
-        """Whether the streams can be used as they are."""
+        """True if the streams can be used as they are."""
         return (
             self.clock_offset_s == self.command_latency_s == self.rotation_rad == 0.0
             and self.lever_arm_m == (0.0, 0.0)
@@ -76,24 +76,24 @@ class Calibration:
 
     @property
     def is_exact(self) -> bool:
-        """Whether nothing is left to correct, not even noise: a textbook recording."""
+        """True if there is nothing to correct, not even noise: a textbook recording."""
         return self.is_identity and self.position_noise_m == self.heading_noise_rad == 0.0
 
     @property
     def mounting(self) -> Array:
-        """Pose (3,) of the tracked body as seen from `base_link`."""
+        """Pose (3,) of the tracked body in `base_link`."""
         return np.array([*self.lever_arm_m, -self.rotation_rad])
 
     def to_base(self, tracked: ArrayLike) -> Array:
-        """Poses (..., 3) of `base_link` of poses of the tracked body."""
+        """Converts poses (..., 3) of the tracked body to poses of `base_link`."""
         return geometry.compose(tracked, geometry.between(self.mounting, np.zeros(3)))
 
     def to_tracked(self, base: ArrayLike) -> Array:
-        """Poses (..., 3) of the tracked body of poses of `base_link`."""
+        """Converts poses (..., 3) of `base_link` to poses of the tracked body."""
         return geometry.compose(base, self.mounting)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for YAML."""
+        """Returns plain data for YAML."""
         return {
             "clock_offset_s": self.clock_offset_s,
             "command_latency_s": self.command_latency_s,
@@ -112,7 +112,7 @@ class Calibration:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Calibration:
-        """Reads what `to_dict` wrote. Raises ModelError with the key that is wrong."""
+        """Reads the output of `to_dict`. Raises ModelError with the wrong key."""
         try:
             x, y = data["lever_arm_m"]
             swapped = data["wheels_swapped"]

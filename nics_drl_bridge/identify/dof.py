@@ -1,13 +1,13 @@
-"""The fit of one degree of freedom: least squares, Eq. 2, least squares anew.
+"""Fit of one degree of freedom: least squares, Eq. 2, least squares again.
 
-Pruning: the terms that Eq. 2 keeps, and those that noise could have made.
+Pruning: the terms that Eq. 2 keeps, and those that are significant in noise.
 
 Instrumental variables: a fit to measured states that are themselves noisy.
 
-The noise of a state stands both in X and in its rate, so that least squares would take it for
-a fast decay. The state one step earlier has noise of its own: what it tells of X is free of the
-noise in dQ. Soederstroem, Stoica: Instrumental variable methods for system identification,
-1983; two-stage least squares.
+The noise of a state is both in X and in its rate, so that least squares would mistake it for a
+fast decay. The noise of the state one step earlier is independent of the noise in dQ, so that
+state serves as an instrument for X. Soederstroem, Stoica: Instrumental variable methods for
+system identification, 1983; two-stage least squares.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ ROUNDING = 1e-9
 
 
 def parse_alpha(text: str) -> Alpha:
-    """The pruning threshold of Eq. 2 as a user writes it: a number, or `auto`.
+    """Parses a pruning threshold of Eq. 2: a number from 0 to 1, or `auto`.
 
     Raises:
         ConfigError: it is neither.
@@ -51,14 +51,14 @@ def parse_alpha(text: str) -> Alpha:
 
 @dataclass(frozen=True)
 class DofFit:
-    """A degree of freedom of dQ/dt.
+    """Fit of one degree of freedom of dQ/dt.
 
     Attributes:
         coefficients: (K,) zero where a term is not kept.
         errors: (K,) their standard errors.
         curve: accuracy against the number of terms.
-        inliers: (T,) the rows that the fit used.
-        condition: condition number of the standardised features that are kept.
+        inliers: (T,) mask of the rows that the fit used.
+        condition: condition number of the standardised kept features.
     """
 
     coefficients: Array
@@ -68,7 +68,7 @@ class DofFit:
     condition: float
 
     def spread_over(self, allowed: NDArray[np.bool_]) -> DofFit:
-        """The same among more features (K',), of which only those `allowed` were used."""
+        """Expands the fit to all features (K',), of which it used only those `allowed`."""
         coefficients, errors = np.zeros(len(allowed)), np.zeros(len(allowed))
         coefficients[allowed], errors[allowed] = self.coefficients, self.errors
         return replace(self, coefficients=coefficients, errors=errors)
@@ -90,7 +90,7 @@ def fit_dof(
         terms: (K,) names of the features.
         chi: (T, K) features.
         target: (T,) rates.
-        usual: width of their usual range, for outliers.
+        usual: width of the usual range of the rates, for outliers.
         alpha: see `fit.fit`.
         noisy: see `fit.fit`.
     """
@@ -122,7 +122,7 @@ def fit_dof(
 
 
 def _scale(chi: Array) -> Array:
-    """The spread (K,) of each feature; 1 for the constant."""
+    """Returns the spread (K,) of each feature; 1 for the constant."""
     spread = chi.std(axis=0)
     return np.where(spread > 0.0, spread, 1.0)
 
@@ -132,17 +132,18 @@ CERTAIN = 3.0
 
 
 def by_weight(beta: Array, noise_floor: float = 0.0) -> NDArray[np.intp]:
-    """Indices of standardised coefficients (K,), the largest first, without rounding errors."""
+    """Returns indices of standardised coefficients (K,), largest first, without rounding errors."""
     size = np.where(np.abs(beta) > noise_floor, np.abs(beta), 0.0)
     order = np.argsort(-size, kind="stable")
     return np.asarray(order[size[order] > 0.0])
 
 
 def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.bool_]:
-    """Which of the standardised coefficients (K,) to keep (Eq. 2).
+    """Selects the standardised coefficients (K,) to keep (Eq. 2).
 
-    Sorted by size, those are kept whose sum stays below `alpha` of the whole, and the one
-    that crosses it. Coefficients below `noise_floor` are rounding errors and never count.
+    In order of size, coefficients are kept while their sum stays below the share `alpha` of the
+    total, and also the one that crosses it. Those up to `noise_floor` are rounding errors and
+    never count.
     """
     order = by_weight(beta, noise_floor)
     size = np.abs(beta[order])
@@ -152,10 +153,10 @@ def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.boo
 
 
 def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
-    """Which features (K,) of a noisy target (T,) can be told from noise.
+    """Selects the significant features (K,) of a noisy target (T,).
 
-    The least certain goes first, until each of those left is `CERTAIN` times its standard
-    error; the error is widened for residuals that resemble their neighbours.
+    The least certain feature is removed until each coefficient is at least `CERTAIN` times its
+    standard error, which is widened for autocorrelated residuals.
     """
     rest = target - chi @ np.linalg.lstsq(chi, target, rcond=None)[0]
     power = max(float(rest @ rest), np.finfo(np.float64).tiny)
@@ -175,14 +176,15 @@ def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
 
 
 NOISY = 5e-4
-"""A measured state is noisy from this share of its range on."""
+"""A measured state is noisy if its noise exceeds this share of its range."""
 SAME_STEP, ROUNDING_S = 1e-3, 1e-6
 WEAK = 1e4
-"""Instruments whose products with the features are conditioned worse tell too little."""
+"""Instruments are too weak if the condition number of their products with the features is
+larger."""
 
 
 def states_are_noisy(samples: Samples, spec: RobotSpec) -> bool:
-    """Whether the noise of a measured state would bend a fit."""
+    """True if the noise of a measured state would bias a fit."""
     if not spec.state:
         return False
     size = len(spec.state)
@@ -193,17 +195,17 @@ def states_are_noisy(samples: Samples, spec: RobotSpec) -> bool:
 def reestimated(
     part: DofFit, dof: int, samples: Samples, powers: NDArray[np.int64], states: int
 ) -> DofFit:
-    """A rate of the state with its kept coefficients estimated by instruments.
+    """Estimates the kept coefficients of a state's rate again, by instrumental variables.
 
     Args:
         part: the fit by least squares; its terms stay.
-        dof: its place in dQ.
-        samples: (T,) rows that it was made of.
+        dof: its index in dQ.
+        samples: (T,) rows of that fit.
         powers: (K, V) of the features.
-        states: S, how many of X are measured.
+        states: S, number of measured variables in X.
 
     Returns:
-        The same with other values; unchanged where the instruments tell too little.
+        The fit with the new values; unchanged if the instruments are too weak.
     """
     kept = np.flatnonzero(part.coefficients)
     follows = np.abs(np.diff(samples.t) - samples.dt) < SAME_STEP * samples.dt + ROUNDING_S

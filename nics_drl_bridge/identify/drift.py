@@ -1,9 +1,9 @@
-"""Measures the noise of sensors and what a model leaves unexplained of the motion.
+"""Measurement of sensor noise, and of the motion that a model leaves unexplained.
 
-The drift is judged over a second: systematic errors of a model grow faster than noise, so over a
-longer horizon the same model seems to drift more.
+The drift is measured over a second: systematic errors of a model grow faster than noise, so over
+a longer horizon the same model seems to drift more.
 
-Noise of the odometry: how far the velocities that the wheels report are from the motion.
+Noise of the odometry: the deviation of reported velocities from the motion.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ GROWTH_S = (0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
 STATE_HORIZON_S = 0.1
 MIN_WINDOWS = 20
 OUTLYING = 10.0
-"""A window that errs this many times as much as usual holds a jump."""
+"""A window whose error is more than this many times the median contains a jump."""
 RUN_AWAY_M = 1e4
-"""No prediction over a second that is off by more is of a drift."""
+"""A larger error of a prediction over a second is divergence, not drift."""
 BLOCKS = 8
 TINY = 1e-9
 NEGLIGIBLE = 1e-4
-"""Less than this is rounding: a tenth of a millimetre after a second."""
+"""A smaller level is rounding: a tenth of a millimetre after a second."""
 
 
 def measure_noise(
@@ -48,12 +48,12 @@ def measure_noise(
     samples: Samples,
     spec: RobotSpec,
 ) -> Noise:
-    """The noise that a recording shows, each level marked as measured or assumed.
+    """Measures the noise in a recording; each level is marked as measured or assumed.
 
     Args:
         recording: the whole drive, repaired.
         calibration: of the drive.
-        model: fitted to it.
+        model: fitted to the drive.
         samples: of the drive, aligned.
         spec: the robot.
     """
@@ -73,7 +73,7 @@ def measure_noise(
 
 
 def level(variances: Array, unit: str) -> Level:
-    """A measured level from squares (n,) in order of time, noise taken off already.
+    """Returns a measured level from squares (n,) in order of time, sensor noise subtracted.
 
     The uncertainty is that of the mean over blocks of the drive.
     """
@@ -88,7 +88,7 @@ def level(variances: Array, unit: str) -> Level:
 
 
 def _pose_levels(recording: Recording) -> tuple[Level, Level]:
-    """Noise of the pose sensor; its uncertainty from how parts of the drive differ."""
+    """Returns the noise of the pose sensor; its uncertainty comes from blocks of the drive."""
     t, values = recording.pose.t, recording.pose.values
     bursts = find_bursts(t)
     whole, default = pose_noise(values, bursts, t), Noise()
@@ -113,7 +113,7 @@ def _pose_drift(
     spec: RobotSpec,
     noise: Noise,
 ) -> tuple[Level, Level] | None:
-    """Drift of position and heading; None if the drive is too short or the model runs away."""
+    """Returns the drift of position and heading; None if too short or the model diverges."""
     duration = float(recording.pose.t[-1] - recording.pose.t[0])
     chosen = windows(recording, calibration, 0.0, duration, HORIZON_S, SPACING_S)
     if len(chosen.start_t) < MIN_WINDOWS:
@@ -127,7 +127,7 @@ def _pose_drift(
     away = np.sum((chosen.end - chosen.start)[inside, :2] ** 2, axis=1)
     turn = error[inside, 2] ** 2 - 2.0 * heading**2
     grown = max(float(turn.mean()), 0.0)
-    # A wrong heading at the start, and one that drifts on the way, lead aside.
+    # Errors of the initial heading, and heading drift on the way, cause lateral errors.
     aside = 0.5 * away * (heading**2 + grown / 3.0)
     shift = 0.5 * size[inside] ** 2 - 2.0 * position**2 - aside
     return level(shift / HORIZON_S, "m/sqrt(s)"), level(turn / HORIZON_S, "rad/sqrt(s)")
@@ -136,9 +136,9 @@ def _pose_drift(
 def drift_growth(
     recording: Recording, calibration: Calibration, model: TaylorModel, spec: RobotSpec
 ) -> tuple[Array, Array, Array] | None:
-    """How the error of predictions grows: horizons (n,) [s], position (n,) [m], heading [rad].
+    """Returns the growth of prediction errors: horizons [s], position [m], heading [rad], all (n,).
 
-    Root mean squares; the position's is that of one axis. None if the drive is too short.
+    The errors are root mean squares, of the position per axis. None if the drive is too short.
     """
     duration = float(recording.pose.t[-1] - recording.pose.t[0])
     rows = []
@@ -163,9 +163,9 @@ def _predicted(
     spec: RobotSpec,
     chosen: Windows,
 ) -> Array:
-    """Poses (W, 3) at the ends: by the measured state where there is one, else by the commands.
+    """Predicts end poses (W, 3) from the measured state if there is one, else from commands.
 
-    So what the state's own rates do not explain is not counted twice.
+    The unexplained part of the state's rates is thus not counted twice.
     """
     if recording.state is None:
         return predict(model, calibration, recording, spec, chosen)
@@ -181,7 +181,7 @@ def _predicted(
 def _state_drift(
     recording: Recording, model: TaylorModel, samples: Samples, spec: RobotSpec
 ) -> dict[str, Level]:
-    """What the rates of a measured state leave unexplained; assumed where it was not measured."""
+    """Returns the drift of a measured state; assumed levels for an unmeasured one."""
     nominal = {
         v.name: assumed(ASSUMED_STATE_DRIFT * (v.max - v.min), f"{v.unit}/sqrt(s)")
         for v in spec.state
@@ -208,17 +208,17 @@ def _state_drift(
 
 
 WITHIN_SIGMA = 68.27
-"""So many per cent of a normal distribution lie within one standard deviation."""
+"""Percentage of a normal distribution within one standard deviation."""
 MIN_ROWS = 40
 
 
 def odometry_noise(
     recording: Recording, calibration: Calibration, model: TaylorModel, samples: Samples
 ) -> tuple[Level, Level]:
-    """Linear and angular noise, against the twist that the fitted model gives.
+    """Returns linear and angular noise relative to the twist of the fitted model.
 
-    From the recorded odometry; else from the wheels, if the calibration knows their scale; else
-    the assumed values of `Noise`.
+    It comes from the recorded odometry; else from the wheels, if the calibration knows their
+    scale; else it is the assumed noise of `Noise`.
     """
     default = Noise()
     rest = odometry_residual(recording, calibration, model, samples)
@@ -231,7 +231,7 @@ def odometry_noise(
 def odometry_residual(
     recording: Recording, calibration: Calibration, model: TaylorModel, samples: Samples
 ) -> Array | None:
-    """Reported twist less that of the model (n, 3); None if there is nothing to compare."""
+    """Returns reported minus modelled twist (n, 3); None if there is nothing to compare."""
     stream = recording.odometry
     if stream is not None:
         t, twist = stream.t, stream.values
@@ -248,14 +248,14 @@ def odometry_residual(
     if inside.sum() < MIN_ROWS:
         return None
     rates = model.rates(samples.x)[:, :3]
-    # The rates hold from each sample to the next: at the middle of the step.
+    # The rates are means from each sample to the next, so they belong to the middle of the step.
     middle = samples.t + samples.dt / 2.0
     expected = np.stack([np.interp(t[inside], middle, column) for column in rates.T], axis=1)
     return np.asarray(twist[inside] - expected)
 
 
 def _level(rest: Array, unit: str) -> Level:
-    """A level that single outliers do not change."""
+    """Returns a level that is robust against single outliers."""
     parts = np.array([_sigma(part) for part in np.array_split(rest, BLOCKS)])
     return Level(
         std=_sigma(rest),

@@ -1,13 +1,13 @@
-"""Excitation: which inputs a drive moved, and which of them it moved apart from each other.
+"""Excitation: inputs that a drive moved, and those that it moved independently of each other.
 
-Robust regression: which rows of a fit are outliers, as a jump of the pose makes them.
+Robust regression: detection of outlying rows, such as those that a jump of the pose causes.
 
-Least trimmed squares in concentration steps finds the bulk of the rows (Rousseeuw, Van
-Driessen: Computing LTS regression for large data sets), what lies far from it is left out, and
-the rest is fitted by ordinary least squares: reweighted least squares with weights of 0 and 1.
-A recording without outliers is so fitted as if this did not exist.
+Least trimmed squares with concentration steps finds the bulk of the rows (Rousseeuw, Van
+Driessen: Computing LTS regression for large data sets). Rows far from it are dropped and the rest
+is fitted by ordinary least squares: reweighted least squares with weights of 0 and 1. Without
+outliers, the fit is plain least squares.
 
-Coverage: how well a drive moved each command, told before anything is fitted.
+Coverage: the range of motion of each command in a drive, computed before any fit.
 """
 
 from __future__ import annotations
@@ -26,20 +26,21 @@ Array = NDArray[np.float64]
 STILL = 1e-3
 """A variable whose spread is below this share of its range did not move."""
 NOISE_ONLY = 1.5
-"""Nor did a measured state whose spread is below this multiple of its noise."""
+"""Nor did a measured state whose spread is below this multiple of its noise, if its command did
+not move."""
 DEPENDENT = 1e-7
-"""A standardised feature whose part orthogonal to the others is below this is a copy."""
+"""A normalised feature whose component orthogonal to those before it is below this is a copy."""
 TOGETHER = 1e-3
-"""Commands move together where less than this share of one's spread is its own."""
+"""Commands are linearly dependent if a normalised combination of them is smaller than this."""
 DIFFERENCE = 6
 DIFFERENCE_GAIN = np.sqrt(924.0)  # white noise grows by this in a sixth difference
 GAUSSIAN_MAD = 0.6745
 
 
 def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
-    """Names of the variables of X that stayed where they were for the whole drive.
+    """Returns the names of the variables of X that stayed constant for the whole drive.
 
-    A state whose command never moved did not move either if all that it shows is noise.
+    A state whose command never moved did not move either if it shows nothing but noise.
     """
     limits = np.array([v.max - v.min for v in (*spec.state, *spec.command)])
     spread = samples.x.std(axis=0)
@@ -53,7 +54,7 @@ def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
 
 
 def white_noise(x: Array) -> Array:
-    """Standard deviation (V,) of white noise on series (T, V), from their sixth differences."""
+    """Returns the standard deviation (V,) of white noise on series (T, V), by differences."""
     rest = np.diff(x, DIFFERENCE, axis=0) / DIFFERENCE_GAIN
     if len(rest) < DIFFERENCE:
         return np.zeros(x.shape[1])
@@ -61,7 +62,7 @@ def white_noise(x: Array) -> Array:
 
 
 def commands_together(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
-    """Names of the commands that moved, but of which one is always made of the others."""
+    """Returns the names of the commands that moved, but were linearly dependent."""
     moved = [
         i
         for i, c in enumerate(spec.command, start=len(spec.state))
@@ -79,7 +80,7 @@ def commands_together(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
 
 
 def levels(samples: Samples, spec: RobotSpec) -> dict[str, int]:
-    """How many different values each command took; more than ten count as ten."""
+    """Returns the number of different values of each command; more than ten count as ten."""
     first = len(spec.state)
     return {
         c.name: min(10, len(np.unique(np.round(samples.x[:, first + i], 9))))
@@ -88,37 +89,38 @@ def levels(samples: Samples, spec: RobotSpec) -> dict[str, int]:
 
 
 def independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Splits columns into an independent set and copies; low orders are kept first."""
+    """Splits columns into an independent set and copies; earlier, low-order ones are kept first."""
     unit = chi / np.linalg.norm(chi, axis=0)
     independent: list[int] = []
     dependent: list[int] = []
-    r = np.abs(np.diag(qr(unit, mode="r")[0]))  # without pivoting: each against those before it
+    r = np.abs(np.diag(qr(unit, mode="r")[0]))  # no pivoting: each against its predecessors
     for k in range(chi.shape[1]):
         (independent if k < len(r) and r[k] > DEPENDENT else dependent).append(k)
     return np.array(independent, dtype=np.intp), np.array(dependent, dtype=np.intp)
 
 
 BULK = 0.75
-"""Share of the rows that the start is fitted to."""
+"""Share of the rows used in the initial fit."""
 CONCENTRATIONS = 12
 FAR = 8.0
 """An outlier is this many standard deviations of the bulk away,"""
 LARGE = 1.0
-"""and by more than this share of the rates' usual range: no misfit of the model is that."""
+"""and rows are searched only if some residual also exceeds this share of the rates' usual range,
+more than any misfit of the model."""
 LEAST = 1e-6
 """Rates below this, in SI units, are rounding errors and never outliers."""
 USUAL = (5.0, 95.0)
 """Percentiles that bound the usual range; jumps in 5 % of the rows lie outside."""
 MOST = 0.2
-"""More rows than this are no outliers: the model does not fit."""
+"""A larger share of rows is not outliers but a misfit of the model."""
 BEYOND = 0.5
-"""A variable this share of its range beyond its limits was not measured but made up."""
+"""A value beyond its limits by this share of its range is a sensor fault."""
 BULK_PERCENTILE, GAUSSIAN_BULK = 90.0, 1.645
-"""Once there are outliers, the misfit of the rest is judged by its tail, not by its middle."""
+"""If there are outliers, the misfit of the rest is estimated from its tail, not from its median."""
 
 
 def inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
-    """Which rows (T,) of a regression of a target (T,) on features (T, K) are no outliers.
+    """Selects the rows (T,) of a regression of a target on features that are not outliers.
 
     Args:
         chi: (T, K).
@@ -141,7 +143,7 @@ def inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
 
 
 def plausible(x: Array, low: Array, high: Array) -> NDArray[np.bool_]:
-    """Which rows (T,) of X (T, V) lie not far outside the variables' limits (V,)."""
+    """Selects the rows (T,) of X (T, V) that are within or close to the variables' limits (V,)."""
     margin = BEYOND * (high - low)
     inside = ((x >= low - margin) & (x <= high + margin)).all(axis=1)
     everything = np.ones(len(x), dtype=np.bool_)
@@ -149,7 +151,7 @@ def plausible(x: Array, low: Array, high: Array) -> NDArray[np.bool_]:
 
 
 def _concentrated(chi: Array, target: Array, chosen: NDArray[np.intp]) -> Array:
-    """Residuals (T,) of the fit to the rows that it fits best."""
+    """Returns absolute residuals (T,) of the fit to the best fitting rows, found from `chosen`."""
     rest = np.abs(target - chi @ _solve(chi[chosen], target[chosen]))
     for _ in range(CONCENTRATIONS):
         again = np.argsort(rest, kind="stable")[: len(chosen)]
@@ -161,7 +163,7 @@ def _concentrated(chi: Array, target: Array, chosen: NDArray[np.intp]) -> Array:
 
 
 def usual_ranges(dq: Array) -> Array:
-    """Width (D,) of the range in which rates (T, D) usually are; x and y share the wider."""
+    """Returns the width (D,) of the usual range of rates (T, D); x and y share the wider one."""
     low, high = np.percentile(dq, USUAL, axis=0)
     width = np.maximum(high - low, LEAST)
     width[:2] = width[:2].max()
@@ -178,21 +180,21 @@ def _sigma(rest: Array) -> float:
 
 GRID_S = 0.05
 ENDS = (2.0, 98.0)
-"""Percentiles between which a command is said to have moved."""
+"""Percentiles that bound the range of a command."""
 
 
 @dataclass(frozen=True)
 class CommandCoverage:
-    """How a drive moved one command.
+    """Coverage of one command by a drive.
 
     Attributes:
         name: of the command.
         unit: its unit.
-        low, high: between which it moved, but for 2 % at each end.
+        low, high: its range, without 2 % at each end.
         share: of the range that the robot's limits allow.
         own: share of its spread that the other commands do not explain.
-        levels: how many different values it took; more than ten count as ten.
-        fault: why nothing can be learnt of it; empty if something can.
+        levels: number of different values; more than ten count as ten.
+        fault: why nothing can be learnt about it; empty if something can.
     """
 
     name: str
@@ -205,7 +207,7 @@ class CommandCoverage:
     fault: str
 
     def line(self) -> str:
-        """For people."""
+        """Returns a human-readable line."""
         if self.fault:
             return f"{self.name}: {self.fault}"
         return (
@@ -215,14 +217,14 @@ class CommandCoverage:
 
 
 def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ...]:
-    """How a recording's commands moved, by the rules that a fit judges a drive by.
+    """Measures the coverage of a recording's commands, by the same rules as a fit.
 
     Args:
         recording: of the robot.
         spec: the robot.
 
     Returns:
-        One for each command, in the order of the spec.
+        One per command, in the order of the spec.
     """
     t, row = recording.command.t, recording.command.values
     grid = np.arange(t[0], t[-1], GRID_S)
@@ -248,7 +250,7 @@ def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ..
 
 
 def _own(x: Array) -> Array:
-    """Share (C,) of each column's spread that no linear combination of the others explains."""
+    """Returns the share (C,) of each column's spread that is linearly independent of the others."""
     centred = x - x.mean(axis=0)
     own = np.zeros(x.shape[1])
     for i, size in enumerate(np.linalg.norm(centred, axis=0)):

@@ -1,4 +1,4 @@
-"""What a calibration found and what it could not learn, in sentences."""
+"""Sentences on the findings of a calibration and on what could not be learnt."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 @dataclass(frozen=True)
 class Findings:
-    """What the sentences are about, beside the calibration's values.
+    """Findings for the sentences, in addition to the calibration's values.
 
     Attributes:
         bursts: of the pose's stamps.
-        noise_known: whether the pose's noise could be measured.
-        separated: whether clock offset and latency could be told apart.
-        clocks_differ: whether pose and commands are on clocks of their own.
+        noise_known: True if the pose's noise could be measured.
+        separated: True if clock offset and latency could be separated.
+        clocks_differ: True if pose and commands are on different clocks.
         lag_sigma: (S,) uncertainty of the lags [s]; NaN for a nominal one.
-        mounting: None if nothing could be learnt of it.
+        mounting: None if it could not be learnt.
         unmoved: commands that never changed.
     """
 
@@ -37,7 +37,7 @@ class Findings:
 
 
 def sentences(calibration: Calibration, found: Findings, spec: RobotSpec) -> tuple[str, ...]:
-    """The notes of a calibration."""
+    """Returns the notes of a calibration."""
     return (
         *_about_stamps(calibration, found),
         *_about_clocks(calibration, found, len(spec.command)),

@@ -1,4 +1,4 @@
-"""Fit by least squares, then prune the terms that hardly matter (Sec. IV-A, Eq. 2)."""
+"""Fit by least squares, then pruning of terms that hardly matter (Sec. IV-A, Eq. 2)."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ ALPHA = 0.99
 ORDER = 2
 MIN_SAMPLES_PER_TERM = 5
 NEGLIGIBLE = 1e-3
-"""A direction in which the robot moves by less than this share of the other is left at zero."""
+"""A velocity component below this share of the other one is modelled as zero."""
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """What a drive moved.
+    """Excitation of a robot's variables by a drive.
 
     Attributes:
-        unmoved: variables that the drive never moved, so that no term has them.
-        together: commands that moved, but of which one was always made of the others.
-        levels: how many different values each command took, at most 10.
+        unmoved: variables that the drive never moved, so that no term contains them.
+        together: commands that moved, but were linearly dependent.
+        levels: number of different values of each command, at most 10.
     """
 
     unmoved: tuple[str, ...]
@@ -59,19 +59,18 @@ class Excitation:
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted model and how well it fits.
+    """A fitted model and its goodness of fit.
 
     Attributes:
         model: the pruned model, with standard errors.
-        rmse: (D,) root mean square of dQ/dt that the model leaves over, in the dof's unit;
-            outliers apart.
-        r2: (D,) share of the variance explained; 1 where the dof does not move.
+        rmse: (D,) root mean square residual of dQ/dt, in the dof's unit, without outliers.
+        r2: (D,) share of the variance explained; 1 if the dof does not move.
         terms_total: D x K before pruning.
-        excitation: what the drive moved.
+        excitation: of the variables by the drive.
         dependent: terms that are copies of others on this drive.
-        curves: accuracy against the number of terms, of the dofs that move.
-        outliers: (D,) share of the rows that were left out as outliers.
-        condition: (D,) condition number of the standardised features that are kept.
+        curves: accuracy against the number of terms, for the dofs that move.
+        outliers: (D,) share of the rows that were dropped as outliers.
+        condition: (D,) condition number of the standardised kept features.
         samples: number of rows.
     """
 
@@ -88,7 +87,7 @@ class Fit:
 
     @property
     def unmoved(self) -> tuple[str, ...]:
-        """Variables that the drive never moved, so that no term has them."""
+        """Variables that the drive never moved, so that no term contains them."""
         return self.excitation.unmoved
 
 
@@ -103,18 +102,19 @@ def fit(
     """Fits and prunes a Taylor model.
 
     Args:
-        samples: (t, Q, X, dQ) on one time axis. Rows that jump are left out as outliers.
-        spec: gives names and units.
+        samples: (t, Q, X, dQ) on one time axis. Rows that jump are dropped as outliers.
+        spec: gives names, units and limits.
         order: of the expansion, 1 to 4; the paper's is 2.
         alpha: the share of the summed standardised coefficients that the kept terms of each
             degree of freedom reach (Eq. 2). The term that crosses the threshold is kept too:
-            to the letter of Eq. 2 a differential robot, whose wheels weigh the same, would
-            lose one of them. `auto` keeps as many terms, in the same order, as the
-            cross-validated error is worth (`accuracy.knee`).
-        noisy: for any recording but an exact one. Terms that can't be told from noise are
-            dropped before Eq. 2 counts the rest. The body twist is then taken to be a function
-            of the state alone, if there is a state, and to be zero at zero speed, if the speed
-            moved: within a step a command acts through the state, and noise can't tell the two.
+            with a literal Eq. 2 a differential robot, whose wheels have equal weight, would
+            lose one of them. `auto` keeps as many terms, in the same order, as improve the
+            cross-validated error (`accuracy.knee`).
+        noisy: True for any recording but an exact one. Insignificant terms are dropped before
+            Eq. 2 is applied to the rest. The body twist is then modelled as a function of the
+            state alone, if there is a state, and as zero at zero speed, if the speed moved:
+            within a step a command acts through the state, and in noise the two are
+            indistinguishable.
 
     Returns:
         The model with its errors.
@@ -151,7 +151,7 @@ def fit(
 
 
 def excitation_of(samples: Samples, spec: RobotSpec) -> Excitation:
-    """What a drive moved."""
+    """Returns the excitation of the variables by a drive."""
     return Excitation(
         unmoved_variables(samples, spec), commands_together(samples, spec), levels(samples, spec)
     )
@@ -160,7 +160,7 @@ def excitation_of(samples: Samples, spec: RobotSpec) -> Excitation:
 def build_model(
     samples: Samples, spec: RobotSpec, powers: NDArray[np.int64], coefficients: Array, errors: Array
 ) -> TaylorModel:
-    """A TaylorModel of the terms that some degree of freedom keeps."""
+    """Builds a TaylorModel of the terms that any degree of freedom keeps."""
     used = np.abs(coefficients).sum(axis=0) > 0.0
     return TaylorModel(
         variables=spec.variable_names,
@@ -178,7 +178,7 @@ def build_model(
 def _moved_terms(
     samples: Samples, powers: NDArray[np.int64], names: tuple[str, ...], unmoved: tuple[str, ...]
 ) -> NDArray[np.int64]:
-    """The terms (K, V) of variables that moved, if there are samples enough for them."""
+    """Returns the terms (K, V) of variables that moved; refuses too few samples for them."""
     still = [names.index(name) for name in unmoved]
     moved: NDArray[np.int64] = powers[(powers[:, still] == 0).all(axis=1)]
     if len(samples.t) < MIN_SAMPLES_PER_TERM * len(moved):
@@ -202,7 +202,7 @@ def _fit_dofs(
     noisy: bool,
     unmoved: tuple[str, ...],
 ) -> dict[int, DofFit]:
-    """Each degree of freedom that moves."""
+    """Fits each degree of freedom that moves."""
     labels = np.array([taylor.term_name(row, spec.variable_names) for row in powers])
     by_state = _through_state(powers, spec, unmoved)
     usual, parts = usual_ranges(samples.dq), {}
@@ -225,7 +225,7 @@ def _fit_dofs(
 
 
 def _stacked(parts: dict[int, DofFit], dofs: int, terms: int) -> tuple[Array, Array]:
-    """Coefficients and standard errors (D, K); zero for a dof that does not move."""
+    """Returns coefficients and standard errors (D, K); zero for a dof that does not move."""
     coefficients, errors = np.zeros((dofs, terms)), np.zeros((dofs, terms))
     for d, part in parts.items():
         coefficients[d], errors[d] = part.coefficients, part.errors
@@ -233,7 +233,7 @@ def _stacked(parts: dict[int, DofFit], dofs: int, terms: int) -> tuple[Array, Ar
 
 
 def _errors(model: TaylorModel, samples: Samples, parts: dict[int, DofFit]) -> tuple[Array, Array]:
-    """RMSE (D,) and R2 (D,) on the rows that each degree of freedom was fitted to."""
+    """Returns RMSE (D,) and R2 (D,) on the rows that each degree of freedom was fitted to."""
     rmse, r2 = errors_of(model, samples)
     for d, part in parts.items():
         if not part.inliers.all():
@@ -250,7 +250,7 @@ def _outliers(part: DofFit | None, left_out: float) -> float:
 def _through_state(
     powers: NDArray[np.int64], spec: RobotSpec, unmoved: tuple[str, ...]
 ) -> NDArray[np.bool_]:
-    """Which terms (K,) the body twist of a noisy recording may have."""
+    """Selects the terms (K,) allowed in the body twist of a noisy recording."""
     if not spec.state:
         return np.ones(len(powers), dtype=np.bool_)
     allowed = (powers[:, len(spec.state) :] == 0).all(axis=1)
@@ -260,7 +260,7 @@ def _through_state(
 
 
 def _moves(dq: Array) -> NDArray[np.bool_]:
-    """Which degrees of freedom (D,) move at all, beside the fastest of their kind."""
+    """Selects the dofs (D,) that move: of vx and vy the non-negligible, and all others."""
     size = np.sqrt((dq**2).mean(axis=0))
     moves = np.ones(len(size), dtype=np.bool_)
     moves[:2] = size[:2] > NEGLIGIBLE * size[:2].max()

@@ -1,4 +1,4 @@
-"""From a recording to a model: calibrate, align, fit, prune, refine, and try it out."""
+"""Identification of a model from a recording: calibrate, align, fit, prune, refine and test."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ TRAIN_SHARE = 2.0 / 3.0
 
 @dataclass(frozen=True)
 class Identified:
-    """All that was learnt from a recording.
+    """Result of an identification.
 
     Attributes:
         model: the model, refined and, on request, completed by assumption, with standard
             errors and quality.
         calibration: of the recording.
         fit: the linear fit, before refinement.
-        samples: that the fit used.
+        samples: the samples that the fit used.
         unseen: samples of the part that the fit did not see; None if there are too few.
         recording: the whole drive, repaired.
-        train_until_s: where the training part ended, from the drive's first pose [s].
-        held_out: open-loop errors on the rest; None if it was too short for them.
+        train_until_s: end of the training part, from the drive's first pose [s].
+        held_out: open-loop errors on the rest; None if it was too short.
         alpha: of the pruning; `auto` for the knee of the accuracy curve.
         noise: of sensors and motion, each level measured or assumed.
-        findings: of the calibration, for pictures.
-        notes: sentences on what was found, what could not be learnt, what was assumed.
+        findings: of the calibration, for plots.
+        notes: sentences on findings, on what could not be learnt and on assumptions.
     """
 
     model: TaylorModel
@@ -73,7 +73,7 @@ class Identified:
 
 
 @one_blas_thread
-@np.errstate(over="ignore", invalid="ignore")  # its figures tell of a model that runs away
+@np.errstate(over="ignore", invalid="ignore")  # a diverging model shows in its figures
 def identify(
     recording: Recording,
     spec: RobotSpec,
@@ -83,26 +83,26 @@ def identify(
     assume: bool = False,
     strict: bool = False,
 ) -> Identified:
-    """Learns a robot's motion from the first part of a recording and tries it on the rest.
+    """Learns a robot's motion from the first part of a recording and tests it on the rest.
 
     Args:
-        recording: of a drive in which every command varied. Single samples that jump and rows
-            that repeat are left out first.
+        recording: of a drive in which every command varied. Single samples that jump and
+            repeated rows are dropped first.
         spec: the robot.
         order: of the Taylor expansion.
         alpha: of the pruning (Eq. 2), or `auto`.
-        train_until: end of the part to learn from, from the first pose [s]; the first two
-            thirds when None.
+        train_until: end of the training part, from the first pose [s]; after two thirds of the
+            drive when None.
         assume: completes the model by the textbook for inputs that never moved.
-        strict: refuses a drive that did not move every input on its own, instead of giving a
-            model without.
+        strict: refuses a drive that did not move every input independently, instead of
+            returning a model without those inputs.
 
     Returns:
         Model, calibration, errors and sentences.
 
     Raises:
         RecordingError: the recording can't be used for this robot.
-        FitError: the drive does not hold enough to fit a model.
+        FitError: the drive does not contain enough information to fit a model.
     """
     check_units(check(recording, spec), spec)
     duration = float(recording.pose.t[-1] - recording.pose.t[0])
@@ -146,10 +146,10 @@ def identify(
 
 
 def cut(recording: Recording, until: float) -> Recording:
-    """The part of a recording up to `until` seconds after its first pose.
+    """Returns the part of a recording up to `until` seconds after its first pose.
 
-    The other streams end at about that time: how far the clocks are apart is not known yet.
-    Commands last a little longer, since no pose can be learnt from them.
+    The other streams end at about that time, since the clock offset is not known yet. Commands
+    last a little longer, since they reveal no pose.
     """
     pose = recording.pose.t
 
@@ -171,7 +171,7 @@ def cut(recording: Recording, until: float) -> Recording:
 def _refined(
     model: TaylorModel, calibration: Calibration, training: Recording, spec: RobotSpec, until: float
 ) -> tuple[TaylorModel, Calibration, tuple[str, ...]]:
-    """Refines a model of a real recording; that of an exact one is left alone."""
+    """Refines a model of a real recording; the model of an exact recording is unchanged."""
     if calibration.is_exact:
         return model, calibration, ()
     linear = model
@@ -200,9 +200,9 @@ def _refined(
 def _by_definition(
     model: TaylorModel, calibration: Calibration, spec: RobotSpec
 ) -> tuple[TaylorModel, Calibration]:
-    """Scales an inferred speed so that vx = 1 speed, and takes lateral motion as noise.
+    """Scales an inferred speed so that vx = 1 speed, and treats lateral motion as noise.
 
-    `base_link` of a robot that has no command sideways is the point without lateral motion.
+    `base_link` of a robot without a lateral command is the point without lateral motion.
     """
     coefficients = model.coefficients.copy()
     if all(command.cmd_vel != "linear.y" for command in spec.command):

@@ -1,4 +1,4 @@
-"""Compiled sensitivities: where a known course of X leads, and how each coefficient moves that."""
+"""Compiled sensitivities: end poses of known courses of X, and their derivatives."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from nics_drl_bridge.kernels import kernel
 
 SMALL_TURN = 0.3
-"""Below this the series of sin(a)/a below is exact to the last digits [rad]."""
+"""Below this angle the series of sin(a)/a is exact to the last digits [rad]."""
 
 
 @kernel(allocates=True)
@@ -22,7 +22,7 @@ def _product(row, factors, count):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _sinc(half):  # type: ignore[no-untyped-def]
-    """sin(a) / a."""
+    """Returns sin(a) / a."""
     if abs(half) > SMALL_TURN:
         return math.sin(half) / half
     square = half * half
@@ -31,7 +31,7 @@ def _sinc(half):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True, inline=True)
 def _follow_derivatives(now, values, dof, free, arc, along_x, along_y, dt):  # type: ignore[no-untyped-def]
-    """Moves the derivatives (3, P) of a pose along one arc: (dx, dy, turn)."""
+    """Propagates the derivatives (3, P) of a pose along one arc: (dx, dy, turn)."""
     dx, dy, turn = arc
     for p in range(now.shape[1]):
         value, d = values[free[p]], dof[free[p]]
@@ -55,19 +55,19 @@ def _follow_derivatives(now, values, dof, free, arc, along_x, along_y, dt):  # t
 
 @kernel(allocates=True)
 def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-untyped-def]
-    """Integrates body twists along courses of X that no coefficient changes.
+    """Integrates body twists along courses of X that do not depend on the coefficients.
 
     Each step is the exact arc of its twist, as in the simulator. Shapes: W windows, T steps, V
-    variables, K terms of the twist, P coefficients that may move.
+    variables, K terms of the twist, P free coefficients.
 
     Args:
-        ends: (W, 3) poses at the ends, relative to the starts, headings unwrapped; result.
-        moved: (W, 3, P) their derivatives by the free coefficients; result. P = 0 skips them.
-        x: (W, T, V) X during each step.
+        ends: (W, 3) output: end poses relative to the starts, headings unwrapped.
+        moved: (W, 3, P) output: their derivatives by the free coefficients. P = 0 skips them.
+        x: (W, T, V + 1) X during each step, and a last entry of 1.
         steps: (W,) whole steps to the end.
-        share: (W,) of one more step.
+        share: (W,) remaining fraction of one more step.
         terms: degree of freedom (K,), coefficient (K,), factors (K, order), their number (K,).
-        free: (P,) which of the terms may move.
+        free: (P,) indices of the free terms.
         dt: length of a step [s].
     """
     dof, coefficient, factors, count = terms

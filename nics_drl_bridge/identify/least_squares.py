@@ -1,4 +1,4 @@
-"""Least squares of a calibration: what features explain, and the least of a residual."""
+"""Least squares of a calibration: unexplained parts of signals, and minimised residuals."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ MAX_STEPS = 40
 
 
 def unexplained(chi: Array, signal: Array) -> Array:
-    """What no linear combination of features (n, K) explains of a signal (n, D); flattened.
+    """Returns the residual of a signal (n, D) on features (n, K) by least squares, flattened.
 
-    In shares of each component's spread.
+    It is a share of each component's spread.
     """
     spread = signal.std(axis=0)
     scaled = (signal - signal.mean(axis=0)) / np.where(spread > 1e-9, spread, 1e9)
@@ -36,17 +36,17 @@ def minimise(
     bounds: tuple[Array, Array] | None = None,
     jacobian: Callable[[Array], Array] | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Least squares in steps of each parameter's own scale, however large its value is.
+    """Minimises a residual by least squares, in steps of each parameter's scale.
 
     Args:
-        residual: of parameters (P,).
+        residual: function of parameters (P,).
         start: (P,).
-        scale: (P,) by which a parameter may be expected to move.
+        scale: (P,) expected change of each parameter, whatever its value.
         bounds: least and greatest parameters (P,).
         jacobian: of the residual (n, P); by finite differences when None.
 
     Returns:
-        Parameters (P,), Jacobian (n, P) and residual (n,) there.
+        Parameters (P,), and Jacobian (n, P) and residual (n,) there.
     """
     low, high = bounds or (np.full(len(start), -np.inf), np.full(len(start), np.inf))
     slope: Any = "2-point"
@@ -66,9 +66,9 @@ def minimise(
 
 
 def uncertainty(jacobian: Array, residual: Array) -> Array:
-    """Standard uncertainty (P,) of least squares.
+    """Returns the standard uncertainty (P,) of least squares.
 
-    Widened for residuals that resemble their neighbours.
+    It is widened for autocorrelated residuals.
     """
     rest = residual - residual.mean()
     power = float((rest**2).sum())

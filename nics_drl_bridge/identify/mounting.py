@@ -1,11 +1,11 @@
-"""Mounting: where and how the tracked body sits on the robot.
+"""Mounting: position and rotation of the tracked body on the robot.
 
 Uncertainty of a mounting by the delete-one-block jackknife.
 
-Efron, Tibshirani: An Introduction to the Bootstrap, ch. 11. It sees what formulas of least squares
-do not: wheels that slip alike for seconds, and errors of the regressors themselves.
+Efron, Tibshirani: An Introduction to the Bootstrap, ch. 11. It covers what least-squares formulas
+miss: wheel slip that is correlated over seconds, and errors of the regressors themselves.
 
-Wheels: what a unit of their speed means, and whether left and right are interchanged.
+Wheels: the scale of their speeds, and interchanged left and right wheels.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from nics_drl_bridge.recording.recording import Recording
 Array = NDArray[np.float64]
 
 TURN_SCALE_M = 0.2
-"""Weighs yaw rates against speeds: a heading error counts as at this distance."""
+"""Weighs yaw rates against speeds: a yaw rate counts as the speed at this distance."""
 DISTINCT = 4.0
-"""The second direction of motion must stand out of the noise by this factor."""
+"""The second direction of motion must exceed the noise by this factor."""
 MIN_SECOND = 0.05
-"""It must have at least this share of the first one's size."""
+"""It must have at least this share of the size of the first."""
 STILL = 1e-3
 
 
@@ -42,11 +42,11 @@ class Mounting:
     """Rotation and lever arm, as in `Calibration`, with standard uncertainty.
 
     Attributes:
-        rotation: heading of `base_link` less that of the tracked body [rad].
-        lever: (2,) of the tracked point seen from `base_link` [m].
+        rotation: heading of `base_link` minus that of the tracked body [rad].
+        lever: (2,) position of the tracked point in `base_link` [m].
         rotation_sigma: [rad].
         lever_sigma: (2,) [m]; NaN for a component that could not be learnt.
-        turns: whether the robot turned at all.
+        turns: True if the robot turned at all.
     """
 
     rotation: float
@@ -57,19 +57,19 @@ class Mounting:
 
 
 def mounting_without_lateral_motion(motion: Motion, forward: Array) -> Mounting | None:
-    """Mounting on a robot whose `base_link` never moves sideways.
+    """Estimates the mounting on a robot whose `base_link` never moves sideways.
 
     The lateral speed of the tracked point is then yaw rate x lever arm:
     `cos(rotation) uy - sin(rotation) ux - lever_x wz = 0`, the direction in which the twists
-    have no extent. Where the path has one curvature only, rotation and lever arm can't be
-    told apart: the lever arm is taken as zero.
+    have no extent. If the path has a single curvature, rotation and lever arm can't be
+    separated, and the lever arm is set to zero.
 
     Args:
         motion: twists of the tracked body.
-        forward: (n,) what the robot was told or measured to drive; only its sign counts.
+        forward: (n,) commanded or measured forward speed; only its sign matters.
 
     Returns:
-        The mounting; its lever arm along y is not known here. None if nothing moved.
+        The mounting, with unknown lever arm along y. None if nothing moved.
     """
     rows = motion.twist * np.array([1.0, 1.0, TURN_SCALE_M])
     size, axes = np.linalg.svd(rows, full_matrices=False)[1:]
@@ -98,7 +98,7 @@ def _facing(
     sigma: float,
     turns: bool,
 ) -> Mounting:
-    """Chooses between forward and backward; `travel` is the course in the tracked frame."""
+    """Resolves forward and backward; `travel` is the direction of travel in the tracked frame."""
     lever, lever_sigma = lever_x
     along = motion.twist[:, :2] @ np.array([np.cos(travel), np.sin(travel)])
     if float(along @ forward) < 0.0:
@@ -113,10 +113,11 @@ def _facing(
 
 
 def lateral_lever(motion: Motion, rotation: float, speed: Array) -> tuple[float, float]:
-    """Lever arm along y and its uncertainty [m], from measured or commanded speed (n,).
+    """Estimates the lever arm along y and its uncertainty [m] from a speed (n,).
 
-    The tracked point runs faster than `base_link` on the outside of a curve:
-    `ux = gain speed - lever_y wz`. NaN uncertainty where all curves were alike.
+    The speed is measured or inferred from commands. The tracked point is faster than `base_link`
+    on the outside of a curve: `ux = gain speed - lever_y wz`. The uncertainty is NaN if all
+    curves were alike.
     """
     along = rotate(motion.twist[:, :2], -rotation)[:, 0]
     chi = np.stack([speed, motion.twist[:, 2]], axis=1)
@@ -128,15 +129,14 @@ def lateral_lever(motion: Motion, rotation: float, speed: Array) -> tuple[float,
 
 
 def mounting_by_commands(motion: Motion, response: Array) -> Mounting | None:
-    """Mounting on a robot that moves in every direction.
+    """Estimates the mounting on an omnidirectional robot.
 
     Args:
         motion: twists of the tracked body.
-        response: (n, 3) the body twist, up to one factor, that state or commands make
-            expect of `base_link`.
+        response: (n, 3) twist of `base_link` expected from state or commands, up to one factor.
 
     Returns:
-        The mounting, or None if it did not move along x and y and turn.
+        The mounting, or None unless the robot moved along x and y and turned.
     """
     size = np.linalg.svd(response, compute_uv=False)
     if size[2] <= MIN_SECOND * size[0]:
@@ -163,16 +163,16 @@ Estimate = Callable[[Recording, Motion], Mounting | None]
 def jackknifed(
     recording: Recording, twists: Motion, offset: float, estimate: Estimate
 ) -> Mounting | None:
-    """A mounting, its uncertainty at least that of leaving out blocks of the drive in turn.
+    """Estimates a mounting, with at least the uncertainty of the delete-one-block jackknife.
 
     Args:
         recording: the drive.
         twists: of the tracked body.
         offset: of the pose's clock, as in `Calibration` [s].
-        estimate: of a drive and its twists.
+        estimate: estimates the mounting from a drive and its twists.
 
     Returns:
-        The mounting of the whole drive; None if it shows none.
+        The mounting from the whole drive; None if it can't be estimated.
     """
     whole = estimate(recording, twists)
     if whole is None:
@@ -194,14 +194,14 @@ def jackknifed(
 
 
 def _spread(values: Array) -> Array:
-    """Standard errors (...) of estimates (B, ...) that each left one block out."""
+    """Returns standard errors (...) from estimates (B, ...) that each omit one block."""
     return np.asarray(np.sqrt((len(values) - 1.0) * values.var(axis=0)))
 
 
 def _without(
     recording: Recording, twists: Motion, offset: float, begin: float, end: float
 ) -> tuple[Recording, Motion]:
-    """Leaves out the twists and the measured state between two times of the pose's clock."""
+    """Drops the twists and the measured state between two times of the pose's clock [s]."""
     rows = (twists.end <= begin) | (twists.start >= end)
     kept = Motion(twists.start[rows], twists.end[rows], twists.twist[rows])
     state = recording.state
@@ -213,7 +213,7 @@ def _without(
 
 
 def wheels_swapped(recording: Recording, twists: Motion, offset: float) -> bool | None:
-    """Whether the left wheel is faster in left turns; None if the wheels don't tell."""
+    """True if the left wheel is faster in left turns; None if the wheels do not show it."""
     if recording.wheels is None:
         return None
     start, end = twists.start + offset, twists.end + offset
@@ -227,7 +227,7 @@ def wheels_swapped(recording: Recording, twists: Motion, offset: float) -> bool 
 
 
 def wheel_scales(recording: Recording, twists: Motion, calibration: Calibration) -> Calibration:
-    """Adds what a unit of the wheels' speed means, where the drive shows it."""
+    """Adds the scales of the wheel speeds, as far as the drive shows them."""
     if recording.wheels is None:
         return calibration
     start, end = (t + calibration.clock_offset_s for t in (twists.start, twists.end))

@@ -1,4 +1,4 @@
-"""Noise of the pose, and the rates of the pose over intervals that it allows."""
+"""Noise of the pose, and body twists over intervals long enough for that noise."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DIFFERENCE = 6
 DIFFERENCE_GAIN = np.sqrt(924.0)  # white noise grows by this in a sixth difference
 GAUSSIAN_MAD = 0.6745
 UNEVEN = 0.5
-LEAST_WHOLE = 0.1  # of the stretches must be without a gap, to be taken alone
+LEAST_WHOLE = 0.1  # share of gap-free stretches from which on only those are used
 NEGLIGIBLE = 1e-6  # m, rad
 REST_SAMPLES = 12
 REST_DRIFT = 3.0  # standard errors; straight motion shows at least 4
@@ -29,12 +29,12 @@ MAX_GAP_S = 0.25
 
 @dataclass(frozen=True)
 class Motion:
-    """Body twists of the tracked body over intervals.
+    """Twists of the tracked body over intervals.
 
     Attributes:
-        start, end: (n,) of the intervals, on the clock of the pose [s].
-        twist: (n, 3) constant twist whose arc joins the poses at both ends, in the tracked
-            body's own frame.
+        start, end: (n,) of the intervals, on the pose's clock [s].
+        twist: (n, 3) constant twist whose arc joins the poses at both ends, in the frame of the
+            tracked body.
     """
 
     start: Array
@@ -45,11 +45,11 @@ class Motion:
 def pose_noise(
     pose: Array, bursts: Bursts | None, t: Array | None = None
 ) -> tuple[float, float] | None:
-    """Standard deviation of position [m] and heading [rad] of poses (T, 3) at times (T,).
+    """Returns standard deviations of position [m] and heading [rad] of poses (T, 3) at times (T,).
 
-    From differences so high that motion has none, over stretches without a gap; in bursts,
-    where sample times are not known well enough for that, from the stretches in which the robot
-    stood still. None if there are none.
+    They come from sixth differences, in which smooth motion vanishes, over gap-free stretches. In
+    bursts, whose sample times are not known well enough, they come from the stretches in which
+    the robot stood still. None if there are none.
     """
     pose = unwrapped(pose)
     if bursts is None:
@@ -67,14 +67,14 @@ def pose_noise(
 
 
 def pose_residual(pose: Stream) -> Array | None:
-    """The noise (n, 3) of poses that are stamped one by one, scaled to its own size; else None."""
+    """Returns the noise (n, 3) of poses at its own scale; None for bursts or too few poses."""
     if find_bursts(pose.t) is not None or len(pose.t) <= 2 * DIFFERENCE:
         return None
     return _high_differences(unwrapped(pose.values), pose.t)
 
 
 def _high_differences(pose: Array, t: Array | None) -> Array:
-    """Differences (n, 3) so high that motion has none, over stretches without a gap."""
+    """Returns sixth differences (n, 3) at the scale of the noise, over gap-free stretches."""
     rest = np.diff(pose, DIFFERENCE, axis=0) / DIFFERENCE_GAIN
     if t is None or not len(rest):
         return np.asarray(rest)
@@ -85,7 +85,7 @@ def _high_differences(pose: Array, t: Array | None) -> Array:
 
 
 def white_noise(values: Array) -> float:
-    """Standard deviation of white noise on an even series (T,) that is smooth besides."""
+    """Returns the standard deviation of white noise on an otherwise smooth, even series (T,)."""
     if len(values) <= 2 * DIFFERENCE:
         return 0.0
     rest = np.diff(values, DIFFERENCE) / DIFFERENCE_GAIN
@@ -93,7 +93,7 @@ def white_noise(values: Array) -> float:
 
 
 def _spread_at_rest(pose: Array) -> Array | None:
-    """Spread (3,) in stretches whose first and second half do not differ."""
+    """Returns the spread (3,) in stretches whose two halves do not differ; None if too few."""
     count = len(pose) // REST_SAMPLES
     blocks = pose[: count * REST_SAMPLES].reshape(count, REST_SAMPLES, 3)
     spread = blocks.std(axis=1, ddof=1)
@@ -107,13 +107,13 @@ def _spread_at_rest(pose: Array) -> Array | None:
 
 
 def motion(t: Array, pose: Array, bursts: Bursts | None, noise: tuple[float, float]) -> Motion:
-    """Twists of the tracked body over intervals long enough for the noise.
+    """Returns twists of the tracked body over intervals long enough for the noise.
 
     Args:
-        t: (T,) sample times [s], the newest of each burst only.
+        t: (T,) sample times [s], of each burst only the newest.
         pose: (T, 3).
         bursts: of the stream.
-        noise: of position and heading.
+        noise: of position [m] and heading [rad].
     """
     stride = 1 if bursts is not None else _stride(t, pose, noise)
     limit = 1.8 * bursts.period_s if bursts is not None else MAX_GAP_S
@@ -125,7 +125,7 @@ def motion(t: Array, pose: Array, bursts: Bursts | None, noise: tuple[float, flo
 
 
 def _stride(t: Array, pose: Array, noise: tuple[float, float]) -> int:
-    """How many samples apart two poses must be for the noise not to drown their difference."""
+    """Returns the number of samples between poses that makes motion stand out of the noise."""
     dt = float(np.median(np.diff(t)))
     coarse = max(1, round(MAX_SPAN_S / dt))
     far = geometry.log(geometry.between(pose[:-coarse:coarse], pose[coarse::coarse])) / (

@@ -1,4 +1,4 @@
-"""Open-loop prediction: how far a model is from the truth after some seconds of commands."""
+"""Open-loop prediction: the error of a model after some seconds of commands."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ Array = NDArray[np.float64]
 HORIZON_S = 5.0
 SPACING_S = 0.1
 SETTLE_S = 1.0
-"""Windows start no sooner than this after the first command, when the state is inferred."""
+"""Windows start no sooner than this after the first command if the state is inferred."""
 END_TOLERANCE = 0.6
-"""A window ends at the sample next to its horizon, if within this share of the period."""
+"""A window ends at the sample nearest to its horizon, if within this share of the period."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,13 @@ class OpenLoop:
     measured pose at the end of the horizon, both of the tracked point.
 
     Attributes:
-        horizon_s: how long each prediction runs [s].
+        horizon_s: length of each prediction [s].
         windows: number of predictions.
         mean_position_error_m, median_position_error_m, max_position_error_m: at the end [m].
         mean_heading_error_rad: mean absolute error of the heading at the end [rad].
         mean_path_m: mean length of the measured path in the horizon [m].
-        median_displacement_m: median distance from its start to its end [m], the position error
-            that a robot which stands still would leave.
+        median_displacement_m: median distance from the start to the end of that path [m], the
+            position error of predicting that the robot stands still.
     """
 
     horizon_s: float
@@ -81,15 +81,15 @@ def windows(
     horizon: float,
     spacing: float,
 ) -> Windows:
-    """Chooses the windows that lie between two times, counted from the first pose.
+    """Selects the windows between two times, counted from the first pose.
 
     Args:
         recording: the drive.
         calibration: of this drive.
-        start: of the part of the drive that windows lie in, from its first pose [s].
+        start: start of the part of the drive that contains the windows, from its first pose [s].
         stop: its end [s].
         horizon: length of a window [s].
-        spacing: least time between two starts [s].
+        spacing: minimum time between two starts [s].
     """
     best = repair.newest(recording.pose.t, repair.find_bursts(recording.pose.t))
     t, pose = recording.pose.t[best], recording.pose.values[best]
@@ -110,7 +110,7 @@ def windows(
 
 
 def _spaced(t: Array, spacing: float) -> NDArray[np.intp]:
-    """Indices of times (T,) at least (nearly) `spacing` apart."""
+    """Returns indices of times (T,) that are at least (nearly) `spacing` apart [s]."""
     chosen: list[int] = []
     for k, value in enumerate(t):
         if not chosen or value - t[chosen[-1]] > 0.9 * spacing:
@@ -125,9 +125,9 @@ def predict(
     spec: RobotSpec,
     chosen: Windows,
 ) -> Array:
-    """Poses (W, 3) of the tracked body at the ends of windows, predicted by the commands.
+    """Predicts poses (W, 3) of the tracked body at the ends of windows from the commands.
 
-    The state at the start comes from what was measured or commanded before it.
+    The state at the start is the measured one, or follows from the commands before it.
     """
     base = calibration.to_base(chosen.start)
     by = _by_one_rollout if recording.state is None else _by_windows
@@ -142,10 +142,10 @@ def _by_one_rollout(
     spec: RobotSpec,
     chosen: Windows,
 ) -> Array:
-    """Relative poses (W, 3); an inferred state needs commands only, so all windows share it."""
+    """Returns relative poses (W, 3) from one roll-out: an inferred state needs commands only."""
     start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
     lead = np.ceil((max(0.0, start.min() - recording.command.t[0]) + 1.0) / model.dt)
-    # Whole steps before the first window: windows of regular poses then begin and end with a step.
+    # Whole steps before the first window: windows of regular poses then begin and end on the grid.
     grid = start.min() + model.dt * np.arange(-lead, (end.max() - start.min()) / model.dt + 2.0)
     begin = grid - calibration.command_latency_s
     command = held(recording.command, spec, begin, begin + model.dt)
@@ -167,7 +167,7 @@ def from_measured_states(
 
     Returns:
         Poses (W, T + 1, 3) from the origin, states (W, T + 1, S), commands (W, T, C), whole steps
-        (W,) to the end and the share (W,) of one more.
+        (W,) to the end and the remaining fraction (W,) of one more.
     """
     start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
     steps = int(np.ceil(float((end - start).max()) / model.dt - 1e-6)) + 1
@@ -186,16 +186,16 @@ def _by_windows(
     spec: RobotSpec,
     chosen: Windows,
 ) -> Array:
-    """Relative poses (W, 3), each window from its own measured state."""
+    """Returns relative poses (W, 3), each window started from its measured state."""
     poses, _, _, step, share = from_measured_states(model, calibration, recording, spec, chosen)
     row, share = np.arange(len(step)), share[:, None]
     return np.asarray((1.0 - share) * poses[row, step] + share * poses[row, step + 1])
 
 
 def _roll(model: TaylorModel, state: Array, command: Array) -> tuple[Array, Array]:
-    """Poses (W, T + 1, 3) from the origin and states (W, T + 1, S), under commands (W, T, C).
+    """Rolls out poses (W, T + 1, 3) from the origin and states (W, T + 1, S).
 
-    Headings are unwrapped.
+    The commands are (W, T, C). Headings are unwrapped.
     """
     count, steps = command.shape[:2]
     poses, states = np.zeros((count, steps + 1, 3)), np.empty((count, steps + 1, state.shape[1]))
@@ -213,22 +213,22 @@ def open_loop_error(
     stop: float,
     horizon: float = HORIZON_S,
 ) -> OpenLoop:
-    """Predicts open-loop on a part of a drive and compares the ends.
+    """Predicts a part of a drive open-loop and compares the end poses.
 
     Args:
         model: the model.
         calibration: of this drive.
         recording: the drive.
         spec: the robot.
-        start: of the part of the drive to use, from its first pose [s].
+        start: start of the part of the drive to use, from its first pose [s].
         stop: its end [s].
-        horizon: how long each prediction runs [s].
+        horizon: length of each prediction [s].
 
     Returns:
         The errors over windows that start every 0.1 s.
 
     Raises:
-        RecordingError: the part holds no window.
+        RecordingError: the part is too short for a window.
     """
     chosen = windows(recording, calibration, start, stop, horizon, SPACING_S)
     if len(chosen.start_t) == 0:

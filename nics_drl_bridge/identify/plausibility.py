@@ -1,4 +1,4 @@
-"""Plausibility: recordings that no calibration can repair, since an axis or a unit is wrong."""
+"""Plausibility: detects wrong axes and units, which no calibration can repair."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from nics_drl_bridge.robot.spec import RobotSpec, Variable
 Array = NDArray[np.float64]
 
 WRONG_UNIT = 5.0
-"""Values this many times the limit are in another unit: degrees are 57, rpm 9.5 times as many."""
+"""Values this many times the limit are in another unit: degrees are 57, rpm 9.5 times larger."""
 UNIT_PERCENTILE = 75.0
 TRAVEL_SHARE = 0.1
-"""Directions of travel are taken over this share of the footprint, or more."""
+"""Directions of travel are measured over at least this share of the footprint's radius."""
 MIN_DIRECTIONS = 30
 MIN_TURN = 1.0
-"""Of a drive that turned by less [rad], a reversed axis does not show."""
+"""A reversed axis does not show in a drive that turned by less than this [rad]."""
 CONSISTENT, INCONSISTENT = 0.9, 0.6
-"""Of the direction of travel in the body's frame, 1 where it is always what it should be."""
+"""Consistency of the direction of travel in the body frame; 1 is perfect."""
 MIRRORED = -0.5
 """Correlation of yaw rate and steering below which the robot turns the wrong way."""
 
@@ -33,7 +33,7 @@ def check_units(recording: Recording, spec: RobotSpec) -> None:
     """Refuses states and commands that only another unit can explain.
 
     Raises:
-        RecordingError: with the variable and the factor by which it is too large.
+        RecordingError: a variable is too large; with its value and its limit.
     """
     streams: list[tuple[Stream, tuple[Variable, ...]]] = [(recording.command, spec.command)]
     if recording.state is not None:
@@ -53,8 +53,8 @@ def check_units(recording: Recording, spec: RobotSpec) -> None:
 def check_axes(recording: Recording, spec: RobotSpec) -> None:
     """Refuses poses whose heading turns against the direction of travel.
 
-    A robot without sideways motion travels in the same direction of its own frame all the
-    time; that of another depends on its commands. If either holds only when the heading is
+    In its own frame, a robot without sideways motion always travels in the same direction; that
+    of an omnidirectional robot depends on its state. If this is true only with the heading
     mirrored, then x, y or heading is reversed.
 
     Raises:
@@ -79,7 +79,7 @@ def check_axes(recording: Recording, spec: RobotSpec) -> None:
 
 
 def _far_apart(pose: Stream, distance: float) -> tuple[Array, Array]:
-    """Stamps (n,) and poses (n, 3) of a stream, thinned to about a distance apart [m]."""
+    """Returns stamps (n,) and poses (n, 3) of a stream, about `distance` [m] apart."""
     best = repair.newest(pose.t, repair.find_bursts(pose.t))
     t, values = pose.t[best], pose.values[best]
     path = np.append(0.0, np.cumsum(np.hypot(*np.diff(values[:, :2], axis=0).T)))
@@ -89,7 +89,7 @@ def _far_apart(pose: Stream, distance: float) -> tuple[Array, Array]:
 
 
 def _steadiness(pose: Array) -> float:
-    """How constant the direction of travel is in the body's frame, forward or backward: 0 to 1."""
+    """Returns the constancy (0 to 1) of the body-frame axis of travel, forward or backward."""
     moved = geometry.log(geometry.between(pose[:-1], pose[1:]))[:, :2]
     size = np.hypot(*moved.T)
     course = np.exp(2j * np.arctan2(moved[:, 1], moved[:, 0]))
@@ -97,7 +97,10 @@ def _steadiness(pose: Array) -> float:
 
 
 def _explained(t: Array, pose: Array, state: Stream) -> float:
-    """Share of the body velocity between poses (n, 3) that is linear in the state, 0 to 1."""
+    """Returns the share (0 to 1) of the velocity between poses (n, 3) that the state explains.
+
+    The body velocity is linear in the state.
+    """
     span = np.diff(t)
     keep = span > 0.0
     velocity = geometry.log(geometry.between(pose[:-1], pose[1:]))[keep, :2] / span[keep, None]
@@ -106,7 +109,7 @@ def _explained(t: Array, pose: Array, state: Stream) -> float:
 
 
 def mirror_note(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
-    """A sentence if the robot turns right where its command says left."""
+    """Returns a sentence if the robot turns right when commanded to turn left."""
     for i, command in enumerate(spec.command, start=len(spec.state)):
         if command.cmd_vel != "angular.z":
             continue

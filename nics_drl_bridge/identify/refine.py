@@ -1,11 +1,11 @@
-"""Refines a model by its open-loop errors over seconds (the output-error method).
+"""Refinement of a model by its open-loop errors over seconds (the output-error method).
 
-Least squares on rates asks for the next instant; a simulator is asked for the next seconds.
-Ljung, System Identification, ch. 7; the paper's kept terms stay, their values move.
+Least squares on rates predicts the next instant; a simulator must predict the next seconds.
+Ljung, System Identification, ch. 7; the paper's kept terms stay, their values change.
 
-What may move when a model is refined, and what is fixed by definition or by measurement.
+Free parameters of a refinement; the others are fixed by definition or by measurement.
 
-Leaves out refined terms that hardly help to predict.
+Removal of refined terms that hardly improve the prediction.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ Array = NDArray[np.float64]
 DIVERGED = 1e3
 LEAST_SCALE = 0.05
 WITHIN = 12.0**-0.5
-"""A model moves by what holds at the start of a step: a time is uncertain by where in a step it
-lies, as a uniform distribution over the step is."""
+"""A model uses the values at the start of a step, so a time is uncertain by the standard deviation
+of a uniform distribution over the step."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Refined:
 
 @dataclass(frozen=True)
 class _Free:
-    """What may move: coefficients (D, K), a time of the calibration, its rotation."""
+    """Free parameters: coefficients (D, K), a time of the calibration, its rotation."""
 
     coefficients: NDArray[np.bool_]
     time: str | None
@@ -64,12 +64,12 @@ class _Free:
 
     @property
     def count(self) -> int:
-        """How many coefficients."""
+        """Number of free coefficients."""
         return int(self.coefficients.sum())
 
 
 def refine(problem: Problem, model: TaylorModel, calibration: Calibration) -> Refined:
-    """Moves coefficients and calibration to the least open-loop error.
+    """Adjusts coefficients and calibration to the least open-loop error.
 
     Args:
         problem: the windows to predict.
@@ -105,7 +105,7 @@ def refine(problem: Problem, model: TaylorModel, calibration: Calibration) -> Re
 def _coefficient_errors(
     problem: Problem, free: _Free, jacobian: Array, rest: Array, model: TaylorModel
 ) -> Array:
-    """Standard errors (D, K); windows that share a stretch of the drive are one cluster."""
+    """Returns standard errors (D, K); windows of one stretch of the drive form a cluster."""
     starts = np.concatenate([np.repeat(w.start_t, 3) for w in problem.chosen])
     cluster = np.floor((starts - starts.min()) / max(HORIZONS_S)).astype(np.intp)
     errors = np.full(model.coefficients.shape, np.nan)
@@ -165,7 +165,7 @@ def _unpack(
 
 
 def _response(model: TaylorModel, spec: RobotSpec, response: Response) -> Response:
-    """The lag and the gain that the coefficients of the state's rate amount to."""
+    """Returns the lag and gain that correspond to the coefficients of the state's rate."""
     d = model.dofs.index(f"d_{response.state}")
     own, command = (linear_term(model, spec, n) for n in (response.state, response.command))
     if own is None or command is None or not 0.0 < -model.coefficients[d, own] * model.dt < 1.0:
@@ -183,10 +183,10 @@ def _bounded(error: Array) -> Array:
 def free_coefficients(
     model: TaylorModel, calibration: Calibration, spec: RobotSpec
 ) -> NDArray[np.bool_]:
-    """Which coefficients (D, K) may move: kept, and not fixed by what a state is.
+    """Selects the free coefficients (D, K): kept, and not fixed by the definition of a state.
 
-    An inferred speed is by definition the speed along the travel, so that vx = 1 speed; its
-    lag stays where the wheels showed it.
+    An inferred speed is by definition the speed along the direction of travel, so that
+    vx = 1 speed; its lag is fixed if the wheels showed it.
     """
     free = model.coefficients != 0.0
     if not calibration.responses:
@@ -197,7 +197,7 @@ def free_coefficients(
             continue
         if model.coefficients[0, alone] == 1.0:
             free[0, alone] = False
-        else:  # another scale of this state would serve as well: its gain stays
+        else:  # the scale of this state is arbitrary, so its gain is fixed
             free[3 + i, linear_term(model, spec, response.command)] = False
         if lag_is_measured(calibration):
             free[3 + i, alone] = False
@@ -205,29 +205,32 @@ def free_coefficients(
 
 
 def lag_is_measured(calibration: Calibration) -> bool:
-    """Offset and latency are both known only where the wheels showed the response."""
+    """True if both offset and latency are known: only the wheels' response separates them."""
     return {"clock_offset_s", "command_latency_s"} <= set(calibration.uncertainty)
 
 
 def linear_term(model: TaylorModel, spec: RobotSpec, name: str) -> int | None:
-    """Column of the term that is one variable alone."""
+    """Returns the column of the term that is one variable alone; None without such a term."""
     wanted = np.array([v == name for v in spec.variable_names], dtype=np.int64)
     hits = np.flatnonzero((model.powers == wanted).all(axis=1))
     return int(hits[0]) if len(hits) else None
 
 
 def may_turn(calibration: Calibration, spec: RobotSpec) -> bool:
-    """Whether the rotation may move.
+    """True if the rotation is free.
 
-    It is known by the direction in which a robot can't move. One that moves in every direction
-    would be described as well in any other frame, with other coefficients.
+    It is defined by the direction in which a robot can't move. An omnidirectional robot can be
+    described equally well in any other frame, with other coefficients.
     """
     everywhere = any(command.cmd_vel == "linear.y" for command in spec.command)
     return "rotation_rad" in calibration.uncertainty and not calibration.is_exact and not everywhere
 
 
 def free_time(calibration: Calibration) -> str | None:
-    """The time that may move: the clock offset, else the latency; none that the state showed."""
+    """Returns the free time: the clock offset, else the latency; None if neither is free.
+
+    Times estimated from a measured state are fixed.
+    """
     if not calibration.responses:
         return None
     if "clock_offset_s" in calibration.uncertainty:
@@ -238,13 +241,13 @@ def free_time(calibration: Calibration) -> str | None:
 
 
 WORTH = 0.1
-"""A term whose loss raises the error by less than this share is left out."""
+"""Terms are removed while the error rises by less than this share in total."""
 
 
 def simplify(problem: Problem, refined: Refined) -> Refined:
-    """Leaves out terms of the body twist that hardly help to predict the training part.
+    """Removes terms of the body twist that hardly improve the prediction of the training part.
 
-    The one that is least certain goes first; the rest is refined anew.
+    The term with the least weight is tried first; the rest is refined again.
     """
     best, tried = refined, set[tuple[int, int]]()
     limit = refined.error * (1.0 + WORTH)
@@ -252,12 +255,12 @@ def simplify(problem: Problem, refined: Refined) -> Refined:
         tried.add(weakest)
         coefficients = best.model.coefficients.copy()
         coefficients[weakest] = 0.0
-        if not coefficients[:3].any():  # the last one: without it the robot would not move
+        if not coefficients[:3].any():  # the last term: without it the robot would not move
             break
         shorter = replace(best.model, coefficients=coefficients)
         try:
             again = refine(problem, shorter, best.calibration)
-        except np.linalg.LinAlgError:  # what is left is unstable: its slopes overflow
+        except np.linalg.LinAlgError:  # the remaining model is unstable: its slopes overflow
             continue
         if again.error < limit:
             best = again
@@ -273,7 +276,7 @@ def simplify(problem: Problem, refined: Refined) -> Refined:
 def _weakest(
     refined: Refined, spec: RobotSpec, tried: set[tuple[int, int]]
 ) -> tuple[int, int] | None:
-    """The free term of the twist that weighs least, standardised by the range of X."""
+    """Returns the untried free term of the twist with the least weight over the range of X."""
     model = refined.model
     free = free_coefficients(model, refined.calibration, spec)[:3]
     reach = np.maximum(np.abs(model.low), np.abs(model.high))

@@ -1,8 +1,8 @@
-"""Repairs a recording: repeated rows, jumps of single samples, commands beyond the limits.
+"""Repair of a recording: repeated rows, jumps of single samples, commands beyond the limits.
 
-What is left out is a gap afterwards. A recording without such faults comes back as it is.
+Dropped rows leave gaps. A recording without such faults is returned unchanged.
 
-Stamps: bursts of arrivals become sample times.
+Stamps: conversion of bursts of arrivals to sample times.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Array = NDArray[np.float64]
 
 NEIGHBOURS = 3
-"""A jump stands out from the median of this many samples on either side."""
+"""A jump is measured by the median difference from this many samples on either side."""
 STEPS = 6.0
 """It is larger than this many usual changes from sample to sample,"""
 USUAL = 60.0
-"""(the percentile of the changes that counts as usual: jumps in 20 % of the rows spoil 40 %)"""
+"""(the percentile of changes that counts as usual: jumps in 20 % of the rows spoil 40 % of them)"""
 REACH = 1.5
-"""than this many times what the robot's greatest command could do meanwhile,"""
+"""than this many times the distance that the robot's greatest command allows in that time,"""
 HEADING_REACH = 0.1
-"""than this angle [rad],"""
+"""than this angle [rad], for a heading,"""
 STATE_SHARE = 0.2
-"""and, of a state, than this share of its usual range."""
+"""and than this share of the usual range, for a state."""
 MOST = 0.15
-"""More jumps than this share of the rows are no faults of single samples."""
+"""Jumps in more than this share of the rows are not faults of single samples."""
 EXCESS = 0.01
-"""A command this share of its range beyond its limits is beyond them."""
+"""Commands may exceed their limits by this share of their range."""
 
 
 @dataclass(frozen=True)
 class Repaired:
-    """A recording that was repaired.
+    """A repaired recording.
 
     Attributes:
         recording: without the faults.
-        notes: a sentence for each kind of fault.
+        notes: one sentence per kind of fault.
     """
 
     recording: Recording
@@ -52,7 +52,7 @@ class Repaired:
 
 
 def repair(recording: Recording, spec: RobotSpec) -> Repaired:
-    """Leaves out repeated rows and jumps, and holds commands at the robot's limits."""
+    """Drops repeated rows and jumps, and clips commands to the robot's limits."""
     recording, repeated = _without_repetitions(recording)
     recording, jumps = _without_jumps(recording, spec)
     recording, beyond = _within_limits(recording, spec)
@@ -60,7 +60,7 @@ def repair(recording: Recording, spec: RobotSpec) -> Repaired:
 
 
 def _with_rows(recording: Recording, name: str, keep: NDArray[np.bool_]) -> Recording:
-    """The recording with some rows (T,) only of one stream."""
+    """Returns the recording with only the rows `keep` (T,) of one stream."""
     stream = recording.streams[name]
     some: Any = {name: replace(stream, t=stream.t[keep], values=stream.values[keep])}
     return replace(recording, **some)
@@ -101,7 +101,7 @@ def _without_jumps(recording: Recording, spec: RobotSpec) -> tuple[Recording, li
 
 
 def _jumps_of_pose(pose: Stream, spec: RobotSpec) -> NDArray[np.bool_]:
-    """Which poses (T,) jump in position or heading."""
+    """Selects the poses (T,) that jump in position or heading."""
     if len(pose.t) <= 2 * NEIGHBOURS:
         return np.zeros(len(pose.t), dtype=np.bool_)
     t = spread(pose.t, find_bursts(pose.t))
@@ -116,7 +116,7 @@ def _jumps_of_pose(pose: Stream, spec: RobotSpec) -> NDArray[np.bool_]:
 
 
 def _jumps_of_state(state: Stream) -> NDArray[np.bool_]:
-    """Which states (T,) jump in any component."""
+    """Selects the states (T,) that jump in any component."""
     out = np.zeros(len(state.t), dtype=np.bool_)
     if len(state.t) <= 2 * NEIGHBOURS:
         return out
@@ -127,12 +127,12 @@ def _jumps_of_state(state: Stream) -> NDArray[np.bool_]:
 
 
 def _stands_out(values: Array, least: Array, turning: bool = False) -> NDArray[np.bool_]:
-    """Which of values (T,) are further than `least` (T,) from both sides, the same way.
+    """Selects the values (T,) that differ from both sides, in the same direction.
 
     Args:
-        values: of one component.
-        least: by how much, beside `STEPS` times the usual change.
-        turning: whether they are angles; differences are then wrapped.
+        values: (T,) of one component.
+        least: (T,) minimum difference, in addition to `STEPS` times the usual change.
+        turning: True for angles, whose differences are wrapped.
     """
     back, ahead = _differences(values, turning)
     usual = float(np.percentile(np.abs(back[0][1:]), USUAL))
@@ -142,7 +142,7 @@ def _stands_out(values: Array, least: Array, turning: bool = False) -> NDArray[n
 
 
 def _differences(values: Array, turning: bool) -> tuple[Array, Array]:
-    """Differences (NEIGHBOURS, T) from the samples before and after; at the ends, zero."""
+    """Returns differences (NEIGHBOURS, T) from the samples before and after; zero at the ends."""
     count = len(values)
     back, ahead = np.zeros((NEIGHBOURS, count)), np.zeros((NEIGHBOURS, count))
     for n in range(1, NEIGHBOURS + 1):
@@ -153,7 +153,7 @@ def _differences(values: Array, turning: bool) -> tuple[Array, Array]:
 
 
 def _within_limits(recording: Recording, spec: RobotSpec) -> tuple[Recording, list[str]]:
-    """Holds commands at the limits that the robot holds them at."""
+    """Clips commands to the robot's limits, unless it followed them beyond."""
     command, margin = recording.command, EXCESS * (spec.command_high - spec.command_low)
     values = command.values
     beyond = (values < spec.command_low - margin) | (values > spec.command_high + margin)
@@ -175,7 +175,10 @@ def _within_limits(recording: Recording, spec: RobotSpec) -> tuple[Recording, li
 
 
 def _unexplained(recording: Recording, command: Array) -> float:
-    """What commands (T, C) leave unexplained of the measured state's rates; 0 without a state."""
+    """Returns the share of the state's rates that commands (T, C) leave unexplained.
+
+    0 without a measured state.
+    """
     state = recording.state
     if state is None or len(state.t) < 2:
         return 0.0
@@ -191,19 +194,19 @@ def _unexplained(recording: Recording, command: Array) -> float:
 
 MIN_STAMPS = 20
 BURSTY = 5.0
-"""In bursts the mean interval is this many times the 30th percentile of the intervals."""
+"""In bursts the mean interval is more than this many times the 30th percentile."""
 WITHIN_BURST = 0.25
-"""Share of the period below which two stamps belong to one burst."""
+"""Stamps less than this share of the period apart belong to one burst."""
 
 
 @dataclass(frozen=True)
 class Bursts:
-    """Arrivals that come several at a time.
+    """Bursts of arrivals.
 
     Attributes:
         period_s: usual time between two bursts [s].
-        size: usual number of samples in one.
-        of: (T,) the burst that each sample belongs to.
+        size: usual number of samples per burst.
+        of: (T,) index of the burst of each sample.
         newest: (K,) index of the last sample of each burst, the freshest on arrival.
     """
 
@@ -214,7 +217,7 @@ class Bursts:
 
 
 def find_bursts(t: Array) -> Bursts | None:
-    """Finds bursts in stamps (T,) [s]; None when the samples come one by one."""
+    """Finds bursts in stamps (T,) [s]; None if the samples arrive one by one."""
     if len(t) < MIN_STAMPS:
         return None
     gaps = np.diff(t)
@@ -228,11 +231,11 @@ def find_bursts(t: Array) -> Bursts | None:
 
 
 def spread(t: Array, bursts: Bursts | None) -> Array:
-    """Sample times (T,) of arrival stamps (T,) [s].
+    """Estimates sample times (T,) from arrival stamps (T,) [s].
 
-    The samples of a burst were taken one after the other since the burst before, the newest
-    just before its arrival. After a gap they are taken to fill one period, or more if there
-    are more of them than usual.
+    The samples of a burst were taken one after the other since the previous burst, the newest
+    just before its arrival. After a gap they are assumed to fill one period, or more if the
+    burst is larger than usual.
     """
     if bursts is None:
         return t
@@ -245,5 +248,5 @@ def spread(t: Array, bursts: Bursts | None) -> Array:
 
 
 def newest(t: Array, bursts: Bursts | None) -> NDArray[np.intp]:
-    """Indices of the samples whose time is known best: the newest of each burst, or all."""
+    """Returns indices of the samples with the best known time: the newest per burst, or all."""
     return np.arange(len(t)) if bursts is None else bursts.newest

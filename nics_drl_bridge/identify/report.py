@@ -1,6 +1,6 @@
-"""The fit report: what a model says, how well it fits, and what it could not learn.
+"""Fit report: the model's equations, the quality of its fit, and what could not be learnt.
 
-The list of all that a calibration can estimate: value and uncertainty, or why there is none.
+List of all possible estimates of a calibration: value and uncertainty, or why there is none.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ CURVE_POINTS = 8
 
 
 def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
-    """The report as text for people.
+    """Returns the report as human-readable text.
 
     Args:
         source: where the recording came from.
         spec: the robot.
-        identified: all that was learnt.
+        identified: the result of the identification.
     """
     model = identified.model
     lines = [
@@ -76,7 +76,7 @@ def _latency(identified: Identified) -> list[str]:
 
 
 def equations_with_errors(model: TaylorModel) -> list[str]:
-    """One line per degree of freedom: `wz = (4.63 +- 0.02)*speed*steering  [rad/s]`."""
+    """Returns one line per degree of freedom: `wz = (4.63 +- 0.02)*speed*steering  [rad/s]`."""
     errors, names, lines = model.named_errors, model.term_names, []
     for d, dof in enumerate(model.dofs):
         text = ""
@@ -91,9 +91,9 @@ def equations_with_errors(model: TaylorModel) -> list[str]:
 
 
 def with_error(value: float, error: float | None) -> str:
-    """A number with the digits that its standard error leaves: `(4.63 +- 0.02)`.
+    """Formats a number to the digits that its standard error leaves: `(4.63 +- 0.02)`.
 
-    An error that begins with a 1 has two digits. One of rounding only is not shown.
+    An error that begins with a 1 has two digits. A mere rounding error is not shown.
     """
     if error is None or error <= 1e-6 * value:
         return f"{value:.5g}"
@@ -119,7 +119,7 @@ def _pruning(alpha: Alpha) -> list[str]:
 
 
 def _curve(curve: Curve) -> list[str]:
-    """The error with 0, 1, 2... terms, in per cent of the rates' size."""
+    """Formats the error with 0, 1, 2... terms, in per cent of the size of the rates."""
     shown = min(max(CURVE_POINTS, curve.kept + 1), len(curve.error))
     points = [
         f"{n}{'*' if n == curve.kept else ''}: {100.0 * curve.share[n]:.3g} %" for n in range(shown)
@@ -187,10 +187,10 @@ class Estimate:
 
     Attributes:
         name: in words.
-        value: None if it was not possible.
-        sigma: standard uncertainty; None where there is none.
+        value: None if it could not be estimated.
+        sigma: standard uncertainty; None if there is none.
         unit: of both.
-        remark: why it was not possible, or what it means.
+        remark: why it could not be estimated, or its meaning.
     """
 
     name: str
@@ -201,7 +201,7 @@ class Estimate:
 
     @property
     def text(self) -> str:
-        """`command latency 0.0825 +- 0.0072 s`."""
+        """One line of text: `command latency 0.0825 +- 0.0072 s`."""
         if not self.unit and self.value is not None:
             return f"{self.name}: {self.remark}"
         if self.value is None:
@@ -214,7 +214,7 @@ class Estimate:
 def estimates(
     recording: Recording, calibration: Calibration, findings: Findings
 ) -> dict[str, Estimate]:
-    """All estimates by the name in `Calibration`."""
+    """Returns all estimates by their names in `Calibration`."""
     return {
         **_timing(recording, calibration, findings),
         **_mounting(calibration, findings),

@@ -16,15 +16,15 @@ SMOOTHING_BATCH = 64
 
 
 def held(command: Stream, spec: RobotSpec, start: Array, end: Array) -> Array:
-    """Mean of a held command over intervals.
+    """Returns the mean of a held command over intervals.
 
     Before its first command a robot stands still: commands that ever change are zero then.
-    A command that never changes is taken to have been so all the time.
+    A command that never changes is assumed to have had that value before.
 
     Args:
         command: (T, C) commands, each held until the next.
         spec: gives the limits of the commands.
-        start: (...) of the intervals, on the clock of the commands [s].
+        start: (...) of the intervals, on the commands' clock [s].
         end: (...) [s].
 
     Returns:
@@ -37,19 +37,19 @@ def held(command: Stream, spec: RobotSpec, start: Array, end: Array) -> Array:
 def held_features(
     command: Stream, spec: RobotSpec, powers: NDArray[np.int64], start: Array, end: Array
 ) -> Array:
-    """Means (..., K) of features (K, C) of held commands over intervals (...), as in `held`."""
+    """Returns means (..., K) of features (K, C) of held commands over intervals, as in `held`."""
     values = np.concatenate([_before(command, spec)[None], command.values])
     return _means_of_held(command.t, taylor.evaluate(values, powers), start, end)
 
 
 def _before(command: Stream, spec: RobotSpec) -> Array:
-    """Commands (C,) before the first."""
+    """Returns the command (C,) in effect before the first one."""
     still = np.clip(0.0, spec.command_low, spec.command_high)
     return np.asarray(np.where(np.ptp(command.values, axis=0) > 0.0, still, command.values[0]))
 
 
 def _means_of_held(t: Array, values: Array, start: Array, end: Array) -> Array:
-    """Means (..., K) over intervals of values (T + 1, K) that change at times (T,)."""
+    """Returns means (..., K) over intervals of values (T + 1, K) that change at times (T,)."""
     low, high = min(start.min(), t[0]) - 1.0, max(end.max(), t[-1]) + 1.0
     edges = np.concatenate([[low], t, [high]])
     area = np.concatenate(
@@ -63,10 +63,10 @@ def _means_of_held(t: Array, values: Array, start: Array, end: Array) -> Array:
 
 
 def lagged(signal: Array, lags: Array, dt: float, initial: Array) -> Array:
-    """First-order responses to a signal that is constant over each step.
+    """Returns first-order responses to a signal that is constant over each step.
 
     Args:
-        signal: (T, S) what each response follows.
+        signal: (T, S) input of each response.
         lags: (S,) time constants [s].
         dt: step [s].
         initial: (S,) response at the start.
@@ -83,7 +83,7 @@ def lagged(signal: Array, lags: Array, dt: float, initial: Array) -> Array:
 
 
 def interval_means(t: Array, values: Array, start: Array, end: Array) -> Array:
-    """Means (n, K) of sampled values (T, K), linear between stamps (T,), over intervals (n,)."""
+    """Returns means (n, K) over intervals (n,) of values (T, K), linear between stamps (T,)."""
     steps = np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2.0
     area = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
     means = [
@@ -94,18 +94,18 @@ def interval_means(t: Array, values: Array, start: Array, end: Array) -> Array:
 
 
 def unwrapped(pose: Array) -> Array:
-    """Poses (T, 3) with a heading that does not jump."""
+    """Returns poses (T, 3) with unwrapped headings."""
     return np.concatenate([pose[:, :2], np.unwrap(pose[:, 2])[:, None]], axis=1)
 
 
 def resample(t: Array, pose: Array, at: Array, half_width: float) -> Array:
-    """Poses (n, 3) at times (n,) of unwrapped poses (T, 3) at increasing times (T,).
+    """Resamples unwrapped poses (T, 3) at times (T,), never decreasing, to poses (n, 3).
 
     Args:
         t: (T,) sample times [s].
         pose: (T, 3), heading unwrapped.
         at: (n,) times [s].
-        half_width: of a local parabola that is fitted to noisy samples [s]; 0 interpolates.
+        half_width: of a local parabola fitted to noisy samples [s]; 0 interpolates.
     """
     distinct = np.concatenate([[True], np.diff(t) > 0.0])
     t, pose = t[distinct], pose[distinct]

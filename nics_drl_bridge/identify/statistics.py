@@ -1,6 +1,6 @@
 """Statistics of a fit: standard errors, conditioning, errors per degree of freedom.
 
-Accuracy against the number of terms: what each further term of Eq. 2 is worth.
+Accuracy against the number of terms: the benefit of each further term of Eq. 2.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 Array = NDArray[np.float64]
 
 UNLIKE = 0.05
-"""Correlation below which residuals are taken as independent."""
+"""Correlation below which residuals are assumed to be independent."""
 LONGEST = 0.1
-"""Share of the rows that residuals may stay alike for."""
+"""Longest correlation of residuals, as a share of the rows."""
 
 
 def standard_errors(chi: Array, residual: Array) -> Array:
-    """Standard errors (K,) of least squares, valid for unequal and correlated residuals.
+    """Returns standard errors (K,) of least squares for unequal and correlated residuals.
 
     Newey, West: A simple, positive semi-definite, heteroskedasticity and autocorrelation
     consistent covariance matrix, Econometrica 1987.
 
     Args:
         chi: (T, K) features.
-        residual: (T,) what they leave over, in order of time.
+        residual: (T,) residual of the fit, in order of time.
     """
     count, terms = chi.shape
     if terms == 0 or count <= terms:
@@ -44,7 +44,7 @@ def standard_errors(chi: Array, residual: Array) -> Array:
 
 
 def long_run(chi: Array, residual: Array) -> Array:
-    """Covariance (K, K) of the sum of features (T, K) times residuals (T,), alike for a while."""
+    """Returns the covariance (K, K) of summed features (T, K) x autocorrelated residuals (T,)."""
     scores = chi * residual[:, None]
     middle = scores.T @ scores
     reach = correlation_reach(residual)
@@ -55,7 +55,7 @@ def long_run(chi: Array, residual: Array) -> Array:
 
 
 def clustered_errors(jacobian: Array, residual: Array, cluster: NDArray[np.intp]) -> Array:
-    """Standard errors (P,) of least squares whose residuals (n,) are alike within clusters (n,).
+    """Returns standard errors (P,) of least squares with residuals correlated within clusters (n,).
 
     Cameron, Miller: A practitioner's guide to cluster-robust inference, 2015, with their
     correction for few clusters.
@@ -75,7 +75,7 @@ def clustered_errors(jacobian: Array, residual: Array, cluster: NDArray[np.intp]
 
 
 def correlation_reach(residual: Array) -> int:
-    """How many rows apart residuals (T,) still resemble each other, or more."""
+    """Returns the largest lag [rows] at which residuals (T,) are treated as correlated."""
     count = len(residual)
     usual = int(4.0 * (count / 100.0) ** (2.0 / 9.0))
     rest = residual - residual.mean()
@@ -92,7 +92,7 @@ def correlation_reach(residual: Array) -> int:
 
 
 def condition(chi: Array) -> float:
-    """Condition number of the standardised features (T, K); 1 is best, inf is singular."""
+    """Returns the condition number of the standardised features (T, K); inf if singular."""
     if chi.shape[1] == 0:
         return 1.0
     spread = chi.std(axis=0)
@@ -101,7 +101,7 @@ def condition(chi: Array) -> float:
 
 
 def errors_of(model: TaylorModel, samples: Samples) -> tuple[Array, Array]:
-    """RMSE (D,) and R2 (D,) of the rates of a model on samples."""
+    """Returns RMSE (D,) and R2 (D,) of the rates of a model on samples."""
     residual = samples.dq - model.rates(samples.x)
     rmse = np.sqrt((residual**2).mean(axis=0))
     variance = samples.dq.var(axis=0)
@@ -112,7 +112,7 @@ def errors_of(model: TaylorModel, samples: Samples) -> tuple[Array, Array]:
 
 BLOCKS = 5
 WORTH = 1e-3
-"""Terms that lower the error by less than this share of the rates' size are not worth it."""
+"""Terms that lower the error by less than this share of the rates' size are not kept."""
 
 
 @dataclass(frozen=True)
@@ -123,10 +123,10 @@ class Curve:
         dof: name.
         terms: (n,) terms in the order of Eq. 2, the largest weight first.
         alpha: (n + 1,) share of the summed weights that the first 0..n terms reach.
-        error: (n + 1,) RMSE of the first 0..n terms on blocks that their fit did not see, in
-            the unit of the rate.
+        error: (n + 1,) RMSE of the first 0..n terms on blocks held out of their fit, in the unit
+            of the rate.
         sigma: (n + 1,) standard error of `error` over the blocks.
-        kept: how many terms the model has.
+        kept: number of terms in the model.
     """
 
     dof: str
@@ -138,12 +138,12 @@ class Curve:
 
     @property
     def share(self) -> Array:
-        """(n + 1,) error as a share of the size of the rates."""
+        """Error (n + 1,) as a share of the size of the rates."""
         return self.error / max(float(self.error[0]), np.finfo(np.float64).tiny)
 
 
 def curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array, beta: Array) -> Curve:
-    """The curve of one degree of freedom; `kept` is its knee.
+    """Returns the curve of one degree of freedom; `kept` is its knee.
 
     Args:
         dof: name.
@@ -160,10 +160,10 @@ def curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array, beta: Arr
 
 
 def knee(error: Array, sigma: Array) -> int:
-    """The fewest terms whose error can't be told from the least, or is hardly above it.
+    """Returns the fewest terms whose error is not significantly, or hardly, above the least.
 
-    Breiman's rule of one standard error; Hastie, Tibshirani, Friedman: The Elements of
-    Statistical Learning, ch. 7.10.
+    Breiman's one-standard-error rule; Hastie, Tibshirani, Friedman: The Elements of Statistical
+    Learning, ch. 7.10.
     """
     least = int(np.argmin(error))
     limit = error[least] + max(float(sigma[least]), WORTH * float(error[0]))
@@ -171,10 +171,10 @@ def knee(error: Array, sigma: Array) -> int:
 
 
 def cross_validated(chi: Array, target: Array) -> Array:
-    """Mean squared errors (B, n + 1) of the first 0..n features on each of B blocks in time.
+    """Returns mean squared errors (B, n + 1) of the first 0..n features on B blocks in time.
 
-    Each block is predicted by a fit to the others. The blocks are compressed to triangles
-    first, so that all numbers of terms cost one factorisation.
+    Each block is predicted by a fit to the others. The blocks are first compressed to triangles
+    (QR), so that all numbers of terms share one factorisation.
     """
     rows = np.array_split(np.arange(len(target)), BLOCKS)
     both = np.concatenate([chi, target[:, None]], axis=1)
@@ -192,7 +192,7 @@ def cross_validated(chi: Array, target: Array) -> Array:
 
 
 def _safe(r: Array) -> Array:
-    """A triangle that can be solved: a feature that the other blocks did not move is left out."""
+    """Makes a triangle solvable: features that the other blocks did not excite are dropped."""
     diagonal = np.abs(np.diag(r))
     singular = diagonal <= 1e-10 * max(float(diagonal.max()), 1e-300)
     if not singular.any():

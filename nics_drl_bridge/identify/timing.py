@@ -1,10 +1,10 @@
-"""Delays and lags: what shift in time makes a signal a function of the commands.
+"""Delays and lags: the shift in time that makes a signal a function of the commands.
 
 Every estimate is a separable least squares: for a given delay (and lags) the best linear
-combination of the features of the paper (Eq. 1) is known at once, so only the delay and the
-lags are searched for.
+combination of the paper's features (Eq. 1) has a closed form, so the search is over the delay
+and the lags only.
 
-Clocks: offset, latency and lags of a recording, from whatever follows the commands.
+Clocks: offset, latency and lags of a recording, from any stream that follows the commands.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Array = NDArray[np.float64]
 
 STEP_S = 0.01
-LEAD_S = 2.0  # for the states to forget where they started
+LEAD_S = 2.0  # for the states to forget their initial values
 STEPS_S = (0.05, 0.005, 0.0005)
 SEARCH_S = 5.0
 DEFAULT_LAG_S = 0.1
@@ -33,13 +33,13 @@ LAG_RANGE_S = (0.005, 2.0)
 MAX_ROWS = 2000
 EXACT = 1e-6
 LONG_STEP = 1.5
-"""A step this much longer than the usual one is a gap."""
+"""A step longer than this many usual steps is a gap."""
 REGULAR = 0.8
 
 
 @dataclass(frozen=True)
 class Delay:
-    """A delay that was searched for.
+    """An estimated delay.
 
     Attributes:
         value: from the command's stamp to its effect, each on its own clock [s].
@@ -57,27 +57,27 @@ class Delay:
 
 
 def followed(spec: RobotSpec) -> NDArray[np.intp]:
-    """(S,) index of the command that each state variable follows."""
+    """Returns the index (S,) of the command that each state variable follows."""
     names = [c.name for c in spec.command]
     return np.array([names.index(str(v.follows)) for v in spec.state], dtype=np.intp)
 
 
 def moved_commands(command: Stream) -> NDArray[np.bool_]:
-    """(C,) whether each command ever changed."""
+    """Returns a mask (C,) of the commands that ever changed."""
     return np.asarray(np.ptp(command.values, axis=0) > 0.0)
 
 
 def nominal_lags(spec: RobotSpec) -> Array:
-    """(S,) time constants that the spec gives, `NAME_lag`, else a usual one [s]."""
+    """Returns the spec's time constants (S,), `NAME_lag`, else a typical one [s]."""
     return np.array([spec.parameters.get(f"{v.name}_lag", DEFAULT_LAG_S) for v in spec.state])
 
 
 def inferred_states(
     command: Stream, spec: RobotSpec, lags: Array, latency: float, grid: Array
 ) -> Array:
-    """States (T, S) at uniform times (T,), on the commands' clock, at gain one.
+    """Infers states (T, S) at uniform times (T,) on the commands' clock, with gain one.
 
-    Each state follows its command; one whose command never changes stays at that value.
+    Each state follows its command; if the command never changes, the state keeps its value.
     """
     dt = float(grid[1] - grid[0])
     target = held(command, spec, grid - latency, grid + dt - latency)[:, followed(spec)]
@@ -93,14 +93,14 @@ def delay_of_response(
     centers: tuple[float, ...] = (0.0,),
     lags: Array | None = None,
 ) -> Delay:
-    """The delay and the lags with which a signal follows the commands.
+    """Estimates the delay and the lags with which a signal follows the commands.
 
     Args:
         command: the commands.
-        spec: whose state variables all follow a command.
+        spec: the robot; each of its state variables follows a command.
         target: start (n,), end (n,) of intervals and the signal's mean (n, K) over each.
-        centers: around which to search for the delay [s].
-        lags: (S,) known time constants; None to estimate those that the drive shows.
+        centers: of the search for the delay [s].
+        lags: (S,) known time constants; None to estimate those of the commands that moved.
     """
     moved = moved_commands(command)[followed(spec)] if spec.state else moved_commands(command)
     free = np.flatnonzero(moved[: len(spec.state)]) if lags is None else np.zeros(0, dtype=np.intp)
@@ -122,7 +122,7 @@ def delay_of_response(
 def response_residual(
     command: Stream, spec: RobotSpec, target: tuple[Array, Array, Array]
 ) -> Callable[[Array, float], Array]:
-    """What commands, by way of lags (S,) and a delay [s], leave unexplained of a signal."""
+    """Returns the residual of a signal explained by commands, given lags (S,) and a delay [s]."""
     start, end, signal = target
     moved = moved_commands(command)[followed(spec)] if spec.state else moved_commands(command)
     powers = taylor.exponents(len(moved), 2)
@@ -140,9 +140,9 @@ def response_residual(
 
 
 def fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
-    """Whether the command was recorded at times (n,), or its row may be missing.
+    """Returns a mask of the times (n,) at which the command is known; rows may be missing.
 
-    Of commands that are recorded now and then only, each is taken to hold until the next.
+    If commands are recorded irregularly, each is assumed to be held until the next.
     """
     span = np.diff(command.t)
     usual = float(np.median(span)) if len(span) else 0.0
@@ -153,9 +153,9 @@ def fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
 
 
 def latency_of_state(command: Stream, state: Stream, spec: RobotSpec) -> Delay | None:
-    """The delay with which a measured state starts to follow the commands.
+    """Estimates the delay with which a measured state starts to follow the commands.
 
-    None if the drive does not show it; exactly zero if zero explains every digit.
+    None if no command changed; exactly zero if zero explains the state to rounding.
     """
     if not moved_commands(command).any():
         return None
@@ -163,10 +163,10 @@ def latency_of_state(command: Stream, state: Stream, spec: RobotSpec) -> Delay |
 
 
 def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Callable[[Array], Array]:
-    """What commands of a delay (1,) [s] leave unexplained of the rates of a measured state."""
+    """Returns the residual of a measured state's rates, given a delay (1,) of the commands [s]."""
     span = np.diff(state.t)
     keep = np.flatnonzero((span > 0.0) & (span < LONG_STEP * np.median(span)))
-    if len(keep) > MAX_ROWS:  # by the golden section: no stride that commands could share
+    if len(keep) > MAX_ROWS:  # golden-section sampling: no stride that commands could share
         keep = keep[np.unique((np.arange(MAX_ROWS) * 0.6180339887 % 1.0 * len(keep)).astype(int))]
     start, end = state.t[keep], state.t[keep + 1]
     rates = (state.values[keep + 1] - state.values[keep]) / (end - start)[:, None]
@@ -182,14 +182,14 @@ def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Callable[
 def delay_of_pose(
     state: Stream, target: tuple[Array, Array, Array], centers: tuple[float, ...]
 ) -> Delay:
-    """The delay of the pose's clock behind that of a measured state."""
+    """Estimates the delay of the pose's clock behind that of a measured state."""
     return _search_or_zero(residual_by_shift(state, target), centers)
 
 
 def residual_by_shift(
     state: Stream, target: tuple[Array, Array, Array]
 ) -> Callable[[Array], Array]:
-    """What a measured state of a delay (1,) [s] leaves unexplained of the pose's rates."""
+    """Returns the residual of the pose's rates, given a delay (1,) of the measured state [s]."""
     start, end, signal = target
     chi = taylor.evaluate(state.values, taylor.exponents(state.values.shape[1], 2))
 
@@ -213,7 +213,10 @@ def _search_or_zero(
 def _search(
     residual: Callable[[Array], Array], centers: tuple[float, ...], log_lags: Array
 ) -> tuple[Array, Array, float]:
-    """Delay and log lags of least residual, their uncertainty, and the share explained."""
+    """Returns delay and log lags of least residual, their uncertainty and the explained share.
+
+    The delay is searched on ever finer grids, then refined together with the lags.
+    """
     around = np.array(centers)
     for reach, step in zip((SEARCH_S, *STEPS_S[:-1]), STEPS_S, strict=True):
         tries = np.add.outer(around, np.arange(-reach, reach + step / 2.0, step)).ravel()
@@ -229,25 +232,26 @@ def _search(
 
 
 WHEELS_EXPLAINED = 0.5
-"""The wheels must be explained by the commands to this share of their variance."""
+"""The commands must explain this share of the wheels' variance."""
 WITHIN_TICK = 12.0**-0.5
-"""Wheel speeds are taken as the mean over the tick that ends at their stamp; some drivers report
-them as they are at the stamp: a time is uncertain by where in the tick they hold."""
+"""Wheel speeds are assumed to be the mean over the tick that ends at their stamp, but some drivers
+report instantaneous speeds. A time is uncertain by the standard deviation of a uniform
+distribution over the tick."""
 MIN_TIME_S = 5e-4
 CERTAIN = 3.0
-"""A correction below this many standard uncertainties is left out."""
+"""A correction below this many standard uncertainties is not made."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Offset and latency as in `Calibration`, and what they were learnt from.
+    """Offset and latency as in `Calibration`, with lags and uncertainties.
 
     Attributes:
         offset, latency: [s].
-        sigma: standard uncertainty of what was estimated, by the name in `Calibration`.
-        lags: (S,) of the inferred states, empty where the state was measured.
-        lag_sigma: (S,) NaN where nominal.
-        separated: whether offset and latency could be told apart.
+        sigma: standard uncertainty of each estimated value, by its name in `Calibration`.
+        lags: (S,) of the inferred states [s]; empty if the state was measured.
+        lag_sigma: (S,) [s]; NaN for a nominal lag.
+        separated: True if offset and latency could be separated.
     """
 
     offset: float
@@ -259,7 +263,7 @@ class Timing:
 
 
 def timing_of(recording: Recording, spec: RobotSpec, twists: Motion) -> Timing:
-    """Finds clock offset, latency and lags, each where the recording shows it."""
+    """Estimates clock offset, latency and lags as far as the recording allows."""
     if recording.state is not None:
         return _timing_of_measured_state(recording, recording.state, spec, twists)
     if not moved_commands(recording.command).any():
@@ -309,12 +313,12 @@ def _timing_of_measured_state(
 
 
 def _likely_shifts(recording: Recording) -> tuple[float, ...]:
-    """Where to search for the delay of the pose's clock: no shift, or a common start."""
+    """Returns search centres for the delay of the pose's clock: no shift, or a common start [s]."""
     return 0.0, float(recording.pose.t[0] - recording.command.t[0])
 
 
 def _wheel_delay(recording: Recording, spec: RobotSpec) -> Delay | None:
-    """The response of the wheels, if they are on the commands' clock and follow at all."""
+    """Returns the delay of the wheels; None on another clock or if they do not follow commands."""
     wheels = recording.wheels
     if wheels is None or wheels.clock != recording.command.clock:
         return None
@@ -326,5 +330,5 @@ def _wheel_delay(recording: Recording, spec: RobotSpec) -> Delay | None:
 
 
 def if_certain(value: float, sigma: float, least: float) -> float:
-    """A correction, or zero if it is too small or too uncertain to be made."""
+    """Returns a correction, or zero if it is too small or too uncertain."""
     return value if abs(value) > max(CERTAIN * sigma, least) else 0.0

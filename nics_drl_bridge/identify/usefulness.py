@@ -1,4 +1,4 @@
-"""Usefulness: whether a model predicts unseen data better than that the robot stands still."""
+"""Usefulness of a model: its predictions of unseen data against those of a standing robot."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.spec import RobotSpec
 
 MOST_LEFT = 0.5
-"""Of the error of standing still: a model that leaves more is hardly better."""
+"""Share of the error of standing still above which a model is hardly better."""
 COARSE = 2.0 / 3.0
-"""The course of a state that changes by this share of its range between two rows is not seen."""
+"""A state that changes by this share of its range between two rows is sampled too coarsely."""
 ENDS = (1.0, 99.0)
-"""Percentiles between which a state is said to have moved."""
+"""Percentiles that bound the range of a state."""
 
 
 def is_useless(error: float, standing: float, path: float, radius: float) -> bool:
-    """Whether predictions are hardly better than that the robot stays where it is.
+    """True if predictions are hardly better than assuming that the robot stands still.
 
     Persistence is the usual baseline of a forecast (Murphy: Skill scores based on the mean square
-    error, Monthly Weather Review, 1988). A robot that drives in circles, or turns on the spot, is
-    back where it was: there the path and the robot's size say what is little.
+    error, Monthly Weather Review, 1988). A robot that drives in circles or turns on the spot
+    returns to its start: there the path and the robot's size set the scale.
 
     Args:
-        error: median position error of the predictions [m]; NaN or inf where they run away.
+        error: median position error of the predictions [m]; NaN or inf if they diverge.
         standing: median position error on the same windows if the robot stood still [m].
         path: mean length of the measured path [m].
         radius: of the robot [m].
@@ -35,9 +35,9 @@ def is_useless(error: float, standing: float, path: float, radius: float) -> boo
 
 
 def why_useless(identified: Identified, spec: RobotSpec, order: int = ORDER) -> str:
-    """One sentence on a model of no use, of some order; empty if it is of some, or was not tried.
+    """Returns one sentence on why a model is useless; empty if it is useful or untested.
 
-    The median counts: a pose that jumps once, for good, spoils some of the predictions only.
+    The median counts: a single permanent jump of the pose spoils only some of the predictions.
     """
     held_out, recording = identified.held_out, identified.recording
     if held_out is None:
@@ -60,7 +60,7 @@ def _end(error: float) -> str:
 
 
 def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
-    """What may have spoilt the fit, and what to do."""
+    """Returns the likely cause of a bad fit, and its remedy."""
     recording, unmoved = identified.recording, identified.fit.unmoved
     coarsest = max(_steps(recording, spec, unmoved), default=(0.0, ""))
     rows = recording.pose if recording.state is None else recording.state
@@ -87,7 +87,10 @@ def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
 def _steps(
     recording: Recording, spec: RobotSpec, unmoved: tuple[str, ...]
 ) -> list[tuple[float, str]]:
-    """How far each measured state that moved goes between two rows, in shares of its range."""
+    """Returns the step between rows and the name of each measured state that moved.
+
+    The step is the 99th percentile, as a share of the state's range.
+    """
     if recording.state is None:
         return []
     moved = [i for i, v in enumerate(spec.state) if v.name not in unmoved]

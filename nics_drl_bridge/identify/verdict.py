@@ -1,6 +1,6 @@
-"""The verdict: what a drive could not show, in sentences, or as a refusal.
+"""Verdict on a drive: sentences on what it could not show, or a refusal.
 
-Assessment of a model: standard errors of what was refined, and its quality on unseen data.
+Assessment of a model: standard errors of refined coefficients, and quality on unseen data.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from nics_drl_bridge.robot.taylor import Quality, TaylorModel
 FEW_LEVELS = 2
 ILL_CONDITIONED = 1e6
 FAR_OFF = 0.25
-"""A prediction that ends off by this share of its path is no prediction."""
+"""Predictions whose mean error exceeds this share of the path are not to be trusted."""
 UNEXPLAINED = 0.5
 MANY_OUTLIERS = 0.001
 
 
 def refuse_unexcited(linear: Fit, spec: RobotSpec) -> None:
-    """Refuses a drive that did not move every input on its own.
+    """Refuses a drive that did not move every input independently.
 
     Raises:
         FitError: names the inputs.
@@ -53,7 +53,10 @@ def refuse_unexcited(linear: Fit, spec: RobotSpec) -> None:
 
 
 def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> tuple[str, ...]:
-    """A sentence on each input that the drive did not move, or not on its own."""
+    """Returns sentences on inputs that the drive did not move, or not independently.
+
+    Also on states that depended on others, and on commands with two values only.
+    """
     already = {r.command for r in calibration.responses} | {r.state for r in calibration.responses}
     excitation = linear.excitation
     missing = [name for name in excitation.unmoved if name not in already]
@@ -92,7 +95,7 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> tuple[st
 
 
 def doubts(linear: Fit, held_out: OpenLoop | None, exact: bool) -> tuple[str, ...]:
-    """A sentence on each thing that makes the fit or its predictions doubtful."""
+    """Returns a sentence on each reason to doubt the fit or its predictions."""
     notes = []
     for d, dof in enumerate(linear.model.dofs):
         if linear.outliers[d] > MANY_OUTLIERS:
@@ -125,7 +128,7 @@ def doubts(linear: Fit, held_out: OpenLoop | None, exact: bool) -> tuple[str, ..
 
 
 def _list(names: tuple[str, ...] | list[str]) -> str:
-    """`a`, `a and b`, `a, b and c`."""
+    """Joins names: `a`, `a and b`, `a, b and c`."""
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
@@ -136,13 +139,13 @@ MIN_ROWS = 20
 
 
 def merged(model: TaylorModel, linear: TaylorModel, refined: Errors) -> TaylorModel:
-    """The model with the standard errors of its coefficients.
+    """Returns the model with the standard errors of its coefficients.
 
     Args:
         model: the model.
-        linear: the linear fit; its errors hold where a row of the model is the fit's own.
-        refined: errors of the coefficients that were refined; where the linear fit was less
-            certain, its own stand.
+        linear: the linear fit; its errors apply to rows that the model has unchanged from it.
+        refined: errors of the refined coefficients; the larger of these and the linear fit's
+            errors is used.
     """
     first = linear.named_errors
     own = {dof: row for dof, row in first.items() if _same_row(model, linear, dof)}
@@ -164,7 +167,7 @@ def _same_row(model: TaylorModel, linear: TaylorModel, dof: str) -> bool:
 def unseen_samples(
     recording: Recording, calibration: Calibration, spec: RobotSpec, until: float
 ) -> Samples | None:
-    """The samples of the part of a drive that a fit did not see; None if there are too few."""
+    """Returns the samples of the part of a drive that the fit did not see; None if too few."""
     try:
         samples = align(recording, calibration, spec)
     except RecordingError:
@@ -181,7 +184,7 @@ def with_quality(
     held_out: OpenLoop | None,
     spec: RobotSpec,
 ) -> TaylorModel:
-    """The model with its figures of merit."""
+    """Returns the model with its figures of merit."""
     dofs = model.dofs
 
     def by_dof(values: Array) -> dict[str, float]:

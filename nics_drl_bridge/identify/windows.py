@@ -1,10 +1,10 @@
-"""What a refinement predicts: windows of a drive, their errors and the errors' derivatives.
+"""Prediction problem of a refinement: windows of a drive, errors and their derivatives.
 
-Courses of X over windows that no coefficient of the body twist changes.
+Courses of X over windows, independent of the coefficients of the body twist.
 
-Where the state was measured, state and commands of a window are known before the twist is: the
-model of the state's rates stays as it was fitted. Then one pass through a window gives the pose
-at its end and the derivative by every coefficient of the twist.
+If the state was measured, state and commands of a window are known before the twist is: the
+model of the state's rates stays as fitted. One pass through a window then gives the pose at its
+end and its derivatives by all coefficients of the twist.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ MIN_WINDOWS = 10
 HEADING_ARM_M = 0.3
 """A heading error counts as a position error at this distance."""
 OUTLYING = 10.0
-"""A window that ends this many times the usual error away holds a jump,"""
+"""A window whose error is this many times the median contains a jump,"""
 OUTLYING_SHARE = 0.25
-"""if that is also more than this share of the longest path."""
+"""if the error is also more than this share of the longest path."""
 MOST_OUTLIERS = 0.3
 STEEPEST = 1e100
-"""Slopes of a model that runs away are cut here, so that what they are scaled by stays finite."""
+"""Slopes of a diverging model are clipped here, so that their scaling stays finite."""
 TURN_RAD = 1e-5
-"""By so much the rotation is turned to see what that does."""
+"""Step of the finite difference by the rotation [rad]."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What a refinement predicts: windows of one drive, the same for every model tried on them.
+    """Prediction problem of a refinement: windows of one drive, the same for every trial model.
 
     Attributes:
         recording, spec: the drive and the robot.
-        chosen: windows of each horizon, without those that hold a jump of the pose.
-        courses: of X over them where the state was measured, else empty.
+        chosen: windows of each horizon, without those that contain a jump of the pose.
+        courses: of X over them if the state was measured, else empty.
     """
 
     recording: Recording
@@ -65,14 +65,14 @@ def problem_of(
     start: float,
     stop: float,
 ) -> Problem | None:
-    """Chooses the windows that a refinement predicts.
+    """Selects the windows that a refinement predicts.
 
     Args:
         model: the fitted model.
         calibration: of the drive.
         recording: the drive.
         spec: the robot.
-        start: of the part of the drive to use, from its first pose [s].
+        start: start of the part of the drive to use, from its first pose [s].
         stop: its end [s].
 
     Returns:
@@ -101,7 +101,7 @@ def _without_outliers(
     recording: Recording,
     spec: RobotSpec,
 ) -> Windows:
-    """Leaves out windows that a jump of the pose lies in, or at an end."""
+    """Drops windows that contain a jump of the pose, or have one at an end."""
     error = predict(model, calibration, recording, spec, chosen) - chosen.end
     size = np.hypot(error[:, 0], error[:, 1])
     far = max(OUTLYING * float(np.median(size)), OUTLYING_SHARE * float(chosen.path.max()))
@@ -112,9 +112,9 @@ def _without_outliers(
 
 
 def prediction_errors(problem: Problem, model: TaylorModel, calibration: Calibration) -> Array:
-    """Errors (n,) of all predictions: x, y and heading of each window [m]."""
+    """Returns the errors (n,) of all predictions: x, y and heading of each window [m]."""
     parts = []
-    with np.errstate(all="ignore"):  # a step of the search may diverge; it is then taken back
+    with np.errstate(all="ignore"):  # a trial step may diverge; it is then rejected
         for k, chosen in enumerate(problem.chosen):
             if problem.courses:
                 ends = relative_ends(problem.courses[k], model)[0]
@@ -134,14 +134,14 @@ def prediction_slopes(
     coefficients: NDArray[np.bool_],
     turn: bool,
 ) -> Array:
-    """Derivatives (n, P) of `prediction_errors`, where the state was measured.
+    """Returns the derivatives (n, P) of `prediction_errors` for a measured state.
 
     Args:
         problem: the windows to predict.
         model: the model.
         calibration: of the drive.
-        coefficients: (D, K) which of them to derive by.
-        turn: whether to derive by the rotation too, in the last column.
+        coefficients: (D, K) mask of the coefficients to differentiate by.
+        turn: True to differentiate by the rotation too, in the last column.
     """
     parts = []
     for course in problem.courses:
@@ -169,7 +169,7 @@ class Course:
         chosen: the windows.
         x: (W, T, V + 1) X during each step, and a last entry of 1.
         steps: (W,) whole steps to the end of each window.
-        share: (W,) of one more step.
+        share: (W,) remaining fraction of one more step.
     """
 
     chosen: Windows
@@ -185,7 +185,7 @@ def course_of(
     spec: RobotSpec,
     chosen: Windows,
 ) -> Course:
-    """The course over windows, each from its own measured state."""
+    """Returns the course of X over windows, each started from its measured state."""
     states, command, steps, share = from_measured_states(
         model, calibration, recording, spec, chosen
     )[1:]
@@ -197,11 +197,11 @@ def course_of(
 def relative_ends(
     course: Course, model: TaylorModel, free: NDArray[np.bool_] | None = None
 ) -> tuple[Array, Array]:
-    """Poses at the ends relative to the starts, and how coefficients move them.
+    """Returns the end poses relative to the starts, and their derivatives by coefficients.
 
     Args:
         course: of the windows.
-        model: its body twist is followed.
+        model: its body twist is integrated.
         free: (D, K) coefficients to differentiate by, even where they are zero.
 
     Returns:
@@ -221,13 +221,13 @@ def relative_ends(
 
 
 def tracked_ends(course: Course, calibration: Calibration, ends: Array) -> Array:
-    """Poses (W, 3) of the tracked body where `base_link` has moved by relative poses (W, 3)."""
+    """Returns poses (W, 3) of the tracked body after `base_link` moved by `ends` (W, 3)."""
     base = calibration.to_base(course.chosen.start)
     return calibration.to_tracked(geometry.compose(base, ends))
 
 
 def tracked_slopes(course: Course, calibration: Calibration, ends: Array, moved: Array) -> Array:
-    """Derivatives (W, 3, P) of `tracked_ends`, from those of the relative poses."""
+    """Returns derivatives (W, 3, P) of `tracked_ends`, from those of the relative poses."""
     heading = calibration.to_base(course.chosen.start)[:, 2]
     arm = geometry.rotate(np.broadcast_to(calibration.mounting[:2], (len(ends), 2)), ends[:, 2])
     across = np.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None]

@@ -1,6 +1,6 @@
-"""Baking: every shape scanned beforehand, on the lidar's main axis (Sec. IV-B).
+"""Baking: scans of every shape on the lidar's main axis, stored in a table (Sec. IV-B).
 
-What a sensor model changes in a table that has just been baked.
+Application of a sensor model to a freshly baked table.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
     pass
 
 TOUCHING = 1e-6
-"""The nearest grid distance is this much more than the radius, as a part of it."""
+"""Excess of the nearest grid distance over the radius, as a share of the radius."""
 COARSE = np.radians(2.0)
-"""What a shape does between grid rotations is looked at in steps of at most half of this [rad]."""
+"""Shapes are evaluated between grid rotations in steps of at most half of this [rad]."""
 MOST_NUMBERS = 2**31 - 2**20
 FIRST_BEAM = -(2**15)
-"""A row begins no farther to the right of the bearing."""
+"""Least first beam of a row, relative to the bearing."""
 MISS = 0.02
-"""An edge that two corners would miss by so many beams is looked for along the hull."""
+"""An edge that two corners would miss by more than this [beams] is found by climbing the hull."""
 Progress = Callable[[int, int], None]
-"""Called with how many rotations are done, and of how many."""
+"""Called with the number of rotations done and their total."""
 
 
 @dataclass(frozen=True)
@@ -61,16 +61,16 @@ def bake(
     sensor_model: Function | Sequence[SensorModel] | None = None,
     progress: Progress | None = None,
 ) -> LidarTable:
-    """Scans shapes straight ahead, at a grid of distance and rotation, with the exact scanner.
+    """Scans shapes straight ahead, on a grid of distances and rotations, with the exact scanner.
 
     Args:
         spec: the lidar.
         shapes: H; equal ones are baked once.
         density: of the grid; by default `Density.for_beams`.
         sensor_model: by default that of the lidar; named models, see `sensor_models`, or a
-            function of ranges and incidence that gives `inf` where the device sees nothing. It is
-            baked in and costs nothing later. Such a beam goes through to what is behind.
-        progress: told how far it is.
+            function of ranges and incidence that returns `inf` where the device gets no return. It
+            is baked in and has no run-time cost. Such a beam passes through to objects behind.
+        progress: called after each rotation.
 
     Returns:
         The table.
@@ -118,7 +118,7 @@ def bake(
 
 
 def with_shapes(spec: LidarSpec, table: LidarTable, shapes: Sequence[Shape]) -> LidarTable:
-    """The table itself if it holds all of these shapes, or one of the same density that does."""
+    """Returns the table if it contains all of these shapes, or else one of equal density."""
     if set(shapes) <= set(table.shapes):
         return table
     if not table.has_rows:
@@ -127,7 +127,7 @@ def with_shapes(spec: LidarSpec, table: LidarTable, shapes: Sequence[Shape]) -> 
 
 
 def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Grid:
-    """Where the cells of a shape lie and how wide their rows are."""
+    """Computes the cells of a shape and the widths of their rows."""
     shape, radius, order = outlines.shapes[h], outlines.radii[h], outlines.orders[h]
     distances = np.linspace(radius, spec.range_max + radius, density.distances)
     distances[0] *= 1.0 + TOUCHING
@@ -152,7 +152,7 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
             cell[..., 2 + 2 * side : 4 + 2 * side] = two
             miss = _miss(hull, two, edges[..., side], turns, distances, parts)
             far_off = miss > MISS * spec.angle_increment
-            far_off[:, 0] = True  # nearly touching, a rim says little of what lies within
+            far_off[:, 0] = True  # near contact, the rim of a cell does not bound its interior
             climb = _climbs(wound, parts, len(hull))
             cell[..., 2 + 2 * side : 4 + 2 * side][far_off] = climb[far_off]
     if cell[..., 1].max() > MOST_WIDE or cell[..., 0].min() < FIRST_BEAM:
@@ -164,9 +164,9 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
 
 
 def _within(values: NDArray[Any], parts: int, outer: np.ufunc) -> NDArray[Any]:
-    """(T, D) the outermost value in each cell, of values (T * parts + 1, D) around and between.
+    """Outermost value in each cell (T, D), from values (T * parts + 1, D) around and between.
 
-    The kernels blend two distances: a cell reaches to the next one.
+    The kernels blend two distances: a cell extends to the next one.
     """
     count = len(values) // parts
     turned = outer.reduce([values[k:][: count * parts : parts] for k in range(parts + 1)])
@@ -176,7 +176,7 @@ def _within(values: NDArray[Any], parts: int, outer: np.ufunc) -> NDArray[Any]:
 
 
 def _reach_of(edge: NDArray[np.float64], parts: int, outer: np.ufunc) -> NDArray[np.float64]:
-    """(T, D) the outermost edge of all cells that use the row of a cell."""
+    """Outermost edge (T, D) of all cells that use the row of a cell."""
     result = _within(edge, parts, outer)
     result[:, 1:] = outer(result[:, 1:], result[:, :-1])
     return result
@@ -185,13 +185,13 @@ def _reach_of(edge: NDArray[np.float64], parts: int, outer: np.ufunc) -> NDArray
 def _wound(
     hull: NDArray[np.float64], hints: NDArray[np.int64], along: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Corners that make an edge, counted on around the hull where the shape turns on.
+    """Unwraps the corners at an edge: indices continue around the hull as the shape rotates.
 
     Args:
         hull: (V, 2) counter-clockwise.
         hints: (...) indices of the corners.
-        along: (...) direction of the edge in the shape's frame, so that the hull lies to its left
-            [rad]; it is between those of the hull's sides before and after the corner.
+        along: (...) direction of the edge in the shape's frame, with the hull to its left [rad];
+            it lies between those of the hull's sides before and after the corner.
     """
     x, y = (np.roll(hull, -1, axis=0) - hull).T
     after = np.arctan2(y, x)
@@ -201,11 +201,11 @@ def _wound(
 
 
 def _candidates(wound: NDArray[np.int64], parts: int, corners: int) -> NDArray[np.int64]:
-    """(T, D, 2) two corners that can be an edge within each cell.
+    """Two corners (T, D, 2) that can be an edge within each cell.
 
-    Along a line and around a circle outside of the shape the corner moves one way only, so those
-    at the rim of a cell hold all between them. Where there are more than two, those at a quarter
-    and three quarters stand for all.
+    Along a line and around a circle outside the shape the corner changes monotonically, so those at
+    the rim of a cell enclose all others. If there are more than two, those at one quarter and three
+    quarters represent all.
     """
     low, high = _within(wound, parts, np.minimum), _within(wound, parts, np.maximum)
     quarter = (high - low) // 4
@@ -213,7 +213,7 @@ def _candidates(wound: NDArray[np.int64], parts: int, corners: int) -> NDArray[n
 
 
 def _climbs(wound: NDArray[np.int64], parts: int, corners: int) -> NDArray[np.int64]:
-    """(T, D, 2) the corner in the middle of each cell, and minus the stride to climb with."""
+    """Corner in the middle of each cell, and minus the initial stride for climbing (T, D, 2)."""
     low, high = _within(wound, parts, np.minimum), _within(wound, parts, np.maximum)
     first = wound[parts // 2 :: parts]
     away = np.clip(np.maximum(high - first, first - low), 1, corners - 1)
@@ -229,7 +229,7 @@ def _miss(
     distances: NDArray[np.float64],
     parts: int,
 ) -> NDArray[np.float64]:
-    """(T, D) by how much the nearer of two corners misses the edge at the rim of a cell [rad]."""
+    """Error (T, D) of the nearer of two corners against the edge at the rim of a cell [rad]."""
     count = len(two)
     worst = np.zeros(two.shape[:2])
     for k in range(parts + 1):
@@ -270,7 +270,7 @@ def _rows_of_turn(
 def apply_model(
     table: LidarTable, grids: Sequence[Grid], model: Function | Sequence[SensorModel]
 ) -> LidarTable:
-    """The table as the device sees it; the rows of the given one are overwritten.
+    """Returns the table as measured by the device; the rows of the given one are overwritten.
 
     Args:
         table: without a model.
@@ -298,12 +298,12 @@ def apply_model(
 
 
 def _ends(table: LidarTable) -> NDArray[np.int64]:
-    """(cells,) where each row ends in `rows`."""
+    """Returns the end of each row in `rows` (cells,)."""
     return table.start + table.widths * table.density.phases
 
 
 def _cosines(table: LidarTable, grids: Sequence[Grid]) -> NDArray[np.float32]:
-    """(R,) cosine of the angle between each ray and the normal of what it meets, in [0, 1]."""
+    """Returns the cosine (R,) of the angle of incidence of each ray, in [0, 1]."""
     cosines, outlines = np.zeros(table.rows.shape, np.float32), table.outlines
     for h, (grid, (first, _)) in enumerate(zip(grids, table.cells_of_shapes(), strict=True)):
         corners = outlines.corners[outlines.corner[h] : outlines.corner[h + 1]]
@@ -324,7 +324,7 @@ def _cosines(table: LidarTable, grids: Sequence[Grid]) -> NDArray[np.float32]:
 
 
 def _apply_function(model: Function, table: LidarTable, cosines: NDArray[np.float32]) -> None:
-    """Changes every row by a function, which is given its points in the order of their angles."""
+    """Applies a function to every row, with its points in the order of their angles."""
     phases = table.density.phases
     for begin, end in zip(table.start, _ends(table), strict=True):
         part, cosine = (a[begin:end].reshape(phases, -1).T.ravel() for a in (table.rows, cosines))

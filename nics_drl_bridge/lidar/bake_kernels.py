@@ -1,4 +1,4 @@
-"""Compiled inner loops of baking: a shape on the lidar's main axis, scanned beforehand."""
+"""Compiled inner loops of baking: scans of a shape on the lidar's main axis."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
 
 EDGE = 1e-6
-"""So far within an edge, as a part of the whole width, is its range taken."""
+"""Ranges at an edge are taken this far inside it, as a share of the whole width."""
 
 
 @kernel(allocates=True)
 def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[no-untyped-def]
-    """Outermost directions of a shape straight ahead, and the corners that make them.
+    """Computes the outermost directions of a shape straight ahead, and their corners.
 
     Args:
-        hull: (V, 2) of its convex hull [m]; unused for a circle.
+        hull: (V, 2) corners of its convex hull [m]; unused for a circle.
         radius: of a circle [m], 0 for another shape.
         distances: (D,) of its origin [m].
-        turns: (T,) its rotation [rad].
+        turns: (T,) rotations of the shape [rad].
         edges: (T, D, 2) result: right and left edge [rad].
         hints: (T, D, 2) result: index of the corner at each.
     """
@@ -74,7 +74,7 @@ def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # 
         radius: of a circle [m].
         distance: of its origin [m].
         cos, sin: of its rotation.
-        edge: (2,) its right and left edge [rad].
+        edge: (2,) right and left edge [rad].
     """
     fine[:] = np.inf
     if corners.shape[0] == 0:
@@ -88,7 +88,7 @@ def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # 
         first += 1
     while last > first and not np.isfinite(fine[last]):
         last -= 1
-    if not np.isfinite(fine[first]):  # thinner than the points: seen by none
+    if not np.isfinite(fine[first]):  # thinner than the spacing of the points: hit by none
         fine[:] = along((edge[0] + edge[1]) / 2.0, corners, radius, distance, cos, sin)
         return
     inside = EDGE * (edge[1] - edge[0])
@@ -98,7 +98,7 @@ def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # 
 
 @kernel(allocates=True)
 def into_phases(rows, fine, width, phases):  # type: ignore[no-untyped-def]
-    """Sorts points (width * phases,) so that those of one phase stand together."""
+    """Sorts points (width * phases,) so that those of one phase are contiguous."""
     for phase in range(phases):
         for k in range(width):
             rows[phase * width + k] = fine[k * phases + phase]
@@ -106,12 +106,12 @@ def into_phases(rows, fine, width, phases):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
-    """All rows of one rotation.
+    """Computes all rows of one rotation.
 
     Args:
         rows: (R,) float32 result: the table's ranges [m].
-        layout: (3, D) where each row begins in `rows`, its first beam from the bearing, and its
-            width in beams.
+        layout: (3, D) index in `rows` of the begin of each row, its first beam relative to the
+            bearing, and its width in beams.
         shape: corners and radius, see `row`.
         distances: (D,) [m].
         turn: rotation [rad].

@@ -1,9 +1,9 @@
-"""Compiled inner loops of the lidar: what one object does to the beams of one scan.
+"""Compiled inner loops of the lidar: the exact ranges of one object in one scan.
 
-Each function lowers the beams that its object touches in a scan `out` (B,), float32, in
-metres, and leaves the others alone, so that calling them one after the other is the fusion by
-minimum of Eq. 4. Positions are in the frame of the lidar. `beams` is the geometry of the
-beams: angle_min, angle_increment, and 1.0 for a full circle.
+Each function lowers the beams that hit its object in a scan `out` (B,), float32, in metres, and
+leaves the others unchanged, so that calling them one after the other is the fusion by minimum of
+Eq. 4. Positions are in the frame of the lidar. `beams` is the geometry of the beams: angle_min,
+angle_increment, and 1.0 for a full circle.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from nics_drl_bridge.kernels import kernel
 
 TWO_PI = 2.0 * math.pi
 ROUNDING = 1e-6
-"""A beam this near to an edge, in beams, is tried; the exact test decides."""
+"""Beams this near to an edge, in beams, are candidates; the exact test decides."""
 
 
 HALF_PI = 0.5 * math.pi
 TINY = 1e-300
-"""Keeps the angle of no vector at all from being none."""
+"""Avoids NaN for the angle of a zero vector."""
 ATAN = (
     0.9999999996145,
     -0.3333332366563,
@@ -39,9 +39,9 @@ ATAN = (
 
 @kernel(inline=True)
 def arctan2(y, x):  # type: ignore[no-untyped-def]
-    """The angle of (x, y) within 3e-10 rad, without a branch and so many at a time.
+    """Angle of (x, y) within 3e-10 rad, without branches, so that loops over it are vectorised.
 
-    A polynomial in the square of the smaller over the larger, fitted at Chebyshev's nodes.
+    A polynomial in the square of the ratio of smaller to larger, fitted at Chebyshev nodes.
     """
     ax, ay = abs(x), abs(y)
     ratio = min(ax, ay) / (max(ax, ay) + TINY)
@@ -64,17 +64,16 @@ def arctan2(y, x):  # type: ignore[no-untyped-def]
 
 @kernel
 def _lower(out, i, value):  # type: ignore[no-untyped-def]
-    """Fuses one return into beam i of a full or partial circle."""
+    """Fuses one return into beam i."""
     if value < out[i]:
         out[i] = value
 
 
 @kernel
 def beam_span(low, high, beams, count):  # type: ignore[no-untyped-def]
-    """First beam index and number of beams in the angles [low, high].
+    """Returns the first beam and the number of beams in the angles [low, high].
 
-    In a full circle the beams may run over the seam: the index has to be taken modulo the
-    count.
+    In a full circle the beams may cross the seam: indices are modulo the count.
     """
     first = math.ceil((low - beams[0]) / beams[1] - ROUNDING)
     last = math.floor((high - beams[0]) / beams[1] + ROUNDING)
@@ -86,14 +85,14 @@ def beam_span(low, high, beams, count):  # type: ignore[no-untyped-def]
 
 @kernel
 def circle(out, directions, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
-    """Exact ranges to a circle at (x, y)."""
+    """Fuses the exact ranges to a circle at (x, y)."""
     d2 = x * x + y * y
     r2 = radius * radius
     d = math.sqrt(d2)
     if d - radius > range_max or radius <= 0.0:
         return
     count = out.shape[0]
-    if d2 <= r2:  # the lidar is inside: it sees the far side, in all directions
+    if d2 <= r2:  # the lidar is inside: every beam hits the far side
         for i in range(count):
             c, s = directions[i, 0], directions[i, 1]
             across = c * y - s * x
@@ -118,13 +117,13 @@ def circle(out, directions, beams, x, y, radius, range_max):  # type: ignore[no-
 
 @kernel
 def segment(out, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
-    """Exact ranges to the straight wall from (x1, y1) to (x2, y2)."""
+    """Fuses the exact ranges to the straight wall from (x1, y1) to (x2, y2)."""
     edge(out, directions, beams, x1, y1, arctan2(y1, x1), x2, y2, arctan2(y2, x2), False)
 
 
 @kernel(inline=True)
 def edge(out, directions, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore[no-untyped-def]
-    """The same, with the directions of its ends [rad]; `one_sided`: only seen from its right."""
+    """Like `segment`, with directions of its ends [rad]; `one_sided`: visible from its right."""
     count = out.shape[0]
     ex, ey = x2 - x1, y2 - y1
     cross = x1 * ey - y1 * ex
@@ -144,7 +143,7 @@ def edge(out, directions, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # 
 
 @kernel(inline=True)
 def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyped-def]
-    """Fuses a straight line into the beams from `begin` to `end`, many at a time."""
+    """Fuses a straight line into the beams from `begin` to `end`, in a vectorised loop."""
     for k in range(end - begin):
         i = np.uintp(begin + k)
         distance = np.float32(cross / (directions[i, 0] * ey - directions[i, 1] * ex))
@@ -155,7 +154,7 @@ def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyp
 
 @kernel
 def polygon(out, directions, beams, x, y, c, s, corners):  # type: ignore[no-untyped-def]
-    """Exact ranges to the outline `corners` (V, 2), turned by (c, s), with its origin at (x, y)."""
+    """Fuses the exact ranges to the outline `corners` (V, 2), turned by (c, s), at (x, y)."""
     last, cull = corners.shape[0] - 1, beside_convex(x, y, c, s, corners)
     ax, ay = turned(x, y, c, s, corners[last])
     angle = arctan2(ay, ax)
@@ -168,10 +167,10 @@ def polygon(out, directions, beams, x, y, c, s, corners):  # type: ignore[no-unt
 
 @kernel
 def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
-    """Whether an outline only turns to the left, and not around the lidar; see `polygon`.
+    """True if an outline is convex and does not enclose the lidar; see `polygon`.
 
-    Then a ray meets it first on a side that has the lidar to its right. Where a side points at the
-    lidar, it may stand on it: that is not beside.
+    Then a ray first meets a side that has the lidar to its right. False if a side points at the
+    lidar, which may lie on it.
     """
     last, rounds = corners.shape[0] - 1, 0
     bx, by = turned(x, y, c, s, corners[max(last - 1, 0)])
@@ -182,7 +181,7 @@ def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
         gx, gy, cross = bx - ax, by - ay, ax * by - ay * bx
         if ex * gy - ey * gx < 0.0 or cross == 0.0:
             return False
-        if (ay <= 0.0) != (by <= 0.0):  # it passes the ray ahead, or the one behind
+        if (ay <= 0.0) != (by <= 0.0):  # it crosses the ray ahead, or the one behind
             rounds += int(ay <= 0.0 and cross > 0.0) - int(ay > 0.0 and cross < 0.0)
         ax, ay, ex, ey = bx, by, gx, gy
     return rounds == 0
@@ -190,13 +189,13 @@ def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
 
 @kernel(inline=True)
 def turned(x, y, c, s, corner):  # type: ignore[no-untyped-def]
-    """Where a corner (2,) lies when its shape is turned by (c, s) and put at (x, y)."""
+    """Position of a corner (2,) of a shape turned by (c, s) and placed at (x, y)."""
     return x + c * corner[0] - s * corner[1], y + s * corner[0] + c * corner[1]
 
 
 @kernel
 def clear(ranges, n, m):  # type: ignore[no-untyped-def]
-    """Begins the scan of robot m in world n of `ranges` (N, M, B): no return anywhere."""
+    """Sets the scan of robot m in world n of `ranges` (N, M, B) to no return."""
     nothing = np.float32(np.inf)
     for i in range(ranges.shape[2]):
         ranges[n, m, i] = nothing
@@ -204,7 +203,7 @@ def clear(ranges, n, m):  # type: ignore[no-untyped-def]
 
 @kernel
 def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
-    """Ends a scan (B,) of exact ranges: too far is `inf`, too close is `-inf` (REP-117)."""
+    """Applies the limits to a scan (B,): too far becomes `inf`, too close `-inf` (REP-117)."""
     low, high = np.float32(range_min), np.float32(range_max)
     for i in range(out.shape[0]):
         value = out[i]
@@ -214,7 +213,7 @@ def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
 
 @kernel(inline=True)
 def sensor_pose(poses, n, m, mount):  # type: ignore[no-untyped-def]
-    """x, y, heading of a lidar in its world, from poses (N, M, 3) and the mount (3,)."""
+    """Returns x, y, heading of a lidar in its world, from poses (N, M, 3) and the mount (3,)."""
     x, y, heading = poses[n, m, 0], poses[n, m, 1], poses[n, m, 2]
     if mount[0] != 0.0 or mount[1] != 0.0:
         c, s = math.cos(heading), math.sin(heading)
@@ -224,7 +223,7 @@ def sensor_pose(poses, n, m, mount):  # type: ignore[no-untyped-def]
 
 @kernel
 def to_sensor(poses, n, m, mount):  # type: ignore[no-untyped-def]
-    """The same, and cos and sin of its heading."""
+    """Like `sensor_pose`, with cos and sin of the heading."""
     x, y, heading = sensor_pose(poses, n, m, mount)
     return x, y, heading, math.cos(heading), math.sin(heading)
 
@@ -233,10 +232,10 @@ def to_sensor(poses, n, m, mount):  # type: ignore[no-untyped-def]
 def walls_into(out, directions, beams, sx, sy, c, s, walls, range_max):  # type: ignore[no-untyped-def]
     """Fuses straight walls (W, 4), given in the world, into a scan from (sx, sy, c, s).
 
-    Only the beams that can meet the part of a wall within `range_max` are looked at.
+    Only beams that can meet the part of a wall within `range_max` are computed.
 
     Returns:
-        How many walls are within the range.
+        Number of walls within range.
     """
     near = 0
     for w in range(walls.shape[0]):
@@ -249,7 +248,7 @@ def walls_into(out, directions, beams, sx, sy, c, s, walls, range_max):  # type:
         chord2 = range_max * range_max * length2 - cross * cross
         if chord2 < 0.0 or length2 == 0.0:
             continue
-        # In parts of its length, the wall is nearest at `foot`, and within the range by `half`.
+        # As shares of its length: the wall is nearest at `foot`, and in range within +-`half`.
         foot, half = -(ax * ex + ay * ey) / length2, math.sqrt(chord2) / length2 + ROUNDING
         first, last = max(foot - half, 0.0), min(foot + half, 1.0)
         if first <= last:

@@ -11,18 +11,18 @@ from nics_drl_bridge.lidar import exact_kernels, fuse_kernels, map_kernels
 
 @kernel
 def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # type: ignore[no-untyped-def]
-    """Scans of the robots of some worlds.
+    """Scans from the robots of some worlds.
 
-    Bodies that are looked up wait on the lanes until these are full, while the next scans begin:
-    the minimum does not mind in which order. All arrays are taken out of their tuples once, here:
-    to do so for each scan took as long as the look-ups.
+    Bodies to be looked up are collected in the lanes until these are full, across scans: the
+    minimum does not depend on the order. All arrays are unpacked from their tuples once, here:
+    doing so for each scan took as long as the look-ups.
 
     Args:
-        ranges: (N, M, B) result, whose beams stand one after the other.
+        ranges: (N, M, B) result, with contiguous beams.
         poses: (N, M, 3) of `base_link` in the world.
-        chosen: (n,) which worlds.
+        chosen: (n,) indices of the worlds.
         bodies: (N, K, 7), see `shapes.BODY`.
-        first: the body that robot 0 is, the others follow; -1 when robots are no bodies.
+        first: index of the body of robot 0, the others follow; -1 if robots are not bodies.
         walls: (W, 4) x1, y1, x2, y2 [m], the same in every world.
         sensor: see `scanner.Scanner.arguments`.
         room: see `scanner.Scanner.room`.
@@ -70,7 +70,7 @@ def add_map(ranges, poses, chosen, sensor, map_arrays, exact, room):  # type: ig
     Args:
         ranges: (N, M, B) scans, in place.
         poses: (N, M, 3) of `base_link` in the world.
-        chosen: (n,) which worlds.
+        chosen: (n,) indices of the worlds.
         sensor: see `scanner.Scanner.arguments`.
         map_arrays: see `maps_grid.GridMap.arrays`.
         exact: whether to walk from cell to cell.

@@ -1,7 +1,7 @@
 """Compiled inner loops of the canonical scan: from the beams of a lidar to sectors of a layout.
 
-Ranges inside are those of REP-117: `inf` no return, `-inf` too close, NaN unknown. Shapes: B
-beams, S sectors. `plan` is `canonical.Plan.arguments`.
+Ranges follow REP-117: `inf` no return, `-inf` too close, NaN unknown. Shapes: B beams, S sectors.
+`plan` is `canonical.Plan.arguments`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ TURN = 2.0 * math.pi
 
 @kernel(allocates=True)
 def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
-    """The nearest return (S,) in each sector, of one scan (B,)."""
+    """Writes the nearest return in each sector (S,) of one scan (B,)."""
     first, count, directions, shift, ring = plan
     if shift[0] != 0.0 or shift[1] != 0.0:
         _by_place(out, ranges, directions, shift, ring)
@@ -27,14 +27,14 @@ def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def resample_all(out, ranges, plan):  # type: ignore[no-untyped-def]
-    """`resample` of scans (R, B) into (R, S)."""
+    """Applies `resample` to scans (R, B), into (R, S)."""
     for i in range(ranges.shape[0]):
         resample(out[i], ranges[i], plan)
 
 
 @kernel(allocates=True)
 def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
-    """A sector takes `count` beams from `first` on, past the last one from beam 0 again."""
+    """Fills each sector from `count` beams from `first` on, wrapping around to beam 0."""
     beams = ranges.shape[0]
     for s in range(out.shape[0]):
         near, known = np.float32(np.inf), np.int32(0)
@@ -50,18 +50,17 @@ def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _by_place(out, ranges, directions, shift, ring):  # type: ignore[no-untyped-def]
-    """A sector takes the returns that lie in it as seen from the layout's viewpoint.
+    """Fills each sector from the returns that lie in it as seen from the layout's viewpoint.
 
-    Where the move leaves a sector between the returns of two neighbouring beams empty, it takes
-    the nearer of the two.
+    A sector left empty between the returns of two neighbouring beams takes the nearer of the two.
 
     Args:
         out: (S,) result.
         ranges: (B,).
         directions: (B, 2) of the beams in `base_link`.
         shift: (2,) of the lidar from the viewpoint [m].
-        ring: angle_min and width of the sectors [rad], limits of the lidar [m], whether the last
-            beam and the first are neighbours.
+        ring: angle_min and width of the sectors [rad], limits of the lidar [m], 1 if the last beam
+            and the first are neighbours.
     """
     sectors, beams = out.shape[0], ranges.shape[0]
     where, value = np.empty(beams, np.int32), np.empty(beams, np.float32)
@@ -91,17 +90,17 @@ def _by_place(out, ranges, directions, shift, ring):  # type: ignore[no-untyped-
 
 @kernel(allocates=True)
 def _seen(r, direction, shift, ring):  # type: ignore[no-untyped-def]
-    """Sector of a return as seen from the viewpoint, -1 unknown, and its distance from there."""
+    """Sector of a return seen from the viewpoint, -1 if unknown, and its distance from there."""
     if r != r:
         return -1, np.float32(np.nan)
     reach = min(max(float(r), 0.5 * ring[2]), ring[3])
     x, y = shift[0] + reach * direction[0], shift[1] + reach * direction[1]
     angle = (math.atan2(y, x) - ring[0]) % TURN
-    s = int(angle / ring[1]) if angle < TURN else 0  # a tiny negative one is rounded up to TURN
+    s = int(angle / ring[1]) if angle < TURN else 0  # a tiny negative angle is rounded to TURN
     return s, np.float32(math.sqrt(x * x + y * y)) if math.isfinite(r) else r
 
 
 @kernel(allocates=True)
 def _nearer(one, other):  # type: ignore[no-untyped-def]
-    """The lesser of two; `other` where `one` is NaN."""
+    """Returns the lesser of two; `other` if `one` is NaN."""
     return one if one <= other else other

@@ -1,7 +1,7 @@
-"""The canonical scan: sectors around the robot, whatever lidar looks into them.
+"""The canonical scan: sectors around the robot, independent of the lidar.
 
 A policy learns on the sectors of one `ScanLayout`. The scan of any lidar is resampled into them by
-angle: simulator, middleware and deployment all do it here.
+angle: simulator, middleware and deployment all use this module.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
 
 COARSEST_RAD = 0.21
-"""Beams farther apart than this are refused: at 1 m, what is 0.2 m wide would slip through."""
+"""Beams farther apart than this are rejected: at 1 m they would miss objects 0.2 m wide."""
 BORDER_RAD = 1e-4
 """A beam this near to a border counts in both sectors; headers carry angles in float32."""
 RANGE_TOLERANCE = 1e-5
-"""Share by which a lidar may see less far than the layout, as rounded to float32."""
+"""Share by which a lidar's range may be less than the layout's, as rounded to float32."""
 
 
 class ScanLayout(Schema):
@@ -41,8 +41,8 @@ class ScanLayout(Schema):
 
     Attributes:
         sectors: S.
-        angle_min: where the first sector begins [rad].
-        angle_max: where the last sector ends [rad].
+        angle_min: begin of the first sector [rad].
+        angle_max: end of the last sector [rad].
         range_max: farther returns count as none [m].
         viewpoint: x, y in `base_link` [m].
     """
@@ -63,7 +63,7 @@ class ScanLayout(Schema):
 
     @property
     def width(self) -> float:
-        """Of a sector [rad]."""
+        """Width of a sector [rad]."""
         return (self.angle_max - self.angle_min) / self.sectors
 
     @cached_property
@@ -76,19 +76,19 @@ LAYOUTS = {
     "around": ScanLayout(sectors=72, range_max=3.0),
     "front": ScanLayout(sectors=54, angle_min=-0.75 * np.pi, angle_max=0.75 * np.pi, range_max=3.0),
 }
-"""Layouts by name: all around, and the 270 deg that most lidars at the front of a robot see."""
+"""Layouts by name: the full circle, and the 270 deg that most front-mounted lidars cover."""
 
 
 def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
-    """A layout from what a user gives for it.
+    """Returns the layout for a user's setting.
 
     Args:
         given: None, a ScanLayout, the name of one of `LAYOUTS`, its fields, or a number of sectors
-            over all that the lidar sees, from where it is mounted.
-        lidar: for a number.
+            over the lidar's field of view, seen from its mount.
+        lidar: used with a number of sectors.
 
     Raises:
-        ConfigError: nothing of that.
+        ConfigError: none of these.
     """
     if given is None or isinstance(given, ScanLayout):
         return given
@@ -117,14 +117,14 @@ def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
 
 @dataclass(frozen=True)
 class Plan:
-    """How the beams of one lidar fill the sectors of one layout; made once, used for each scan.
+    """Assignment of the beams of one lidar to the sectors of one layout; computed once.
 
     Attributes:
         first: (S,) int32, the first beam of each sector.
-        count: (S,) int32, how many beams it takes; they go on with beam 0 after the last.
+        count: (S,) int32, number of its beams; they continue with beam 0 after the last.
         directions: (B, 2) of the beams in `base_link`.
-        shift: (2,) of the lidar from the viewpoint [m]; zeros: sectors are filled by beam.
-        ring: (5,) angle_min and width of the sectors [rad], limits of the lidar [m], and 1 where
+        shift: (2,) of the lidar from the viewpoint [m]; if zero, sectors are filled by beam.
+        ring: (5,) angle_min and width of the sectors [rad], limits of the lidar [m], and 1 if
             the last beam and the first are neighbours.
     """
 
@@ -136,14 +136,14 @@ class Plan:
 
     @property
     def arguments(self) -> tuple[NDArray[Any], ...]:
-        """What the kernels take."""
+        """Arguments of the kernels."""
         return self.first, self.count, self.directions, self.shift, self.ring
 
     def resample(self, ranges: Ranges) -> Ranges:
-        """Scans (..., B) as the nearest return (..., S) in each sector [m], REP-117.
+        """Resamples scans (..., B) to the nearest return (..., S) in each sector [m], REP-117.
 
-        A sector without a beam of its own takes the nearer of the two beams beside it. NaN stays
-        where nothing was measured.
+        A sector without a beam takes the nearer return of the two adjacent beams. NaN stays where
+        nothing was measured.
         """
         rows = np.ascontiguousarray(ranges, np.float32).reshape(-1, len(self.directions))
         out = np.empty((len(rows), len(self.first)), np.float32)
@@ -154,15 +154,15 @@ class Plan:
 NO_PLAN = Plan(
     np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(2), np.zeros(5)
 )
-"""Of no sectors, where beams are seen as they are."""
+"""Plan without sectors, for policies that observe the beams themselves."""
 
 
 def plan_of(lidar: LidarSpec, layout: ScanLayout) -> Plan:
-    """How a lidar fills a layout.
+    """Returns the plan by which a lidar fills a layout.
 
     Raises:
-        ConfigError: it can't: it does not look into every sector, or not as far, or its beams are
-            more than `COARSEST_RAD` apart.
+        ConfigError: the lidar does not cover every sector, its range is too short, or its beams
+            are more than `COARSEST_RAD` apart.
     """
     x, y, heading = lidar.mount
     angles = lidar.angles + heading
@@ -182,11 +182,11 @@ def plan_of(lidar: LidarSpec, layout: ScanLayout) -> Plan:
 
 
 def _beams_of(away: Array, half: float) -> tuple[int, int]:
-    """First beam and number of beams within `half` of a direction, or those on either side.
+    """First beam and number of beams within `half` of a direction, or the adjacent beams if none.
 
     Args:
-        away: (B,) of each beam from the middle of the sector [rad], wrapped.
-        half: of the width of the sector [rad].
+        away: (B,) angle of each beam from the middle of the sector [rad], wrapped.
+        half: half the width of the sector [rad].
     """
     inside = np.abs(away) <= half
     if not inside.any():
@@ -228,32 +228,32 @@ def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
 
 @dataclass(frozen=True)
 class Reader:
-    """How the ranges of a device are put in the order of a LidarSpec.
+    """Converts the ranges of a device to the beam order of a LidarSpec.
 
     Attributes:
-        lidar: what the device is.
-        backwards: whether its beams come clockwise.
+        lidar: the device.
+        backwards: whether its beams are in clockwise order.
     """
 
     lidar: LidarSpec
     backwards: bool
 
     def ordered(self, values: Ranges) -> Ranges:
-        """Ranges (..., B), counter-clockwise."""
+        """Returns ranges (..., B) in counter-clockwise order."""
         return values[..., ::-1] if self.backwards else values
 
 
 def reader_of(header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool = False) -> Reader:
-    """The lidar whose scans have a header.
+    """Returns the reader for scans with a given header.
 
     Args:
         header: of a LaserScan. A negative `angle_increment` means clockwise beams.
         beams: B.
-        like: gives all that no header says: mount, frame, the word for no return.
-        upside_down: whether the device hangs with its z axis down, so that it turns clockwise.
+        like: provides the properties that headers lack: mount, frame, the value for no return.
+        upside_down: whether the device is mounted with its z axis down, so that it turns clockwise.
 
     Raises:
-        ConfigError: the header describes no lidar.
+        ConfigError: the header does not describe a lidar.
     """
     begin, step = header.angle_min, header.angle_increment
     if upside_down:
@@ -273,7 +273,7 @@ def reader_of(header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool
     if abs(span + step - turn) < 0.1 * step:
         span = turn  # the next beam would be the first again
     elif turn - FULL_CIRCLE_TOLERANCE < span < turn + 0.1 * step:
-        span = turn - 2.0 * FULL_CIRCLE_TOLERANCE  # a device with a double beam
+        span = turn - 2.0 * FULL_CIRCLE_TOLERANCE  # first and last beam coincide
     fields = like.model_dump() | {
         "name": "scan", "beams": beams, "angle_min": begin, "angle_max": begin + span,
         "range_min": header.range_min, "range_max": header.range_max,
@@ -284,14 +284,14 @@ def reader_of(header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool
 def reader_beside(
     header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool = False
 ) -> Reader:
-    """`reader_of`, but exactly the expected lidar where the header says the same."""
+    """Like `reader_of`, but returns exactly the expected lidar if the header agrees with it."""
     found = reader_of(header, beams, like, upside_down)
     limits = np.array([found.lidar.range_min, found.lidar.range_max])
     same = found.lidar.beams == like.beams and np.allclose(
         limits, [like.range_min, like.range_max], rtol=1e-4, atol=1e-4
     )
     turned = found.lidar.angles - like.angles if same else np.ones(1)
-    whole = 2.0 * np.pi * np.round(turned[0] / (2.0 * np.pi))  # the same beams, by other names
+    whole = 2.0 * np.pi * np.round(turned[0] / (2.0 * np.pi))  # the same beams, off by full turns
     if same and np.abs(turned - whole).max() < 0.1 * like.angle_increment:
         return Reader(like, found.backwards)
     return found

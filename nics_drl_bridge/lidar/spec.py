@@ -1,11 +1,11 @@
-"""LidarSpec: the one home of a lidar's beams, limits and header fields.
+"""LidarSpec: the single definition of a lidar's beams, limits and header fields.
 
-Ranges as a device reports them, to and from the package's own, which follow REP-117.
+Conversion of ranges between a device's convention and the package's own, which is REP-117.
 
-Inside: `inf` is no return, `-inf` too close, NaN an invalid measurement, and everything else
-lies within the limits. Devices agree on little of that; `LidarSpec.no_return` names the
-convention, and this is the one place that knows it. Limits are compared in float32, as the
-message carries them: 0.16 m is a little less there, and still a return.
+In the package, `inf` is no return, `-inf` too close, NaN an invalid measurement, and everything
+else lies within the limits. Devices differ; `LidarSpec.no_return` names the convention, and only
+this module handles it. Limits are compared in float32, as in the message: 0.16 m is a little less
+there, and still a return.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ NoReturn = Literal["inf", "zero", "nan", "range_max"]
 
 
 class ScanHeader(NamedTuple):
-    """The fields of a LaserScan that follow from the lidar, by their names there.
+    """The fields of a LaserScan that follow from the lidar, with their names in the message.
 
     Attributes:
         angle_min: of the first beam [rad].
-        angle_max: of the last beam, also of a full circle [rad].
+        angle_max: of the last beam, also for a full circle [rad].
         angle_increment: between neighbouring beams [rad].
-        time_increment: between neighbouring beams [s]; 0 where all are measured at once,
-            negative where the device turns clockwise.
+        time_increment: between neighbouring beams [s]; 0 if all are measured at once,
+            negative if the device turns clockwise.
         scan_time: between scans [s].
         range_min: nearest return [m].
         range_max: farthest return [m].
@@ -58,7 +58,7 @@ class LidarSpec(Schema):
     measured twice.
 
     Attributes:
-        name: what users call it.
+        name: the name users refer to it by.
         beams: B.
         angle_min: of the first beam, in the frame of the lidar [rad].
         angle_max: of the last beam, or of the end of the circle [rad].
@@ -68,10 +68,10 @@ class LidarSpec(Schema):
         mount: x [m], y [m], heading [rad] of `laser` in `base_link`.
         noise_std: standard deviation of a range [m].
         frame: id of the lidar's own frame.
-        no_return: what the device puts on the wire where nothing came back: `inf` (REP-117),
-            `zero`, `nan` or `range_max`. Inside the package it is `inf`; see `lidar.rep117`.
-        faults: what else the device does to its ranges.
-        sensor_model: what it makes of the surfaces that it meets, baked into its tables.
+        no_return: the device's value for no return: `inf` (REP-117), `zero`, `nan` or
+            `range_max`. In the package it is `inf`; see `lidar.rep117`.
+        faults: further faults of the device's ranges.
+        sensor_model: effects of the surfaces on its returns, baked into its tables.
     """
 
     name: str = "lidar"
@@ -104,7 +104,7 @@ class LidarSpec(Schema):
 
     @property
     def full_circle(self) -> bool:
-        """Whether the beams go all around."""
+        """True if the beams cover a full circle."""
         return self.angle_max - self.angle_min > 2.0 * np.pi - FULL_CIRCLE_TOLERANCE
 
     @property
@@ -135,12 +135,12 @@ class LidarSpec(Schema):
 
     @property
     def sweep_time(self) -> float:
-        """Time that a device which turns once per scan spends on its beams [s]."""
+        """Duration of all beams of a device that turns once per scan [s]."""
         return self.beam_time * self.beams
 
     @cached_property
     def header(self) -> ScanHeader:
-        """Every field of a LaserScan but stamp, frame and ranges."""
+        """The fields of a LaserScan except stamp, frame and ranges."""
         return ScanHeader(
             angle_min=float(self.angles[0]),
             angle_max=float(self.angles[-1]),
@@ -153,12 +153,12 @@ class LidarSpec(Schema):
 
     @property
     def fault_parameters(self) -> NDArray[np.float64]:
-        """The faults of this lidar as the row (P,) that the kernels take."""
+        """The faults of this lidar as the kernels' row (P,)."""
         return self.faults.parameters(self.noise_std)
 
 
 def load_lidar(name: str | Path) -> LidarSpec:
-    """Loads a shipped lidar by name (`paper`), or any by the path of its YAML file."""
+    """Loads a shipped lidar by name (`paper`), or any other by the path of its YAML file."""
     return load_yaml(find_config(name, "lidars"), LidarSpec)
 
 
@@ -166,10 +166,9 @@ Ranges = NDArray[np.float32]
 
 
 def to_device(ranges: ArrayLike, spec: LidarSpec) -> Ranges:
-    """Ranges (..., B) of the package as the device puts them on the wire.
+    """Converts ranges (..., B) of the package to the device's convention.
 
-    Only no return is rewritten. A device that can't say `-inf` has another
-    `LidarFaults.too_close`.
+    Only `inf` is replaced. For a device that cannot report `-inf`, set `LidarFaults.too_close`.
     """
     out = np.array(ranges, dtype=np.float32)
     if spec.no_return != "inf":
@@ -179,11 +178,11 @@ def to_device(ranges: ArrayLike, spec: LidarSpec) -> Ranges:
 
 
 def from_device(values: ArrayLike, spec: LidarSpec) -> Ranges:
-    """What a device put on the wire (..., B) as ranges of the package.
+    """Converts ranges (..., B) of a device to those of the package.
 
     A finite value below range_min means that something is too close, unless it is the device's
-    word for no return: it must not be taken for free space. Of a device that says NaN for no
-    return, invalid measurements can't be told from it.
+    value for no return: it must not be taken for free space. If a device reports NaN for no return,
+    invalid measurements cannot be distinguished from it.
     """
     out = np.array(values, dtype=np.float32)
     low, high = np.float32(spec.range_min), np.float32(spec.range_max)

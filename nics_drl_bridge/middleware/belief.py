@@ -1,6 +1,6 @@
-"""What the filter holds at a time, and what it foresees.
+"""State of the filter at a time, and its prediction.
 
-How far a robot may have come while nothing could be used of what it said.
+Bounds on the motion of a robot while none of its data could be used.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ Array = NDArray[np.float64]
 
 
 class Anchor(NamedTuple):
-    """The newest odometry, and what the filter held after it.
+    """The newest odometry, and the state of the filter after it.
 
     Attributes:
-        time_ns: of it [ns].
+        time_ns: of the odometry [ns].
         odom: (3,) its pose in `odom`.
         mean: (3 + S,) see `Belief`.
         covariance: (3 + S, 3 + S).
@@ -34,15 +34,15 @@ class Anchor(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """All that the filter holds at a time; its arrays are never changed in place.
+    """Complete state of the filter at a time; its arrays are never modified in place.
 
     Attributes:
         time_ns: of the belief [ns].
         mean: (3 + S,) x [m], y [m], heading [rad] in `map`, then the state of the RobotSpec.
         covariance: (3 + S, 3 + S).
-        outliers: how many of each kind came in a row.
+        outliers: number of consecutive outliers of each kind.
         anchor: the newest odometry; None before the first.
-        lost: whether the robot may have driven unseen since the anchor.
+        lost: True if the robot may have moved unobserved since the anchor.
     """
 
     time_ns: int
@@ -54,10 +54,10 @@ class Belief(NamedTuple):
 
 
 class Foreseen(NamedTuple):
-    """What a prediction comes to: time [ns], mean, covariance, and the twist to measure then.
+    """Result of a prediction: time [ns], mean, covariance, and the expected twist measurement.
 
-    And where there was time for it, what such a measurement makes of it, whatever its value: the
-    gain (3 + S, 3) and the covariance after it.
+    If computed in advance, `update` is the gain (3 + S, 3) and the covariance after such a
+    measurement, which do not depend on its value.
     """
 
     time_ns: int
@@ -68,18 +68,18 @@ class Foreseen(NamedTuple):
 
 
 def parted(covariance: Array) -> Array:
-    """A copy of a covariance (3 + S, 3 + S) in which pose and state tell nothing of each other."""
+    """Returns a copy of a covariance (3 + S, 3 + S) with pose and state uncorrelated."""
     copied = np.array(covariance)
     copied[:3, 3:], copied[3:, :3] = 0.0, 0.0
     return copied
 
 
 JITTER_S = 0.2
-"""The time that is not accounted for is known this well: data take longer now and then [s]."""
+"""Uncertainty of the unobserved time: transmission takes longer now and then [s]."""
 MARGIN = 1.2
-"""Odometry that is noisy or slips tells of at most so many times the greatest speed."""
+"""Factor by which odometry, through noise or slip, may exceed the greatest speed."""
 LEVELS, MOST_CORNERS = 3, 4096
-"""Of each variable, so many values are tried for the greatest speed, and so many together."""
+"""Values tried per variable for the greatest speed, and greatest number of combinations."""
 
 
 def greatest_twist(model: SimulatorModel) -> tuple[float, float]:
@@ -97,13 +97,13 @@ def greatest_twist(model: SimulatorModel) -> tuple[float, float]:
 
 
 class Unseen:
-    """Says how far a robot may have come unseen, and how well its odometry bridges that.
+    """Bounds the unobserved motion of a robot, and bridges it by odometry.
 
     Args:
         model: of the robot.
-        process: (3 + S, 3 + S) what the filter's covariance grows by in a second.
+        process: (3 + S, 3 + S) growth of the filter's covariance per second.
         noise: (3, 3) of the twist that odometry measures.
-        news: (3 + S,) variance of a state about which there may be news; 0 for the pose.
+        news: (3 + S,) variance of the state after possible news, see `Outcome`; 0 for the pose.
 
     Attributes:
         walk: (3,) variance that a pose by odometry gains in a second [m^2, m^2, rad^2].
@@ -112,19 +112,19 @@ class Unseen:
     def __init__(self, model: SimulatorModel, process: Array, noise: Array, news: Array) -> None:
         self._news = news
         self._fastest = greatest_twist(model)
-        # Odometry adds up its twists, so their noise walks at random, a step each period.
+        # Odometry integrates its twists, so their noise is a random walk with a step each period.
         self.walk = np.diag(process)[:3] + np.diag(noise) * model.control_period
 
     def reach(self, seconds: float) -> tuple[float, float]:
-        """How far [m] and by what angle [rad] it may have come, by its greatest speeds."""
+        """Greatest distance [m] and turn [rad] in a time, by the greatest speeds."""
         speed, rate = self._fastest
         longest = max(seconds, 0.0) + JITTER_S
         return speed * longest, min(rate * longest, np.pi)
 
     def doubted(self, covariance: Array, seconds: float) -> Array:
-        """A covariance (3 + S, 3 + S), after a time in which the robot may have driven anywhere.
+        """Covariance (3 + S, 3 + S) after a time in which the robot may have driven anywhere.
 
-        Of x, y and heading every place within reach is as likely as another.
+        x, y and heading are uniformly distributed within reach.
         """
         doubted, (far, turned) = parted(covariance), self.reach(seconds)
         variance = np.maximum(self._news, np.diag(doubted))
@@ -133,15 +133,16 @@ class Unseen:
         return doubted
 
     def bridged(self, anchor: Anchor, odom: Array, seconds: float) -> tuple[Array, Array] | None:
-        """Pose (3,) and its covariance (3, 3) by what odometry says has been driven unseen.
+        """Bridges unobserved motion by odometry.
 
         Args:
-            anchor: before.
+            anchor: the odometry and estimate before.
             odom: (3,) pose in `odom` now.
-            seconds: between the two.
+            seconds: between the two [s].
 
         Returns:
-            None where the robot can't have come so far: its odometry began anew, or jumped.
+            Pose (3,) and its covariance (3, 3); None if the motion is beyond reach: odometry was
+            restarted, or jumped.
         """
         moved = geometry.between(anchor.odom, odom)
         far, turned = self.reach(seconds)
@@ -156,11 +157,11 @@ class Unseen:
         return pose, before + self._drift(lever, far, max(seconds, 0.0))
 
     def _drift(self, lever: Array, far: float, seconds: float) -> Array:
-        """(3, 3) that a pose by odometry gains in a time, on a way that ends at a `lever` (2,).
+        """Covariance (3, 3) that a pose by odometry gains in a time, on a path with `lever` (2,).
 
-        An error of the heading that grows on the way turns the rest of it: on a straight one by a
-        third of its variance at the end. A way that was no straight one led aside, at most as
-        far as the greatest speed allows; Thrun et al., Probabilistic Robotics, Sec. 5.4.
+        A heading error that grows along the path rotates the rest of it: on a straight path with a
+        third of its variance at the end. A path that was not straight may have led aside, at most
+        as far as the greatest speed allows; Thrun et al., Probabilistic Robotics, Sec. 5.4.
         """
         position, heading = max(self.walk[:2]) * seconds, self.walk[2] * seconds
         aside = max(far * far - float(lever @ lever), 0.0) / 4.0

@@ -36,8 +36,8 @@ class Middleware:
 
     The simulator in process, the nodes and the vehicle all feed this one class, so that the
     same data give the same view. Times are stamps in nanoseconds; arrivals are on the clock of
-    the receiver, which need not be that of the stamps. What can't be used is counted by reason,
-    see `health`, and changes nothing else.
+    the receiver, which need not be that of the stamps. Data that cannot be used are counted by
+    reason, see `health`, and change nothing else.
 
     Args:
         model: of the robot.
@@ -55,12 +55,12 @@ class Middleware:
         self.reset(0, np.zeros(3))
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
-        """Forgets everything; the robot stands at a pose (3,) in `map`.
+        """Forgets everything; the robot is at rest at a pose (3,) in `map`.
 
         Args:
-            time_ns: when [ns]; data that are not newer correct nothing.
+            time_ns: of the reset [ns]; data that are not newer correct nothing.
             pose: x [m], y [m], heading [rad].
-            std: how well it is known [m, rad]: one number, or (3,).
+            std: standard deviation of the pose [m, rad]: one number, or (3,).
         """
         self.cache = TopicCache()
         self._clock_jumps = 0
@@ -70,26 +70,26 @@ class Middleware:
         self._begin(time_ns)
 
     def _begin(self, time_ns: int) -> None:
-        """Goes on from a time with what the estimator holds."""
+        """Continues from a time with the present state of the estimator."""
         self._start_ns, self._unstamped_ns = time_ns, time_ns - 1
         self._stamps.reset()
         self._timeline.reset()
 
     def expect_beams(self, beams: int) -> None:
-        """Takes scans of so many beams from now on; the newest one is forgotten."""
+        """Sets the number of beams of the scans to come; the newest scan is forgotten."""
         self._beams, self._unknown = beams, np.full(beams, np.nan, np.float32)
         self.cache.newest.pop(SCAN, None)
 
     def command(
         self, stamp_ns: int | None, command: ArrayLike, arrival_ns: int | None = None
     ) -> bool:
-        """Notes a command (C,) that was sent to the robot; says whether it was used.
+        """Takes a command (C,) that was sent to the robot; True if it was used.
 
         Args:
-            stamp_ns: when it was sent [ns]; when None, at the stamp of the newest datum, and
+            stamp_ns: when it was sent [ns]; if None, at the stamp of the newest datum, and
                 after every earlier command without a stamp.
             command: in the units and the order of the RobotSpec.
-            arrival_ns: when it came [ns]; None for one's own, whose stamp needs no check.
+            arrival_ns: when it arrived [ns]; None for own commands, whose stamps need no check.
         """
         if stamp_ns is None:
             stamp_ns = max(self.newest_ns or self._start_ns, self._unstamped_ns + 1)
@@ -101,7 +101,7 @@ class Middleware:
         elif not np.isfinite(value).all():
             reason = NOT_FINITE
         else:
-            # Whatever its stamp, the robot follows it: the clock may have been set meanwhile.
+            # The robot follows it whatever its stamp: the clock may have been set meanwhile.
             self._commanded = value
         reason = reason or self._stamps.fault(stamp_ns, arrival_ns)
         reason = reason or self._timeline.command(stamp_ns, value)
@@ -111,11 +111,11 @@ class Middleware:
         return True
 
     def foresee(self, stamp_ns: int) -> None:
-        """Prepares for an odometry of a stamp [ns], the next that is expected."""
+        """Prepares for the next expected odometry, of a stamp [ns]."""
         self.estimator.foresee(stamp_ns)
 
     def scan(self, stamp_ns: int, arrival_ns: int, ranges: NDArray[np.float32]) -> bool:
-        """Takes a scan (B,); says whether it was used. Of scans only the newest counts."""
+        """Takes a scan (B,); True if it was used. Only the newest scan is kept."""
         fault = self._stamps.fault(stamp_ns, arrival_ns)
         if ranges.shape != (self._beams,):
             fault = f"shape {ranges.shape}, not ({self._beams},)"
@@ -128,10 +128,10 @@ class Middleware:
         return True
 
     def odometry(self, stamp_ns: int, arrival_ns: int, pose: ArrayLike, twist: ArrayLike) -> bool:
-        """Takes an odometry: pose (3,) in `odom`, body twist (3,); says whether it was taken.
+        """Takes an odometry: pose (3,) in `odom`, body twist (3,); True if it was accepted.
 
-        The twist corrects the estimate; the pose, which drifts, tells how far the robot came
-        where nothing else does: while its clock was set, or it was not heard.
+        The twist corrects the estimate. The pose, which drifts, only bridges motion for which
+        there are no other data: when the clock was set, or after a loss of data.
         """
         value = np.array(pose, dtype=np.float64), np.array(twist, dtype=np.float64)
         if not (np.isfinite(value[0]).all() and np.isfinite(value[1]).all()):
@@ -142,7 +142,7 @@ class Middleware:
             return False
         told = Told(stamp_ns, arrival_ns, *value)
         if stamp_ns == self._start_ns and ODOM not in self.cache.newest:
-            # That of a reset tells nothing new of a robot that stands at a known pose.
+            # At a reset the pose is known: the odometry of that time adds nothing.
             self._timeline.anchor(value[0])
         elif self._trail.contradicts(told):
             self._follow_clock(told)
@@ -154,7 +154,7 @@ class Middleware:
         return True
 
     def _measure_odometry(self, told: Told, value: tuple[Array, Array]) -> bool:
-        """Says whether it was taken; where its clock was set, goes on from it."""
+        """Measures an odometry; True if accepted. Continues from it if the clock was set."""
         measurement = Measurement(Kind.TWIST, told.twist, odom=told.pose)
         reason = self._measure(told.stamp_ns, told.arrival_ns, measurement, value)
         if not reason:
@@ -173,13 +173,13 @@ class Middleware:
         pose: ArrayLike,
         covariance: ArrayLike | None = None,
     ) -> bool:
-        """Takes a measured pose, as of motion capture or AMCL; says whether it was taken.
+        """Takes a measured pose, such as from motion capture or AMCL; True if it was accepted.
 
         Args:
             stamp_ns: when it was measured [ns].
-            arrival_ns: when it came [ns].
+            arrival_ns: when it arrived [ns].
             pose: (3,) x [m], y [m], heading [rad] in `map`.
-            covariance: (3, 3) of it; the model's pose noise when None or all zeros.
+            covariance: (3, 3) of the pose; the model's pose noise if None or all zeros.
         """
         value = np.array(pose, dtype=np.float64)
         return self._optional(Kind.POSE, stamp_ns, arrival_ns, value, covariance, LEAST_POSE_STD)
@@ -187,13 +187,13 @@ class Middleware:
     def imu(
         self, stamp_ns: int, arrival_ns: int, yaw_rate: float, variance: float | None = None
     ) -> bool:
-        """Takes a yaw rate [rad/s] of a gyro; says whether it was taken.
+        """Takes a yaw rate [rad/s] of a gyro; True if it was accepted.
 
         Args:
             stamp_ns: when it was measured [ns].
-            arrival_ns: when it came [ns].
+            arrival_ns: when it arrived [ns].
             yaw_rate: about the upward axis, counter-clockwise [rad/s].
-            variance: of it [rad^2/s^2]; that of a cheap gyro when None or zero.
+            variance: of the yaw rate [rad^2/s^2]; that of a cheap gyro if None or zero.
         """
         value = np.array([yaw_rate], dtype=np.float64)
         covariance = None if variance is None else [[variance]]
@@ -209,7 +209,7 @@ class Middleware:
         covariance: ArrayLike | None,
         least_std: float,
     ) -> bool:
-        """Takes a measurement that came with its own covariance; says whether it was taken."""
+        """Takes a measurement that came with its own covariance; True if it was accepted."""
         if not np.isfinite(value).all():
             self.cache.reject(f"{kind.topic}: {NOT_FINITE}")
             return False
@@ -221,7 +221,7 @@ class Middleware:
         return not self._measure(stamp_ns, arrival_ns, Measurement(kind, value, noise), value)
 
     def _measure(self, stamp_ns: int, arrival_ns: int, measurement: Measurement, kept: Any) -> str:
-        """Returns why a measurement can not be used, or nothing."""
+        """Takes a measurement; returns the reason if it cannot be used, or an empty string."""
         topic = measurement.kind.topic
         fault = self._stamps.fault(stamp_ns, arrival_ns)
         reason = fault or self._timeline.measure(stamp_ns, measurement)
@@ -233,10 +233,10 @@ class Middleware:
         return reason
 
     def _follow_clock(self, told: Told) -> None:
-        """Goes on from an odometry to whose stamp the clock was set.
+        """Continues from an odometry to whose stamp the clock was set.
 
-        From the pose of the last odometry that was used, by as much as odometry says that the
-        robot has driven since; where it does not say so, the robot may be anywhere within reach.
+        Starts at the estimate after the last used odometry and adds the motion that odometry
+        shows since; if odometry is not continuous, the robot may be anywhere within reach.
         """
         seconds, continuous = self._trail.seconds(told), self._trail.continuous(told)
         self.estimator.lose(told.stamp_ns, seconds, continuous, self._commanded)
@@ -249,11 +249,11 @@ class Middleware:
 
     @property
     def newest_ns(self) -> int | None:
-        """Stamp of the newest datum of all topics [ns]; None when there is none."""
+        """Stamp of the newest datum of all topics [ns]; None if there is none."""
         return max((datum.stamp_ns for datum in self.cache.newest.values()), default=None)
 
     def view(self, now_ns: int) -> RobotView:
-        """What is known about the robot at a time; NaN ranges before the first scan."""
+        """Returns the view of the robot at a time; NaN ranges before the first scan."""
         pose, twist = self.estimator.at(now_ns)
         scan, newest_ns = self.cache.newest.get(SCAN), self.newest_ns
         return RobotView(
@@ -266,7 +266,7 @@ class Middleware:
         )
 
     def health(self, arrival_ns: int) -> Health:
-        """How well the robot is heard, at a time of the receiver's clock [ns]."""
+        """Returns the health of all topics at a time of the receiver's clock [ns]."""
         cache, outcomes = self.cache, self._timeline.outcomes()
         distances = {kind.topic: d for kind, d in self._timeline.distances().items()}
         topics = {
@@ -291,9 +291,9 @@ class Middleware:
 
 
 def rehearse(model: SimulatorModel) -> RobotView:
-    """Runs a middleware through two periods of a robot that stands still; its last view.
+    """Runs a middleware through two periods of a robot at rest; returns its last view.
 
-    Nothing then remains to be compiled while the robot moves: that can take seconds.
+    This compiles everything beforehand, which could take seconds while the robot moves.
     """
     middleware, period_ns = Middleware(model), round(model.control_period * 1e9)
     middleware.reset(0, np.zeros(3))

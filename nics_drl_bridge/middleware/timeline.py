@@ -1,4 +1,4 @@
-"""Late data count as if they had come in time: the last second of the filter, to be re-run."""
+"""Replay of late data: the last second of the filter is kept and re-run with them in order."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.measurement import Kind, Measurement, Outcome, Verdict
 
 HISTORY_NS = 1_000_000_000
-"""So long [ns] the past may still change."""
+"""Length of the past that may still change [ns]."""
 BEFORE_START = "not after the reset"
 TOO_OLD = f"older than {HISTORY_NS * 1e-9:g} s"
 DUPLICATE = "duplicate"
@@ -25,7 +25,7 @@ Moment = tuple[int, int]
 
 @dataclass(slots=True)
 class _Entry:
-    """A measurement, what was made of it, and what the filter held after it."""
+    """A measurement, its verdict, and the state of the filter after it."""
 
     moment: Moment
     measurement: Measurement | None
@@ -34,15 +34,15 @@ class _Entry:
 
 
 class Timeline:
-    """Puts measurements and commands in the order of their stamps and feeds the estimator.
+    """Feeds measurements and commands to the estimator in the order of their stamps.
 
-    A late one is put where it belongs, and the filter is run again from before it. The same
-    arithmetic is done as if it had come in time, so that the result is the same to the bit, as
-    long as nothing is later than `HISTORY_NS`. Going back to a snapshot of the filter is the idea
-    of robot_localization's `smooth_lagged_data`.
+    A late one is inserted at its time, and the filter is re-run from before it. The arithmetic is
+    the same as if it had arrived in time, so the result is bit-identical, unless something is
+    later than `HISTORY_NS`. Going back to a snapshot of the filter is the idea of
+    robot_localization's `smooth_lagged_data`.
 
     Args:
-        estimator: to feed; nobody else may.
+        estimator: to feed; it must not be fed otherwise.
     """
 
     def __init__(self, estimator: Estimator) -> None:
@@ -51,7 +51,7 @@ class Timeline:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the past; begins with what the estimator holds."""
+        """Forgets the past; begins with the present state of the estimator."""
         self._start_ns = self._estimator.time_ns
         self._past: Counter[tuple[Kind, Outcome]] = Counter()
         self._distances: dict[Kind, float] = {}
@@ -66,15 +66,15 @@ class Timeline:
         return self._entries[-1].moment[0]
 
     def anchor(self, odom: NDArray[np.float64]) -> None:
-        """Notes the pose (3,) in `odom` of the start, if nothing was measured since."""
+        """Records the pose (3,) in `odom` of the start, if nothing was measured since."""
         if len(self._entries) == 1:
             self._estimator.anchor(odom)
             self._entries[0].belief = self._estimator.belief
 
     def measure(self, stamp_ns: int, measurement: Measurement) -> str:
-        """Takes a measurement; returns why it can not be used, or nothing.
+        """Takes a measurement; returns the reason if it cannot be used, or an empty string.
 
-        What the gate says of it does not count here: that may change with what is still to come.
+        The verdict of the gate is no such reason: it may change with data still to come.
         """
         moment = (stamp_ns, measurement.kind)
         if moment > self._entries[-1].moment and stamp_ns > self._start_ns:
@@ -89,7 +89,7 @@ class Timeline:
         return ""
 
     def command(self, stamp_ns: int, command: ArrayLike) -> str:
-        """Takes a command (C,); returns why it can not be used, or nothing."""
+        """Takes a command (C,); returns the reason if it cannot be used, or an empty string."""
         if stamp_ns < self._start_ns:
             return BEFORE_START
         effective_ns = self._estimator.effective_ns(stamp_ns)
@@ -105,7 +105,7 @@ class Timeline:
         return ""
 
     def outcomes(self) -> Mapping[tuple[Kind, Outcome], int]:
-        """How many measurements of each kind had each outcome."""
+        """Returns the number of measurements by kind and outcome."""
         recent = Counter(
             (entry.measurement.kind, entry.verdict.outcome)
             for entry in self._entries
@@ -114,7 +114,7 @@ class Timeline:
         return self._past + recent
 
     def distances(self) -> Mapping[Kind, float]:
-        """Squared, normalised innovation of the newest measurement of each kind."""
+        """Returns the squared, normalised innovation of the newest measurement of each kind."""
         return self._distances | {
             entry.measurement.kind: entry.verdict.distance
             for entry in self._entries
@@ -122,7 +122,7 @@ class Timeline:
         }
 
     def _place(self, moment: Moment) -> tuple[int, str]:
-        """Where a late measurement belongs, or why it can not be used."""
+        """Returns the place of a late measurement, or the reason if it cannot be used."""
         if moment[0] <= self._start_ns:
             return 0, BEFORE_START
         if moment[0] < self.newest_ns - HISTORY_NS:
@@ -140,7 +140,7 @@ class Timeline:
         return _Entry(moment, measurement, verdict, self._estimator.belief)
 
     def _rerun(self, place: int) -> None:
-        """Runs the filter again over all entries from a place on."""
+        """Re-runs the filter over all entries from a place on."""
         self._estimator.belief = self._entries[place - 1].belief
         for index in range(place, len(self._entries)):
             entry = self._entries[index]
@@ -149,7 +149,7 @@ class Timeline:
         self.replayed += 1
 
     def _forget(self) -> None:
-        """Drops what can not change any more, but for the last belief before it."""
+        """Drops entries that can no longer change, except the last one before the history."""
         needed_ns = self.newest_ns - HISTORY_NS
         while self._entries[1].moment[0] < needed_ns:
             entry = self._entries.popleft()

@@ -1,4 +1,4 @@
-"""The backends over ROS 2, by the way time runs.
+"""Backends over ROS 2, for lock-step and real time.
 
 FleetBackend: several robots of one simulator behind ROS 2 topics, each in its namespace.
 """
@@ -26,19 +26,22 @@ MODES = {"lockstep": DdsBackend, "realtime": RealtimeBackend}
 def dds_backend(
     model: SimulatorModel, world: World, mode: str = "lockstep", robots: int = 1, **options: Any
 ) -> Backend:
-    """A robot behind ROS 2 topics, or a team in lock-step, see `FleetBackend`.
+    """Returns the backend of a robot behind ROS 2 topics, or of a team in lock-step.
+
+    For a team it is a `FleetBackend`.
 
     Args:
         model: of the robot.
-        world: that it stands in.
+        world: of the robot.
         mode: `lockstep` with a simulator node, see `DdsBackend`; or `realtime` with one or with a
             vehicle, see `RealtimeBackend`.
-        robots: how many; their `namespaces` are robot1, robot2, ... unless given as an option.
-        options: of that class.
+        robots: number of robots; their `namespaces` are robot1, robot2, ... unless given as an
+            option.
+        options: of the chosen class.
 
     Raises:
-        ConfigError: no such mode, or not for a team.
-        BackendError: nobody is there.
+        ConfigError: there is no such mode, or not for a team.
+        BackendError: no peer is there.
     """
     if mode not in MODES:
         raise ConfigError(f"backend_options: there is no mode {mode!r}; {nearest(mode, MODES)}")
@@ -66,14 +69,14 @@ Array = NDArray[np.float64]
 class FleetBackend:
     """M robots in lock-step with one simulator node, which moves when all have their commands.
 
-    Views and commands have a leading (M,). Each robot is a `DdsBackend` of its own.
+    Views and commands have a leading (M,). Each robot has its own `DdsBackend`.
 
     Args:
         model: of every robot; must be the one that the simulator node runs.
         world: likewise.
         namespaces: of the robots, in the order of its parameter `robots`.
         simulator: full name of the simulator's node.
-        options: further ones of every DdsBackend.
+        options: further options of each DdsBackend.
 
     Raises:
         BackendError: no simulator is there, or a robot is missing.
@@ -101,7 +104,7 @@ class FleetBackend:
             raise
 
     def reset(self, start: Start) -> RobotView:
-        """Begins one episode for all, at poses (M, 3); see `DdsBackend.reset`."""
+        """Begins one episode for all robots, at poses (M, 3); see `DdsBackend.reset`."""
         leader = self._robots[0]
         with self._zero_after_an_error():
             leader.choose(start)
@@ -126,20 +129,20 @@ class FleetBackend:
             raise
 
     def halt(self) -> None:
-        """Publishes a zero command for each robot, whatever one of them raises."""
+        """Publishes a zero command for each robot, even if one of them raises."""
         with ExitStack() as each:
             for robot in self._robots:
                 each.callback(robot.halt)
 
     def close(self) -> None:
-        """Publishes a zero command for each robot and ends the nodes, whatever one raises."""
+        """Publishes a zero command for each robot and ends the nodes, even if one raises."""
         with ExitStack() as each:
             for robot in self._robots:
                 each.callback(robot.close)
 
 
 def together(facts: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Facts of M robots as one: what is the same for all as it is, else stacked to (M, ...)."""
+    """Merges the facts of M robots: equal values stay as they are, others become (M, ...)."""
     return {
         name: value
         if all(np.array_equal(value, each[name]) for each in facts)

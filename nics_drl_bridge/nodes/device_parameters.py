@@ -1,6 +1,6 @@
-"""Parameters of a device node: what it simulates, how its time runs, and how it tells of it.
+"""Parameters of a device node: simulated devices, timing, frames and episodes.
 
-How often a device publishes, when its world moves in steps of its own.
+Pacing of a device's topics while its world moves in its own steps.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 
 @dataclass(frozen=True)
 class Timing:
-    """How the time of a device runs; lock-step is exact, without any of the delays.
+    """Timing of a device; lock-step is exact, without any of the delays.
 
     Attributes:
         mode: one of `MODES`.
         rate: simulated seconds per second in realtime.
-        step_ns: by which the world moves.
+        step_ns: step of the world.
         odom_ns: between two odometries.
         scan_ns: between two scans.
-        scan_late_ns: least delay from a scan's measurement until it is told, and how much more the
-            greatest is.
-        odom_late_ns: the same of odometry.
+        scan_late_ns: least delay from a scan's measurement to its publication, and greatest
+            additional delay.
+        odom_late_ns: the same for odometry.
     """
 
     mode: str
@@ -54,12 +54,12 @@ class Timing:
 
     @property
     def lockstep(self) -> bool:
-        """Whether the world waits for commands."""
+        """True if the world waits for commands."""
         return self.mode == LOCKSTEP
 
     @property
     def late(self) -> bool:
-        """Whether anything is told later than it was measured."""
+        """True if anything is published later than it was measured."""
         return any((*self.scan_late_ns, *self.odom_late_ns))
 
 
@@ -74,8 +74,8 @@ class Frames:
 
 
 def declare_device(node: Node, laser_frame: str) -> None:
-    """Declares all but what belongs to the kind of simulator, and checks what can be set later."""
-    # First, so that it also judges the values that the node is started with.
+    """Declares all but the parameters of one kind of simulator, and checks later changes."""
+    # First, so that it also checks the values that the node is started with.
     node.add_on_set_parameters_callback(_check_episode)
     world = "World file, or the name of a shipped world."
     declare(node, "world", "arena", world, read_only=True)
@@ -121,7 +121,7 @@ def _declare_time(node: Node) -> None:
 
 
 def timing(node: Node, model: SimulatorModel) -> Timing:
-    """How time runs, as the parameters say; in lock-step as the model alone says."""
+    """Returns the timing given by the parameters; in lock-step, by the model alone."""
     mode = choice(node, "mode", MODES)
     value = {
         name: float(node.get_parameter(name).value or 0.0)
@@ -140,7 +140,7 @@ def timing(node: Node, model: SimulatorModel) -> Timing:
 
 
 def _late_ns(node: Node, topic: str, model: SimulatorModel) -> tuple[int, int]:
-    """The least delay of a topic and its jitter [ns]: as asked for, else as the model has them."""
+    """Returns least delay and jitter of a topic [ns]: as requested, otherwise as in the model."""
     own = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
     asked = (
         float(node.get_parameter(name).value or 0.0)
@@ -154,7 +154,7 @@ def _late_ns(node: Node, topic: str, model: SimulatorModel) -> tuple[int, int]:
 
 
 def timed_model(node: Node, model: SimulatorModel, time: Timing) -> SimulatorModel:
-    """The model with the step that the world moves by and the latency that was asked for."""
+    """Returns the model with the step of the world and the requested latency."""
     latency = float(node.get_parameter("command_latency").value or 0.0)
     if time.lockstep:
         return model
@@ -167,7 +167,7 @@ def timed_model(node: Node, model: SimulatorModel, time: Timing) -> SimulatorMod
 
 
 def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
-    """A parameter that must be one of some words. Raises ConfigError with the nearest."""
+    """Returns a parameter that must be one of some words. Raises ConfigError with the nearest."""
     value = str(node.get_parameter(name).value)
     if value not in valid:
         raise ConfigError(f"parameter {name!r}: unknown value {value!r}; {nearest(value, valid)}")
@@ -175,7 +175,7 @@ def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
 
 
 def namespaces(node: Node) -> tuple[str, ...]:
-    """The namespace of each robot below the node's own; one empty name for a robot alone.
+    """Returns the namespace of each robot below the node's own; one empty name for a single robot.
 
     Raises:
         ConfigError: `robots` is neither a count nor a list of different names.
@@ -194,12 +194,12 @@ def namespaces(node: Node) -> tuple[str, ...]:
 
 
 def default_namespaces(robots: int) -> tuple[str, ...]:
-    """Of so many robots: robot1, robot2, ..."""
+    """Returns the default namespaces of several robots: robot1, robot2, ..."""
     return tuple(f"robot{k + 1}" for k in range(robots))
 
 
 def frames(node: Node, namespace: str) -> Frames:
-    """The frames of a robot: those of a fleet begin with its namespace, but for the shared map."""
+    """Returns the frames of a robot; those of a fleet begin with its namespace, except the map."""
     prefix = str(node.get_parameter("frame_prefix").value) + (f"{namespace}/" if namespace else "")
     name = {
         each: str(node.get_parameter(f"{each}_frame").value)
@@ -223,17 +223,17 @@ def _check_episode(parameters: list[Parameter]) -> SetParametersResult:
 
 
 SLACK = 0.1
-"""A step may be made earlier by this share of it, because a timer is no better."""
+"""A step may be early by this share of it, because timers are no more precise."""
 PATIENCE_NS = NS_PER_S // 2
-"""Steps that were missed for longer are not made up for."""
+"""Steps missed for longer than this are not made up for [ns]."""
 
 
 class Pace:
-    """Says when a topic is due, so that its mean rate is the asked one, whatever the steps.
+    """Decides when a topic is due, so that its mean rate is the requested one with any step.
 
     Args:
         period_ns: between two messages.
-        step_ns: between two looks; where it divides the period, the messages are regular.
+        step_ns: between two calls of `due`; if it divides the period, the messages are regular.
     """
 
     def __init__(self, period_ns: int, step_ns: int) -> None:
@@ -241,11 +241,11 @@ class Pace:
         self._next_ns = 0
 
     def begin(self, now_ns: int) -> None:
-        """Begins anew: the next message is due now."""
+        """Starts anew: the next message is due now."""
         self._next_ns = now_ns
 
     def due(self, now_ns: int) -> bool:
-        """Whether a message is due at a time; if so, it counts as sent."""
+        """True if a message is due at a time; it then counts as sent."""
         if now_ns + self._slack_ns < self._next_ns:
             return False
         self._next_ns += self._period_ns
@@ -253,23 +253,23 @@ class Pace:
 
 
 def common_step(dt: float, periods: tuple[float, ...]) -> int:
-    """The longest step, in steps of the model, that meets all periods as well as it can.
+    """Returns the longest step, in steps of the model, that suits all periods as well as possible.
 
     Args:
         dt: step of the model [s].
-        periods: of what is published [s].
+        periods: of the published topics [s].
 
     Returns:
-        Steps of the model: a divisor of all periods where `dt` divides them.
+        Steps of the model: a divisor of all periods if `dt` divides them.
     """
     return math.gcd(*(max(1, round(period / dt)) for period in periods))
 
 
 class RealTime:
-    """Says how many steps the world is behind the steady clock.
+    """Tracks by how many steps the world is behind the steady clock.
 
     Args:
-        step_ns: by which the world moves.
+        step_ns: step of the world.
         rate: simulated seconds per second.
     """
 
@@ -278,19 +278,19 @@ class RealTime:
         self._began_ns = self._then_ns = 0
 
     def begin(self, steady_ns: int, now_ns: int) -> None:
-        """Both clocks stand at these times together."""
+        """Aligns a time of the steady clock with a simulated time."""
         self._began_ns, self._then_ns = steady_ns, now_ns
 
     def time_at(self, steady_ns: int) -> int:
-        """The simulated time [ns] at a time of the steady clock."""
+        """Returns the simulated time [ns] at a time of the steady clock."""
         return self._then_ns + int((steady_ns - self._began_ns) * self._rate)
 
     def behind(self, steady_ns: int, now_ns: int) -> int:
-        """Steps to make at a time of the steady clock, for a world that stands at `now_ns`."""
+        """Returns the steps due at a time of the steady clock, for a world at `now_ns`."""
         missing_ns = self.time_at(steady_ns) - now_ns
         return max(0, int((missing_ns + SLACK * self._step_ns) // self._step_ns))
 
     def lost(self, steady_ns: int, now_ns: int) -> bool:
-        """Whether the world is so far behind that it can't be in real time any more."""
+        """True if the world is too far behind to catch up with real time."""
         late_ns = self.time_at(steady_ns) - now_ns - self._step_ns
         return late_ns > PATIENCE_NS * self._rate

@@ -1,10 +1,10 @@
-"""RobotPort: what one simulated robot tells, written into messages that are there already.
+"""RobotPort: the data of one simulated robot, written into prepared messages.
 
-CommandInlet: the commands of one robot, in whatever message they come.
+CommandInlet: the commands of one robot, in any supported message.
 
-Outbox: what a device measured at one time and tells at a later one.
+Outbox: messages that a device publishes later than it measured them.
 
-Transforms of a device: `/tf` and `/tf_static`, where the message package is there.
+Transforms of a device: `/tf` and `/tf_static`, if the message package is installed.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ DIAGONAL = np.arange(0, 36, 7)
 class RobotPort:
     """Publishes `scan`, `odom`, `joint_states` and `ground_truth` of one robot.
 
-    The last two cost nothing while nobody listens.
+    The last two cost nothing without subscribers.
 
     Args:
         node: that publishes.
         namespace: of the robot below the node's, empty or with a slash at its end.
         model: of the robot.
         frames: of the robot.
-        time: how it runs.
+        time: timing of the device.
     """
 
     def __init__(
@@ -75,21 +75,21 @@ class RobotPort:
             self._moving.append(transform_message(frames.map, frames.odom))
 
     def mount(self) -> TransformStamped:
-        """base_link -> laser."""
+        """Returns the transform base_link -> laser."""
         message = transform_message(self.frames.base, self.frames.laser)
         return fill(message, self._model.lidar.mount, Time())
 
     def moving(self, now: Time, sensed: Sensed) -> list[TransformStamped]:
-        """Odom -> base_link; and map -> odom where that was asked for."""
+        """Returns the transforms odom -> base_link, and map -> odom if requested."""
         fill(self._moving[0], sensed.odom, now)
         for message in self._moving[1:]:
-            # That which takes the pose by odometry to the true one.
+            # The transform from the odometry pose to the true one.
             home = geometry.between(sensed.odom, np.zeros(3))
             fill(message, geometry.compose(sensed.pose, home), now)
         return self._moving
 
     def tell_odometry(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
-        """Publishes where the robot takes itself to be, and what only a simulator knows."""
+        """Publishes odometry, and joints and true pose if they have subscribers."""
         late_ns = self._time.odom_late_ns
         odometry = self._odom.write(now_ns, sensed.odom, sensed.twist, sensed.covariance)
         outbox.send(self._odoms, odometry, now_ns, late_ns)
@@ -100,14 +100,14 @@ class RobotPort:
             self._truths.publish(self._truth.write(now_ns, sensed.pose, sensed.true_twist))
 
     def tell_scan(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
-        """Publishes what the robot's lidar sees, stamped with the time of beam 0."""
+        """Publishes the robot's scan, stamped with the time of beam 0."""
         ranges = to_device(sensed.ranges, self._model.lidar)
         message = self._scan.write(now_ns - self._sweep_ns, ranges)
         outbox.send(self._scans, message, now_ns, self._time.scan_late_ns)
 
 
 def scan_message(model: SimulatorModel, frame: str, time: Timing) -> LaserScan:
-    """A scan whose ranges and stamp are still to be filled in."""
+    """Returns a scan whose ranges and stamp are still to be filled in."""
     free = np.full(model.lidar.beams, np.inf, np.float32)
     message = conversions.scan_to_ros(model.lidar, free, 0, frame)
     message.scan_time = time.scan_ns / NS_PER_S
@@ -115,12 +115,12 @@ def scan_message(model: SimulatorModel, frame: str, time: Timing) -> LaserScan:
 
 
 def odometry_message(frames: Frames) -> Odometry:
-    """An odometry whose numbers are still to be filled in; what a plane lacks is unknown."""
+    """Returns an odometry to be filled in; its out-of-plane values are marked as unknown."""
     return _planar_message(frames.odom, frames.base)
 
 
 def truth_message(frames: Frames) -> Odometry:
-    """The same of what is exact."""
+    """Returns the same for the exact pose and twist."""
     message = _planar_message(frames.map, frames.base)
     for covariance in (message.pose.covariance, message.twist.covariance):
         covariance[DIAGONAL[PLANAR]] = LEAST_VARIANCE
@@ -138,23 +138,23 @@ def _planar_message(parent: str, child: str) -> Odometry:
 Array = NDArray[np.float64]
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 SWITCH = {STAMPED: "enable_stamped_cmd_vel:=false", TWIST: "enable_stamped_cmd_vel:=true"}
-"""What to set to hear the other type than this one."""
+"""By the expected type: the setting that selects the other type."""
 QUIET_S = 5.0
 
 
 class CommandInlet:
-    """Listens to `cmd_vel`, and to `ackermann_cmd` where the robot steers and the message exists.
+    """Listens to `cmd_vel`, and to `ackermann_cmd` if the robot steers and the message exists.
 
-    A stamped command is judged as ros2_control's drive controllers do: a stamp of zero counts as
-    now, and one that is older than the command timeout is ignored.
+    A stamped command is treated as by ros2_control's drive controllers: a stamp of zero counts as
+    now, and a command older than the command timeout is ignored.
 
     Args:
-        node: that listens; its parameter `enable_stamped_cmd_vel` says to which type.
+        node: that listens; its parameter `enable_stamped_cmd_vel` selects the type.
         namespace: of the robot below the node's, empty or with a slash at its end.
-        robot: what commands mean.
+        robot: defines the commands.
         quality: of the subscriptions.
-        take: is given each command (C,).
-        too_old: whether a stamp [ns] is too old to be obeyed.
+        take: called with each command (C,).
+        too_old: returns whether a stamp [ns] is too old to be obeyed.
     """
 
     def __init__(
@@ -182,7 +182,7 @@ class CommandInlet:
         try:
             kind = import_module("ackermann_msgs.msg").AckermannDriveStamped
         except ModuleNotFoundError:
-            return  # an option of those who have it
+            return  # an optional package
         self._node.create_subscription(kind, topic, self._on_ackermann, quality)
 
     def _on_bytes(self, content: bytes) -> None:
@@ -224,7 +224,7 @@ class CommandInlet:
         self._node.get_logger().warning(f"{self._topic}: {what}", throttle_duration_sec=QUIET_S)
 
     def watch(self) -> None:
-        """Warns once of each node that publishes the other type, which is never heard."""
+        """Warns once of each node that publishes the other type, which is never received."""
         for end in self._node.get_publishers_info_by_topic(self._topic):
             kind, who = end.topic_type, owner(end)
             if kind == self._kind or who is None or f"{who} {kind}" in self._warned:
@@ -238,19 +238,19 @@ class CommandInlet:
 
 
 def steering_of(robot: RobotSpec) -> tuple[int, int] | None:
-    """Which commands are speed [m/s] and steering angle [rad]; None where the robot has others."""
+    """Returns the indices of speed [m/s] and steering angle [rad]; None for other commands."""
     units = [variable.unit for variable in robot.command]
     return (units.index("m/s"), units.index("rad")) if sorted(units) == ["m/s", "rad"] else None
 
 
 class Outbox:
-    """Publishes messages a latency and a jitter after they were made, each topic in order.
+    """Publishes messages after a latency and a jitter, each topic in order.
 
-    Without either a message goes out at once. Otherwise its bytes are kept, so that whoever made
-    it may use it again.
+    Without either, a message is published at once. Otherwise its bytes are kept, so that the
+    caller may reuse it.
 
     Args:
-        seed: of the draws of the jitter.
+        seed: of the random jitter.
     """
 
     def __init__(self, seed: int = 0) -> None:
@@ -262,13 +262,13 @@ class Outbox:
     def send(
         self, publisher: Publisher, message: Any, now_ns: int, late_ns: tuple[int, int]
     ) -> None:
-        """Publishes a message now, or notes when to.
+        """Publishes a message now, or schedules it.
 
         Args:
             publisher: to publish with.
             message: to publish, or its bytes.
-            now_ns: the present.
-            late_ns: least delay, and the greatest further one, drawn evenly for each message.
+            now_ns: present time.
+            late_ns: least delay, and greatest additional one, drawn uniformly for each message.
         """
         delay, jitter = late_ns
         if jitter:
@@ -288,7 +288,7 @@ class Outbox:
             publisher.publish(content)
 
     def clear(self) -> None:
-        """Forgets what waits: it was of an episode that is over."""
+        """Drops the waiting messages: they are from an episode that is over."""
         self._waiting.clear()
         self._latest.clear()
 
@@ -300,7 +300,7 @@ MISSING = (
 
 
 def transform_message(parent: str, child: str) -> TransformStamped:
-    """A transform between two frames that is still to be filled in."""
+    """Returns a transform between two frames that is still to be filled in."""
     message = TransformStamped(child_frame_id=child)
     message.header.frame_id = parent
     return message
@@ -316,7 +316,7 @@ def fill(message: TransformStamped, pose: ArrayLike, stamp: Any) -> TransformSta
 
 
 class Transforms:
-    """Publishes transforms; says once, in the log, why it does not.
+    """Publishes transforms; if it can't, it logs the reason once.
 
     Args:
         node: that publishes.
@@ -335,11 +335,11 @@ class Transforms:
 
     @property
     def published(self) -> bool:
-        """Whether there is anybody to publish."""
+        """True if transforms are published."""
         return self._moving is not None
 
     def tell_fixed(self, transforms: list[TransformStamped]) -> None:
-        """Publishes, once, what never changes; who comes later gets it too."""
+        """Publishes once what never changes; late joiners get it, too."""
         if self.published:
             self._fixed.publish(self._kind(transforms=transforms))
 
@@ -350,7 +350,7 @@ class Transforms:
         now_ns: int,
         late_ns: tuple[int, int],
     ) -> None:
-        """Publishes what changes, as late as the odometry that it comes from."""
+        """Publishes what changes, with the delay of the odometry that it comes from."""
         if self.published:
             self._message.transforms = transforms
             outbox.send(self._moving, self._message, now_ns, late_ns)

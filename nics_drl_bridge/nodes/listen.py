@@ -1,4 +1,4 @@
-"""Listens to a live robot for a while and collects what `report.doctor` judges."""
+"""Collection of facts about a live robot, by listening, for `report.doctor`."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ QUEUE = 100
 ANY_PUBLISHER = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=QUEUE, reliability=ReliabilityPolicy.BEST_EFFORT
 )
-"""Matches whatever is offered, so that a topic is never silent for the doctor's own sake."""
+"""Matches any offer, so that a topic is never silent because of the doctor."""
 
 
 def listen(seconds: float, namespace: str = "", domain_id: int | None = None) -> Facts:
-    """Hears a robot without sending anything.
+    """Listens to a robot without sending anything.
 
     Args:
-        seconds: how long, from the first message on; nobody is waited for longer than 10 s.
+        seconds: duration from the first message on, which is awaited for at most 10 s.
         namespace: of the robot.
         domain_id: DDS domain; the environment's by default.
     """
@@ -60,7 +60,7 @@ def listen(seconds: float, namespace: str = "", domain_id: int | None = None) ->
 
 
 def _look(node: Node, facts: Facts, subscribed: set[str]) -> None:
-    """Who is there; subscribes to what is of a type that can be judged."""
+    """Notes the publishers and subscribers; subscribes to topics of types that can be judged."""
     for topic, kinds in node.get_topic_names_and_types():
         offers = node.get_publishers_info_by_topic(topic)
         asks = [i for i in node.get_subscriptions_info_by_topic(topic) if i.node_name != NAME]

@@ -1,6 +1,6 @@
-"""Witness: watches where a simulated robot really goes, from outside.
+"""Witness: observes the true motion of a simulated robot from outside.
 
-Beginning an episode in a simulator behind services.
+Start of episodes in a simulator behind services.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ ANSWER_S = 2.0
 
 
 class Witness(AbstractContextManager["Witness", None]):
-    """Collects `ground_truth` in a thread of its own; a context manager.
+    """Collects `ground_truth` in its own thread; a context manager.
 
     Args:
         domain_id: DDS domain.
@@ -67,17 +67,17 @@ class Witness(AbstractContextManager["Witness", None]):
 
     @property
     def path(self) -> NDArray[np.float64]:
-        """(T, 3) all poses so far."""
+        """All poses so far (T, 3)."""
         with self._changed:
             return np.array(self._poses).reshape(-1, 3)
 
     def sees(self, timeout_s: float) -> bool:
-        """Waits for a first pose; False after the time."""
+        """Waits for a first pose; False after the time [s]."""
         with self._changed:
             return self._changed.wait_for(lambda: bool(self._poses), timeout_s)
 
     def arrives(self, goal: ArrayLike, radius: float, timeout_s: float) -> bool:
-        """Waits until the robot has been within `radius` of a goal (2,); False after the time."""
+        """Waits until the robot is within `radius` of a goal (2,); False after the time [s]."""
         deadline = time.monotonic() + timeout_s
         goal = np.asarray(goal)
         with self._changed:
@@ -89,14 +89,14 @@ class Witness(AbstractContextManager["Witness", None]):
                 self._changed.wait(0.2)
 
     def arms(self, gate: str, timeout_s: float) -> str:
-        """Asks a gate to let commands pass, again and again until it does.
+        """Requests a gate to let commands pass, repeatedly until it does.
 
         Args:
             gate: name of the node.
-            timeout_s: for how long [s].
+            timeout_s: longest time to try [s].
 
         Returns:
-            Nothing, or the gate's last reason not to.
+            An empty string, or the gate's last reason to refuse.
         """
         answer = self._asked(f"{gate}/arm", timeout_s)
         return "" if answer.success else str(answer.message)
@@ -106,7 +106,7 @@ class Witness(AbstractContextManager["Witness", None]):
 
         Args:
             simulator: name of the node.
-            timeout_s: for how long [s].
+            timeout_s: longest time to try [s].
 
         Raises:
             BackendError: it does not answer.
@@ -117,7 +117,7 @@ class Witness(AbstractContextManager["Witness", None]):
         return bool(np.any(json.loads(answer.message)))
 
     def _asked(self, service: str, timeout_s: float) -> Trigger.Response:
-        """The first answer that is a success, else the last one."""
+        """Returns the first successful answer, otherwise the last one."""
         client = self._node.create_client(Trigger, service)
         answer = Trigger.Response(success=False, message=f"{service} does not answer")
         deadline = time.monotonic() + timeout_s
@@ -144,10 +144,10 @@ LOST_S = 1.0
 
 
 class Episodes:
-    """The services of a simulator node by which an episode begins.
+    """The services of a simulator node that begin an episode.
 
     Args:
-        link: to call by.
+        link: for the calls.
         simulator: name of the node.
         model: that it must run.
         world: likewise.
@@ -167,11 +167,11 @@ class Episodes:
 
     @property
     def there(self) -> bool:
-        """Whether a simulator offers them."""
+        """True if a simulator offers them."""
         return all(client.service_is_ready() for client in self.clients)
 
     def choose(self, start: Start, timeout_s: float) -> None:
-        """Says which episode the next `begin` begins. Raises BackendError if it is refused."""
+        """Chooses the episode for the next `begin`. Raises BackendError if it is refused."""
         request = SetParametersAtomically.Request()
         request.parameters = [
             Parameter("episode_seed", value=int(start.seed)).to_parameter_msg(),
@@ -183,9 +183,9 @@ class Episodes:
             raise BackendError(f"the simulator refused the episode: {result.reason}")
 
     def repeat(self) -> None:
-        """Asks for the present data again, without waiting; not while the last asking goes on.
+        """Requests the present data again, without waiting; not while the last request is pending.
 
-        An asking that gets no answer for long was lost itself, and is given up.
+        A request that stays unanswered was itself lost, and is dropped.
         """
         now, asked = time.monotonic(), self._repeating
         if asked is not None and not asked.done():
@@ -196,7 +196,7 @@ class Episodes:
             self._repeating, self._asked_s = self._repeat.call_async(Trigger.Request()), now
 
     def begin(self, timeout_s: float) -> int:
-        """Begins the chosen episode; the stamp of its first data [ns].
+        """Begins the chosen episode; returns the stamp of its first data [ns].
 
         Raises:
             BackendError: the simulator refuses, or does not answer.

@@ -1,6 +1,6 @@
 """record_node: drives a robot so that it shows its whole motion, and records it.
 
-The parameters of `record_node`.
+Parameters of `record_node`.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ Array = NDArray[np.float64]
 PATIENCE_S = 10.0
 POLL_S = 0.01
 HALT_S = 0.5
-"""Zero is repeated for so long: a robot that listens best effort may miss one."""
+"""Zero is repeated for this long [s]: a best-effort subscriber may miss one."""
 PERIOD_NS = round(PERIOD_S * NS_PER_S)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a drive ended.
+    """Result of a drive.
 
     Attributes:
-        complete: whether it went to its end.
-        failure: why it did not; None if it did, or if somebody interrupted it.
+        complete: whether it was completed.
+        failure: the reason if it was not; None if it was, or if it was interrupted.
         recording: what was saved; None if nothing was.
         line: one sentence about it.
     """
@@ -63,17 +63,17 @@ class Outcome:
 
 
 class RecordNode(QosWatch):
-    """Sends `cmd_vel` at 20 Hz, hears `odom`, `joint_states`, `imu`, `pose`, writes a recording.
+    """Sends `cmd_vel` at 20 Hz; writes `odom`, `joint_states`, `imu` and `pose` to a recording.
 
-    The circle lies around the place where the robot stands at the start; each segment of the
-    drive is chosen from where odometry says that the robot is. The drive ends with zero
-    commands, and also at a signal, at an error, when odometry is silent, and when the robot
-    leaves the circle; what was recorded until then is saved. Should this process be killed, only
-    the robot's own timeout on `cmd_vel` stops it.
+    The centre of the circle is the robot's place at the start; each segment of the drive is chosen
+    from the robot's position by odometry. The drive ends with zero commands, also on a signal, on
+    an error, when odometry is silent, and when the robot leaves the circle; what was recorded
+    until then is saved. If this process is killed, only the robot's own timeout on `cmd_vel` stops
+    it.
 
     Args:
-        context: to live in.
-        given: parameters, before those of the command line.
+        context: of the node.
+        given: parameters that override those of the command line.
     """
 
     def __init__(self, context: Context, given: Mapping[str, Any] | None = None) -> None:
@@ -96,14 +96,14 @@ class RecordNode(QosWatch):
         self._stamp_ns = 0
         self._pose: Array | None = None
         self._start: Array = np.zeros(3)
-        # Steady: what guards the robot must not depend on whose time the node follows.
+        # Steady: the robot's guard must not depend on the time source of the node.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(POLL_S, self._on_time, clock=steady)
 
     def _now_ns(self) -> int:
-        """Simulated time, or the system's when this began, continued by the steady clock [ns]."""
+        """Returns simulated time, or the system time at the start plus steady time [ns]."""
         if self._sim_time:
-            # Odometry may come in before the tick of /clock that it belongs to.
+            # Odometry may arrive before its tick of /clock.
             return max(int(self.get_clock().now().nanoseconds), self._stamp_ns)
         return self._steady_origin_ns + time.monotonic_ns()
 
@@ -130,7 +130,7 @@ class RecordNode(QosWatch):
             self._end(None, complete=True)
 
     def _ready(self) -> bool:
-        """Whether the robot listens and tells where it is; it is waited for 10 s."""
+        """True if the robot listens and reports its pose; raises BackendError after 10 s."""
         listeners = self._topic.get_subscription_count()
         if self._pose is not None and listeners > 0 and self._now_ns() > 0:
             others = self.count_publishers(self._topic.topic_name) - 1
@@ -154,27 +154,27 @@ class RecordNode(QosWatch):
         return False
 
     def _place(self, topic: str) -> str:
-        """Where a topic was looked for."""
+        """Returns a topic's full name, with namespace and domain, for messages."""
         return (
             f"{self.resolve_topic_name(topic)!r} (namespace {self.get_namespace()!r}, ROS domain "
             f"{self.context.get_domain_id()})"
         )
 
     def _go_on(self) -> None:
-        """Sends the command that is due, if one is."""
+        """Sends the command if one is due."""
         self._guard()
         due = (self._now_ns() - self._origin_ns) // PERIOD_NS + 1 - self._ticks
         if due <= 0:
             return
         if self._ticks < STILL_S / PERIOD_S <= self._ticks + due:
             self._log.check()
-        for _ in range(due):  # more than one where time goes on in greater steps
+        for _ in range(due):  # several if time advances in larger steps
             command = self._drive.next()
             self._ticks += 1
         self._send(command)
 
     def _guard(self) -> None:
-        """Raises BackendError when the robot must not go on."""
+        """Raises BackendError if the robot must not continue."""
         age = time.monotonic() - self._heard
         if age > self._order.odom_timeout:
             raise BackendError(
@@ -203,12 +203,12 @@ class RecordNode(QosWatch):
         return stamped
 
     def stop(self) -> None:
-        """Leaves the robot standing still, and saves what was recorded."""
+        """Leaves the robot at rest, and saves what was recorded."""
         if self.outcome is None:
             self._end(None)
 
     def _end(self, failure: BridgeError | None, complete: bool = False) -> None:
-        """Stops the robot, saves, and ends the node; for every way in which a drive ends."""
+        """Stops the robot, saves, and ends the node, however the drive ended."""
         self.outcome = Outcome(complete, failure, None, "")
         recording, told = None, "the robot was not moved, nothing is recorded"
         if self._ticks:
@@ -229,7 +229,7 @@ class RecordNode(QosWatch):
         last_word(self._topic, self._message(np.zeros(3)))
 
     def _save(self) -> tuple[Recording | None, str]:
-        """What was saved, and a clause about it."""
+        """Saves the recording; returns it with a clause about it."""
         try:
             recording = self._log.recording()
             write_drive(recording, self._order.out, self._order.plan.robot)
@@ -242,11 +242,11 @@ def record(given: Mapping[str, Any] | None = None, args: Sequence[str] | None = 
     """Drives and records until the end, an error, SIGINT or SIGTERM.
 
     Args:
-        given: parameters, before those of the command line.
+        given: parameters that override those of the command line.
         args: the command line, `sys.argv` by default.
 
     Returns:
-        How it ended.
+        The result of the drive.
     """
     nodes: list[RecordNode] = []
 
@@ -272,11 +272,11 @@ if __name__ == "__main__":
 
 @dataclass(frozen=True)
 class DriveParameters:
-    """What `record_node` is to do.
+    """Values of the parameters of `record_node`.
 
     Attributes:
-        plan: of the drive.
-        out: where the recording goes.
+        plan: plan of the drive.
+        out: path of the recording.
         odom_timeout: silence of odometry that stops the robot [s].
         stamped: whether `cmd_vel` is a TwistStamped.
         roles: may name the joints of state and wheels.

@@ -1,6 +1,6 @@
-"""What `nics record` does around `record_node`: preview, drive, and what to do next.
+"""The part of `nics record` around `record_node`: preview, drive, and next steps.
 
-It imports ROS 2 only when asked to drive, so that a drive can be previewed without.
+It imports ROS 2 only to drive, so that a drive can be previewed without it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NODE = "nics_drl_bridge.nodes.record_node"
 
 @dataclass(frozen=True)
 class Order:
-    """What to record, as `nics record` takes it.
+    """Options of `nics record`.
 
     Attributes:
         robot: name or YAML file of the robot.
@@ -57,7 +57,7 @@ class Order:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Of `record_node`."""
+        """Parameters for `record_node`."""
         return {
             "robot": self.robot,
             "out": str(self.out),
@@ -72,10 +72,10 @@ class Order:
 
     @property
     def arguments(self) -> list[str]:
-        """The command line of `record_node`.
+        """Command line for `record_node`.
 
         Raises:
-            ConfigError: a remapping is none.
+            ConfigError: a remapping rule is malformed.
         """
         rules = [f"__ns:=/{self.namespace.strip('/')}"] if self.namespace.strip("/") else []
         for rule in self.remap:
@@ -92,7 +92,7 @@ def require_ros() -> None:
     """Imports ROS 2.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: it is not installed.
     """
     try:
         import_module(NODE)
@@ -103,7 +103,7 @@ def require_ros() -> None:
 
 
 def preview(order: Order) -> tuple[str, ...]:
-    """Draws the expected drive beside the recording.
+    """Draws the expected drive next to the recording.
 
     Returns:
         Lines for people.
@@ -112,7 +112,7 @@ def preview(order: Order) -> tuple[str, ...]:
         ConfigError: the order can't be carried out.
     """
     robot, out = load_robot(order.robot), check_out(order.out)
-    topic_roles(order.topics)  # a wrong file is told of before anybody drives
+    topic_roles(order.topics)  # reports a wrong file before the robot moves
     plan = DrivePlan(robot, order.bound, order.duration, order.speed, order.seed)
     pattern = plan.preview()
     picture = out.parent / f"{out.stem}_preview.png"
@@ -124,10 +124,10 @@ def drive(order: Order) -> tuple[tuple[str, ...], bool]:
     """Drives the robot and records it.
 
     Returns:
-        Lines for people, and whether the drive went to its end; otherwise it was interrupted.
+        Lines for people, and whether the drive was completed; otherwise it was interrupted.
 
     Raises:
-        BridgeError: why it ended before, and what was saved.
+        BridgeError: the drive failed; with the reason, and what was saved.
     """
     outcome = import_module(NODE).record(order.parameters, order.arguments)
     if outcome.failure is not None:
@@ -139,7 +139,7 @@ def drive(order: Order) -> tuple[tuple[str, ...], bool]:
 
 
 def summary(recording: Recording, robot: RobotSpec, order: Order) -> tuple[str, ...]:
-    """How far the robot went, how well each command was moved, and what to do next."""
+    """Returns lines about the robot's path, the coverage of each command, and the next step."""
     place = recording.pose.values[:, :2] - recording.pose.values[0, :2]
     path = float(np.hypot(*np.diff(place, axis=0).T).sum())
     reach = float(np.hypot(*place.T).max())

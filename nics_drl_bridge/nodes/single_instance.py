@@ -1,4 +1,4 @@
-"""A second node of the same name in the same namespace does not start."""
+"""Single instance: a second node of the same name in the same namespace does not start."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from rclpy.node import Node
 from nics_drl_bridge.errors import BackendError
 
 SETTLE_S = 0.3
-"""Until the graph shows who is there."""
+"""Time until the graph shows all nodes [s]."""
 POLL_S = 0.02
 ANSWER_S = 1.5
-"""A node that does not answer within this time has died: the graph shows it for some 20 s more."""
+"""A node that does not answer within this time is dead; the graph shows it for some 20 s more."""
 
 
 @contextlib.contextmanager
 def sole(context: Context, name: str) -> Iterator[None]:
-    """Around the life of a node: nobody else has its name, or it does not begin.
+    """Ensures a single instance while a node runs: if its name is taken, it does not start.
 
-    Two that start at the same moment on one machine are told apart by a socket's name that only
-    one of them gets, and that dies with its process. Others, and nodes of other packages, are seen
-    in the graph and asked whether they live.
+    Two that start at the same moment on one machine are told apart by the name of a socket, which
+    only one of them gets, and which ends with its process. Others, and nodes of other packages, are
+    found in the graph and asked whether they are alive.
 
     Args:
-        context: of the node, whose arguments may give it another name or a namespace.
+        context: of the node; its arguments may set another name or a namespace.
         name: of the node.
 
     Raises:
-        BackendError: there is one.
+        BackendError: another instance is running.
     """
     probe = Node(
         name, context=context, start_parameter_services=False, enable_rosout=False
-    )  # its name is made as that of the node
+    )  # resolves its name as the node will
     claim = None
     try:
         whole = probe.get_fully_qualified_name()
@@ -61,7 +61,7 @@ def sole(context: Context, name: str) -> Iterator[None]:
 
 
 def _claimed(key: str) -> socket.socket | None:
-    """What only one process on this machine (and in its network namespace) can hold."""
+    """Returns what only one process per machine (and network namespace) can have, or None."""
     claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     if sys.platform != "linux":
         return claim
@@ -74,7 +74,7 @@ def _claimed(key: str) -> socket.socket | None:
 
 
 def _seen(probe: Node, whole: str) -> bool:
-    """Whether the graph comes to show another node of the probe's name."""
+    """True if the graph shows another node of the probe's name within `SETTLE_S`."""
     deadline = time.monotonic() + SETTLE_S
     while True:
         nodes = [
@@ -88,7 +88,7 @@ def _seen(probe: Node, whole: str) -> bool:
 
 
 def _lives(probe: Node, whole: str) -> bool:
-    """Whether the other one answers."""
+    """True if the other node answers."""
     client = probe.create_client(GetParameters, f"{whole}/get_parameters")
     executor = SingleThreadedExecutor(context=probe.context)
     executor.add_node(probe)

@@ -1,4 +1,4 @@
-"""Shadow mode: what a policy would have commanded in a recorded drive, beside what was driven."""
+"""Shadow mode: compares the commands of a policy with those of a recorded drive."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from nics_drl_bridge.recording.messages import command_row
 
 Array = NDArray[np.float64]
 JITTER = 0.25
-"""So many periods may a scan be early."""
+"""Permitted earliness of a scan, in control periods."""
 HELD_S = 1.0
-"""A command that is older is no longer what the robot does."""
+"""Age from which a command no longer applies to the robot."""
 DEAD_BAND = 0.05
-"""Smaller commands, in shares of their greatest, have no sign."""
+"""Commands below this share of their maximum have no sign."""
 PERCENTILES = (50, 90, 99)
 
 
 @dataclass(frozen=True)
 class Shadow:
-    """A policy beside a drive, at T times at which it would have acted.
+    """A policy compared with a drive, at the T times at which it would have acted.
 
     Attributes:
         names, units: (C) of the commands.
         time: (T,) since the first [s].
         pose: (T, 3) estimated, in `map`.
-        goal: (T, 2) that the policy was given [m].
-        policy: (T, C) its commands.
-        driven: (T, C) the recorded ones.
-        scale: (C,) the greatest that each command can be.
-        skipped: reason -> at how many times nothing was compared.
+        goal: (T, 2) goal given to the policy [m].
+        policy: (T, C) commands of the policy.
+        driven: (T, C) recorded commands.
+        scale: (C,) maximum magnitude of each command.
+        skipped: reason -> number of times that were not compared.
     """
 
     names: tuple[str, ...]
@@ -56,10 +56,10 @@ class Shadow:
     skipped: Mapping[str, int]
 
     def differences(self) -> dict[str, dict[str, float]]:
-        """How far the policy is from the drive, for each command.
+        """Differences between policy and drive, for each command.
 
-        Mean (policy less drive), mean, percentiles and greatest of its size, in the command's unit;
-        and of the times at which both tell a direction, the share at which they differ.
+        Mean of policy minus drive; mean, percentiles and maximum of its magnitude, in the command's
+        unit; and the share of opposite signs among the times at which both have a sign.
         """
         told = {}
         for c, name in enumerate(self.names):
@@ -76,14 +76,14 @@ class Shadow:
 
 
 def _opposite(one: Array, other: Array, band: float) -> float:
-    """Share of the times at which both are beyond a band, and on different sides."""
+    """Share of opposite signs among the times at which both are outside a band."""
     told = (np.abs(one) > band) & (np.abs(other) > band)
     return float((one[told] * other[told] < 0.0).mean()) if told.any() else 0.0
 
 
 @dataclass
 class _Moment:
-    """A time at which the policy would act."""
+    """A time at which the policy would act, with its view and the driven command."""
 
     receive_ns: int
     stamp_ns: int
@@ -99,20 +99,20 @@ def shadow(
     goal: ArrayLike | None = None,
     ahead_s: float = 4.0,
 ) -> Shadow:
-    """Gives a policy what a robot saw, in process and always alike.
+    """Runs a policy on a recorded drive, in process and deterministically.
 
-    The policy acts when `policy_node` would: once per scan, with an odometry at least as new, at
-    most once in a control period of the stamps. A command is compared with the first one that was
-    recorded after that, or else with the one that still held.
+    The policy acts when `policy_node` would: once per scan, with odometry at least as new, at most
+    once per control period of the stamps. Its command is compared with the first one recorded after
+    that, or else with the one that still applied.
 
     Args:
         path: of the bag.
         model: of the robot.
-        policy: a file, or the name of a shipped one or of a baseline.
+        policy: a file, or the name of a shipped policy or of a baseline.
         topics: role -> topic, see `playback.chosen`.
-        goal: (2,) in `map` [m], where the first odometry is what it says. None takes in its place
-            where the robot was `ahead_s` later: the driver's intention, in hindsight.
-        ahead_s: see there [s].
+        goal: (2,) in `map` [m], in which the first odometry is taken at face value. None uses the
+            robot's position `ahead_s` later instead: the driver's intention, in hindsight.
+        ahead_s: see `goal` [s].
 
     Raises:
         RecordingError: the bag can't be used, or lacks scans or commands.
@@ -168,14 +168,14 @@ def _moments(
 
 
 def _hold(moments: list[_Moment], held: tuple[int, Array] | None) -> None:
-    """The newest moment's command is the one that held, if none came after it."""
+    """Gives the newest moment the command that still applied, if none came after it."""
     if moments and moments[-1].driven is None and held is not None:
         age_s = (moments[-1].receive_ns - held[0]) * S_PER_NS
         moments[-1].driven = held[1] if age_s <= HELD_S else None
 
 
 def _goals(moments: list[_Moment], goal: ArrayLike | None, ahead_s: float) -> Array:
-    """(T, 2) the goal of each moment."""
+    """(T, 2) goal of each moment."""
     if goal is not None:
         return np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
     times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS

@@ -1,6 +1,6 @@
 """95 % intervals: of a rate by Wilson's score, of a mean by Student's t.
 
-What the same episodes came to in several worlds.
+Comparison of the same episodes in several worlds.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure and the interval that holds the true one with 95 % confidence.
+    """A figure with its 95 % confidence interval.
 
     Attributes:
-        value: NaN where nothing was observed.
+        value: NaN if nothing was observed.
         low, high: ends of the interval; infinite for the mean of a single observation.
     """
 
@@ -34,14 +34,14 @@ class Estimate:
 
 
 def rate(hits: int, trials: int) -> Estimate:
-    """A share of trials with Wilson's score interval (1927), which holds for few trials too."""
+    """A share of trials with Wilson's score interval (1927), valid for few trials too."""
     if trials < 1:
         return Estimate(math.nan, 0.0, 1.0)
     share, z = hits / trials, float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
     scale = 1.0 + z * z / trials
     middle = (share + z * z / (2.0 * trials)) / scale
     half = z / scale * math.sqrt(share * (1.0 - share) / trials + (z / (2.0 * trials)) ** 2)
-    # Of no hit or none but hits, rounding must not part the end from 0 or 1.
+    # With no hits, or hits only, rounding must not move the end away from 0 or 1.
     low = 0.0 if hits == 0 else middle - half
     return Estimate(share, low, 1.0 if hits == trials else middle + half)
 
@@ -64,19 +64,19 @@ RESULTS = ("success", "collision")
 
 @dataclass(frozen=True)
 class Tally:
-    """What the episodes of one world came to, each figure with its 95 % interval.
+    """Figures of the episodes of one world, each with its 95 % interval.
 
     Attributes:
-        episodes: how many.
-        success, collision: shares of the episodes, by the truth where it is known.
-        time_out: share of those that ended neither way.
-        believed: share that the robot itself took for a success.
+        episodes: number of episodes.
+        success, collision: shares of the episodes, by the truth if it is known.
+        time_out: share of episodes that ended neither way.
+        believed: share of episodes that the robot itself believed successful.
         length: mean path of the successful ones [m].
         time: mean duration of the successful ones [s].
         same: share of the episodes that ended as in the first world.
-        deviation: mean over the episodes of the greatest distance between the true path and that
+        deviation: mean over the episodes of the maximum distance between the true path and that
             in the first world at the same step [m].
-        greatest_deviation: of all episodes [m].
+        greatest_deviation: maximum over all episodes [m].
     """
 
     episodes: int
@@ -91,7 +91,7 @@ class Tally:
     believed: Estimate
 
     def figures(self) -> dict[str, Any]:
-        """As plain data; what is not finite is null."""
+        """The tally as plain data; non-finite values become null."""
         told = {name: list(v.values()) if isinstance(v, dict) else v
                 for name, v in asdict(self).items()}  # fmt: skip
         return {name: _finite(value) for name, value in told.items()}
@@ -104,11 +104,11 @@ def _finite(value: Any) -> Any:
 
 
 def tally(episodes: Sequence[Episode], first: Sequence[Episode], control_period: float) -> Tally:
-    """The figures of episodes.
+    """Computes the figures of episodes.
 
     Args:
         episodes: of one world.
-        first: the same seeds in the world that it is compared with.
+        first: the same seeds in the world to compare with.
         control_period: of the robot [s].
     """
     count = len(episodes)
@@ -135,7 +135,7 @@ def tally(episodes: Sequence[Episode], first: Sequence[Episode], control_period:
 
 
 def tallies(runs: Mapping[str, Sequence[Episode]], control_period: float) -> dict[str, Tally]:
-    """The figures of each world; all are compared with the first."""
+    """Computes the figures of each world, compared with the first."""
     first = next(iter(runs.values()))
     return {place: tally(episodes, first, control_period) for place, episodes in runs.items()}
 

@@ -1,6 +1,6 @@
-"""Training a policy with Stable-Baselines3 on the vector env: begun, kept, taken up again.
+"""Trains a policy with Stable-Baselines3 on the vector env, with checkpoints and resumption.
 
-A run of training: several seeds, each trained, evaluated, and kept in a folder of its own.
+A training run: several seeds, each trained, evaluated, and saved in its own folder.
 """
 
 from __future__ import annotations
@@ -49,18 +49,18 @@ CHECKPOINT = "checkpoint.pt"
 SEEDS = 2**40
 Tell = Callable[[Progress], None]
 LOG_EVERY = {"ppo": 1, "sac": 1000}
-"""Rollouts, or episodes, between two entries of TensorBoard."""
+"""Roll-outs (PPO) or episodes (SAC) between two entries of TensorBoard."""
 
 
 @dataclass(frozen=True)
 class Trained:
-    """A training that has ended.
+    """A finished training.
 
     Attributes:
-        algorithm: with its policy; on Ray only the part that acts.
-        steps: environment steps of all.
+        algorithm: with its policy; on Ray only the acting part.
+        steps: environment steps of all worlds together.
         wall_s: time that this process spent on it [s].
-        stepping_s: of which in the simulator [s].
+        stepping_s: part of it in the simulator [s].
     """
 
     algorithm: BaseAlgorithm | Actor
@@ -78,18 +78,18 @@ def train(
 ) -> Trained:
     """Trains one policy.
 
-    Interrupted and taken up again, it comes to the same weights, to the bit, as without a break:
-    a checkpoint holds the network, the optimiser, all random generators and all worlds.
+    An interrupted and resumed training gives bit-identical weights to an uninterrupted one: a
+    checkpoint contains the network, the optimiser, all random generators and all worlds.
 
     Args:
         settings: what to learn.
-        seed: of all that is drawn.
-        folder: for checkpoint and TensorBoard's logs; made when missing.
-        tell: is told of the progress, some times a second.
-        resumed: whether to go on from the checkpoint in `folder`.
+        seed: of all random numbers.
+        folder: for checkpoint and TensorBoard logs; created if missing.
+        tell: called with the progress, a few times per second.
+        resumed: True continues from the checkpoint in `folder`.
 
     Raises:
-        ConfigError: settings that do not fit together, or no checkpoint that fits them.
+        ConfigError: the settings are inconsistent, or no checkpoint fits them.
     """
     begin, path = time.perf_counter(), folder / CHECKPOINT
     content = read_checkpoint(path) if resumed else None
@@ -120,12 +120,12 @@ def make_train_env(
     model: SimulatorModel | None = None,
     scenes: Mapping[str, World] | None = None,
 ) -> TrainVecEnv:
-    """The worlds that settings name, side by side.
+    """Makes the worlds of the settings in one env.
 
     Args:
         settings: of the training.
-        model: of the robot, where it is open already.
-        scenes: name -> world, where they are loaded already.
+        model: of the robot, if it is already open.
+        scenes: name -> world, if they are already loaded.
     """
     model = model or open_model(settings.robot)
     return TrainVecEnv(
@@ -144,7 +144,7 @@ def _begin(settings: TrainingSettings, env: TrainVecEnv, seed: int) -> BaseAlgor
     rng = np.random.default_rng(seed)
     env.seed(int(rng.integers(SEEDS)))
     algorithm = make_algorithm(settings, env, seed, observed(env, rng))
-    env.seed(int(rng.integers(SEEDS)))  # the algorithm gave its own seed, whose next are near
+    env.seed(int(rng.integers(SEEDS)))  # replaces the algorithm's seed, near those of other runs
     return algorithm
 
 
@@ -155,7 +155,7 @@ def _again(
     env: TrainVecEnv,
     path: Path,
 ) -> BaseAlgorithm:
-    """The algorithm of a checkpoint. Raises ConfigError when it is of another training."""
+    """Restores the algorithm of a checkpoint. Raises ConfigError if it is of another training."""
     check_same(content["about"], about, path)
     size = int(np.prod(env.observation_space.shape))
     algorithm = make_algorithm(settings, env, about["seed"], (np.zeros(size), np.ones(size)))
@@ -170,10 +170,10 @@ def _again(
 
 
 def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
-    """Raises ConfigError unless a checkpoint is of the settings and seed of a training.
+    """Raises ConfigError unless a checkpoint has the settings and seed of a training.
 
     Args:
-        old: seed and settings that the checkpoint is of.
+        old: seed and settings of the checkpoint.
         new: those of the training.
         path: of the checkpoint.
     """
@@ -196,7 +196,7 @@ def evaluate(
     episodes: int,
     model: SimulatorModel | None = None,
 ) -> Outcomes:
-    """Episodes of the evaluation protocol in a world, with the policy of an algorithm."""
+    """Drives the episodes of the evaluation protocol in a world with an algorithm's policy."""
     env = BridgeVectorEnv(
         episodes, model or open_model(settings.robot), world, settings.task,
         settings.task_options, settings.max_episode_steps, randomisation=settings.randomisation,
@@ -206,19 +206,19 @@ def evaluate(
 
 SETTINGS, EVALUATION, POLICY = "settings.yaml", "evaluation.json", "policy.onnx"
 GREATEST_SEED = 2**32 - 1
-"""That numpy's shared generator takes, from which Stable-Baselines3 draws."""
+"""Largest seed of numpy's global generator, from which Stable-Baselines3 draws."""
 Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]
-"""As `train`: of settings, seed, folder, whom to tell, and whether it was begun before."""
+"""A function like `train`: of settings, seed, folder, progress callback and `resumed`."""
 
 
 @dataclass(frozen=True)
 class SeedResult:
-    """What one seed came to.
+    """Result of one seed.
 
     Attributes:
         seed: of the training.
-        trained: the algorithm with its policy.
-        summaries: world -> how the policy drives there.
+        trained: the training that ended, with its policy.
+        summaries: world -> evaluation of the policy there.
     """
 
     seed: int
@@ -228,15 +228,15 @@ class SeedResult:
 
 @dataclass(frozen=True)
 class TrainOrder:
-    """What a run is to do.
+    """An order for a training run.
 
     Attributes:
-        settings: what to learn; a resumed run gives its own, see `settings_of`.
+        settings: what to learn; for a resumed run its own, see `settings_of`.
         seeds: of the trainings.
         out: folder of the run; each seed gets one below it.
-        episodes: of an evaluation in each world.
-        resumed: whether to go on from the checkpoints that there are.
-        command: what the user called, for the policy files.
+        episodes: number of episodes of the evaluation in each world.
+        resumed: True continues from the existing checkpoints.
+        command: the user's command line, for the policy files.
     """
 
     settings: TrainingSettings
@@ -253,16 +253,16 @@ def run(
     done: Callable[[SeedResult], None] = lambda _: None,
     learn: Learn = train,
 ) -> list[SeedResult]:
-    """Trains seed after seed and evaluates each in the worlds that it learned in.
+    """Trains seed after seed and evaluates each in its training worlds.
 
     Args:
-        order: what to do.
-        tell: is told of the progress.
-        done: is told of each seed that is through.
+        order: the order.
+        tell: called with the progress.
+        done: called with the result of each seed.
         learn: trains one policy.
 
     Raises:
-        ConfigError: the folder holds a run already, or none to resume.
+        ConfigError: the folder already contains a run, or none to resume.
     """
     _check(order.seeds, order.out, order.resumed)
     settings = order.settings
@@ -282,12 +282,12 @@ def run(
 
 
 def export(settings: TrainingSettings, result: SeedResult, command: str, path: Path) -> None:
-    """Writes the policy file, which tells how the policy came about and how well it drives.
+    """Writes the policy file, which records the policy's origin and its success rates.
 
     Args:
         settings: of the training.
         result: of one seed.
-        command: what the user called.
+        command: the user's command line.
         path: of the file, `*.onnx`.
     """
     model = open_model(settings.robot)
@@ -311,7 +311,7 @@ def _check(seeds: Sequence[int], out: Path, resumed: bool) -> None:
 
 
 def settings_of(out: Path) -> TrainingSettings:
-    """The settings of a run that was begun. Raises ConfigError where there is none."""
+    """Reads the settings of an existing run. Raises ConfigError if there is none."""
     if not (out / SETTINGS).is_file():
         raise ConfigError(f"{out}: holds no {SETTINGS}; name the folder of a run with --out.")
     return load_yaml(out / SETTINGS, TrainingSettings)
@@ -328,7 +328,7 @@ def _evaluated(settings: TrainingSettings, trained: Trained, episodes: int) -> d
 
 
 def line_of(summary: Summary) -> str:
-    """A summary in words, every figure with its 95 % interval."""
+    """Formats a summary as text, every figure with its 95 % interval."""
     shares = (summary.success, summary.collision, summary.time_out)
     named = zip(("success", "collision", "time-out"), shares, strict=True)
     rates = ", ".join(f"{name} {_percent(share)}" for name, share in named)

@@ -1,8 +1,8 @@
-"""PPO and SAC of Stable-Baselines3, made from settings.
+"""PPO and SAC of Stable-Baselines3, built from settings.
 
-The normaliser of observations: a part of the network, so that it can't get lost.
+Normaliser of observations, a part of the network so that it can't get lost.
 
-The part of a network that acts, as a module of its own: normaliser and hidden layers.
+The acting part of a network as a separate module: normaliser and layers.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from nics_drl_bridge.policy.training_settings import PpoSettings, SacSettings, T
 
 Array = NDArray[np.float64]
 RECENT = 1000
-"""Episodes that the success rate of the progress is of."""
+"""Number of episodes over which the progress reports its rates."""
 LEAST_RATE = 0.02
-"""Share of the learning rate of PPO at the end."""
+"""Share of PPO's learning rate that is left at the end."""
 
 
 def make_algorithm(
     settings: TrainingSettings, env: TrainVecEnv, seed: int, normaliser: tuple[Array, Array]
 ) -> BaseAlgorithm:
-    """An algorithm that has learned nothing yet.
+    """Makes an untrained algorithm.
 
     Args:
         settings: of the training.
-        env: to learn on.
-        seed: of the network's weights and all that the algorithm draws.
+        env: the training env.
+        seed: of the network's weights and all random numbers of the algorithm.
         normaliser: mean and standard deviation (O,) of the observations.
 
     Raises:
-        ConfigError: the algorithm does not serve the task.
+        ConfigError: the algorithm does not suit the task.
     """
     check_serves(settings, env)
     torch.set_num_threads(settings.threads)
@@ -60,7 +60,7 @@ def make_algorithm(
 
 
 def check_serves(settings: TrainingSettings, env: TrainVecEnv) -> None:
-    """Raises ConfigError when the algorithm does not serve the task."""
+    """Raises ConfigError if the algorithm does not suit the task."""
     if len(env.observation_space.shape) != 1:
         raise ConfigError(
             f"task {settings.task!r}: shows {env.observation_space.shape}, and training "
@@ -119,7 +119,7 @@ def _sac(
 
 
 def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
-    """What the policy of an algorithm does at its best: without the noise of exploration."""
+    """Returns the deterministic policy of an algorithm, without exploration noise."""
 
     def act(observations: NDArray[np.float32]) -> NDArray[Any]:
         seen = torch.as_tensor(observations)
@@ -138,10 +138,10 @@ LOOKS = 64
 
 
 class Normaliser(BaseFeaturesExtractor):
-    """First layer of actor and critic: (observation - mean) / std, cut at +-5. It never learns.
+    """First layer of actor and critic: (observation - mean) / std, cut at +-5; not trained.
 
     Args:
-        space: of the observations, Box (O,).
+        space: observation space, Box (O,).
         mean, std: (O,), see `observed`.
     """
 
@@ -154,15 +154,16 @@ class Normaliser(BaseFeaturesExtractor):
         self.register_buffer("std", torch.as_tensor(std, dtype=torch.float32))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """(N, O) normalised."""
+        """Normalises observations (N, O)."""
         return torch.clamp((observations - self.mean) / self.std, -LIMIT, LIMIT)
 
 
 def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Mean and standard deviation (O,) of what worlds show under random actions.
+    """Mean and standard deviation (O,) of the observations under random actions.
 
-    Each world holds its action for several steps, as otherwise a robot with inertia stays where
-    it is. A part that hardly varies gets a deviation of 0.05. The env stands anywhere afterwards.
+    Each world holds its action for several steps, because otherwise a robot with inertia would stay
+    in place. A part that hardly varies gets a deviation of 0.05. The state of the env is arbitrary
+    afterwards.
     """
     seen = [np.array(env.reset())]
     for k in range(LOOKS):
@@ -182,11 +183,11 @@ def _random_actions(env: VecEnv, rng: np.random.Generator) -> NDArray[Any]:
 
 GAIN = 2.0**0.5
 ACTION_GAIN = 0.01
-"""Of the last layer of an actor at the start: all its actions are near zero."""
+"""Initial gain of an actor's last layer: all its actions are near zero."""
 
 
 class Actor(torch.nn.Module):
-    """From observations (n, O) to raw actions (n, C), or to logits (n, A) of discrete ones.
+    """Maps observations (n, O) to raw actions (n, C), or to logits (n, A) of discrete ones.
 
     Args:
         observations: space of one observation, Box (O,).
@@ -211,7 +212,7 @@ class Actor(torch.nn.Module):
         self.layers = layers_of([self.normaliser.features_dim, *hidden, count], ACTION_GAIN)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """What the distribution of actions is made of; its mode, where they are continuous."""
+        """Parameters of the distribution of actions: its mode if continuous, else logits."""
         raw: torch.Tensor = self.layers(self.normaliser(observations))
         return raw
 
@@ -222,7 +223,7 @@ class Actor(torch.nn.Module):
 
 
 def layers_of(widths: Sequence[int], gain: float) -> torch.nn.Sequential:
-    """Linear layers with tanh between them, orthogonal at the start, as Stable-Baselines3 has them.
+    """Linear layers with tanh in between, initialised orthogonally as in Stable-Baselines3.
 
     Args:
         widths: of input, hidden layers and output.

@@ -1,12 +1,11 @@
-"""Checkpoints of a training: all that it needs to go on with the same bits.
+"""Checkpoints of a training: all that it needs to continue bit-identically.
 
-A checkpoint is the trainer's own and is never deployed. It holds tensors, numbers and text only
-and is read by PyTorch's `weights_only` reader, which makes no other objects: nothing in it can
-run code.
+A checkpoint is for training only and is never deployed. It contains only tensors, numbers and text
+and is read by PyTorch's `weights_only` reader, which builds no other objects: it can't run code.
 
-How a training gets on: told to the user and to TensorBoard, and kept in checkpoints.
+Progress of a training: reported to the user and to TensorBoard; checkpoints.
 
-The state of a vector env: all that changes while it runs, taken out and put back.
+Snapshots of a vector env: saves and restores all that changes while it runs.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 
 FORMAT = "nics_drl_bridge/checkpoint/2"
 MOST_BYTES = 4 * 2**30
-"""Of a file, which holds all of SAC's buffer."""
+"""Maximum size of a file, which contains all of SAC's buffer."""
 COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
 REPLAYED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
@@ -46,13 +45,13 @@ REPLAYED = ("observations", "next_observations", "actions", "rewards", "dones", 
 def save_checkpoint(
     path: Path, algorithm: BaseAlgorithm, env: TrainVecEnv, about: dict[str, Any]
 ) -> None:
-    """Writes a checkpoint, whole or not at all, between two rollouts.
+    """Writes a checkpoint, completely or not at all, between two roll-outs.
 
     Args:
         path: the file.
-        algorithm: that learns on `env`.
-        env: where it stands.
-        about: plain data that tell which training it is of.
+        algorithm: the algorithm that learns on `env`.
+        env: the training env.
+        about: plain data that identify the training.
     """
     content = {
         "format": FORMAT,
@@ -73,21 +72,21 @@ _LAST = ("_last_obs", "_last_episode_starts")
 
 
 def write_content(path: Path, content: dict[str, Any]) -> None:
-    """Writes a checkpoint of tensors, numbers and text, whole or not at all."""
+    """Writes a checkpoint of tensors, numbers and text, completely or not at all."""
     buffer = io.BytesIO()
     torch.save(content, buffer)
     write_bytes(path, sealed(buffer.getvalue()))
 
 
 def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
-    """The content of a checkpoint; `about` is that of `save_checkpoint`.
+    """Reads the content of a checkpoint; `about` is that of `save_checkpoint`.
 
     Args:
         path: the file.
-        kind: which format it is to have.
+        kind: the expected format.
 
     Raises:
-        ConfigError: there is none, or it is damaged or of another kind.
+        ConfigError: there is none, or it is damaged or of another format.
     """
     if not path.is_file():
         raise ConfigError(f"{path}: no such checkpoint; leave out --resume to begin anew.")
@@ -101,7 +100,7 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
                 if any(member.compress_type for member in archive.infolist()):
                     raise ValueError("torch packs nothing")
             file.seek(0)
-            # What else a pickle could do, it does not do here; with torch before 2.6 it could.
+            # weights_only blocks whatever else a pickle could do; before torch 2.6 it had gaps.
             content: Any = torch.load(file, map_location="cpu", weights_only=True)
         _check_tensors(content, size)
         found = str(content["format"])
@@ -120,7 +119,7 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
 
 
 def _check_tensors(content: Any, size: int) -> None:
-    """Raises ValueError for a tensor that is larger than the file, as one repeated number is."""
+    """Raises ValueError for a tensor larger than the file, such as one repeated number."""
     parts = content.values() if isinstance(content, dict) else content
     for part in parts if isinstance(content, dict | list | tuple) else ():
         _check_tensors(part, size)
@@ -129,7 +128,7 @@ def _check_tensors(content: Any, size: int) -> None:
 
 
 def resume(content: dict[str, Any], algorithm: BaseAlgorithm, env: TrainVecEnv) -> None:
-    """Puts a checkpoint into an algorithm and an env that are made as those were."""
+    """Puts a checkpoint into an algorithm and an env made with the same arguments."""
     algorithm.set_parameters(content["parameters"], exact_match=True)
     for name, value in content["variables"].items():
         getattr(algorithm, name).data.copy_(value)
@@ -152,7 +151,7 @@ def _tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
 
 
 def _variables(algorithm: BaseAlgorithm) -> dict[str, torch.Tensor]:
-    """What an algorithm learns beside its networks: the temperature of SAC."""
+    """Learned variables other than the networks: the temperature of SAC."""
     names = algorithm._get_torch_save_params()[1]
     return {name: getattr(algorithm, name).detach().clone() for name in names}
 
@@ -173,7 +172,7 @@ def _fill_replay(algorithm: OffPolicyAlgorithm, content: dict[str, Any]) -> None
 
 
 def _random_state(algorithm: BaseAlgorithm) -> dict[str, Any]:
-    """Of all generators that draw: PyTorch's, numpy's global one, that of the action space."""
+    """State of all random generators: PyTorch's, numpy's global one, the action space's."""
     shared = np.random.get_state(legacy=False)  # noqa: NPY002 - Stable-Baselines3 draws from it
     spaces = algorithm.action_space.np_random.bit_generator.state
     return {
@@ -193,19 +192,19 @@ def _set_random_state(algorithm: BaseAlgorithm, content: dict[str, Any]) -> None
 
 
 TOLD_S = 0.2
-"""Progress is told at most so often [s]."""
+"""Minimum time between two reports of the progress [s]."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a training stands.
+    """Progress of a training.
 
     Attributes:
         seed: of the training.
         steps: environment steps done.
-        total: of all.
+        total: environment steps of the whole training.
         success, collision: shares of the last 1000 episodes; NaN before the first has ended.
-        steps_per_s: since this process took it up.
+        steps_per_s: since this process began or resumed it.
         env_share: share of the wall time that went to the simulator.
     """
 
@@ -219,15 +218,15 @@ class Progress:
 
 
 class Companion(BaseCallback):
-    """Looks after each step and rollout of a training.
+    """Callback that monitors each step and roll-out of a training.
 
     Args:
-        env: that is learned on.
+        env: the training env.
         seed: of the training.
-        total: environment steps of all.
+        total: environment steps of the whole training.
         checkpoint_every: environment steps between two calls of `save`.
-        save: keeps all that there is; called between two rollouts only.
-        tell: is told of the progress.
+        save: saves everything; called between two roll-outs only.
+        tell: called with the progress.
     """
 
     def __init__(
@@ -252,7 +251,7 @@ class Companion(BaseCallback):
         self._first = self._saved = self.num_timesteps
 
     def _on_rollout_start(self) -> None:
-        """Between two rollouts nothing is half done: the place for a checkpoint."""
+        """Saves a checkpoint if due: between two roll-outs nothing is half done."""
         if self.model.num_timesteps // self._every > self._saved // self._every:
             self._save()
             self._saved = self.model.num_timesteps
@@ -273,7 +272,7 @@ class Companion(BaseCallback):
         self._tell(progress)
 
     def progress(self) -> Progress:
-        """Where the training stands now."""
+        """The current progress."""
         taken = max(time.perf_counter() - self._begin, 1e-9)
         successes = self.model.ep_success_buffer
         return Progress(
@@ -289,13 +288,13 @@ class Companion(BaseCallback):
 
 Arrays = dict[str, NDArray[Any]]
 MEMORY, DRAWN = "memory.", "drawn."
-"""What the names begin with whose number only the running episodes tell."""
+"""Prefixes of the arrays whose names depend on the running episodes."""
 
 
 def snapshot(env: BridgeVectorEnv) -> Arrays:
-    """All that changes in a vector env, copied, by name.
+    """Copies all that changes in a vector env, by name.
 
-    An env of the same arguments that is given it by `restore` goes on with the same bits.
+    An env with the same arguments continues bit-identically from it after `restore`.
     """
     found = dict(env.changing)
     found |= {MEMORY + name: rows for name, rows in env.memory.items()}
@@ -304,10 +303,10 @@ def snapshot(env: BridgeVectorEnv) -> Arrays:
 
 
 def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
-    """Puts a snapshot into a vector env of the same arguments.
+    """Puts a snapshot into a vector env with the same arguments.
 
     Raises:
-        ConfigError: it is of an env with other worlds, robots, lidar or task.
+        ConfigError: the snapshot is of an env with other worlds, robots, lidar or task.
     """
     targets = env.changing
     known = {name for name in state if not name.startswith((MEMORY, DRAWN))}
@@ -320,7 +319,7 @@ def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
                 f"{target.shape}; {_SAME}"
             )
     for name, target in targets.items():
-        target[...] = state[name]  # in place: the compiled steps hold these arrays
+        target[...] = state[name]  # in place: the compiled steps refer to these arrays
     env.memory = _below(MEMORY, state)
     env.simulator.drawn = _below(DRAWN, state)
     env.ready = bool((targets["episode"] >= 0).all())

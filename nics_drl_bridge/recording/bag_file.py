@@ -1,8 +1,8 @@
-"""Opens a rosbag2 recording, and makes sure that it is whole.
+"""Opens a rosbag2 recording and verifies that it is complete.
 
-A reader of bags gives what it can still find in a damaged one, often without a word. So the
-database is checked page by page, and all that a topic gives is held against the bag's summary.
-What no bag keeps a checksum of, a bit that flipped inside of a number, can't be found here.
+Bag readers return what they still find in a damaged bag, often silently. So the database is
+checked page by page, and the messages of each topic are compared with the bag's summary. Data
+without a checksum, such as a flipped bit inside a number, can't be verified.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Message:
     """A message of a bag.
 
     Attributes:
-        receive_ns: when the bag received it [ns].
-        content: what it tells, with the fields of its type.
+        receive_ns: time of receipt by the recorder [ns].
+        content: the decoded message, with the fields of its type.
     """
 
     receive_ns: int
@@ -46,7 +46,7 @@ class Message:
 
 
 def is_bag(path: str | Path) -> bool:
-    """Whether a path is a rosbag2 recording: its folder, or one of its files."""
+    """True if a path is a rosbag2 recording: its folder, or one of its files."""
     path = Path(path)
     if path.is_dir():
         return (path / METADATA).is_file() or any(is_storage(p) for p in path.iterdir())
@@ -54,17 +54,17 @@ def is_bag(path: str | Path) -> bool:
 
 
 def is_storage(path: Path) -> bool:
-    """Whether a file's name is that of a bag's file, compressed or not."""
+    """True if a file has the name of a bag file, compressed or not."""
     plain = path.with_suffix("") if path.suffix in COMPRESSED else path
     return plain.suffix in SUFFIXES
 
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[BagFile]:
-    """Opens a bag; whatever a damaged one makes the library raise becomes one sentence.
+    """Opens a bag; any exception that a damaged bag causes in rosbags becomes one sentence.
 
     Args:
-        path: the bag's folder, or its one file.
+        path: the bag's folder, or its only file.
 
     Raises:
         RecordingError: there is no such bag, it is damaged, empty or was not closed, or the
@@ -93,7 +93,7 @@ def opened(path: str | Path) -> Iterator[BagFile]:
             yield BagFile(reader, str(path))
     except BridgeError:
         raise
-    except Exception as error:  # noqa: BLE001 - a damaged file breaks the reader in any way
+    except Exception as error:  # noqa: BLE001 - the reader can raise anything on a damaged file
         raise RecordingError(
             f"{path}: can't be read as a bag ({_reason(error)}); it is damaged or was not closed: "
             "save the rest with `nics bag salvage`, try `ros2 bag reindex`, or record anew."
@@ -106,7 +106,7 @@ def _reason(error: Exception) -> str:
 
 
 def _check_name(path: Path) -> None:
-    """The library opens a database by a URI, and cuts its path off at these characters."""
+    """Refuses paths with characters at which rosbags, which opens databases by URI, cuts them."""
     name = str(path)
     if DATABASE in path.suffixes or (path.is_dir() and any(path.glob(f"*{DATABASE}*"))):
         for sign in (one for one in URI_SIGNS if one in name):
@@ -116,7 +116,7 @@ def _check_name(path: Path) -> None:
 
 
 def _place(path: Path) -> Path:
-    """What to open: the folder where it has metadata, which tell how much there must be."""
+    """Returns what to open: the folder if it has metadata, which give the expected counts."""
     if not path.exists():
         raise RecordingError(f"{path}: no such bag; check the path.")
     folder = path if path.is_dir() else path.absolute().parent
@@ -138,10 +138,10 @@ def _place(path: Path) -> Path:
 
 
 def _check_metadata(file: Path) -> None:
-    """Reads a bag's metadata with the bounds of `strict_yaml`, which its library has not.
+    """Reads a bag's metadata within the limits of `strict_yaml`, which rosbags lacks.
 
     Raises:
-        ValueError: they are no YAML, or grow; or a file would when it is unpacked.
+        ValueError: it is not YAML or exceeds the limits, or a file would unpack to too much.
     """
     try:
         data = parse_yaml(read_text(file), file.name)
@@ -155,7 +155,7 @@ def _check_metadata(file: Path) -> None:
 
 
 def _storages(reader: Reader) -> list[Any]:
-    """The readers of an open bag's files, which are unpacked where they were compressed."""
+    """Returns the readers of an open bag's files, decompressed if need be."""
     return list(getattr(reader.storage, "storages", [reader.storage]))
 
 
@@ -208,7 +208,7 @@ def _check_summary(path: Path, reader: Reader) -> None:
 
 
 def _check_topics(path: Path, reader: Reader) -> None:
-    """Holds the topics of a bag's summary against those of its files."""
+    """Compares the topics of a bag's summary with those of its files."""
     told: Counter[tuple[str, str]] = Counter()
     held: Counter[tuple[str, str]] = Counter()
     for connection in reader.connections:
@@ -239,7 +239,7 @@ def _short(name: object) -> str:
 
 
 class BagFile:
-    """An open bag whose topics are read whole or not at all.
+    """An open bag whose topics are read completely or not at all.
 
     Attributes:
         place: its name, for errors.
@@ -262,20 +262,20 @@ class BagFile:
 
     @property
     def span_ns(self) -> tuple[int, int]:
-        """First and last time of receipt that the bag's summary gives [ns]."""
+        """First and last time of receipt, from the bag's summary [ns]."""
         return self._reader.start_time, self._reader.end_time - 1
 
     def offers(self, topic: str) -> tuple[Offer, ...]:
-        """What its publishers offered, as far as the bag tells."""
+        """Returns the offers of a topic's publishers, as far as the bag contains them."""
         found = (offers_of(c.ext.offered_qos_profiles) for c in self._connections[topic])  # type: ignore[union-attr]
         return tuple(offer for some in found for offer in some)
 
     def knows(self, topic: str) -> bool:
-        """Whether messages of the topic can be decoded."""
+        """True if messages of the topic can be decoded."""
         return self.types[topic] in self._store.fielddefs
 
     def messages(self, topic: str) -> list[Message]:
-        """All messages of a topic, with count and time span held against the bag's summary.
+        """Returns all messages of a topic; count and time span are checked by the bag's summary.
 
         Raises:
             RecordingError: messages are missing, outside of the time span, or damaged.
@@ -284,7 +284,7 @@ class BagFile:
         return [Message(ns, self._decoded(topic, k, t, d)) for k, (t, ns, d) in enumerate(raw)]
 
     def serialized(self, topic: str) -> list[tuple[int, bytes]]:
-        """The same as they were recorded: time of receipt [ns] and bytes."""
+        """Returns the same messages undecoded: time of receipt [ns] and bytes."""
         return [(ns, bytes(data)) for _, ns, data in self._raw(topic)]
 
     def _raw(self, topic: str) -> list[tuple[str, int, bytes]]:
@@ -309,7 +309,7 @@ class BagFile:
     def _decoded(self, topic: str, k: int, kind: str, data: bytes) -> Any:
         try:
             return self._store.deserialize_cdr(data, kind)
-        except Exception as error:  # noqa: BLE001 - damaged bytes break the decoder in any way
+        except Exception as error:  # noqa: BLE001 - the decoder can raise anything on damaged bytes
             raise RecordingError(
                 f"{self.place}: topic {topic!r}: message {k} can't be decoded as {kind} "
                 f"({_reason(error)}); it is damaged: save the rest with `nics bag "

@@ -1,6 +1,6 @@
 """Reads a drive from a rosbag2 recording, SQLite or MCAP, without ROS.
 
-The latency that a bag shows: how long after its stamp a message was received.
+Latency in a bag: the delay from a message's stamp to its receipt.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recordin
     """Reads a drive of a robot from a bag.
 
     Args:
-        path: the bag's folder, or its one file.
-        mapping: which topic plays which role; what it leaves out is guessed.
+        path: the bag's folder, or its only file.
+        mapping: roles of the topics; missing roles are guessed.
         spec: the robot.
 
     Returns:
@@ -74,7 +74,7 @@ def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recordin
 def _table(
     bag: BagFile, topic: str, messages: Sequence[Message], row: Callable[[Any], Row]
 ) -> TopicData:
-    """The rows of a topic's messages."""
+    """Converts a topic's messages to rows."""
     receive = np.array([m.receive_ns for m in messages], dtype=np.int64)
     header = None
     if hasattr(messages[0].content, "header"):
@@ -89,7 +89,7 @@ def _table(
 
 
 def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
-    """Commands (T, C) of the robot."""
+    """Reads the commands (T, C) of the robot."""
     if bag.types[topic] in (topic_roles.ACKERMANN, topic_roles.ACKERMANN_STAMPED):
         for variable in spec.command:
             if variable.cmd_vel == "angular.z" and variable.unit != "rad":
@@ -103,7 +103,7 @@ def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
 
 
 def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
-    """Poses (T, 3) of the tracked body."""
+    """Reads the poses (T, 3) of the tracked body."""
     messages = bag.messages(topic)
     if bag.types[topic] in (topic_roles.TRANSFORM, topic_roles.TRANSFORMS):
         messages = _of_one_body(bag, topic, _transforms(messages), mapping)
@@ -119,7 +119,7 @@ def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
 
 
 def _transforms(messages: Sequence[Message]) -> list[Message]:
-    """One message for each transform."""
+    """Splits messages into one per transform."""
     return [
         Message(message.receive_ns, transform)
         for message in messages
@@ -130,7 +130,7 @@ def _transforms(messages: Sequence[Message]) -> list[Message]:
 def _of_one_body(
     bag: BagFile, topic: str, messages: Sequence[Message], mapping: TopicRoles
 ) -> list[Message]:
-    """The transforms between the two frames that the mapping names, or between the only two."""
+    """Returns the transforms between the two frames of the mapping, or the only two frames."""
     wanted = (mapping.frame, mapping.child_frame)
     pairs = {
         pair
@@ -150,7 +150,7 @@ def _of_one_body(
 
 
 def _joints(bag: BagFile, topic: str, spec: RobotSpec, mapping: TopicRoles) -> dict[str, TopicData]:
-    """Measured state and wheel speeds, where the joints tell them."""
+    """Reads measured state and wheel speeds, if the joints report them."""
     joints = gather(
         topic,
         [
@@ -170,18 +170,18 @@ SCAN = "sensor_msgs/msg/LaserScan"
 LEAST_MESSAGES = 20
 PERCENTILES = (5.0, 50.0, 95.0)
 SPANNED = 0.9
-"""The share of an even distribution that lies between the first and the last of them."""
+"""The share of a uniform distribution between the first and the last of these percentiles."""
 
 
 def latency_of(bag: BagFile, odom: str | None = None) -> Latency:
     """Measures the delays of scan and odometry in a bag.
 
-    Only stamps of the recorder's own clock tell them; where a topic is not there, has too few
-    messages or is stamped by another clock, its delay is not known.
+    Only stamps of the recorder's own clock show them. If a topic is missing, has too few messages
+    or is stamped by another clock, its delay is unknown.
 
     Args:
         bag: an open bag.
-        odom: the topic of odometry; the one of that type or name by default.
+        odom: the odometry topic; by default the one of that type or name.
     """
     scan, odom = _topic(bag, SCAN, "scan"), odom or _topic(bag, ODOMETRY, "odom")
     return Latency(
@@ -191,7 +191,7 @@ def latency_of(bag: BagFile, odom: str | None = None) -> Latency:
 
 
 def _topic(bag: BagFile, kind: str, name: str) -> str | None:
-    """The one topic of a type, or the one of several that has the usual name."""
+    """Returns the only topic of a type, or the only one of several with the usual name."""
     of_kind = [topic for topic, one in bag.types.items() if one == kind and topic not in bag.empty]
     named = [topic for topic in of_kind if re.search(rf"(^|/){name}$", topic)]
     found = of_kind if len(of_kind) == 1 else named
@@ -199,7 +199,7 @@ def _topic(bag: BagFile, kind: str, name: str) -> str | None:
 
 
 def _delay(messages: Sequence[Message]) -> Delay | None:
-    """The delays of messages with stamps, as an even distribution."""
+    """Fits a uniform distribution to the delays of stamped messages."""
     if len(messages) < LEAST_MESSAGES:
         return None
     stamps = np.array([stamp(m.content) for m in messages], dtype=np.int64)
@@ -213,7 +213,7 @@ def _delay(messages: Sequence[Message]) -> Delay | None:
 
 
 def _sweep(message: Message) -> float:
-    """From the stamp of a scan, which is that of beam 0, to its last beam [s]."""
+    """Returns the time from a scan's stamp, that of beam 0, to its last beam [s]; else 0."""
     scan = message.content
     if not hasattr(scan, "ranges"):
         return 0.0

@@ -1,4 +1,4 @@
-"""DrivePlan: a drive for a recording, from its options to the pattern that is expected."""
+"""DrivePlan: a drive for a recording, from its options to its expected pattern."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from nics_drl_bridge.seeds import checked_seeds
 
 SHORTEST_S, LONGEST_S = 20.0, 3600.0
 SPREAD, ALIKE = 0.17, 0.6
-"""Least standard deviation of each command as a share of its range, of which 0.29 is uniform;
-greatest correlation of two."""
+"""Minimum standard deviation of each command as a share of its range (0.29 if uniform); maximum
+correlation of two commands."""
 ATTEMPTS = 8
 
 
 @dataclass(frozen=True)
 class DrivePlan:
-    """What a drive is to be.
+    """Options of a drive.
 
     Attributes:
-        robot: that drives.
-        bound: radius of the circle around the start that the whole robot keeps within [m].
+        robot: the robot that drives.
+        bound: radius of the circle around the start that contains the whole robot [m].
         duration: [s].
         speed: share of the greatest speeds and rates to use.
         seed: of the pattern.
@@ -53,7 +53,7 @@ class DrivePlan:
                 raise ConfigError(f"{name} {value:g}: must be from {low:g} to {high:g}.")
 
     def begin(self) -> Exploration:
-        """The drive that is previewed, at its start.
+        """Returns the previewed drive, at its start.
 
         Raises:
             ConfigError: the circle is too small for the robot to show its motion in it.
@@ -61,7 +61,7 @@ class DrivePlan:
         return self._attempt(self._found[0])
 
     def preview(self) -> Pattern:
-        """The drive as it goes with the expected motion.
+        """Returns the pattern of the drive under the expected motion.
 
         Raises:
             ConfigError: the circle is too small for the robot to show its motion in it.
@@ -74,7 +74,7 @@ class DrivePlan:
 
     @cached_property
     def _found(self) -> tuple[int, Pattern]:
-        """The first attempt that shows all of the motion within the circle."""
+        """Number and pattern of the first attempt that varies all commands within the circle."""
         for number in range(ATTEMPTS):
             drive = self._attempt(number)
             if drive.keep_within <= 0.0:
@@ -90,7 +90,7 @@ class DrivePlan:
 
 
 def _driven(drive: Exploration, bound: float, footprint: float) -> Pattern | None:
-    """The whole drive as expected; None if it finds no way back into its circle."""
+    """Returns the expected pattern of a drive; None if it finds no way back into its circle."""
     poses, commands = [drive.pose], []
     while not drive.done:
         commands.append(drive.next())
@@ -101,7 +101,7 @@ def _driven(drive: Exploration, bound: float, footprint: float) -> Pattern | Non
 
 
 def _varied(pattern: Pattern, drive: Exploration) -> bool:
-    """Whether every command covers its range, none of them following another."""
+    """True if every command covers its range and no two are correlated."""
     if (pattern.command.std(axis=0) < SPREAD * (drive.high - drive.low)).any():
         return False
     alike = np.corrcoef(pattern.command, rowvar=False).reshape(len(drive.low), -1)

@@ -1,15 +1,15 @@
-"""Exploration: commands that show a robot's whole motion and keep it within a circle.
+"""Exploration: commands that excite a robot's whole motion and keep it within a circle.
 
-A drive is a row of segments. At the end of each, the next is drawn at random: new levels for
-one or more of the commands, reached smoothly and held for a random time (amplitude-modulated
-pseudo-random steps; Nelles: Nonlinear System Identification, ch. 21). A segment is taken only if
-the expected path stays within the circle, and if from its end the robot can still turn back.
-Levels that were used least are preferred, so that each command covers its range independently
-of the others, and so are ends from which a way leads near the centre.
+A drive is a sequence of segments. At the end of each, the next is drawn at random: new levels for
+one or more commands, reached smoothly and held for a random time (amplitude-modulated
+pseudo-random steps; Nelles: Nonlinear System Identification, ch. 21). A segment is accepted only
+if the expected path stays within the circle and the robot can still turn back from its end. Rarely
+used levels are preferred, so that each command covers its range independently of the others, and
+so are end points from which a path leads close to the centre.
 
-Pattern: a drive for a recording as it is expected, before the robot moves.
+Pattern: the expected course of a drive, before the robot moves.
 
-Prediction: where commands are expected to lead a robot that no model is known of yet.
+Prediction of the motion of a robot that has no fitted model yet.
 """
 
 from __future__ import annotations
@@ -31,37 +31,39 @@ Array = NDArray[np.float64]
 
 PERIOD_S = 0.05
 STILL_S = 1.0
-"""The robot stands for so long at both ends of a drive."""
+"""Standstill at both ends of a drive [s]."""
 RAMP_S = 0.25
 SEGMENT_S = (0.4, 1.6)
 CANDIDATES = 12
 ALONE, REDRAWN = 0.5, 0.6
-"""Probability that a segment changes one command alone; else, that it changes each more one."""
+"""Probability that a segment changes a single command; otherwise, that it changes each further
+command."""
 BINS = 4
 CENTRED = 2.0
-"""What nearness to the centre weighs against the novelty of a command."""
+"""Weight of the distance from the centre against the familiarity of a command."""
 MARGIN_M, REACTION_S, TOLERANCE_M = 0.05, 0.2, 0.005
-"""The path keeps this far inside, and what the robot drives in this time at its fastest."""
+"""The path stays inside the circle by this margin plus the distance driven in this time at top
+speed; tolerance of that limit."""
 TURNING_SPEED, TURNING = 0.5, 0.8
-"""How the robot turns back, as shares of the greatest commands: less than it could, as a reserve
-for a robot that turns worse than expected."""
+"""Commands for turning back, as shares of the greatest: less than possible, as a reserve for a
+robot that turns worse than expected."""
 WAY_S, WAY_STEP_S = (3.0, 20.0), 0.1
 NEAR, NEARER = 0.25, 0.6
-"""A way back begins within this share of the circle's radius, or ends at this share of its first
-distance from the centre, or turns half round."""
+"""A path back starts within this share of the circle's radius, or reaches this share of its
+initial distance from the centre, or turns by half a turn."""
 LOST = 8
 
 
 class Exploration:
-    """Gives a robot's commands, one per period, and follows where it goes.
+    """Generator of a robot's commands, one per period, that tracks the robot's pose.
 
     Args:
         spec: the robot.
-        bound: radius of the circle around the start that the whole robot keeps within [m].
-        duration: of the drive [s], with 1 s of standing at both ends.
+        bound: radius of the circle around the start that contains the whole robot [m].
+        duration: of the drive [s], including 1 s of standstill at both ends.
         rng: draws the segments.
-        speed: share of the greatest speeds and rates to use, above 0, up to 1; angles are used
-            whole.
+        speed: share of the greatest speeds and rates to use, above 0, up to 1; angles use their
+            full range.
     """
 
     def __init__(
@@ -93,21 +95,21 @@ class Exploration:
 
     @property
     def done(self) -> bool:
-        """Whether the drive is over."""
+        """True if the drive is over."""
         return self._tick >= self._ticks
 
     @property
     def stuck(self) -> bool:
-        """Whether the robot has not found a way back for many segments."""
+        """True if the robot has found no acceptable segment `LOST` times in a row."""
         return self._lost >= LOST
 
     def see(self, pose: Array) -> None:
-        """Takes notice of where the robot is in the present period: (3,) seen from the start."""
+        """Observes the robot's pose (3,) at the start of the current period, in the start frame."""
         self.pose = geometry.compose(pose, geometry.between(self._before, self.pose))
         self._before, self._seen = np.asarray(pose, dtype=np.float64), True
 
     def next(self) -> Array:
-        """The command (C,) for the period that begins now."""
+        """Returns the command (C,) for the period that begins now."""
         if self._tick < self._still or self.done:
             command = self.rest
         else:
@@ -118,14 +120,14 @@ class Exploration:
         return command
 
     def _goes_astray(self) -> bool:
-        """Whether what was seen since leads the rest of the segment too far out."""
+        """True if, from the observed pose, the rest of the segment leads too far out."""
         if not self._seen or self._tick >= self._ticks - self._still:
             return False
         self._seen = False
         return bool(_distance(self._roll(self._queue[None])[0]).max() > self._limit() + MARGIN_M)
 
     def _limit(self) -> float:
-        """How far out the robot may go: where it already is too far, no farther [m]."""
+        """Returns the greatest allowed distance from the start, at least the present one [m]."""
         return max(self.keep_within, float(_distance(self.pose))) + TOLERANCE_M
 
     def _follow(self, command: Array) -> None:
@@ -136,18 +138,18 @@ class Exploration:
         self._tick += 1
 
     def _roll(self, commands: Array) -> tuple[Array, Array]:
-        """Poses and states that commands (K, T, C) lead through from here."""
+        """Rolls out commands (K, T, C) from the present pose and state."""
         many = len(commands)
         pose, state = np.repeat(self.pose[None], many, 0), np.repeat(self._state[None], many, 0)
         return self._motion.roll(pose, state, commands, PERIOD_S)
 
     def _cells(self, command: Array) -> tuple[NDArray[np.intp], ...]:
-        """The cell of commands (..., C), by dimension."""
+        """Returns the cell indices of commands (..., C), by dimension."""
         share = (command - self.low) / (self.high - self.low)
         return tuple(np.moveaxis(np.clip((share * BINS).astype(np.intp), 0, BINS - 1), -1, 0))
 
     def _segment(self) -> Array:
-        """Commands (T, C) up to the next decision."""
+        """Returns the commands (T, C) up to the next decision."""
         left = self._ticks - self._still - self._tick
         if left <= self._ramp:
             return np.asarray(self._towards(self.rest[None], left + self._still)[0])
@@ -162,7 +164,7 @@ class Exploration:
         return self._least_harm(length)
 
     def _candidates(self, alone: bool) -> Array:
-        """Levels (K, C) at random, of one of the commands or of some."""
+        """Draws random levels (K, C) for one command or for several."""
         size = (CANDIDATES, len(self.low))
         fresh = self._rng.uniform(self.low, self.high, size)
         changed = self._rng.random(size) < (0.0 if alone else REDRAWN)
@@ -171,7 +173,7 @@ class Exploration:
         return np.where(changed, fresh, self._command)
 
     def _best(self, levels: Array, length: int) -> Array | None:
-        """Commands (T, C) towards the best of levels (K, C); None if all lead too far out."""
+        """Returns commands (T, C) to the best of levels (K, C); None if all lead too far out."""
         commands = self._towards(levels, length)
         poses, states = self._roll(commands)
         limit = self._limit()
@@ -185,13 +187,16 @@ class Exploration:
         return np.asarray(commands[allowed[best]]) if np.isfinite(score[best]) else None
 
     def _towards(self, levels: Array, length: int) -> Array:
-        """Commands (K, T, C) that go smoothly from the present one to levels (K, C)."""
+        """Returns commands (K, T, C) that go smoothly from the present one to levels (K, C)."""
         done = np.minimum(np.arange(1, length + 1) / self._ramp, 1.0)
         share = (1.0 - np.cos(np.pi * done)) / 2.0
         return np.asarray(self._command + share[None, :, None] * (levels - self._command)[:, None])
 
     def _ways_back(self, factor: Array) -> Array:
-        """Constant commands (E, T, C), long enough for half a turn by the one that turns best."""
+        """Returns constant commands (E, T, C) for turning back.
+
+        They last long enough for half a turn by the one that turns fastest.
+        """
         ends = [
             sorted({low, rest, high})
             for low, rest, high in zip(
@@ -209,9 +214,9 @@ class Exploration:
         return np.repeat(ways, round(needed / WAY_STEP_S), axis=1)
 
     def _way_to_centre(self, pose: Array, state: Array, limit: float) -> Array:
-        """How near the centre ways back lead from poses (K, 3), as a share of the radius.
+        """Returns how close paths back from poses (K, 3) get to the centre, over the radius.
 
-        Infinite where none keeps within a limit and turns the robot half round, or brings it
+        Infinite if no path stays within `limit` and turns the robot by half a turn or brings it
         back.
         """
         many = len(self._ways)
@@ -227,7 +232,10 @@ class Exploration:
         return np.where(useful, reached / self._outermost, np.inf)
 
     def _least_harm(self, length: int) -> Array:
-        """The way that leads farthest in, of those that keep the robot within the circle."""
+        """Returns commands (T, C) towards the least harmful path back.
+
+        That path leaves the circle least, and among equals gets closest to its centre.
+        """
         start = np.repeat(self.pose[None], len(self._emergency), 0)
         state = np.repeat(self._state[None], len(self._emergency), 0)
         away = _distance(self._motion.roll(start, state, self._emergency, WAY_STEP_S)[0])
@@ -237,19 +245,19 @@ class Exploration:
 
 
 def _distance(pose: Array) -> Array:
-    """Of poses (..., 3) from the start [m]."""
+    """Returns the distance of poses (..., 3) from the start [m]."""
     return np.asarray(np.hypot(pose[..., 0], pose[..., 1]))
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """A drive as it is expected; the robot starts at the origin and looks along x.
+    """The expected course of a drive; the robot starts at the origin and faces along x.
 
     Attributes:
-        period: how long each command is held [s].
+        period: time for which each command is held [s].
         command: (T, C).
         pose: (T + 1, 3) at the start of each period, and at the end.
-        bound: radius of the circle around the start that the whole robot keeps within [m].
+        bound: radius of the circle around the start that contains the whole robot [m].
         footprint: radius of the robot [m].
     """
 
@@ -261,12 +269,12 @@ class Pattern:
 
     @property
     def duration(self) -> float:
-        """Of the drive [s]."""
+        """Duration of the drive [s]."""
         return self.period * len(self.command)
 
     @property
     def box(self) -> Array:
-        """(2, 2) least and greatest x and y [m] that the robot's body reaches."""
+        """Least and greatest x and y (2, 2) that the robot's body reaches [m]."""
         place = self.pose[:, :2]
         return np.array([place.min(axis=0) - self.footprint, place.max(axis=0) + self.footprint])
 
@@ -277,17 +285,17 @@ class Pattern:
 
     @property
     def twist(self) -> Array:
-        """(T, 3) mean body twist of each period [m/s, m/s, rad/s]."""
+        """Mean body twist (T, 3) of each period [m/s, m/s, rad/s]."""
         moved = geometry.log(geometry.between(self.pose[:-1], self.pose[1:]))
         return np.asarray(moved / self.period)
 
     @property
     def speed(self) -> Array:
-        """(T,) speed of each period [m/s]."""
+        """Speed (T,) of each period [m/s]."""
         return np.asarray(np.hypot(*self.twist[:, :2].T))
 
     def lines(self) -> tuple[str, ...]:
-        """What somebody has to know before the robot moves, for people."""
+        """Returns the lines that an operator must read before the robot moves."""
         (left, low), (right, high) = self.box
         return (
             f"preview of {self.duration:.0f} s: a path of {self.speed.sum() * self.period:.1f} m, "
@@ -305,12 +313,12 @@ TWIST_UNITS = {"linear.x": "m/s", "linear.y": "m/s", "angular.z": "rad/s"}
 
 @dataclass(frozen=True)
 class Motion:
-    """How a robot is expected to move.
+    """Expected motion of a robot.
 
     Attributes:
-        size: S of the state.
-        respond: the state (K, S) after a command (K, C) was held for some time [s].
-        twist: body twist (K, 3) of state (K, S) and command (K, C).
+        size: S, the size of the state.
+        respond: gives the state (K, S) after a command (K, C) was held for some time [s].
+        twist: gives the body twist (K, 3) for a state (K, S) and a command (K, C).
     """
 
     size: int
@@ -318,7 +326,7 @@ class Motion:
     twist: Callable[[Array, Array], Array]
 
     def roll(self, pose: Array, state: Array, command: Array, period: float) -> tuple[Array, Array]:
-        """Where commands lead, by one arc for each at the state in the middle of its period.
+        """Rolls out commands, one arc per command at the state in the middle of its period.
 
         Args:
             pose: (K, 3).
@@ -341,10 +349,10 @@ class Motion:
 
 
 def expected_motion(spec: RobotSpec) -> Motion:
-    """The motion of a robot's textbook kinematics, or that its `cmd_vel` is its body twist.
+    """Returns the motion of a robot's textbook kinematics, else its `cmd_vel` as body twist.
 
     Raises:
-        ConfigError: it names no textbook, and a command is no part of a twist.
+        ConfigError: the spec names no textbook, and a command is not part of a twist.
     """
     if spec.textbook is not None:
         book = textbook(spec)

@@ -1,4 +1,4 @@
-"""Joints: a robot's state and wheel speeds in what its joints report."""
+"""Joints: a robot's state and wheel speeds from its joint messages."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Joints:
     """Messages about joints.
 
     Attributes:
-        topic: where they came from.
-        receive_ns: (T,) when each was received [ns].
+        topic: their topic.
+        receive_ns: (T,) times of receipt [ns].
         header_ns: (T,) their stamps [ns].
-        names: of the J joints that any message holds.
-        position: (T, J) [rad or m], NaN where a message does not tell.
+        names: of the J joints in any of the messages.
+        position: (T, J) [rad or m], NaN if missing in a message.
         velocity: (T, J) [rad/s or m/s], likewise.
     """
 
@@ -45,7 +45,7 @@ class JointMessage:
     """One message.
 
     Attributes:
-        receive_ns: when it was received [ns].
+        receive_ns: time of receipt [ns].
         header_ns: its stamp [ns].
         names: of the joints in it.
         position: of each, or empty.
@@ -60,7 +60,7 @@ class JointMessage:
 
 
 def gather(topic: str, messages: Sequence[JointMessage]) -> Joints:
-    """Puts messages, which may hold different joints, into one table."""
+    """Collects messages, which may contain different joints, in one table."""
     names = tuple(dict.fromkeys(name for message in messages for name in message.names))
     place = {name: j for j, name in enumerate(names)}
     position, velocity = np.full((2, len(messages), len(names)), np.nan)
@@ -75,7 +75,7 @@ def gather(topic: str, messages: Sequence[JointMessage]) -> Joints:
 
 
 def state_of(joints: Joints, spec: RobotSpec, roles: TopicRoles, place: str) -> TopicData | None:
-    """The measured state (T, S), from the messages that tell all of it.
+    """Returns the measured state (T, S), from the messages that contain all of it.
 
     Args:
         joints: of the robot.
@@ -84,11 +84,11 @@ def state_of(joints: Joints, spec: RobotSpec, roles: TopicRoles, place: str) -> 
         place: the recording's name, for errors.
 
     Returns:
-        The state; None if no joints have the names of the state variables, and none has to be
+        The state; None if joints of some state variables are missing, but no state has to be
         measured because each follows a command.
 
     Raises:
-        RecordingError: a joint is not there, or a state that has to be measured is not.
+        RecordingError: a named joint does not exist, or a required state was not measured.
     """
     there = f"the joints of {joints.topic!r} are {', '.join(joints.names) or 'none'}"
     known = [v.name for v in spec.state]
@@ -113,7 +113,7 @@ def state_of(joints: Joints, spec: RobotSpec, roles: TopicRoles, place: str) -> 
 
 
 def wheels_of(joints: Joints, roles: TopicRoles, place: str) -> TopicData | None:
-    """The speeds (T, 2) of the left and the right wheel; None if no joints are called so."""
+    """Returns the speeds (T, 2) of the left and right wheel; None without such joints."""
     guesses = (_alike(joints.names, wheel) for wheel in WHEELS)
     chosen = list(roles.wheels or (name for name in guesses if name is not None))
     if len(chosen) < len(WHEELS):
@@ -146,7 +146,7 @@ def _require(joints: Joints, name: str, place: str) -> None:
 
 
 def _alike(names: Iterable[str], wanted: str) -> str | None:
-    """The one joint whose name has all words of the wanted one, in any order."""
+    """Returns the only joint whose name has all words of the wanted name, in any order."""
     words = set(wanted.split("_"))
     found = [name for name in names if words <= set(re.split(r"[^a-z]+", name.lower()))]
     return wanted if wanted in found else found[0] if len(found) == 1 else None
@@ -159,7 +159,7 @@ def _column(joints: Joints, variable: StateVariable, source: JointSource) -> Arr
 
 
 def _complete(joints: Joints, values: Array, names: Sequence[str], place: str) -> TopicData:
-    """Leaves out the messages about other joints."""
+    """Drops the messages about other joints."""
     keep = np.asarray(np.isfinite(values).all(axis=1))
     if not keep.any():
         raise RecordingError(

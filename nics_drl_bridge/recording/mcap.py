@@ -1,11 +1,10 @@
-"""The records of an MCAP file, so that damage is found which readers pass over.
+"""Records of an MCAP file, to find damage that readers overlook.
 
-Readers of MCAP follow the index at its end: what a damaged index does not name is missing without
-a word. Here the file is walked from its first byte to its last, as its specification
-(https://mcap.dev/spec) lays it out; counts, times and index have to agree, and every checksum
-that there is.
+MCAP readers follow the index at the end of the file: messages that a damaged index omits are lost
+silently. Here the file is walked from its first byte to its last, as laid out in its specification
+(https://mcap.dev/spec); counts, times and index must agree, and every checksum present must match.
 
-Unpacks parts of bags, of which a few bytes may say that they are terabytes.
+Safe decompression of parts of bags: a few bytes can unpack to terabytes.
 """
 
 from __future__ import annotations
@@ -27,19 +26,19 @@ HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = ra
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET = range(9, 15)
 DATA_END = 15
 PRIVATE = 0x80
-"""From here on, opcodes are free for everybody's own records."""
+"""Opcodes from here on are reserved for private records."""
 PREFIX = 9
 """Bytes of opcode and length in front of a record."""
 FOOTER_BYTES = PREFIX + 20
 CHUNK_CRC = 24
-"""Where a chunk's checksum stands in its content."""
+"""Offset of a chunk's checksum in its content."""
 COMPRESSIONS = ("", "lz4", "zstd")
 INSIDE = (SCHEMA, CHANNEL, MESSAGE)
-"""What may stand in a chunk."""
+"""Records that may occur in a chunk."""
 
 
 class DamageError(ValueError):
-    """What is wrong in a file, and at which byte."""
+    """Damage of a file, with its byte offset."""
 
     def __init__(self, offset: int, what: str) -> None:
         super().__init__(f"byte {offset}: {what}")
@@ -52,7 +51,7 @@ class Record(NamedTuple):
     Attributes:
         offset: of its opcode, from the start of the file or of the chunk.
         op: its opcode.
-        content: what follows the length.
+        content: bytes after the length.
     """
 
     offset: int
@@ -61,7 +60,7 @@ class Record(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Where the next one begins."""
+        """Offset of the next record."""
         return self.offset + PREFIX + len(self.content)
 
 
@@ -91,7 +90,7 @@ class Message(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """The head of a chunk, and its records, still compressed."""
+    """Header of a chunk, and its records, still compressed."""
 
     start_ns: int
     end_ns: int
@@ -103,12 +102,12 @@ class Chunk(NamedTuple):
 
 @dataclass
 class Told:
-    """What is known of a file after some of its records.
+    """Contents of a file, gathered from the records read so far.
 
     Attributes:
         schemas: by id.
         channels: by id.
-        counts: messages of each channel.
+        counts: number of messages by channel.
         span: first and last time [ns]; None before the first message.
     """
 
@@ -118,7 +117,7 @@ class Told:
     span: tuple[int, int] | None = None
 
     def see(self, record: Record) -> Message | None:
-        """Notes a schema, a channel or a message, which it returns."""
+        """Registers a schema, a channel or a message; returns the message."""
         if record.op == SCHEMA:
             key, schema = schema_of(record)
             if self.schemas.setdefault(key, schema) != schema:
@@ -141,7 +140,7 @@ class Told:
 
 
 class _Fields:
-    """Takes the fields of a record one after the other."""
+    """Sequential reader of the fields of a record."""
 
     def __init__(self, record: Record) -> None:
         self._content, self._at, self._offset = record.content, 0, record.offset
@@ -164,7 +163,7 @@ class _Fields:
             raise DamageError(self._offset, "a text is not UTF-8") from None
 
     def inner(self) -> _Fields:
-        """The fields of a map or an array."""
+        """Returns the fields of a map or an array."""
         (size,) = self.numbers("I")
         return _Fields(Record(self._offset, 0, self.take(size)))
 
@@ -181,10 +180,10 @@ class _Fields:
 
 
 def records(data: memoryview, start: int, end: int, base: int = 0) -> Iterator[Record]:
-    """The records from `start` to `end`; `base` is added to the places that errors name.
+    """Yields the records from `start` to `end`; `base` is added to all offsets.
 
     Raises:
-        DamageError: one does not end where the next should begin, or is of an unknown kind.
+        DamageError: a record is truncated or of an unknown kind.
     """
     while start < end:
         if start + PREFIX > end:
@@ -200,7 +199,7 @@ def records(data: memoryview, start: int, end: int, base: int = 0) -> Iterator[R
 
 
 def schema_of(record: Record) -> tuple[int, Schema]:
-    """Id and content of a schema."""
+    """Returns id and content of a schema."""
     fields = _Fields(record)
     (key,) = fields.numbers("H")
     schema = Schema(fields.text(), fields.text(), fields.text())
@@ -209,7 +208,7 @@ def schema_of(record: Record) -> tuple[int, Schema]:
 
 
 def channel_of(record: Record) -> tuple[int, Channel]:
-    """Id and content of a channel."""
+    """Returns id and content of a channel."""
     fields = _Fields(record)
     key, schema = fields.numbers("HH")
     topic, encoding = fields.text(), fields.text()
@@ -221,14 +220,14 @@ def channel_of(record: Record) -> tuple[int, Channel]:
 
 
 def message_of(record: Record) -> Message:
-    """A message."""
+    """Parses a message."""
     fields = _Fields(record)
     channel, _, time_ns, _ = fields.numbers("HIQQ")
     return Message(channel, time_ns, bytes(fields.rest()))
 
 
 def chunk_of(record: Record) -> Chunk:
-    """The head of a chunk."""
+    """Parses the header of a chunk."""
     fields = _Fields(record)
     start, end, size, crc = fields.numbers("QQQI")
     compression = fields.text()
@@ -239,17 +238,17 @@ def chunk_of(record: Record) -> Chunk:
 
 
 def unpacked(record: Record) -> Bytes:
-    """The records of a chunk, decompressed, with size and checksum compared.
+    """Decompresses the records of a chunk and verifies size and checksum.
 
     Raises:
-        DamageError: they do not agree.
+        DamageError: it can't be decompressed, or size or checksum is wrong.
     """
     chunk = chunk_of(record)
     if chunk.compression not in COMPRESSIONS:
         raise DamageError(record.offset, f"there is no compression {chunk.compression!r}")
     try:
         plain = _decompress(chunk)
-    except Exception as error:  # noqa: BLE001 - a damaged chunk breaks the library in any way
+    except Exception as error:  # noqa: BLE001 - the library can raise anything on a damaged chunk
         raise DamageError(record.offset, f"a chunk can't be unpacked ({error})") from None
     if len(plain) != chunk.size:
         raise DamageError(record.offset, "a chunk is not as long as it says")
@@ -265,10 +264,10 @@ def _decompress(chunk: Chunk) -> Bytes:
 
 
 def inner_records(record: Record) -> Iterator[Record]:
-    """The records of a chunk, with their places in it.
+    """Yields the records of a chunk, with their offsets in it.
 
     Raises:
-        DamageError: it is damaged, or holds what no chunk may hold.
+        DamageError: it is damaged, or contains a record that is not allowed in a chunk.
     """
     plain = memoryview(unpacked(record))
     for inner in records(plain, 0, len(plain)):
@@ -278,7 +277,7 @@ def inner_records(record: Record) -> Iterator[Record]:
 
 
 def message_index_of(record: Record) -> tuple[int, list[tuple[int, int]]]:
-    """Channel, and time [ns] and place in the chunk of each of its messages."""
+    """Returns channel, and time [ns] and offset in the chunk of each of its messages."""
     fields = _Fields(record)
     (channel,) = fields.numbers("H")
     inner, entries = fields.inner(), []
@@ -290,13 +289,13 @@ def message_index_of(record: Record) -> tuple[int, list[tuple[int, int]]]:
 
 
 def mapped(path: Path, access: int = ACCESS_READ) -> memoryview:
-    """A file as one piece of memory; it is let go of with the last part of it in use."""
+    """Maps a file into memory; the mapping lasts until its last view is released."""
     with path.open("rb" if access == ACCESS_READ else "r+b") as file:
         return memoryview(mmap(file.fileno(), 0, access=access))
 
 
 def seal(path: Path) -> None:
-    """Writes the checksums of chunks, data and summary into a file that was written without."""
+    """Adds the checksums of chunks, data and summary to a file that was written without them."""
     data = mapped(path, ACCESS_WRITE)
     chunks, place, summary = [], 0, 0
     for record in records(data, len(MAGIC), len(data) - len(MAGIC)):
@@ -315,9 +314,9 @@ def seal(path: Path) -> None:
 
 
 MOST_UNPACKED = 256 * 2**20
-"""Bytes of one chunk or message, unpacked."""
+"""Maximum size of one chunk or message, decompressed [bytes]."""
 MOST_PACKED_SHARE = 1000
-"""So many times as long may a file be unpacked, once it is longer than `MOST_UNPACKED`."""
+"""Maximum compression ratio of a file that decompresses to more than `MOST_UNPACKED`."""
 _PART = 2**20
 
 
@@ -325,19 +324,20 @@ def _zstd() -> Any:
     try:
         return import_module("compression.zstd")
     except ImportError:
-        return import_module("backports.zstd")  # of rosbags, before Python 3.14
+        return import_module("backports.zstd")  # a dependency of rosbags before Python 3.14
 
 
 def unpack(data: bytes, compression: str, most: int = MOST_UNPACKED) -> bytes:
-    """The content of a chunk.
+    """Decompresses the content of a chunk.
 
     Args:
-        data: packed.
+        data: compressed data.
         compression: `lz4` or `zstd`.
-        most: bytes that it may have.
+        most: maximum size of the result [bytes].
 
     Raises:
-        ValueError: it has more. What else the libraries raise at damaged data, they raise.
+        ValueError: the result is larger, or the data is truncated. Other exceptions of the
+            libraries on damaged data are passed on.
     """
     kinds = {"lz4": ("lz4.frame", "LZ4FrameDecompressor")}
     if compression == "zstd":
@@ -354,7 +354,7 @@ def unpack(data: bytes, compression: str, most: int = MOST_UNPACKED) -> bytes:
 
 
 def check_packed(path: Path) -> None:
-    """Raises ValueError for a file that would unpack to very many times its length."""
+    """Raises ValueError for a file that would decompress to far more than its length."""
     most = max(MOST_UNPACKED, MOST_PACKED_SHARE * path.stat().st_size)
     length = 0
     with _zstd().open(path, "rb") as file:
@@ -365,7 +365,7 @@ def check_packed(path: Path) -> None:
 
 
 def check_message(data: bytes) -> None:
-    """Raises ValueError for a packed message that does not say how long it is, or is too long."""
+    """Raises ValueError for a compressed message whose stated size is missing or too large."""
     size = _zstd().get_frame_info(data).decompressed_size
     if size is None or size > MOST_UNPACKED:
         raise ValueError(f"a message unpacks to {size or 'unknown'} bytes")

@@ -1,4 +1,4 @@
-"""Whether an MCAP file is whole."""
+"""Integrity check of an MCAP file."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from nics_drl_bridge.recording.mcap import (
 
 @dataclass
 class _Walk:
-    """What was met on the way through a file."""
+    """Contents found while walking through a file."""
 
     data: Told = field(default_factory=Told)
     summary: Told = field(default_factory=Told)
@@ -46,10 +46,10 @@ class _Walk:
 
 
 def check_mcap(path: Path) -> None:
-    """Walks a file from its first byte to its last.
+    """Checks a file from its first byte to its last.
 
     Raises:
-        DamageError: it is cut off, or two of its parts do not agree.
+        DamageError: it is truncated, a checksum is wrong, or two of its parts disagree.
     """
     if path.stat().st_size < len(MAGIC):
         raise DamageError(0, "the file is empty or ends at once")
@@ -103,7 +103,7 @@ def _data(walk: _Walk, record: Record) -> None:
 
 
 def _chunk(walk: _Walk, record: Record) -> None:
-    """Goes through a chunk; its index follows it."""
+    """Walks through a chunk and keeps its messages for the index records that follow it."""
     chunk, inside = chunk_of(record), Told(walk.data.schemas, walk.data.channels)
     walk.places = {}
     for inner in inner_records(record):
@@ -144,7 +144,7 @@ def _footer(data: memoryview, end: int, section: int) -> None:
 
 
 def _agree(walk: _Walk, place: int) -> None:
-    """Holds the summary, as far as there is one, against the data."""
+    """Compares the summary, if there is one, with the data."""
     told, summary = walk.data, walk.summary
     for name, ours, theirs in (
         ("schemas", told.schemas, summary.schemas),

@@ -1,6 +1,6 @@
-"""What a bag's messages tell: rows of numbers, and the message types that rosbags lacks.
+"""Conversion of a bag's messages to rows of numbers, and message types that rosbags lacks.
 
-Quality of service, as a bag keeps what its publishers offered.
+Quality of service offered by publishers, as stored in a bag.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ACKERMANN_STAMPED_DEFINITION = "std_msgs/Header header\nackermann_msgs/Ackermann
 
 
 def typestore() -> Typestore:
-    """The messages of ROS 2, and those of Ackermann drives."""
+    """Returns the message types of ROS 2, and those of Ackermann drives."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -37,18 +37,18 @@ def typestore() -> Typestore:
 
 
 def frames(transform: Any) -> tuple[str, str]:
-    """Parent and child of a transform, without the leading slash of old publishers."""
+    """Returns parent and child of a transform, without the leading slash of old publishers."""
     return transform.header.frame_id.strip("/"), transform.child_frame_id.strip("/")
 
 
 def stamp(message: Any) -> int:
-    """The stamp of a message's header [ns]."""
+    """Returns the stamp of a message's header [ns]."""
     time = message.header.stamp
     return int(time.sec) * NS_PER_S + int(time.nanosec)
 
 
 def command_row(message: Any) -> Row:
-    """linear.x, linear.y, angular.z; of an Ackermann drive the speed and the steering angle."""
+    """Returns linear.x, linear.y, angular.z; of an Ackermann drive speed, 0, steering angle."""
     drive = getattr(message, "drive", message)
     if hasattr(drive, "steering_angle"):
         return drive.speed, 0.0, drive.steering_angle
@@ -57,7 +57,7 @@ def command_row(message: Any) -> Row:
 
 
 def _place(message: Any) -> tuple[Any, Any]:
-    """Position and quaternion of any message that has them."""
+    """Returns position and quaternion of any message that has them."""
     if hasattr(message, "transform"):
         return message.transform.translation, message.transform.rotation
     pose = getattr(message.pose, "pose", message.pose)
@@ -65,38 +65,38 @@ def _place(message: Any) -> tuple[Any, Any]:
 
 
 def quaternion(message: Any) -> tuple[float, float, float, float]:
-    """x, y, z, w of a message's pose."""
+    """Returns x, y, z, w of a message's orientation."""
     q = _place(message)[1]
     return q.x, q.y, q.z, q.w
 
 
 def pose_row(message: Any) -> Row:
-    """Position x, y [m] and heading [rad]."""
+    """Returns position x, y [m] and heading [rad]."""
     position, q = _place(message)
     heading = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
     return position.x, position.y, heading
 
 
 def twist_row(message: Any) -> Row:
-    """Body velocity x, y [m/s] and yaw rate [rad/s] of an Odometry."""
+    """Returns body velocity x, y [m/s] and yaw rate [rad/s] of an Odometry."""
     twist = message.twist.twist
     return twist.linear.x, twist.linear.y, twist.angular.z
 
 
 def imu_row(message: Any) -> Row:
-    """Acceleration along x and y [m/s^2], yaw rate [rad/s]."""
+    """Returns acceleration along x and y [m/s^2] and yaw rate [rad/s]."""
     acceleration = message.linear_acceleration
     return acceleration.x, acceleration.y, message.angular_velocity.z
 
 
 @dataclass(frozen=True)
 class Offer:
-    """What a publisher offers, as far as it decides who hears it.
+    """Quality of service that a publisher offers, as far as it decides which subscribers match.
 
     Attributes:
         depth: of its history.
-        reliable: or best effort.
-        transient_local: late subscribers get what was sent before; or volatile.
+        reliable: False for best effort.
+        transient_local: late subscribers get earlier messages; False for volatile.
     """
 
     depth: int = 10
@@ -105,7 +105,7 @@ class Offer:
 
 
 def offers_of(profiles: Sequence[Qos]) -> tuple[Offer, ...]:
-    """What was offered, of the profiles that rosbags gives."""
+    """Converts profiles of rosbags to offers."""
     from rosbags.interfaces import QosDurability, QosReliability
 
     return tuple(
@@ -119,7 +119,7 @@ def offers_of(profiles: Sequence[Qos]) -> tuple[Offer, ...]:
 
 
 def profile_of(offer: Offer) -> Qos:
-    """The same as a profile of rosbags; what does not matter here is at its default."""
+    """Converts an offer to a profile of rosbags; the other policies keep their defaults."""
     from rosbags.interfaces import (
         Qos,
         QosDurability,

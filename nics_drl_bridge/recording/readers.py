@@ -1,6 +1,6 @@
-"""Opens a recording, whatever it is kept in.
+"""Reader for recordings of any supported format.
 
-Reads a folder of CSV files: a car's drive under a motion-capture system.
+Reader of a folder of CSV files: a car's drive under a motion-capture system.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ def read_recording(
 
     Args:
         path: the file or the folder.
-        spec: the robot, which tells what a bag's `cmd_vel` and joints mean.
-        topics: which topic of a bag plays which role; guessed by default.
+        spec: the robot, which defines the meaning of a bag's `cmd_vel` and joints.
+        topics: roles of a bag's topics; guessed by default.
 
     Returns:
         The recording.
 
     Raises:
-        RecordingError: there is none, or it can't be read.
+        RecordingError: there is no recording, or it can't be read.
     """
     path = Path(path)
     if path.exists() and is_bag(path):
@@ -78,7 +78,7 @@ COLUMNS = {
     "R_wheel.csv": ("wheel speed", "time [s]"),
     "acceleration.csv": ("ax", "ay", "az", "time [s]"),
 }
-"""The files of a folder and their columns; none has a header."""
+"""Files of a folder and their columns; none has a header line."""
 
 REQUIRED = ("cmd.csv", "vrpn.csv")
 ROBOT_CLOCK, POSE_CLOCK = "robot", "mocap"
@@ -87,15 +87,15 @@ MAX_DURATION_RATIO = 100.0
 MOST_BYTES = 64 * 2**20
 MOST_ROWS = 500_000
 LONGEST_ROW = 1000
-"""Characters."""
+"""In characters."""
 
 
 def load_csv_folder(path: str | Path) -> Recording:
-    """Reads a drive of a car, recorded as five CSV files without a header.
+    """Reads a drive of a car, recorded as up to five CSV files without header lines.
 
-    `cmd.csv` and `vrpn.csv` must be there; the wheels are read when both are. The heading is
-    the yaw of the quaternion. Commands and wheels are stamped by the robot's clock, the pose
-    by the motion capture's: the offset between them is for calibration to find.
+    `cmd.csv` and `vrpn.csv` are required; wheels are read if both files exist. The heading is
+    the yaw of the quaternion. Commands and wheels are stamped by the robot's clock, the pose by
+    that of the motion capture; calibration estimates the offset between them.
 
     Args:
         path: the folder.
@@ -104,8 +104,8 @@ def load_csv_folder(path: str | Path) -> Recording:
         The recording: command (T, 2) as linear.x and angular.z, pose (T, 3), wheels (T, 2).
 
     Raises:
-        RecordingError: a file is missing, empty, or holds a row that can't be used; one
-            sentence with the file, the row and the fix.
+        RecordingError: a file is missing, empty, or contains an unusable row; one sentence with
+            the file, the row and the fix.
     """
     path = Path(path)
     if not path.is_dir():
@@ -127,7 +127,7 @@ def load_csv_folder(path: str | Path) -> Recording:
 
 
 def _read(path: Path) -> Array:
-    """The numbers of a file, checked row by row; time is the last column."""
+    """Reads the numbers of a file and checks them row by row; time is the last column."""
     columns = COLUMNS[path.name]
     try:
         text = _lines(path)
@@ -150,7 +150,7 @@ def _read(path: Path) -> Array:
 
 
 def _lines(path: Path) -> list[str]:
-    """The lines of a file that is no larger than any drive's, none longer than a row."""
+    """Reads the lines of a file; refuses files and lines larger than those of any drive."""
     size = no_device(path).stat().st_size
     if size > MOST_BYTES:
         raise RecordingError(
@@ -190,7 +190,7 @@ def _numbers(path: Path, line: int, row: list[str], columns: tuple[str, ...]) ->
 
 
 def _pose(path: Path, vrpn: Array) -> Array:
-    """Pose (T, 3) of positions and quaternions."""
+    """Converts positions and quaternions to poses (T, 3)."""
     qx, qy, qz, qw = vrpn[:, 3:7].T
     norm = np.linalg.norm(vrpn[:, 3:7], axis=1)
     for k in np.flatnonzero(np.abs(norm - 1.0) > 0.05)[:1]:
@@ -203,9 +203,9 @@ def _pose(path: Path, vrpn: Array) -> Array:
 
 
 def _check_units(path: Path, tables: dict[str, Array]) -> None:
-    """Motion capture in ns, all else in s: all must have lasted about as long.
+    """Refuses files whose durations differ: motion capture is in ns, all else in s.
 
-    Two files that disagree don't tell which of them is wrong: commands that come seconds apart do.
+    A difference alone does not show which file is wrong; commands that are seconds apart do.
     """
     times = tables["cmd.csv"][:, -1]
     seconds, step = np.ptp(times), np.median(np.diff(times)) if len(times) > 1 else 0.0
@@ -226,7 +226,7 @@ def _check_units(path: Path, tables: dict[str, Array]) -> None:
 
 
 def _wheels(tables: dict[str, Array]) -> Stream | None:
-    """Both wheels at the stamps of the left one."""
+    """Returns both wheels at the stamps of the left one."""
     if "L_wheel.csv" not in tables or "R_wheel.csv" not in tables:
         return None
     left, right = tables["L_wheel.csv"], tables["R_wheel.csv"]

@@ -1,8 +1,7 @@
-"""Recording: what was written down while a robot drove; Samples: what a fit takes.
+"""Recording: the recorded data of a drive; Samples: the input of a fit.
 
-A `Recording` holds streams with stamps of their own, as a robot delivers them. Calibration
-turns it into `Samples`, the paper's data `D_t = (t, Q_t, X_t, dQ_t)` (Sec. IV-A) on one time
-axis.
+A `Recording` contains separately stamped streams, as a robot delivers them. Calibration turns it
+into `Samples`, the paper's data `D_t = (t, Q_t, X_t, dQ_t)` (Sec. IV-A) on one time axis.
 """
 
 from __future__ import annotations
@@ -26,18 +25,18 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Array = NDArray[np.float64]
 FORMAT = "nics_drl_bridge/recording/2"
 UNSEALED_FORMAT = "nics_drl_bridge/recording/1"
-"""Of files without a checksum, which are still read."""
+"""Format of files without a checksum, which can still be read."""
 LARGEST_TURN = 1.5
-"""More than this between neighbouring samples [rad] is no robot."""
+"""A larger turn between neighbouring samples [rad] is implausible,"""
 TOO_FAST = 20.0
-"""Nor is a speed of this many times the greatest command."""
+"""and so is a speed of more than this many times the greatest command."""
 SPEED_OVER_S = 0.5
 SLOWEST_SAMPLING_S = 2.0
 IRREGULAR = 0.5
-"""A step whose length is off by this share of the usual one is a gap or a repetition."""
+"""A step whose length differs from the median by this share is a gap or a repetition."""
 JITTER = 1e-4
 ROUNDING_S = 1e-6
-"""Steps that differ by less are equally long, but for the rounding of their stamps."""
+"""Steps whose lengths differ by less are equally long, apart from rounding of their stamps."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +46,8 @@ class Stream:
     Attributes:
         t: (T,) stamps [s], never decreasing.
         values: (T, D).
-        clock: the name of the clock that made the stamps. Streams of one clock share an
-            origin; between two clocks there is an unknown offset.
+        clock: name of the clock of the stamps. Streams of one clock share an origin; between two
+            clocks there is an unknown offset.
     """
 
     t: Array
@@ -63,15 +62,14 @@ class Recording:
     Attributes:
         command: (T, C) commands, in the order of the RobotSpec.
         pose: (T, 3) x [m], y [m], heading [rad] of the tracked body, in a fixed frame.
-        state: (T, S) measured state in the order of the RobotSpec, where there is one.
-        wheels: (T, 2) left and right wheel speed in the encoder's units, where there are any.
-        imu: (T, 3) acceleration along x and y [m/s^2] and yaw rate [rad/s] of the sensor, where
-            there is one.
-        odometry: (T, 3) body twist that the wheels report, vx, vy [m/s] and yaw rate [rad/s],
-            where it was recorded beside a pose of its own.
-        source: where it came from, for reports and errors.
-        variables: names of X = [state, command] of the robot that drove, where known.
-        latency: of its scan and odometry, where the recording shows it.
+        state: (T, S) measured state in the order of the RobotSpec, if any.
+        wheels: (T, 2) left and right wheel speed in the encoder's units, if any.
+        imu: (T, 3) acceleration along x and y [m/s^2] and yaw rate [rad/s] of the sensor, if any.
+        odometry: (T, 3) body twist reported by the wheels, vx, vy [m/s] and yaw rate [rad/s], if
+            it was recorded in addition to a separate pose.
+        source: origin of the recording, for reports and errors.
+        variables: names of X = [state, command] of the recorded robot, if known.
+        latency: of its scan and odometry, if the recording shows it.
     """
 
     command: Stream
@@ -86,7 +84,7 @@ class Recording:
 
     @property
     def streams(self) -> dict[str, Stream]:
-        """The streams that are there, by name."""
+        """Available streams, by name."""
         named = {"command": self.command, "pose": self.pose}
         if self.state is not None:
             named["state"] = self.state
@@ -120,7 +118,7 @@ class Samples:
     notes: tuple[str, ...] = field(default=())
 
     def rows(self, keep: NDArray[np.bool_]) -> Samples:
-        """The samples of the steps for which `keep` (T,) is true."""
+        """Returns the samples of the steps for which `keep` (T,) is true."""
         return Samples(self.t[keep], self.q[keep], self.x[keep], self.dq[keep], self.dt, self.notes)
 
 
@@ -128,14 +126,14 @@ def samples_on_one_clock(t: Array, pose: Array, state: Array, command: Array) ->
     """Builds Samples from series that share stamps.
 
     Args:
-        t: (T,) stamps [s], uniform but for gaps, repetitions and jitter.
+        t: (T,) stamps [s], uniform apart from gaps, repetitions and jitter.
         pose: (T, 3) pose of `base_link` at each stamp.
         state: (T, S) state at each stamp.
         command: (T, C) command held from each stamp to the next.
 
     Returns:
-        A row for each of the T - 1 steps that is about as long as the others: a gap is no step,
-        nor is a repeated stamp.
+        A row for each of the T - 1 steps of about the median length; gaps and repeated stamps
+        are omitted.
     """
     span = np.diff(t)
     dt = float(np.median(span[span > 0.0])) if (span > 0.0).any() else 0.0
@@ -154,14 +152,14 @@ def samples_on_one_clock(t: Array, pose: Array, state: Array, command: Array) ->
 
 
 def check(recording: Recording, spec: RobotSpec) -> Recording:
-    """Makes sure that a recording can be used for a robot.
+    """Verifies that a recording can be used for a robot.
 
     Returns:
         The recording.
 
     Raises:
-        RecordingError: a stream is empty, holds NaN, runs backwards, or has the wrong width;
-            one sentence with the place.
+        RecordingError: it is of another robot, a stream is empty, contains NaN, runs backwards or
+            has the wrong width, or the pose has wrong units; one sentence with the place.
     """
     if recording.variables and recording.variables != spec.variable_names:
         raise RecordingError(
@@ -225,7 +223,7 @@ def _check_stream(place: str, stream: Stream, width: int) -> None:
 
 
 def save_recording(recording: Recording, path: str | Path) -> None:
-    """Writes a recording as `.npz`: `NAME_t`, `NAME` per stream, and `meta`, a JSON text."""
+    """Writes a recording as `.npz`: `NAME_t` and `NAME` per stream, and `meta` as JSON text."""
     arrays: dict[str, NDArray[Any]] = {}
     clocks = {}
     for name, stream in recording.streams.items():
@@ -243,10 +241,10 @@ def save_recording(recording: Recording, path: str | Path) -> None:
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Reads a recording that `save_recording` wrote.
+    """Reads a recording written by `save_recording`.
 
     Raises:
-        RecordingError: no such file, not an `.npz`, damaged, or a stream is missing.
+        RecordingError: there is no such file, or it is not an `.npz`, damaged or incomplete.
     """
     try:
         data = read_file(no_device(Path(path)))

@@ -1,8 +1,8 @@
-"""Stamps: the time axis of each stream of a bag, and whose clock made it.
+"""Stamps: time axis and clock of each stream of a bag.
 
-A message has two times: when the bag received it, and, if it has a header, the stamp that its
-sender put there. The header's is the better one, for it does not shake with the transport; but a
-Twist has none, and the sender's clock may be another one than the recorder's.
+A message has two times: its receipt by the bag, and, if it has a header, the sender's stamp. The
+header's is better, since it has no transport jitter; but a Twist has none, and the sender's clock
+may differ from the recorder's.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ Nanoseconds = NDArray[np.int64]
 
 RECEIVE, HEADER = "receive", "header"
 SAME_CLOCK_S = (-0.001, 0.05)
-"""Headers this much before their receipt [s], in the median, are of the recorder's own clock."""
+"""Range of the median delay from header to receipt [s] if both are of the recorder's clock."""
 MAX_WANDER_S = 1.0
-"""Between headers of one clock and their receipt, the delay varies by less than this [s]."""
+"""The delay from headers of one clock to their receipt varies by less than this [s]."""
 STALLED = 2.0
-"""The share of messages [%] that a recorder which stalled may have received later still."""
+"""Percentage of messages that a stalled recorder may have received even later,"""
 MAX_STALL_S = 30.0
-"""But no later than this [s]."""
+"""but by no more than this [s]."""
 MAX_LATE = 0.01
-"""The share of messages that may come after one with a later stamp."""
+"""Share of messages that may arrive after one with a later stamp."""
 MAX_UNSTAMPED = 0.05
-"""The share of messages at the start that may lack a stamp: a simulation has no time yet."""
+"""Share of messages at the start that may lack a stamp: a simulation has no time yet."""
 ROBOT_STREAMS = ("command", "state", "wheels", "imu")
-"""What a robot's own computer makes: these have to share a clock."""
+"""Streams from the robot's own computer, which must share a clock."""
 
 
 @dataclass(frozen=True)
 class TopicData:
-    """What was read from a topic.
+    """Data read from a topic.
 
     Attributes:
         topic: its name.
-        receive_ns: (T,) when each message was received [ns].
-        header_ns: (T,) stamps of the headers [ns]; None where the type has no header.
+        receive_ns: (T,) times of receipt [ns].
+        header_ns: (T,) stamps of the headers [ns]; None if the type has no header.
         values: (T, D).
     """
 
@@ -55,25 +55,24 @@ class TopicData:
     values: Array
 
     def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> TopicData:
-        """The messages for which `keep` (T,) is true, or those that it counts up."""
+        """Returns the messages selected by `keep`, a mask (T,) or indices."""
         header = None if self.header_ns is None else self.header_ns[keep]
         return TopicData(self.topic, self.receive_ns[keep], header, self.values[keep])
 
 
 def streams(data: Mapping[str, TopicData], stamps: Stamps, place: str) -> dict[str, Stream]:
-    """Gives each stream its time axis.
+    """Assigns a time axis to each stream.
 
-    With `auto`, a stream is stamped by its headers where it has some. Headers that lie less
-    than 50 ms before their receipt are of the recorder's clock, which is also that of streams
-    without header (clock `receive`). Others are of a foreign clock (`header`): their stamps
-    are moved by the median delay, so that the offset left for calibration to find is small.
-    Command, state, wheels and IMU are put on one clock, by receipt if need be. The few
-    messages that came after one with a later stamp are put in order, and those before a
-    simulation's first time are left out.
+    With `auto`, a stream is stamped by its headers if it has any. Headers less than 50 ms before
+    their receipt are of the recorder's clock, which also stamps streams without header (clock
+    `receive`). Others are of a foreign clock (`header`): their stamps are shifted by the median
+    delay, so that only a small offset is left for calibration. Command, state, wheels and IMU are
+    put on one clock, by receipt if need be. The few messages that arrived after one with a later
+    stamp are sorted, and those before a simulation's first time are dropped.
 
     Args:
         data: messages by stream name; empty ones are not allowed.
-        stamps: which of the two times to take.
+        stamps: which of the two times to use, see `TopicRoles`.
         place: the recording's name, for errors.
 
     Returns:
@@ -114,7 +113,7 @@ def _auto(
 def _clocks(
     data: Mapping[str, TopicData], headers: Mapping[str, Nanoseconds | None], place: str
 ) -> dict[str, tuple[str, int]]:
-    """The clock of each stream, and what brings its stamps near the recorder's clock [ns]."""
+    """Returns each stream's clock, and the shift of its stamps to the recorder's clock [ns]."""
     foreign: dict[str, int] = {}
     clocks = {}
     for name, part in data.items():
@@ -144,7 +143,7 @@ def _clocks(
 
 
 def _header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
-    """The header stamps of a topic, checked; None where there are none."""
+    """Returns the checked header stamps of a topic; None if there are none."""
     ns, topic = part.header_ns, f"{place}: topic {part.topic!r}"
     empty = np.zeros(0, bool) if ns is None else ns == 0
     if ns is None or empty.all():
@@ -163,7 +162,7 @@ def _header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
 
 
 def _in_order(part: TopicData, place: str) -> TopicData:
-    """Leaves out what came before there was a time, and sorts the few that came late."""
+    """Drops unstamped messages at the start, and sorts the few late ones by stamp."""
     if part.header_ns is None or not part.header_ns.any():
         return part
     first = int(np.argmax(part.header_ns != 0))

@@ -1,7 +1,7 @@
 """Textbook kinematics of the three wheeled robots, the source of synthetic recordings.
 
-Siegwart, Nourbakhsh, Scaramuzza: Introduction to Autonomous Mobile Robots, ch. 3; the
-paper's reference for Table I. The actuators are first-order lags or rate-limited.
+Siegwart, Nourbakhsh, Scaramuzza: Introduction to Autonomous Mobile Robots, ch. 3; the paper's
+reference for Table I. The actuators are first-order lags or rate-limited.
 """
 
 from __future__ import annotations
@@ -23,16 +23,15 @@ INTEGRATION_STEP_S = 1e-3
 
 @dataclass(frozen=True)
 class Textbook:
-    """The kinematics of a kind of robot.
+    """Kinematics of a type of robot.
 
     Attributes:
-        twist: body twist (..., 3) of a state (..., S).
-        target: the state (..., S) that a command (..., C) asks for.
-        lag: (S,) time constants with which the state follows [s]; of a first-order actuator.
-        rate: (S,) greatest rates of the state [1/s of its unit]; of a rate-limited actuator,
-            which has no lag. inf where the actuator is of first order.
-        structure: for each degree of freedom of the twist, the products of state variables
-            that can occur in it.
+        twist: gives the body twist (..., 3) for a state (..., S).
+        target: gives the state (..., S) that a command (..., C) requests.
+        lag: (S,) time constants of first-order actuators [s]; unused for rate-limited ones.
+        rate: (S,) greatest rates of the state of rate-limited actuators [its unit/s]; inf for
+            first-order ones.
+        structure: possible products of state variables in each degree of freedom of the twist.
     """
 
     twist: Callable[[Array], Array]
@@ -42,24 +41,24 @@ class Textbook:
     structure: dict[str, tuple[str, ...]]
 
     def respond(self, state: Array, goal: Array, t: Array | float) -> Array:
-        """The state (..., S) after a time t, on its way from `state` to `goal`; exact."""
+        """Returns the exact state (..., S) at time t [s] on its way from `state` to `goal`."""
         gap = state - goal
         ramp = np.sign(gap) * np.maximum(np.abs(gap) - np.where(self.limited, self.rate, 0) * t, 0)
         return goal + np.where(self.limited, ramp, gap * np.exp(-t / self.lag))
 
     @property
     def limited(self) -> NDArray[np.bool_]:
-        """(S,) which actuators are rate-limited."""
+        """Mask (S,) of the rate-limited actuators."""
         return np.isfinite(self.rate)
 
 
 def textbook(spec: RobotSpec) -> Textbook:
-    """The textbook kinematics of a robot, with the parameters of its spec.
+    """Returns the textbook kinematics of a robot, with the parameters of its spec.
 
-    Commands are found by their field of `cmd_vel`, speed and steering of a car by their units.
-    Wheels stand in the order left, right; or front left, front right, rear left, rear right.
+    Commands are identified by their field of `cmd_vel`, speed and steering of a car by their
+    units. The order of wheels is left, right; or front left, front right, rear left, rear right.
     An actuator is of first order (`wheel_lag`, `speed_lag`, `steering_lag` [s]) or rate-limited
-    (`wheel_rate`, `speed_rate`, `steering_rate` [1/s of the unit]).
+    (`wheel_rate`, `speed_rate`, `steering_rate` [its unit/s]).
 
     Raises:
         ConfigError: the spec names none, lacks a parameter, or has other variables.
@@ -119,12 +118,12 @@ def _wheeled(
     fields: tuple[CmdVelField, ...],
     moves: tuple[str, ...],
 ) -> Textbook:
-    """A robot whose twist is linear in its wheels.
+    """Builds the kinematics of a robot whose twist is linear in its wheel speeds.
 
     Args:
         spec: the robot.
-        inverse: (S, C) wheel speeds of the commands in the order of `fields`.
-        forward: (3, S) body twist of wheel speeds.
+        inverse: (S, C) wheel speeds per command, in the order of `fields`.
+        forward: (3, S) body twist per wheel speed.
         fields: of `cmd_vel`.
         moves: the degrees of freedom that the wheels can move.
     """
@@ -146,7 +145,7 @@ def _wheeled(
 
 
 def _commands(spec: RobotSpec, fields: tuple[CmdVelField, ...]) -> list[int]:
-    """Places of the commands that feed fields of `cmd_vel`; in order when they name none."""
+    """Returns the indices of the commands for fields of `cmd_vel`; in order if they name none."""
     have = [c.cmd_vel for c in spec.command]
     if not any(have):
         return list(range(len(have)))
@@ -160,7 +159,7 @@ def _commands(spec: RobotSpec, fields: tuple[CmdVelField, ...]) -> list[int]:
 
 
 def _states(spec: RobotSpec, units: tuple[str, ...]) -> list[int]:
-    """Places of the state variables with the given units."""
+    """Returns the indices of the state variables with the given units."""
     have = [v.unit for v in spec.state]
     if sorted(have) != sorted(units):
         raise ConfigError(
@@ -171,7 +170,7 @@ def _states(spec: RobotSpec, units: tuple[str, ...]) -> list[int]:
 
 
 def _actuators(p: dict[str, float], parts: tuple[str, ...]) -> tuple[Array, Array]:
-    """Time constants and greatest rates (S,) of actuators, by the names of their parameters."""
+    """Returns time constants and greatest rates (S,) of actuators, by parameter names."""
     rate = np.array([p.get(f"{part}_rate", np.inf) for part in parts])
     lag = [p[f"{part}_lag"] if f"{part}_rate" not in p else 1.0 for part in parts]
     return np.array(lag), rate
@@ -210,7 +209,7 @@ def integrate(
 
 
 def _arc(book: Textbook, state: Array, goal: Array, since: Array | float, h: float) -> Array:
-    """Body twist x duration (..., 3) of a substep that begins `since` after the state."""
+    """Returns body twist x duration (..., 3) of a substep that begins `since` [s] after `state`."""
     early, late = (
         book.twist(book.respond(state, goal, since + (0.5 + sign * np.sqrt(3.0) / 6.0) * h))
         for sign in (-1.0, 1.0)
@@ -234,14 +233,14 @@ def record(
     dt: float = 0.01,
     hold: float = 0.5,
 ) -> Recording:
-    """Drives a textbook robot at random and records it.
+    """Drives a textbook robot with random commands and records it.
 
     Args:
         spec: the robot.
-        rng: draws the commands, uniform within their limits, anew every `hold` seconds.
+        rng: draws the commands, uniform within their limits, every `hold` seconds.
         duration: of the drive [s].
         dt: sample period [s].
-        hold: how long a command is held [s].
+        hold: time for which each command is held [s].
 
     Returns:
         Command, pose and state on one clock, without noise.
@@ -264,7 +263,7 @@ def record(
 
 
 def _follow(book: Textbook, held: Array, steps: int, h: float) -> tuple[Array, Array]:
-    """States at the start of, and arcs over, each of `steps` substeps per held command."""
+    """Returns the states at the start of each of `steps` substeps per command, and their arcs."""
     since = np.asarray(np.arange(steps)[:, None] * h, dtype=np.float64)
     state = np.zeros(len(book.lag))
     states, arcs = [], []
@@ -276,7 +275,7 @@ def _follow(book: Textbook, held: Array, steps: int, h: float) -> tuple[Array, A
 
 
 def _chain(relative: Array) -> Array:
-    """The poses (T, 3), from the origin on, that relative poses (T, 3) lead through."""
+    """Chains relative poses (T, 3) to the poses (T, 3) at their starts, from the origin on."""
     heading = np.concatenate([[0.0], np.cumsum(relative[:-1, 2])])
     moved = geometry.rotate(relative[:, :2], heading)
     position = np.concatenate([np.zeros((1, 2)), np.cumsum(moved[:-1], axis=0)])

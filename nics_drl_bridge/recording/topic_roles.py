@@ -1,4 +1,4 @@
-"""TopicRoles: which topic of a robot is its command, its pose, its state, its IMU."""
+"""TopicRoles: assignment of a robot's topics to command, pose, state and IMU."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NONE = "none"
 ROLES = ("cmd_vel", "pose", "odom", "joint_states", "imu")
 REQUIRED = "cmd_vel"
 MOST_LISTED = 20
-"""A sentence lists no more topics than this."""
+"""Maximum number of topics listed in an error."""
 TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 ACKERMANN = "ackermann_msgs/msg/AckermannDrive"
 ACKERMANN_STAMPED = f"{ACKERMANN}Stamped"
@@ -36,9 +36,9 @@ TYPES = {
     "joint_states": (JOINTS,),
     "imu": (IMU,),
 }
-"""The message types that can play each role."""
+"""Allowed message types of each role."""
 NEVER_GUESSED = {"pose": (ODOMETRY, TRANSFORMS)}
-"""Types that play a role only when the user says so."""
+"""Types that have a role only if the user assigns it."""
 
 USUAL = {
     "cmd_vel": (r"/cmd_vel$", r"/cmd_vel_stamped$", r"/(ackermann_cmd|drive)$"),
@@ -47,15 +47,15 @@ USUAL = {
     "joint_states": (r"/joint_states$", r"/joint_state[^/]*$"),
     "imu": (r"/imu(/data)?$", r"/imu[^/]*$", r"imu"),
 }
-"""Usual names, the surest first; a guess takes the topics of the first that any has."""
+"""Patterns of usual names, the most reliable first; the first that matches a topic decides."""
 
 
 class JointSource(Schema):
-    """Where a joint's message holds a state variable.
+    """Source of a state variable in joint messages.
 
     Attributes:
         joint: name of the joint.
-        field: `velocity`, or `position`; by the variable's unit when left out.
+        field: `velocity` or `position`; by default chosen by the variable's unit.
         scale: factor from the message's unit to the variable's.
     """
 
@@ -65,22 +65,22 @@ class JointSource(Schema):
 
 
 class TopicRoles(Schema):
-    """Which topic plays which role. A role left out is guessed by type and usual names.
+    """Roles of topics. Missing roles are guessed by type and usual names; `none` disables one.
 
     Attributes:
         cmd_vel: the commands: Twist, TwistStamped, AckermannDrive or AckermannDriveStamped.
         pose: of motion capture or localisation: PoseStamped, PoseWithCovarianceStamped,
-            TransformStamped; or TFMessage and Odometry when named here. Goes before `odom`.
-        odom: Odometry; its pose is taken when there is no `pose`. Named beside a `pose`, its
-            twist shows the noise of the odometry.
+            TransformStamped; or TFMessage and Odometry if named here. Has priority over `odom`.
+        odom: Odometry; its pose is used if there is no `pose`. If named in addition to a `pose`,
+            its twist shows the noise of the odometry.
         joint_states: JointState, for measured state and wheel speeds.
-        imu: Imu. `none` leaves a role out.
-        frame: parent of the transforms to take, of a `pose` topic that holds several.
+        imu: Imu.
+        frame: parent of the transforms to use, for a `pose` topic with several.
         child_frame: their child, the robot.
-        state: joint of each state variable; guessed by the joints' names when left out.
+        state: joint of each state variable; by default guessed by the joints' names.
         wheels: left and right joint whose velocities are the wheel speeds; likewise.
-        stamps: `header` takes all times from the messages' headers, `receive` from when the
-            bag received them, `auto` from the header where there is one.
+        stamps: `header` takes all times from the messages' headers, `receive` from their receipt
+            by the bag, `auto` from the header if there is one.
     """
 
     cmd_vel: str | None = None
@@ -96,11 +96,11 @@ class TopicRoles(Schema):
 
 
 def topic_roles(file: str | Path | None = None, options: Iterable[str] = ()) -> TopicRoles:
-    """The roles that a YAML file and the options `ROLE=TOPIC` of a command line give.
+    """Reads roles from a YAML file and the command-line options `ROLE=TOPIC`.
 
     Args:
-        file: of the keys of `TopicRoles`.
-        options: go before the file.
+        file: with the keys of `TopicRoles`.
+        options: override the file.
 
     Raises:
         ConfigError: the file, a role or a value is wrong.
@@ -122,20 +122,20 @@ def topic_roles(file: str | Path | None = None, options: Iterable[str] = ()) -> 
 def assign(
     roles: TopicRoles, types: Mapping[str, str], empty: Collection[str], place: str
 ) -> dict[str, str]:
-    """The topic of each role that is played.
+    """Assigns topics to roles.
 
     Args:
-        roles: what the user said.
+        roles: as given by the user.
         types: message type of each topic.
-        empty: topics without messages, which play no role.
+        empty: topics without messages, which have no role.
         place: the recording's name, for errors.
 
     Returns:
-        role -> topic. There is a `cmd_vel`, and either a `pose` or an `odom`.
+        role -> topic. There is a `cmd_vel`, and a `pose` or an `odom` or both.
 
     Raises:
-        RecordingError: a topic is missing, of a wrong type, or several could play a role; one
-            sentence with the topics that are there and what to write.
+        RecordingError: a topic is missing, of a wrong type, or several fit a role; one sentence
+            with the available topics and the fix.
     """
     table = _Topics(types, empty, place)
     found = {}
@@ -153,14 +153,14 @@ def assign(
 
 @dataclass(frozen=True)
 class _Topics:
-    """The topics of a bag."""
+    """Topics of a bag."""
 
     types: Mapping[str, str]
     empty: Collection[str]
     place: str
 
     def choose(self, role: str, wanted: str | None) -> str | None:
-        """The topic of a role: the wanted one, or the one that looks like it."""
+        """Returns the topic of a role: the wanted one, or a guess."""
         if wanted == NONE:
             return None
         if wanted is None:
@@ -183,7 +183,7 @@ class _Topics:
         return topic
 
     def _guess(self, role: str) -> str | None:
-        """The one topic with the surest usual name; None when no name is usual."""
+        """Returns the only topic with the most reliable usual name; None if no name matches."""
         allowed = set(TYPES[role]) - set(NEVER_GUESSED.get(role, ()))
         full = [t for t, kind in self.types.items() if kind in allowed and t not in self.empty]
         for pattern in USUAL[role]:
@@ -200,7 +200,7 @@ class _Topics:
         return None
 
     def missing(self, roles: Sequence[str], words: str) -> RecordingError:
-        """That no topic plays any of the roles, and what to write."""
+        """Returns the error that no topic has any of the roles, with the fix."""
         fitting = [(role, topic) for role in roles for topic in self._fitting(role)]
         if fitting:
             role, topic = fitting[0]
@@ -213,13 +213,13 @@ class _Topics:
         )
 
     def _fitting(self, role: str) -> list[str]:
-        """Topics with messages of a type that can play the role."""
+        """Returns the topics with messages of a type allowed in the role."""
         return sorted(
             t for t, kind in self.types.items() if kind in TYPES[role] and t not in self.empty
         )
 
     def _listed(self, roles: Sequence[str]) -> str:
-        """The topics with their types, those that fit a role first."""
+        """Lists the topics with their types, those that fit a role first."""
         fitting = {topic for role in roles for topic in self._fitting(role)}
         topics = sorted(self.types, key=lambda topic: (topic not in fitting, topic))
         told = [

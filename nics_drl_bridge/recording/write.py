@@ -1,8 +1,8 @@
-"""Where a drive is written to: an `.npz` file, or the folder of a rosbag2.
+"""Output of a drive: an `.npz` file, or the folder of a rosbag2.
 
-Writes a recording as a rosbag2 recording, without ROS, for the tools of others.
+Writer of a recording as a rosbag2, without ROS, for third-party tools.
 
-Writes a rosbag2 recording message by message: whole at its end, and salvageable before.
+Incremental writer of a rosbag2 recording: complete at the end, salvageable before.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ NPZ = ".npz"
 
 
 def check_out(path: str | Path) -> Path:
-    """The `.npz` file, or the folder of a rosbag2, that a recording is to be written to.
+    """Checks an output path of a recording: an `.npz` file or the folder of a rosbag2.
 
     Raises:
-        ConfigError: it is there already, or has a suffix that is neither's.
+        ConfigError: it exists already, has another suffix, or needs rosbags, which is missing.
     """
     path = Path(path)
     if path.exists():
@@ -59,7 +59,7 @@ def check_out(path: str | Path) -> Path:
 
 
 def write_drive(recording: Recording, path: str | Path, spec: RobotSpec) -> None:
-    """Writes a recording, whole or not at all: `.npz`, or else a rosbag2 in MCAP.
+    """Writes a recording, completely or not at all: `.npz`, or else a rosbag2 in MCAP.
 
     Raises:
         RecordingError: it can't be written.
@@ -79,7 +79,7 @@ Array = NDArray[np.float64]
 Make = Callable[[Any, Array], Any]
 
 START_NS = 1_700_000_000 * NS_PER_S
-"""What second 0 of the commands' clock becomes."""
+"""Time stamp of second 0 of the commands' clock."""
 FRAMES = ("odom", "base_link")
 
 
@@ -91,18 +91,18 @@ def write_bag(
 ) -> None:
     """Writes a recording as a bag that `load_bag` reads back.
 
-    Commands become `/cmd_vel`, the pose `/odom`; or `/pose` when it has a clock of its own or
-    odometry beside it, whose twist is then `/odom`. State and wheels become `/joint_states`,
-    the IMU `/imu`. Headers hold the streams' stamps.
+    Commands become `/cmd_vel`, the pose `/odom`; or `/pose` if it has a separate clock or if
+    there is odometry, whose twist is then in `/odom`. State, or else wheels, become
+    `/joint_states`, the IMU `/imu`. Headers contain the streams' stamps.
 
     Args:
         recording: of the robot.
-        path: folder to make.
+        path: folder to create.
         spec: the robot.
         storage: format of the file in the folder.
 
     Raises:
-        RecordingError: the folder is there already, or rosbags is not installed.
+        RecordingError: the folder exists already, or rosbags is not installed.
     """
     with bag_sink(path, storage) as sink:
         from rosbags.typesys import Stores, get_typestore
@@ -120,7 +120,7 @@ def write_bag(
 def _topics(
     recording: Recording, spec: RobotSpec, messages: _Messages
 ) -> list[tuple[str, str, Stream, Make]]:
-    """Topic, type, stream and what makes a message of a row."""
+    """Returns topic, type, stream and the function that makes a message of a row."""
     beside = recording.odometry is not None or recording.pose.clock != recording.command.clock
     topics: list[tuple[str, str, Stream, Make]] = [
         (
@@ -151,14 +151,14 @@ def _topics(
 
 
 def _to_commands_clock(recording: Recording, stream: Stream) -> int:
-    """What makes a time of receipt of a stamp [ns]: streams of another clock start together."""
+    """Returns the offset from stamp to receipt [ns]: streams of other clocks start together."""
     if stream.clock == recording.command.clock:
         return 0
     return round(float(recording.command.t[0] - stream.t[0]) * NS_PER_S)
 
 
 class _Messages:
-    """Makes messages of rows."""
+    """Conversion of rows to messages."""
 
     def __init__(self, store: Typestore) -> None:
         self._types = store.types
@@ -194,7 +194,7 @@ class _Messages:
         return self._odometry(header, row, np.zeros(3), np.zeros(36))
 
     def speeds(self, header: Any, row: Array) -> Any:
-        """An odometry of which the twist alone was recorded."""
+        """Makes an odometry message of which only the twist was recorded."""
         unknown = np.zeros(36)
         unknown[0] = -1.0
         return self._odometry(header, np.zeros(3), row, unknown)
@@ -220,16 +220,16 @@ class _Messages:
 Storage = Literal["mcap", "sqlite3"]
 
 NO_HASH = f"RIHS01_{'0' * 64}"
-"""Of a type that is known by its text alone."""
+"""Hash of a type that is known only by its text."""
 CHUNK_BYTES = 1 << 16
-"""A damage costs the chunk that it is in, because a checksum is of a whole chunk."""
+"""Damage costs a whole chunk, since each checksum covers a whole chunk."""
 
 
 class BagSink:
-    """An open bag; `bag_sink` makes it.
+    """An open bag, created by `bag_sink`.
 
     Args:
-        writer: of rosbags, open.
+        writer: open writer of rosbags.
     """
 
     def __init__(self, writer: Writer) -> None:
@@ -245,15 +245,14 @@ class BagSink:
         texts: Mapping[str, str] | None = None,
         definition: str | None = None,
     ) -> None:
-        """Begins a topic.
+        """Adds a topic.
 
         Args:
             topic: its name.
-            kind: type of its messages, as `nav_msgs/msg/Odometry`.
+            kind: type of its messages, such as `nav_msgs/msg/Odometry`.
             offers: of its publishers.
-            texts: the `.msg` texts of the type and of what it is made of, where rosbags does
-                not know it.
-            definition: whole definition of the type as a bag keeps it, instead.
+            texts: `.msg` texts of the type and its component types, if unknown to rosbags.
+            definition: complete definition of the type as stored in a bag, instead.
         """
         if kind not in self._store.fielddefs and texts:
             self._register(texts)
@@ -281,7 +280,7 @@ class BagSink:
             storage.close_chunk()
 
     def flush(self) -> None:
-        """Puts on disk what was written, so that no crash of this process loses it."""
+        """Flushes written messages to the file, so that a crash of this process can't lose them."""
         storage: Any = self._writer.storage
         if hasattr(storage, "close_chunk"):
             if storage.chunk.msgs:
@@ -293,18 +292,19 @@ class BagSink:
 
 @contextmanager
 def bag_sink(path: str | Path, storage: Storage = "mcap") -> Iterator[BagSink]:
-    """Gives a bag to write into, which stands at `path` when the block ends well.
+    """Yields a bag to write to, which is moved to `path` when the block ends without error.
 
-    It is written into a hidden folder `.NAME.*` beside it. After an error nothing is left; a
-    killed process or a full disk leaves that folder, from which `salvage` saves what was flushed.
+    It is written to a hidden folder `.NAME.*` next to `path`. After an error nothing is left; a
+    killed process or a full disk leaves that folder, from which `salvage` recovers the flushed
+    messages.
 
     Args:
-        path: folder to make.
-        storage: format of the file in the folder. MCAP carries checksums, so that any damage is
+        path: folder to create.
+        storage: format of the file in the folder. MCAP has checksums, so that any damage is
             found; SQLite has none.
 
     Raises:
-        RecordingError: the folder is there already, or rosbags is not installed.
+        RecordingError: the folder exists already or can't be written, or rosbags is not installed.
     """
     try:
         from rosbags.rosbag2 import StoragePlugin, Writer

@@ -1,8 +1,8 @@
-"""Pictures of a calibration: one per estimate that the recording allowed, titled with it.
+"""Pictures of a calibration: one per estimate that the recording allowed, which is its title.
 
-The picture of the noise: of each sensor, and how far the robot drifts from its model.
+Picture of the noise of each sensor, and of the robot's drift from its model.
 
-Curves behind the timing: what a shift in time leaves unexplained.
+Curves behind the timing estimates: the residual against a shift in time.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def calibration_pictures(spec: RobotSpec, identified: Identified) -> dict[str, b
 
 
 def timing(spec: RobotSpec, identified: Identified, found: dict[str, Estimate]) -> bytes | None:
-    """What each shift in time leaves unexplained, with the estimate and its uncertainty."""
+    """Draws the unexplained part over each shift in time, with the estimate and its uncertainty."""
     curves = timing_curves(identified.recording, spec, identified.calibration)
     if not curves:
         return None
@@ -95,7 +95,7 @@ def timing(spec: RobotSpec, identified: Identified, found: dict[str, Estimate]) 
 
 
 def bursts(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
-    """Stamps of the poses as they arrived, and as they were spread."""
+    """Draws stamps of the poses as they arrived, and as they were spread."""
     t = identified.recording.pose.t
     groups = repair.find_bursts(t)
     if groups is None:
@@ -120,7 +120,7 @@ def bursts(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
 
 
 def mounting(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
-    """Velocities of the tracked body and of `base_link`: rotation and lever arm as slopes."""
+    """Draws velocities of the tracked body and of `base_link`: rotation and lever arm as slopes."""
     rotation, lever_x, lever_y = (
         found[name] for name in ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
     )
@@ -154,7 +154,7 @@ def _points(axes: Axes, tracked: Sequence[Array], base: Sequence[Array]) -> None
 
 
 def wheels(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
-    """Wheel speeds against the motion: their scale, and which one is the left one."""
+    """Draws wheel speeds against the motion: their scale, and which wheel is the left one."""
     stream, calibration = identified.recording.wheels, identified.calibration
     if stream is None or calibration.wheel_scale is None:
         return None
@@ -199,9 +199,9 @@ REACH = 5.0
 
 
 def noise(spec: RobotSpec, identified: Identified) -> bytes | None:
-    """Histograms of what was measured beside the normal curve, and the growth of the drift.
+    """Draws histograms of the residuals with the normal curve, and the growth of the drift.
 
-    None if the recording is exact to the last digit.
+    Returns None if the recording is free of noise.
     """
     levels, panels = identified.noise, []
     pose = pose_residual(identified.recording.pose)
@@ -271,12 +271,12 @@ POINTS = 81
 
 @dataclass(frozen=True)
 class ShiftCurve:
-    """What is left unexplained, against a time that was estimated.
+    """Residual against an estimated time.
 
     Attributes:
         name: of the estimate, as in `Calibration`.
-        value: of the time (n,) [s].
-        unexplained: (n,) root mean square, in shares of the signal's spread.
+        value: (n,) trial values of the time [s].
+        unexplained: (n,) root mean square residual, as a share of the signal's spread.
     """
 
     name: str
@@ -288,7 +288,7 @@ class ShiftCurve:
 def timing_curves(
     recording: Recording, spec: RobotSpec, calibration: Calibration
 ) -> tuple[ShiftCurve, ...]:
-    """A curve for the clock offset and one for the latency, each where it was estimated."""
+    """Returns a curve for the clock offset and one for the latency, if they were estimated."""
     if not moved_commands(recording.command).any():
         return ()
     curves = []

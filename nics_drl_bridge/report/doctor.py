@@ -1,6 +1,6 @@
-"""What does not fit between a robot as it was heard and what a model expects of it.
+"""Checks of the data received from a robot against the expectations of a model.
 
-Each check is a function of the facts; it yields a finding for each thing that is wrong.
+Each check is a function of the facts; it yields a finding for each fault.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from nics_drl_bridge.report.doctor_facts import (
 
 RATE_TOLERANCE = 0.2
 FUTURE_S, LATE_S, OFFSET_S = 0.005, 0.35, 5.0
-"""Stamps more than this after their arrival are from the future; before it, too old for the gate of
-commands; and so much before it that the clocks must differ."""
+"""Stamps are from the future if this much after their arrival; too old for the command gate if this
+much before it; and so far before it that the clocks must differ."""
 STALE_CLOCK_S = 1.0
 BODY_FRAMES = ("base_link", "base_footprint")
 
 
 def examine(facts: Facts, expected: Expected) -> list[Finding]:
-    """All findings, errors first."""
+    """Runs all checks and returns their findings, errors first."""
     expected = seen(facts, expected)
     checks = (
         presence, quality, speakers, frames, rates, latency, clock, layout, ranges, motion_of,
@@ -45,7 +45,7 @@ def examine(facts: Facts, expected: Expected) -> list[Finding]:
 
 
 def presence(facts: Facts, _: Expected) -> Iterator[Finding]:
-    """Topics that are missing or silent, and types."""
+    """Finds missing and silent topics, and wrong types."""
     for role in (SCAN, ODOM, CMD_VEL):
         name = facts.names[role]
         there = facts.topics.get(name)
@@ -70,7 +70,7 @@ def presence(facts: Facts, _: Expected) -> Iterator[Finding]:
 
 
 def quality(facts: Facts, _: Expected) -> Iterator[Finding]:
-    """Pairs of publisher and subscriber that never match."""
+    """Finds pairs of publisher and subscriber with incompatible quality of service."""
     for role, name in facts.names.items():
         there = facts.topics.get(name)
         if there is None:
@@ -88,7 +88,7 @@ def quality(facts: Facts, _: Expected) -> Iterator[Finding]:
 
 
 def speakers(facts: Facts, _: Expected) -> Iterator[Finding]:
-    """Several publishers of what must come from one."""
+    """Finds several publishers on topics that must have a single one."""
     for role in (CMD_VEL, ODOM, SCAN, CLOCK):
         there = facts.topics.get(facts.names[role])
         if there is not None and len(there.offers) > 1:
@@ -98,7 +98,7 @@ def speakers(facts: Facts, _: Expected) -> Iterator[Finding]:
 
 
 def frames(facts: Facts, expected: Expected) -> Iterator[Finding]:
-    """Names of frames, by REP-105 and by the lidar's."""
+    """Checks names of frames against REP-105 and the lidar's frame."""
     wanted = (
         (SCAN, "frames", (expected.lidar.frame,), "header.frame_id"),
         (ODOM, "frames", ("odom",), "header.frame_id"),
@@ -110,7 +110,7 @@ def frames(facts: Facts, expected: Expected) -> Iterator[Finding]:
             continue
         for frame in sorted(getattr(heard, attribute)):
             if frame.rpartition("/")[2] in good and not frame.startswith("/"):
-                continue  # a prefix is how robots of a fleet keep apart
+                continue  # robots of a fleet have prefixes
             if role == SCAN and frame not in ("", "map", "odom", *BODY_FRAMES):
                 fix = f"call it {good[0]!r} in the driver, or set `frame: {frame}` in the lidar"
             else:
@@ -122,7 +122,7 @@ def frames(facts: Facts, expected: Expected) -> Iterator[Finding]:
 
 
 def rates(facts: Facts, expected: Expected) -> Iterator[Finding]:
-    """Rates as declared: that of the lidar, and odometry at least once a command."""
+    """Checks rates: the scan's as declared, odometry at least one message per command."""
     for role, wanted, exactly in (
         (SCAN, expected.lidar.rate, True),
         (ODOM, 1.0 / expected.period_s, False),
@@ -141,7 +141,7 @@ def rates(facts: Facts, expected: Expected) -> Iterator[Finding]:
 
 
 def _rate(facts: Facts, role: str) -> float | None:
-    """By the stamps where there are some: a simulation may run at another speed."""
+    """Rate by the stamps if there is a `/clock`: a simulation may run at another speed."""
     heard = facts.heard.get(role)
     if heard is None:
         return None
@@ -152,7 +152,7 @@ def _rate(facts: Facts, role: str) -> float | None:
 
 
 def latency(facts: Facts, _: Expected) -> Iterator[Finding]:
-    """Arrival minus stamp, by `/clock` where there is one."""
+    """Checks arrival minus stamp, by `/clock` if there is one."""
     for role in (SCAN, ODOM):
         heard = facts.heard.get(role)
         if heard is None:
@@ -179,18 +179,18 @@ def latency(facts: Facts, _: Expected) -> Iterator[Finding]:
 
 
 def _here(facts: Facts, arrivals: Sequence[int]) -> NDArray[np.int64]:
-    """Arrivals (T,) on the clock that stamps should be of [ns]."""
+    """Arrivals (T,) on the clock that the stamps should use [ns]."""
     times = np.array(arrivals, dtype=np.int64)
     if not facts.clock_ns:
         return times
     ticks = np.array(facts.heard[CLOCK].arrivals_ns, dtype=np.int64)
-    # The tick of a datum is sent with it, and may come in after it.
+    # The tick of a message is sent with it, and may arrive after it.
     place = np.searchsorted(ticks, times, side="right").clip(0, len(ticks) - 1)
     return np.asarray(np.array(facts.clock_ns, dtype=np.int64)[place])
 
 
 def clock(facts: Facts, _: Expected) -> Iterator[Finding]:
-    """Whether `/clock`, where somebody publishes it, goes on."""
+    """Checks that `/clock`, if it has a publisher, advances."""
     there = facts.topics.get(CLOCK)
     if there is None or not there.offers:
         return
@@ -210,7 +210,7 @@ def clock(facts: Facts, _: Expected) -> Iterator[Finding]:
 
 
 def motion_of(facts: Facts, expected: Expected) -> Iterator[Finding]:
-    """Odometry and commands: numbers, units and signs."""
+    """Checks odometry and commands: numbers, units and signs."""
     name = facts.names[ODOM]
     for what, fix, severe in motion(facts, expected.robot):
         yield Finding("error" if severe else "warning", "odometry", name, what, fix)

@@ -1,6 +1,6 @@
-"""Whether a robot's odometry is consistent with itself, with its limits, and with its commands.
+"""Consistency of a robot's odometry with itself, with its limits, and with its commands.
 
-Whether a robot's scans are those of the lidar that is expected.
+Checks of a robot's scans against the expected lidar.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 Word = tuple[str, str, bool]
-"""What is wrong, what to do, and whether it is severe."""
+"""Fault, remedy, and True if it is severe."""
 
 LEAST_PATH_M, LEAST_TURN_RAD = 0.3, 0.3
-"""Below, a drive says nothing about scales."""
+"""A drive with less motion than this does not determine scales."""
 TOLERANCE = 1.4
-"""Pose differences and twist agree within this factor."""
+"""Differences of the pose and the twist must agree within this factor."""
 ALIKE = 0.8
-"""Below this correlation the two have nothing to do with each other, and a factor says nothing."""
+"""Below this correlation pose and twist are unrelated, and their ratio is meaningless."""
 LEAST_ALIKE = 0.3
-"""The same for commands, which the robot follows late and within its limits."""
+"""The same for commands, which the robot follows with delay and within its limits."""
 JUMP = 5.0
-"""Farther than so many times what the greatest speed allows is a jump,"""
+"""A step of more than this multiple of what the maximum speed allows is a jump,"""
 JUMP_M = 0.2
-"""if it is farther than this as well [m]."""
+"""if it is also longer than this [m]."""
 QUATERNION_TOLERANCE = 0.05
 LEAST_STEPS = 10
 UNITS = ((1000.0, "mm/s"), (100.0, "cm/s"), (3.6, "km/h"), (180.0 / np.pi, "degrees per second"))
 
 
 def motion(facts: Facts, robot: RobotSpec) -> Iterator[Word]:
-    """What is wrong with odometry."""
+    """Yields the faults of odometry."""
     poses, twists = np.array(facts.poses), np.array(facts.twists)
     if not len(poses):
         return
@@ -99,7 +99,7 @@ def _moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> Iterato
 
 
 def _compared(field: str, real: Array, told: Array, unit: int) -> Iterator[Word]:
-    """Compares what the pose did (T,) with what the twist says of it (T,)."""
+    """Compares the changes of the pose (T,) with those according to the twist (T,)."""
     ratio = _slope(real, told)
     if 1.0 / TOLERANCE < ratio < TOLERANCE:
         return
@@ -129,20 +129,20 @@ def _compared(field: str, real: Array, told: Array, unit: int) -> Iterator[Word]
 
 
 def _slope(x: Array, y: Array) -> float:
-    """Least-squares factor of y by x; inf where x does not move."""
+    """Least-squares slope of y over x; inf if x is zero."""
     power = float(x @ x)
     return float(x @ y) / power if power > 0.0 else float("inf")
 
 
 def _fastest(robot: RobotSpec) -> float:
-    """The greatest speed that a command asks for [m/s]."""
+    """Maximum speed that can be commanded, at least 0.1 [m/s]."""
     corners = np.array([robot.command_low, robot.command_high])
     speeds = [np.hypot(*robot.to_cmd_vel(row)[:2]) for row in corners]
     return max(float(max(speeds)), 0.1)
 
 
 def scale(facts: Facts) -> float | None:
-    """Factor by which the robot turns as it is told to; None where it was not told to turn."""
+    """Slope of the turns per odometry step over the commanded turn rates; None if undetermined."""
     heard, odometry = facts.heard.get(CMD_VEL), facts.heard.get(ODOM)
     if heard is None or odometry is None or len(facts.poses) < LEAST_STEPS:
         return None
@@ -150,7 +150,7 @@ def scale(facts: Facts) -> float | None:
     place = np.searchsorted(heard.arrivals_ns, odometry.arrivals_ns[:-1], side="right") - 1
     known = place >= 0
     turn = np.asarray(wrap_angle(np.diff(np.array(facts.poses)[:, 2])))[known]
-    forward = np.array(facts.twists)[:-1, 0][known] >= 0.0  # a car that backs turns the other way
+    forward = np.array(facts.twists)[:-1, 0][known] >= 0.0  # a car turns the other way in reverse
     wish = told[place[known], 2]
     if np.abs(turn[forward]).sum() < LEAST_TURN_RAD or np.abs(wish[forward]).sum() < 1.0:
         return None
@@ -161,13 +161,13 @@ def scale(facts: Facts) -> float | None:
 
 LAYOUT = "beam layout"
 ANGLE_TOLERANCE = 0.5
-"""Of a beam's direction, in increments."""
+"""Tolerance of a beam's direction, in increments."""
 ODD_SHARE = 0.01
-"""A lidar that puts a value on the wire in more than this share of its beams means it."""
+"""A value in more than this share of the beams is taken to be intended by the lidar."""
 
 
 def layout(facts: Facts, expected: Expected) -> Iterator[Finding]:
-    """Number and directions of the beams, and limits of their ranges."""
+    """Checks number and directions of the beams, and the limits of their ranges."""
     name = facts.names[SCAN]
     if len(facts.layouts) > 1:
         counts = sorted({one.beams for one in facts.layouts})
@@ -185,7 +185,7 @@ def layout(facts: Facts, expected: Expected) -> Iterator[Finding]:
 
 
 def _unfilled(have: Layout, expected: Expected) -> str:
-    """Why a lidar does not fill the sectors that are wanted; empty if it does, or none are."""
+    """Reason why a lidar does not fill the required sectors; empty if it does, or without any."""
     try:
         if expected.scan is not None:
             filling(have, expected.lidar, expected.scan)
@@ -195,7 +195,7 @@ def _unfilled(have: Layout, expected: Expected) -> str:
 
 
 def _header(have: Layout, name: str) -> Iterator[Finding]:
-    """Whether a header agrees with itself."""
+    """Checks that a header is consistent with itself."""
     if abs(have.last - have.angle_max) > ANGLE_TOLERANCE * max(abs(have.angle_increment), 1e-9):
         what = f"angle_max is {have.angle_max:.5f}, but its beams end at {have.last:.5f} rad"
         yield Finding("warning", LAYOUT, name, what, "correct the driver's header")
@@ -205,7 +205,7 @@ def _header(have: Layout, name: str) -> Iterator[Finding]:
 
 
 def _beams(have: Layout, expected: Expected, name: str) -> Iterator[Finding]:
-    """Whether a header's beams are those of a lidar."""
+    """Compares a header's beams and range limits with those of the expected lidar."""
     want = expected.lidar.header
     fix = "set the driver, or make a lidar file of what it sends and generate the model anew"
     if have.beams != expected.lidar.beams:
@@ -234,7 +234,7 @@ def _beams(have: Layout, expected: Expected, name: str) -> Iterator[Finding]:
 
 
 def ranges(facts: Facts, expected: Expected) -> Iterator[Finding]:
-    """What the lidar puts on the wire where nothing came back, and its unit."""
+    """Checks the lidar's values for no return, and the unit of its ranges."""
     if not facts.ranges:
         return
     spec, name = expected.lidar, facts.names[SCAN]

@@ -1,6 +1,6 @@
-"""What was heard of a robot, live or out of a bag: the facts that the doctor judges.
+"""Facts about a robot, live or from a bag, for the doctor to judge.
 
-What the doctor expects of a robot, and what it finds that does not fit.
+Expectations of the doctor, and its findings.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ SCAN_TYPE, ODOM_TYPE = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 TWIST_TYPE, TWIST_STAMPED_TYPE = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 MOST_SCANS = 200
-"""Ranges are kept of so many scans; of the others only the time."""
+"""Maximum number of scans whose ranges are kept; of the others only the times are."""
 MOST_RAD = 7.0
 
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Who speaks and who listens on a topic.
+    """Publishers and subscribers of a topic.
 
     Attributes:
-        types: of the messages, by what the publishers say.
+        types: of the messages, as declared by the publishers.
         offers: quality of service of each publisher.
-        asks: that each subscriber asks for; the doctor's own is left out.
+        asks: quality of service requested by each subscriber, without the doctor's own.
     """
 
     types: tuple[str, ...]
@@ -56,7 +56,7 @@ class TopicFacts:
     """The messages of a topic.
 
     Attributes:
-        arrivals_ns: when each came [ns].
+        arrivals_ns: times of arrival [ns].
         stamps_ns: of the headers [ns].
         frames: ids of the headers.
         children: ids of the child frames.
@@ -69,14 +69,14 @@ class TopicFacts:
 
     @property
     def rate_hz(self) -> float | None:
-        """Messages per second between the first and the last; None below three."""
+        """Messages per second between the first and the last; None for fewer than three."""
         span = (self.arrivals_ns[-1] - self.arrivals_ns[0]) / NS_PER_S if self.arrivals_ns else 0.0
         return (len(self.arrivals_ns) - 1) / span if len(self.arrivals_ns) > 2 and span else None
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The beams of a scan, as its header tells them, see `ScanHeader`."""
+    """The beams of a scan according to its header, see `ScanHeader`."""
 
     beams: int
     angle_min: float
@@ -92,27 +92,27 @@ class Layout:
 
     @property
     def in_degrees(self) -> bool:
-        """Whether the angles are too great for radians."""
+        """True if the angles are too large for radians."""
         return max(abs(self.angle_min), abs(self.angle_max)) > MOST_RAD
 
 
 @dataclass
 class Facts:
-    """All that was heard.
+    """All facts that were collected.
 
     Attributes:
-        source: where, for people.
-        live: over DDS, or out of a bag.
-        topics: of the robot and what became of each: name -> who is there.
+        source: name of the source, for messages.
+        live: True over DDS, False from a bag.
+        topics: topic -> its publishers and subscribers.
         heard: role (`scan`, `odom`, `cmd_vel`, `/clock`) -> messages.
         names: role -> topic.
-        end_ns: when listening ended, on the clock of arrivals [ns].
-        layouts: of the scans, each different one once.
+        end_ns: end of listening, on the clock of arrivals [ns].
+        layouts: distinct layouts of the scans.
         ranges: of up to 200 scans [m].
         poses: of odometry, rows x, y [m], heading [rad].
         twists: of odometry, rows vx, vy [m/s], wz [rad/s].
         lengths: of odometry's quaternions.
-        uncovered: odometries whose covariance of pose and twist is all zeros.
+        uncovered: number of odometry messages whose covariance of pose or twist is all zeros.
         commands: rows vx, vy [m/s], wz [rad/s].
         clock_ns: content of `/clock` [ns].
     """
@@ -133,7 +133,7 @@ class Facts:
     clock_ns: list[int] = field(default_factory=list)
 
     def take(self, role: str, arrival_ns: int, message: Any) -> None:
-        """Notes a message, of ROS or of a bag: both have the same fields."""
+        """Records a message from ROS or from a bag, which have the same fields."""
         heard = self.heard.setdefault(role, TopicFacts())
         heard.arrivals_ns.append(arrival_ns)
         if hasattr(message, "header"):
@@ -187,11 +187,11 @@ KINDS: dict[str, Sequence[str]] = {
     CMD_VEL: (TWIST_TYPE, TWIST_STAMPED_TYPE),
     CLOCK: (CLOCK_TYPE,),
 }
-"""The message types of each role; what is of another is not looked into."""
+"""Message types of each role; messages of other types are not read."""
 
 
 def facts_of_bag(path: str | Path, namespace: str = "") -> Facts:
-    """What a bag tells of a robot.
+    """Collects the facts of a robot from a bag.
 
     Raises:
         RecordingError: the bag is damaged.
@@ -210,14 +210,14 @@ def facts_of_bag(path: str | Path, namespace: str = "") -> Facts:
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that does not fit.
+    """A mismatch between robot and expectation.
 
     Attributes:
         severity: an `error` makes a policy misbehave; a `warning` may.
-        check: what was looked at.
+        check: name of the check.
         where: the topic.
-        what: what does not fit, with numbers.
-        fix: what to do.
+        what: the mismatch, with numbers.
+        fix: the remedy.
     """
 
     severity: Literal["error", "warning"]
@@ -229,13 +229,13 @@ class Finding:
 
 @dataclass(frozen=True)
 class Expected:
-    """What is expected of a robot, by whatever it was made for.
+    """Expectations of a robot, by a model or a policy.
 
     Attributes:
         robot: units and limits of state and command.
         lidar: beams, limits, rate, frame and range convention.
         period_s: between commands [s].
-        scan: the sectors that any lidar may fill; None: the beams of exactly this one.
+        scan: sectors that any lidar may fill; None: the beams of exactly this one.
     """
 
     robot: RobotSpec
@@ -245,17 +245,17 @@ class Expected:
 
 
 def expected_of_model(model: SimulatorModel) -> Expected:
-    """What a SimulatorModel expects."""
+    """Expectations of a SimulatorModel."""
     return Expected(model.robot, model.lidar, model.control_period)
 
 
 def expected_of_policy(contract: Contract) -> Expected:
-    """What a policy file expects: its robot, and its lidar or one that fills its sectors."""
+    """Expectations of a policy file: its robot, and its lidar or one that fills its sectors."""
     return Expected(contract.robot, contract.lidar, contract.control_period, contract.scan)
 
 
 def seen(facts: Facts, expected: Expected) -> Expected:
-    """Expects the lidar that is there, where sectors are wanted and it fills them."""
+    """Replaces the expected lidar by the present one if that fills the required sectors."""
     if expected.scan is None or not facts.layouts:
         return expected
     try:
@@ -266,7 +266,7 @@ def seen(facts: Facts, expected: Expected) -> Expected:
 
 
 def filling(have: Layout, like: LidarSpec, scan: ScanLayout) -> LidarSpec:
-    """The lidar of a header, mounted like another one.
+    """The lidar of a scan header, mounted like another one.
 
     Raises:
         ConfigError: it does not fill the sectors.

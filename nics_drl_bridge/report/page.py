@@ -1,6 +1,6 @@
-"""The report: one HTML file that holds everything, pictures included.
+"""The report: one self-contained HTML file, including pictures.
 
-What all pictures of a fit share: colours and the way to a PNG.
+Colours and PNG export shared by the pictures of a fit.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Code:
-    """Text to show as it stands."""
+    """Preformatted text."""
 
     text: str
 
@@ -53,12 +53,12 @@ Block = Table | Picture | Code | str
 
 
 def page(title: str, lead: str, sections: Sequence[tuple[str, Sequence[Block]]]) -> str:
-    """An HTML page.
+    """Builds an HTML page.
 
     Args:
         title: of the page.
-        lead: one sentence below it.
-        sections: heading and blocks of each; plain text is a paragraph.
+        lead: one sentence below the title.
+        sections: heading and blocks of each section; plain text is a paragraph.
     """
     body = "".join(
         f"<h2>{escape(heading)}</h2>{''.join(_block(block) for block in blocks)}"
@@ -94,7 +94,7 @@ MEASURED, MODEL, OTHER, DARK = "#1f6fb2", "#d1495b", "#8d99ae", "#333333"
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as a PNG."""
+    """Renders a figure as a PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return buffer.getvalue()

@@ -1,10 +1,10 @@
-"""Pictures: trajectories in their worlds.
+"""Pictures of trajectories in their worlds.
 
-A picture of a drive that is planned: its path, its space, its commands.
+Picture of a planned drive: its path, its bounds, its commands.
 
-The picture of a training: how often its episodes succeed, as it goes on.
+Picture of a training: success and collision rates of its episodes over the steps.
 
-A picture of a policy in the shadow of a drive.
+Picture of a policy in shadow mode.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ LEAST_WIDTH = 5.5
 
 
 def trajectories(runs: Mapping[str, Sequence[Episode]], world: World, footprint: float) -> bytes:
-    """One panel per episode, the paths of all runs in it (the paper's Fig. 7).
+    """Draws one panel per episode with the paths of all runs (the paper's Fig. 7).
 
     Args:
         runs: name -> episodes, the same seeds in each.
-        world: where they were driven.
+        world: the world of the episodes.
         footprint: radius of the robot [m].
 
     Returns:
@@ -89,7 +89,7 @@ PATH, EDGE, START = "#1f6fb2", "#d1495b", "#2f855a"
 
 
 def drive_picture(pattern: Pattern, spec: RobotSpec) -> bytes:
-    """The expected path within its circle, and each command over time.
+    """Draws the expected path within its bounding circle, and each command over time.
 
     Args:
         pattern: of the drive.
@@ -131,7 +131,7 @@ def _path(axes: Axes, pattern: Pattern) -> None:
 
 @dataclass(frozen=True)
 class Point:
-    """Where a training stood.
+    """Progress of a training at one time.
 
     Attributes:
         steps: environment steps done.
@@ -144,7 +144,7 @@ class Point:
 
 
 def training_curve(points: Sequence[Point]) -> bytes:
-    """Success and collisions [%] over the environment steps, as a PNG."""
+    """Draws success and collisions [%] over the environment steps, as a PNG."""
     figure = Figure(figsize=(7.5, 3.8), layout="constrained")
     axes = figure.subplots()
     steps = [point.steps / 1e3 for point in points]
@@ -164,10 +164,10 @@ DRIVEN, POLICY, GAP = "#1f6fb2", "#d1495b", "#777777"
 
 
 def shadow_picture(shadow: Shadow) -> bytes:
-    """Each command over time, as it was driven and as the policy would have it.
+    """Draws each command over time, as driven and as chosen by the policy.
 
     Args:
-        shadow: the policy beside the drive.
+        shadow: the policy compared with the drive.
 
     Returns:
         A PNG.

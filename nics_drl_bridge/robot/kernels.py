@@ -1,11 +1,11 @@
 """Compiled motion: the pruned model's rates, and the exact arc of a body twist.
 
-Only the kept terms cost time. What one robot does in one step is a scalar function, `rates`
-then `move`; `run` does the same to many robots side by side, term by term, so that a
-processor's vector instructions serve several of them at once. Both round alike, in every
-batch: one robot is a batch of one.
+Only the kept terms cost time. A step of one robot consists of scalar functions, `rates` then
+`move`; `run` does the same for a batch of robots, term by term, so that vector instructions
+process several robots at a time. Both give bit-identical results for every batch size: one robot
+is a batch of one.
 
-Shared arguments: `terms` are the arrays of `term_arrays`; `x` holds state, command and a last
+Shared arguments: `terms` are the arrays of `term_arrays`; `x` contains state, command and a last
 entry of 1; `dq` are the rates; `series` is `SERIES` in the type of the other arrays.
 """
 
@@ -27,20 +27,20 @@ Array = NDArray[np.float64]
 Terms = tuple[NDArray[np.int64], Array, NDArray[np.int64], NDArray[np.int64]]
 
 SERIES: Array = np.array([1 / 6, 1 / 120, 1 / 5040, 1 / 2, 1 / 24, 1 / 720])
-"""Coefficients of sin(t) / t and (1 - cos(t)) / t; exact to 1e-14 for turns below 0.1 rad a step,
-to 1e-8 below `WIDE_TURN`."""
+"""Coefficients of sin(t) / t and (1 - cos(t)) / t; exact to 1e-14 for turns below 0.1 rad per
+step, to 1e-8 below `WIDE_TURN`."""
 WIDE_TURN = 0.5
-"""Beyond this in one step the series are no good: sine and cosine take their place [rad]."""
+"""For larger turns per step the series are inaccurate and sine and cosine are used [rad]."""
 GREATEST_ORDER = 4
 
 
 def term_arrays(model: TaylorModel) -> Terms:
-    """The kept terms: dof (T,), coefficient (T,), factors (T, order), factors in use (T,).
+    """Returns the kept terms: dof (T,), coefficient (T,), factors (T, order), their number (T,).
 
-    A factor is a place in `x`; the unused ones point at its last entry, which is 1.
+    A factor is an index into `x`; unused ones point to its last entry, which is 1.
 
     Raises:
-        ModelError: a term is of a higher order than the kernels know.
+        ModelError: a term is of a higher order than the kernels support.
     """
     one = len(model.variables)
     order = max(1, int(model.powers.sum(axis=1).max(initial=1)))
@@ -59,7 +59,7 @@ def term_arrays(model: TaylorModel) -> Terms:
 
 
 def scratch(model: TaylorModel) -> tuple[Array, Array]:
-    """Room for `x` and `dq` of one robot."""
+    """Returns scratch memory for `x` and `dq` of one robot."""
     x = np.zeros(len(model.variables) + 1)
     x[-1] = 1.0
     return x, np.zeros(len(model.dofs))
@@ -67,7 +67,7 @@ def scratch(model: TaylorModel) -> tuple[Array, Array]:
 
 @kernel
 def rates(dq, x, terms):  # type: ignore[no-untyped-def]
-    """dQ/dt (3 + S) of one robot."""
+    """Computes dQ/dt (3 + S,) of one robot."""
     dof, coefficient, factors, count = terms
     dq[:] = 0.0
     for k in range(dof.shape[0]):
@@ -79,7 +79,7 @@ def rates(dq, x, terms):  # type: ignore[no-untyped-def]
 
 @kernel
 def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
-    """Position and direction after the exact arc of a constant body twist.
+    """Returns position and direction after the exact arc of a constant body twist.
 
     Args:
         x, y: position [m].
@@ -98,7 +98,7 @@ def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
 
 @kernel
 def _move_little(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
-    """As `move`, of no wide turn."""
+    """Does the same as `move` for turns up to `WIDE_TURN`."""
     t2 = turn * turn
     a = series[0] - t2 * (series[1] - t2 * series[2])
     a = (series[3] + series[3]) - t2 * a
@@ -108,7 +108,7 @@ def _move_little(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyp
 
 @kernel
 def _along(x, y, c, s, vx, vy, a, b, sine, versine, dt):  # type: ignore[no-untyped-def]
-    """The end of an arc, by a = sin(t) / t, b = (1 - cos(t)) / t, and t times either."""
+    """Returns the end of an arc from a = sin(t) / t, b = (1 - cos(t)) / t, t a and t b."""
     ahead, aside = (a * vx - b * vy) * dt, (b * vx + a * vy) * dt
     x, y = x + (c * ahead - s * aside), y + (s * ahead + c * aside)
     return x, y, c - (c * versine + s * sine), s - (s * versine - c * sine)
@@ -116,7 +116,7 @@ def _along(x, y, c, s, vx, vy, a, b, sine, versine, dt):  # type: ignore[no-unty
 
 @kernel
 def wrap(heading):  # type: ignore[no-untyped-def]
-    """Brings a heading [rad] into [-pi, pi)."""
+    """Wraps a heading [rad] to [-pi, pi)."""
     return heading - 2.0 * math.pi * math.floor((heading + math.pi) / (2.0 * math.pi))
 
 
@@ -130,7 +130,7 @@ def advance(pose, twist, dt, series):  # type: ignore[no-untyped-def]
 
 
 def own(value: Any, lane: int) -> Any:
-    """What a lane has of a value: its own of several, or the one that all share."""
+    """Returns the value of a lane: its entry of an array, or the scalar shared by all lanes."""
     return value[lane] if np.ndim(value) else value
 
 
@@ -143,16 +143,16 @@ def _own(value, lane):  # type: ignore[no-untyped-def]
 
 @kernel
 def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
-    """Moves many robots by the same number of steps, each under a constant command.
+    """Moves a batch of robots by the same number of steps, each under a constant command.
 
     Args:
-        pose: (6, n) x, y [m], cosine and sine of the heading, heading [rad], and what bounds
-            the length of the path [m], in place; the heading is not wrapped.
-        x: (S + C + 1, n); the state in place.
-        dq: (3 + S, n) scratch; holds the rates of the last step.
-        terms, series: see the module; coefficient may be (T, n), then each robot has its own.
+        pose: (6, n) x, y [m], cosine and sine of the heading, heading [rad], and an upper bound
+            of the path length [m], updated in place; the heading is not wrapped.
+        x: (S + C + 1, n); the state is updated in place.
+        dq: (3 + S, n) scratch memory; contains the rates of the last step afterwards.
+        terms, series: see the module; coefficients may be (T, n), one per robot.
         dt: length of a step [s].
-        steps: how many.
+        steps: number of steps.
     """
     for _ in range(steps):
         _rates_of_all(dq, x, terms)
@@ -214,7 +214,7 @@ def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
 
 @kernel
 def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
-    """As `_move_all`, where some of them turn widely: in a loop of its own, as it is slower."""
+    """Does the same as `_move_all` if some turns are wide: in a separate loop, as it is slower."""
     px, py, pc, ps, heading, length = pose[0], pose[1], pose[2], pose[3], pose[4], pose[5]
     vx, vy, wz = dq[0], dq[1], dq[2]
     for i in range(px.shape[0]):
@@ -228,7 +228,7 @@ def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-untyped-def]
-    """Moves robots open-loop by the steps of their commands, one robot after the other.
+    """Rolls out robots open-loop under their commands, one robot after the other.
 
     Args:
         poses: (W, T + 1, 3), the first given, the others written; headings are not wrapped.
@@ -258,7 +258,7 @@ def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-unty
 
 @kernel
 def delayed(substep, delay, substeps, periods):  # type: ignore[no-untyped-def]
-    """Which of the last `periods` commands, newest first, is in effect in a substep."""
+    """Returns the index, newest first, of the one of the last `periods` commands in effect."""
     if delay <= substep:
         return 0
     return min((delay - substep + substeps - 1) // substeps, periods - 1)

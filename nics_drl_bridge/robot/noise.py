@@ -1,6 +1,6 @@
-"""The noise of a robot: what the simulator draws and what the estimator expects.
+"""Noise of a robot, drawn by the simulator and expected by the estimator.
 
-Latency: how long after it was measured a robot's scan and odometry come.
+Latency of a robot's scan and odometry, from measurement to receipt.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 MEASURED: Literal["measured"] = "measured"
 ASSUMED: Literal["assumed"] = "assumed"
 ASSUMED_STATE_DRIFT = 0.1
-"""A state that was not measured drifts by this share of its range within a second."""
+"""Assumed drift of an unmeasured state within a second, as a share of its range."""
 
 
 class Level(Schema):
@@ -26,8 +26,8 @@ class Level(Schema):
     Attributes:
         std: its value.
         unit: of the value.
-        source: `measured` in the recording, or `assumed` where that did not show it.
-        uncertainty: standard uncertainty of the value; None where it is assumed.
+        source: `measured` in the recording, or `assumed` if the recording did not show it.
+        uncertainty: standard uncertainty of the value; None if it is assumed.
     """
 
     std: float = Field(ge=0.0)
@@ -37,31 +37,31 @@ class Level(Schema):
 
     @property
     def measured(self) -> bool:
-        """Whether the recording showed it."""
+        """True if the level was measured in the recording."""
         return self.source == MEASURED
 
 
 def assumed(std: float, unit: str) -> Level:
-    """A level that nothing showed."""
+    """Returns an assumed level."""
     return Level(std=std, unit=unit)
 
 
 class Noise(Schema):
-    """How uncertain a robot's sensors and its motion are.
+    """Noise of a robot's sensors and motion.
 
-    The simulator draws the noise of odometry, and the drift where it was measured: an assumed
-    drift is a margin for the estimator, not a motion of the robot. The estimator takes its R from
-    odometry and pose, its Q from the drift.
+    The simulator draws the odometry noise, and the drift if it was measured: an assumed drift is
+    a margin for the estimator, not a motion of the robot. The estimator takes its R from odometry
+    and pose, its Q from the drift.
 
     Attributes:
         odom_linear: of each component of the measured velocity [m/s].
         odom_angular: of the measured yaw rate [rad/s].
         pose_position: of x and y of the pose sensor [m].
         pose_heading: of its heading [rad].
-        position_drift: what the model does not explain of x and y, growing with the root of the
-            time [m/sqrt(s)].
-        heading_drift: the same of the heading [rad/sqrt(s)].
-        state_drift: the same of each state variable, by name [its unit/sqrt(s)].
+        position_drift: part of x and y that the model does not explain, growing with the square
+            root of time [m/sqrt(s)].
+        heading_drift: the same for the heading [rad/sqrt(s)].
+        state_drift: the same for each state variable, by name [its unit/sqrt(s)].
     """
 
     odom_linear: Level = assumed(0.01, "m/s")
@@ -91,13 +91,13 @@ class Noise(Schema):
         return self.pose_position.std, self.pose_position.std, self.pose_heading.std
 
     def drift(self, spec: RobotSpec) -> NDArray[np.float64]:
-        """(3 + S,) what the estimator expects of pose and state after a second."""
+        """Returns the drift (3 + S,) of pose and state that the estimator expects in a second."""
         states = [self._state(v.name, v.max - v.min, v.unit) for v in spec.state]
         levels = (self.position_drift, self.position_drift, self.heading_drift, *states)
         return np.array([level.std for level in levels])
 
     def simulated_drift(self, spec: RobotSpec) -> NDArray[np.float64]:
-        """(3 + S,) what the simulator draws: the drift that was measured, else none."""
+        """Returns the drift (3 + S,) that the simulator draws: measured levels, else zero."""
         states = [self._state(v.name, v.max - v.min, v.unit) for v in spec.state]
         levels = (self.position_drift, self.position_drift, self.heading_drift, *states)
         return np.array([level.std if level.measured else 0.0 for level in levels])
@@ -106,7 +106,7 @@ class Noise(Schema):
         return self.state_drift.get(name, assumed(ASSUMED_STATE_DRIFT * reach, f"{unit}/sqrt(s)"))
 
     def sentences(self) -> list[str]:
-        """One line per level, for people."""
+        """Returns one human-readable line per level."""
         named = {name: getattr(self, name) for name in type(self).model_fields}
         levels = {n: level for n, level in named.items() if isinstance(level, Level)}
         levels |= {f"state_drift of {name}": level for name, level in self.state_drift.items()}
@@ -119,11 +119,11 @@ class Noise(Schema):
 
 
 class Delay(Schema):
-    """An even distribution of delays.
+    """A uniform distribution of delays.
 
     Attributes:
-        least: the smallest [s].
-        jitter: by how much the greatest is more [s].
+        least: smallest delay [s].
+        jitter: greatest minus smallest delay [s].
     """
 
     least: float = Field(ge=0.0)
@@ -131,7 +131,7 @@ class Delay(Schema):
 
 
 class Latency(Schema):
-    """From what was measured to its receipt; None where nothing showed it.
+    """Delays from measurement to receipt; None if unknown.
 
     Attributes:
         scan: of scans, from the last beam.
@@ -143,12 +143,12 @@ class Latency(Schema):
 
     @property
     def measured(self) -> dict[str, Delay]:
-        """The delays that are known, by topic."""
+        """Known delays, by topic."""
         named = {"scan": self.scan, "odom": self.odom}
         return {topic: delay for topic, delay in named.items() if delay is not None}
 
     def sentences(self) -> list[str]:
-        """One line per topic, for people."""
+        """Returns one human-readable line per topic."""
         return [
             f"{topic} comes {1e3 * delay.least:.1f} to {1e3 * (delay.least + delay.jitter):.1f} ms "
             "after it was measured"

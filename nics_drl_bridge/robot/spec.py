@@ -1,4 +1,4 @@
-"""RobotSpec: the one home of a robot's state, command, their order, units and limits."""
+"""RobotSpec: the single definition of a robot's state and command: order, units and limits."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from nics_drl_bridge.errors import ConfigError
 CmdVelField = Literal["linear.x", "linear.y", "angular.z"]
 CMD_VEL_FIELDS: tuple[CmdVelField, ...] = ("linear.x", "linear.y", "angular.z")
 UNITS = ("m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1")
-"""SI units of a state or a command; 1 for a share or a count."""
+"""SI units of a state or a command; 1 for a ratio or a count."""
 LARGEST = 1e3
-"""Greatest radius of a robot [m]."""
+"""Maximum radius of a robot [m]."""
 MOST_CORNERS = 512
-"""Of a footprint."""
+"""Maximum number of corners of a footprint."""
 MOST_VARIABLES = 32
-"""Of a state, and of a command."""
+"""Maximum number of variables of a state, and of a command."""
 FASTEST = 1e6
-"""Greatest value of a variable, in its unit."""
+"""Maximum absolute value of a variable, in its unit."""
 POSE_RATES = ("vx", "vy", "wz")
 POSE_UNITS = ("m/s", "m/s", "rad/s")
 
@@ -56,8 +56,8 @@ class StateVariable(Variable):
     """A component of the state.
 
     Attributes:
-        follows: the command that it follows with a lag. A recording that does not measure
-            the state can still be used when every state variable names one.
+        follows: the command that it follows with a lag. A recording without measured state can
+            still be used if every state variable names one.
     """
 
     follows: str | None = None
@@ -67,26 +67,25 @@ class CommandVariable(Variable):
     """A component of the command.
 
     Attributes:
-        cmd_vel: the field of `cmd_vel` that carries it; None for a robot that is not driven
-            over ROS 2.
+        cmd_vel: its field of `cmd_vel`; None for a robot that is not driven through ROS 2.
     """
 
     cmd_vel: CmdVelField | None = None
 
 
 class RobotSpec(Schema):
-    """A robot as the package sees it.
+    """Definition of a robot.
 
     Attributes:
-        name: what users call it.
+        name: user-visible name.
         description: one sentence.
-        textbook: the textbook kinematics that make its synthetic recordings, and whose
-            structure may be assumed for what a drive did not show.
+        textbook: the textbook kinematics for its synthetic recordings, whose structure may also
+            be assumed for motion that a drive did not show.
         parameters: of the textbook kinematics [m, s], see `kinematics.textbook`.
-        footprint_radius: radius of the circle around `base_link` that the robot fills [m], or that
-            holds its `footprint`, then it may be left out.
-        footprint: corners of the outline that it fills instead, in `base_link` [m], either way
-            round; edges may not cross.
+        footprint_radius: radius of the circular footprint around `base_link` [m]; optional with a
+            `footprint`, which it then circumscribes.
+        footprint: corners of a polygonal footprint instead, in `base_link` [m], in either
+            direction; edges may not cross.
         state: S components, in the order of every state vector.
         command: C components, in the order of every command vector.
     """
@@ -117,7 +116,7 @@ class RobotSpec(Schema):
             corners = np.array(data["footprint"], dtype=np.float64)
             return data | {"footprint_radius": float(np.hypot(*corners.T).max())}
         except (OverflowError, TypeError, ValueError):
-            return data  # the field's own check says what is wrong with it
+            return data  # the field's own check reports the error
 
     @model_validator(mode="after")
     def _outlined(self) -> RobotSpec:
@@ -172,12 +171,12 @@ class RobotSpec(Schema):
 
     @cached_property
     def command_low(self) -> NDArray[np.float64]:
-        """(C,) least command."""
+        """Least command (C,)."""
         return np.array([c.min for c in self.command])
 
     @cached_property
     def command_high(self) -> NDArray[np.float64]:
-        """(C,) greatest command."""
+        """Greatest command (C,)."""
         return np.array([c.max for c in self.command])
 
     @cached_property
@@ -190,25 +189,25 @@ class RobotSpec(Schema):
         return np.array([CMD_VEL_FIELDS.index(field) for field in fields], dtype=np.intp)
 
     def to_cmd_vel(self, command: ArrayLike) -> NDArray[np.float64]:
-        """Command (..., C) as `cmd_vel` (..., 3): linear.x, linear.y, angular.z."""
+        """Converts a command (..., C) to `cmd_vel` (..., 3): linear.x, linear.y, angular.z."""
         command = np.asarray(command, dtype=np.float64)
         twist = np.zeros((*command.shape[:-1], 3))
         twist[..., self._cmd_vel_index] = command
         return twist
 
     def from_cmd_vel(self, twist: ArrayLike) -> NDArray[np.float64]:
-        """`cmd_vel` (..., 3) as command (..., C); fields the robot has no use for are dropped."""
+        """Converts `cmd_vel` (..., 3) to a command (..., C); unused fields are dropped."""
         return np.asarray(twist, dtype=np.float64)[..., self._cmd_vel_index]
 
 
 def _edges_cross(corners: NDArray[np.float64]) -> bool:
-    """Whether two edges of an outline (V, 2) have a point in common that is no corner of both."""
+    """True if two edges of an outline (V, 2) meet anywhere but at their common corner."""
     start, stop = corners, np.roll(corners, -1, axis=0)
     if (start == stop).all(axis=1).any():
         return True
 
     def side(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(V, V) on which side of each edge (rows) each point lies."""
+        """Returns the side (V, V) of each edge (rows) on which each point lies."""
         along, to = (stop - start)[:, None], points[None] - start[:, None]
         return np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
 
@@ -218,7 +217,7 @@ def _edges_cross(corners: NDArray[np.float64]) -> bool:
     index = np.arange(len(corners))
     gap = (index[None] - index[:, None]) % len(corners)
     distant = (gap > 1) & (gap < len(corners) - 1)
-    # An edge may not run back along the one before it.
+    # An edge may not run back along its predecessor.
     folded = side(stop)[index, (index + 1) % len(corners)] == 0.0
     ahead = ((stop - start) * (np.roll(stop - start, -1, axis=0))).sum(axis=1) > 0.0
     return bool(
@@ -227,16 +226,16 @@ def _edges_cross(corners: NDArray[np.float64]) -> bool:
 
 
 def load_robot(name: str | Path) -> RobotSpec:
-    """Loads a shipped robot by name (`ackermann`), or any by the path of its YAML file.
+    """Loads a shipped robot by name (`ackermann`), or any robot by the path of its YAML file.
 
     Raises:
-        ConfigError: unknown name or a wrong key, with the nearest valid one.
+        ConfigError: unknown name or wrong key, with the nearest valid one.
     """
     return load_yaml(find_config(name, "robots"), RobotSpec)
 
 
 def require_textbook(spec: RobotSpec) -> str:
-    """The name of the robot's textbook kinematics, or one sentence when it has none."""
+    """Returns the name of the robot's textbook kinematics. Raises ConfigError if it has none."""
     if spec.textbook is None:
         raise ConfigError(
             f"robot {spec.name!r} names no textbook kinematics; add `textbook:` to its YAML file "

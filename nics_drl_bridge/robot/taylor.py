@@ -2,7 +2,7 @@
 
 Features of the Taylor model: the products of the variables up to an order (Eq. 1).
 
-Quality: how well a model fits its drive, and how far it can be trusted.
+Quality: goodness of fit of a model, on its training part and on unseen data.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def _unknown() -> Array:
 
 @dataclass(frozen=True)
 class TaylorModel:
-    """`dQ/dt = A chi(X)` with the pruned terms left out (Eq. 1, 2).
+    """`dQ/dt = A chi(X)` without the pruned terms (Eq. 1, 2).
 
     Attributes:
         variables: V names of X = [state, command].
@@ -35,13 +35,13 @@ class TaylorModel:
         dof_units: D units.
         powers: (K, V) exponents of the terms that any degree of freedom keeps.
         coefficients: (D, K); zero where a degree of freedom does not keep a term.
-        dt: the step for which the rates hold [s]; the simulator steps by it.
+        dt: the step for which the rates are valid [s]; the simulator's step.
         low, high: (V,) the box of X that the recording covered.
         assumed: terms (dof, term) that the drive could not show, filled in from the
             textbook's structure on request.
-        std_errors: (D, K) standard errors of the coefficients; NaN where a kept one was not
-            estimated but assumed or fixed by definition. Empty, (0, 0), where none is known.
-        quality: how well it fits; None where not known.
+        std_errors: (D, K) standard errors of the coefficients; NaN for a kept one that was not
+            estimated but assumed or fixed by definition. Empty, (0, 0), if none is known.
+        quality: its goodness of fit; None if unknown.
     """
 
     variables: tuple[str, ...]
@@ -58,20 +58,20 @@ class TaylorModel:
 
     @property
     def state_size(self) -> int:
-        """S."""
+        """Number of state variables, S."""
         return len(self.dofs) - 3
 
     @property
     def terms_kept(self) -> int:
-        """Number of coefficients that are not zero."""
+        """Number of non-zero coefficients."""
         return int(np.count_nonzero(self.coefficients))
 
     def rates(self, x: ArrayLike) -> Array:
-        """dQ/dt (..., D) at X (..., V)."""
+        """Returns dQ/dt (..., D) at X (..., V)."""
         return evaluate(x, self.powers) @ self.coefficients.T
 
     def step(self, pose: ArrayLike, state: ArrayLike, command: ArrayLike) -> tuple[Array, Array]:
-        """One step of `dt`; the readable reference of the simulator's kernel.
+        """Computes one step of `dt`; a readable reference for the simulator's kernel.
 
         Args:
             pose: (..., 3).
@@ -88,12 +88,12 @@ class TaylorModel:
 
     @property
     def term_names(self) -> tuple[str, ...]:
-        """K names: `1`, `speed`, `speed*steering`."""
+        """Names of the K terms: `1`, `speed`, `speed*steering`."""
         return tuple(term_name(row, self.variables) for row in self.powers)
 
     @property
     def named_errors(self) -> dict[str, dict[str, float]]:
-        """Standard errors that are known, of the kept terms: dof -> term -> error."""
+        """Known standard errors of the kept terms: dof -> term -> error."""
         known = self.coefficients != 0.0
         known &= np.isfinite(self.std_errors) if self.std_errors.size else False
         names = self.term_names
@@ -104,7 +104,7 @@ class TaylorModel:
         }
 
     def with_errors(self, errors: Mapping[str, Mapping[str, float]]) -> TaylorModel:
-        """The model with standard errors by dof and term; NaN where a kept term has none."""
+        """Returns the model with standard errors by dof and term; NaN for kept terms without."""
         if not errors:
             return replace(self, std_errors=_unknown())
         names = self.term_names
@@ -113,7 +113,7 @@ class TaylorModel:
         return replace(self, std_errors=np.where(self.coefficients != 0.0, known, 0.0))
 
     def equations(self) -> list[str]:
-        """One line per degree of freedom, with units: `wz = 4.6*speed*steering  [rad/s]`."""
+        """Returns one line per dof, with units: `wz = 4.6*speed*steering  [rad/s]`."""
         lines = []
         for d, dof in enumerate(self.dofs):
             text = ""
@@ -129,7 +129,7 @@ class TaylorModel:
         return lines
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for YAML; every number reads back to the same bits."""
+        """Returns plain data for YAML; every number reads back bit-identical."""
         terms = {
             dof: {
                 term_name(self.powers[k], self.variables): float(self.coefficients[d, k])
@@ -156,7 +156,7 @@ class TaylorModel:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> TaylorModel:
-        """Reads what `to_dict` wrote. Raises ModelError with the key that is wrong."""
+        """Reads the output of `to_dict`. Raises ModelError with the wrong key."""
         try:
             variables, dofs = tuple(data["valid"]), tuple(data["terms"])
             terms = data["terms"]
@@ -189,9 +189,9 @@ class TaylorModel:
 
 
 def exponents(variables: int, order: int) -> NDArray[np.int64]:
-    """The distinct products of up to `order` variables.
+    """Returns the distinct products of up to `order` variables.
 
-    `chi = vec([1, X] (x) [1, X])` of Eq. 1 holds every mixed product twice; each stands here
+    `chi = vec([1, X] (x) [1, X])` of Eq. 1 contains every mixed product twice; here each occurs
     once.
 
     Args:
@@ -209,7 +209,7 @@ def exponents(variables: int, order: int) -> NDArray[np.int64]:
 
 
 def evaluate(x: ArrayLike, powers: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The features chi (..., K) of variables x (..., V) for exponents (K, V)."""
+    """Returns the features chi (..., K) of variables x (..., V) for exponents (K, V)."""
     x = np.asarray(x, dtype=np.float64)
     chi = np.ones((*x.shape[:-1], len(powers)))
     for k, row in enumerate(powers):
@@ -219,18 +219,18 @@ def evaluate(x: ArrayLike, powers: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def term_name(row: NDArray[np.int64], names: tuple[str, ...]) -> str:
-    """A term as text: `1`, `speed`, `speed*steering`, `speed^2`."""
+    """Returns a term as text: `1`, `speed`, `speed*steering`, `speed^2`."""
     factors = [names[v] if row[v] == 1 else f"{names[v]}^{row[v]}" for v in np.flatnonzero(row)]
     return "*".join(factors) or "1"
 
 
 def canonical(row: NDArray[np.int64]) -> tuple[int, ...]:
-    """Sorts exponents (V,) as `exponents` lists them: by order, then by variable."""
+    """Returns a sort key for exponents (V,) in the order of `exponents`: order, then variable."""
     return (int(row.sum()), *(-int(power) for power in row))
 
 
 def parse_term(text: str, names: tuple[str, ...]) -> NDArray[np.int64]:
-    """The exponents (V,) of a term that `term_name` wrote. Raises ValueError otherwise."""
+    """Parses a term written by `term_name` to exponents (V,). Raises ValueError otherwise."""
     row = np.zeros(len(names), dtype=np.int64)
     if text == "1":
         return row
@@ -250,13 +250,13 @@ class Quality:
     """Figures of merit, by degree of freedom where they are mappings.
 
     Attributes:
-        samples: rows that the fit used.
-        outliers: share of the rows that were left out as outliers.
+        samples: number of rows that the fit used.
+        outliers: share of the rows that were dropped as outliers.
         condition: condition number of the standardised kept features.
         rmse: of the rates on the training part, in the unit of the rate.
         r2: share of the variance of the rates that is explained there.
-        held_out_rmse, held_out_r2: the same on data that the fit never saw; empty without.
-        open_loop_horizon_s: length of the open-loop predictions on that data [s]; 0 without.
+        held_out_rmse, held_out_r2: the same on data that the fit never saw; empty if none.
+        open_loop_horizon_s: length of the open-loop predictions on that data [s]; 0 if none.
         open_loop_position_error_m: mean position error at their ends [m].
         open_loop_heading_error_rad: mean heading error [rad].
         open_loop_path_m: mean length of the measured path [m].
@@ -275,12 +275,12 @@ class Quality:
     open_loop_path_m: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for YAML."""
+        """Returns plain data for YAML."""
         return {k: dict(v) if isinstance(v, dict) else v for k, v in vars(self).items()}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Quality:
-        """Reads what `to_dict` wrote. Raises KeyError, TypeError or ValueError otherwise."""
+        """Reads the output of `to_dict`. Raises KeyError, TypeError or ValueError otherwise."""
         values: dict[str, Any] = {
             name: {str(k): float(v) for k, v in value.items()}
             if isinstance(value, dict)

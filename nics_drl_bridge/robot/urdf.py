@@ -1,4 +1,4 @@
-"""A robot as URDF: what RViz draws and robot_state_publisher turns into transforms (REP-103)."""
+"""URDF of a robot, for RViz and robot_state_publisher (REP-103)."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ LASER_RADIUS, LASER_HEIGHT = 0.02, 0.03
 def urdf_of(
     spec: RobotSpec, mount: Place = (0.0, 0.0, 0.0), laser: str = "laser", base: str = "base_link"
 ) -> str:
-    """The text of a robot's URDF.
+    """Returns the text of a robot's URDF.
 
     `base_link` lies on the ground, where its pose is measured; wheels stand on the ground and
-    `laser` lies at its mount, at the height of `base_link`, since the package's world is flat.
-    Joints that move are named as the state variables that `joint_states` tells. A robot without
-    textbook kinematics has no wheels here: its spec does not say where they are.
+    `laser` is at its mount, at the height of `base_link`, since the package's world is flat.
+    Moving joints have the names of the state variables in `joint_states`. A robot without
+    textbook kinematics has no wheels here, since its spec does not contain their positions.
 
     Args:
         spec: of the robot.
@@ -50,7 +50,7 @@ def urdf_of(
 
 
 def car_wheels(parameters: Parameters) -> tuple[float, float]:
-    """`track` and `wheel_radius` of a car [m], or else usual shares of its wheelbase."""
+    """Returns `track` and `wheel_radius` of a car [m]; by default shares of its wheelbase."""
     wheelbase = parameters["wheelbase"]
     return (
         parameters.get("track", 0.8 * wheelbase),
@@ -122,7 +122,7 @@ def _joint(
 def _wheel(
     robot: Element, links: tuple[str, str], place: Place, radius: float, kind: str = "continuous"
 ) -> None:
-    """A wheel whose joint turns about y, forwards, and is named as the wheel."""
+    """Adds a wheel whose joint turns forwards about y and has the name of the wheel."""
     name = links[1]
     joint = _joint(robot, name, kind, (links[0], f"{name}_link"), place)
     if kind == "continuous":
@@ -147,7 +147,7 @@ def _visual_cylinder(
 
 
 def _visual_box(link: Element, size: tuple[float, float], centre: tuple[float, float]) -> None:
-    """A body of a length and a width, at an x and a height."""
+    """Adds a body of the given length and width, at the given x and height."""
     visual = _add(link, "visual")
     _add(visual, "origin", xyz=_numbers(centre[0], 0.0, centre[1]), rpy="0 0 0")
     _add(_add(visual, "geometry"), "box", size=_numbers(*size, BODY_HEIGHT))

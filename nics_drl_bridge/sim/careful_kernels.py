@@ -1,8 +1,9 @@
-"""Compiled motion of the robots of one world where it is tight: up to what they touch.
+"""Compiled motion of the robots of one world in tight spots, up to their contacts.
 
-All bodies move at the same time. At the first touch whoever came nearer stops: a robot until the
-substep is over, an obstacle until the period is. Then the next touch is looked for. Shapes are
-those of `kernels`; `flights`, `events` and `scene` those of `impact_kernels`.
+All bodies move at the same time. At the first contact, each body that approached the other stops:
+a robot until the end of the substep, an obstacle until the end of the period. Then the next
+contact is sought. Shapes are those of `kernels`; `flights`, `events` and `scene` those of
+`impact_kernels`.
 """
 
 from __future__ import annotations
@@ -31,15 +32,15 @@ from nics_drl_bridge.sim.impact_kernels import (
 from nics_drl_bridge.sim.sensing_kernels import drift_of
 
 SHARE = 1e-3
-"""Who makes less than this part of the speed at which two come nearer to each other goes on."""
+"""A body that contributes less than this share of the closing speed is not stopped."""
 SMALL = 0.1
-"""A robot that is in something moves on by so many radii at a time, to see whether it leaves."""
+"""Step, in radii, by which an overlapping robot is moved to test whether it gets out."""
 MOST_MOVES = 1000
 
 
 @kernel
 def rates_at(j, dq, x, state, history, n, m, delay, substeps, terms):  # type: ignore[no-untyped-def]
-    """Rates dq in substep j of a period, under the command that is then in effect."""
+    """Computes the rates dq in substep j of a period, under the command then in effect."""
     row = delayed(j, delay, substeps, history.shape[2])
     size = state.shape[2]
     for s in range(size):
@@ -51,7 +52,7 @@ def rates_at(j, dq, x, state, history, n, m, delay, substeps, terms):  # type: i
 
 @kernel
 def _put(body, base, flight, time, series):  # type: ignore[no-untyped-def]
-    """Puts into `body` (7,) where a robot that began at `base` (7,) is at a time [s]."""
+    """Writes to `body` (7,) a robot that began at `base` (7,), after `time` [s]."""
     turn = flight[TURN] * time
     body[0], body[1], body[3], body[4] = move(
         base[0], base[1], base[3], base[4], flight[VX], flight[VY], turn, time, series
@@ -62,7 +63,7 @@ def _put(body, base, flight, time, series):  # type: ignore[no-untyped-def]
 
 @kernel
 def _first_touch(m, begin, until, tight, events, scene):  # type: ignore[no-untyped-def]
-    """Finds what robot m touches first from a time of the substep on, see `impact_kernels`."""
+    """Finds the first contact of robot m from a time of the substep on, see `impact_kernels`."""
     meets, near, walls, grid = tight
     world, _, first, _, _ = scene
     event, me = events[m], first + m
@@ -81,7 +82,7 @@ def _first_touch(m, begin, until, tight, events, scene):  # type: ignore[no-unty
 
 @kernel
 def _leave(m, until, tight, events, scene, trial, spare):  # type: ignore[no-untyped-def]
-    """Lets a robot that is in something move as long as it gets no deeper."""
+    """Moves a robot that overlaps something for as long as it gets no deeper."""
     meets, near, walls, grid = tight
     world, flights, first, outlines, series = scene
     flight, me = flights[first + m], first + m
@@ -101,7 +102,7 @@ def _leave(m, until, tight, events, scene, trial, spare):  # type: ignore[no-unt
 
 @kernel
 def _within(p, b, until, world, flights, first):  # type: ignore[no-untyped-def]
-    """Whether robot p may come near body b within the substep."""
+    """True if robot p may come near body b within the substep."""
     a = first + p
     dx, dy = world[a, 0] - world[b, 0], world[a, 1] - world[b, 1]
     ways = impact.speed_at(a, -1.0, flights) + impact.speed_at(b, -1.0, flights)
@@ -111,14 +112,14 @@ def _within(p, b, until, world, flights, first):  # type: ignore[no-untyped-def]
 
 @kernel
 def _settle(until, tight, events, touched, scene):  # type: ignore[no-untyped-def]
-    """Stops the bodies of a world at their touches within a substep, in the order of time.
+    """Stops the bodies of a world at their contacts within a substep, in order of time.
 
     Args:
         until: length of the substep [s].
-        tight: what each robot may meet, and near what, walls and map, see `contact_kernels`.
-        events: (M, EVENT) in place.
-        touched: (M,) set to 1 by a touch.
-        scene: its `flights` in place.
+        tight: what each robot may meet, bodies near it, walls and map, see `contact_kernels`.
+        events: (M, EVENT), updated in place.
+        touched: (M,) set to 1 by a contact.
+        scene: its `flights` are updated in place.
     """
     world, flights, first, _, _ = scene
     meets, robots = tight[0], events.shape[0]
@@ -153,7 +154,7 @@ def _settle(until, tight, events, touched, scene):  # type: ignore[no-untyped-de
 
 @kernel
 def _begin_substep(n, time, dt, velocity, moving, bodies, start, flights):  # type: ignore[no-untyped-def]
-    """Puts the obstacles to where they are at a time of the period, and tells how they move on."""
+    """Places the obstacles at a time of the period and sets their flights from there."""
     if moving:
         contacts.move_obstacles(bodies, start, velocity, n, time)
     for k in range(velocity.shape[1]):
@@ -163,7 +164,7 @@ def _begin_substep(n, time, dt, velocity, moving, bodies, start, flights):  # ty
 
 @kernel
 def _hold_obstacles(n, time, dt, velocity, bodies, start, flights):  # type: ignore[no-untyped-def]
-    """Obstacles that stopped within a substep, which begins at `time`, stand from then on."""
+    """Keeps obstacles at rest that were stopped within the substep that begins at `time`."""
     for k in range(velocity.shape[1]):
         stop = flights[k, STOP]
         if stop < dt:
@@ -180,25 +181,25 @@ def move_carefully(  # type: ignore[no-untyped-def]
     n, meets, near, state, history, coefficient, delay, bodies, velocity, moving, walls, grid,
     collided, pose, outlines, motion, room,
 ):  # fmt: skip
-    """Moves robots of one world for one period, up to what they touch.
+    """Moves the robots of one world by one period, up to their contacts.
 
-    A robot that touches something is marked and stops there for the rest of the substep, and so in
-    the next ones as long as it would come nearer; it may leave. One that is in something already
-    gets no deeper. A free one moves exactly as by `robot_kernels.move_freely`.
+    A robot in contact is marked and stops for the rest of the substep, and again in the next ones
+    while it would come nearer; it may move away. A robot that already overlaps something gets no
+    deeper. Without a contact it moves exactly as in `robot_kernels.move_freely`.
 
     Args:
-        n: which world.
-        meets: (M,) what each robot may meet; those that meet nothing are left alone.
+        n: index of the world.
+        meets: (M,) what each robot may meet; those that meet nothing are not moved.
         near: see `contact_kernels.find_near`.
         state, history, coefficient, delay, motion: see `robot_kernels.move_freely`.
         bodies: (N, K + M, 7) obstacles, then robots, see `lidar.shapes.BODY`; in place.
-        velocity, moving: of the obstacles, and whether any has one. One that stopped at a robot
-            is left with its mean velocity of the period.
+        velocity, moving: velocities of the obstacles, and whether any moves. An obstacle stopped
+            by a robot is left with its mean velocity over the period.
         walls: (W, 4).
         grid: see `collision_kernels`.
-        collided: (N, M) set to 1 by a touch.
+        collided: (N, M) set to 1 by a contact.
         pose: (N, M, 3), in place.
-        outlines: corners and where each outline begins.
+        outlines: corners, and the first corner of each outline.
         room: see `worlds.arguments`.
     """
     x, dq, trial, spare, start, began, flights, events = room
@@ -238,7 +239,7 @@ def move_carefully(  # type: ignore[no-untyped-def]
 
 @kernel
 def _look_within(m, tight, events, touched, scene, spare):  # type: ignore[no-untyped-def]
-    """Tells how deep robot m is in something as the period begins, and marks it if it is."""
+    """Records how deep robot m overlaps anything as the period begins; marks it if it does."""
     meets, near, walls, grid = tight
     world, _, first, outlines, _ = scene
     depth, whom = contacts.contact(
@@ -253,7 +254,7 @@ def _look_within(m, tight, events, touched, scene, spare):  # type: ignore[no-un
 
 @kernel
 def _arrive(meets, events, scene, trial):  # type: ignore[no-untyped-def]
-    """Puts the robots to where they are at the end of the substep."""
+    """Moves the robots to their poses at the end of the substep."""
     world, flights, first, _, series = scene
     for m in range(meets.shape[0]):
         if meets[m] != contacts.FREE:
@@ -267,7 +268,7 @@ def _arrive(meets, events, scene, trial):  # type: ignore[no-untyped-def]
 
 @kernel
 def _tell_velocities(n, period, velocity, bodies, start, began):  # type: ignore[no-untyped-def]
-    """Leaves obstacles that were stopped with the velocity that they came along by."""
+    """Sets the velocity of stopped obstacles to their mean over the period."""
     for k in range(velocity.shape[1]):
         stopped = start[k, 0] != began[k, 0] or start[k, 1] != began[k, 1]
         if stopped or start[k, 2] != began[k, 2]:
@@ -281,11 +282,11 @@ def drift_carefully(  # type: ignore[no-untyped-def]
     n, meets, near, state, noise, seed, step, bodies, walls, grid, collided, pose, outlines, motion,
     room,
 ):  # fmt: skip
-    """Lets the robots of one world drift, one after the other, up to what they touch.
+    """Lets the robots of one world drift, one after the other, up to their contacts.
 
     Args:
         noise, seed: see `sensing_kernels.drift_of`.
-        step: of the period, from 1.
+        step: number of the period, from 1.
         n and others: see `move_carefully`.
     """
     flights, events = room[6], room[7]

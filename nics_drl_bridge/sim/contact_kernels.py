@@ -1,18 +1,19 @@
 """Compiled contacts: which robots may touch something within a period, and what they touch.
 
-A robot whose circle can't meet anything within the period moves freely. Of the others, `near`
-lists what they may meet, so that each substep only looks at that. Shapes: N worlds, M robots, K
-obstacles, bodies obstacles then robots.
+A robot whose circle cannot meet anything within the period moves freely. For the others, `near`
+lists the bodies that they may meet, so that each substep tests only those. Shapes: N worlds, M
+robots, K obstacles; bodies are obstacles, then robots.
 
 Compiled broad phase: the bodies of one crowded world sorted into square cells.
 
-Rebuilt each period, by counting, so that a robot looks at the bodies around it only and the cost
-per robot stays the same however many share the world. Bodies larger than a cell are in none and
-are always looked at.
+Rebuilt each period by a counting sort. A robot then tests only the bodies around it, and the cost
+per robot does not depend on how many share the world. Bodies larger than a cell are in no cell and
+are always tested.
 
-`cells` are scratch: begin (C^2 + 2,) where each cell begins in `order` (K,); the last is of the
-large ones; cell_of (K,); frame (5,): x, y [m] of the first cell, cells per metre, greatest radius
-of those in cells [m], and how far any body can have come since [m].
+`cells` are scratch: begin (C^2 + 2,) index in `order` (K,) of the first body of each cell, the last
+cell being that of the large bodies; cell_of (K,); frame (5,): x, y [m] of the first cell, cells per
+metre, greatest radius of the bodies in cells [m], and greatest distance moved since by any body
+[m].
 """
 
 from __future__ import annotations
@@ -32,25 +33,25 @@ from nics_drl_bridge.sim.collision_kernels import (
 )
 
 FREE, BODIES, WALLS, MAP = 0, 1, 2, 4
-"""What a robot may meet; a sum of them."""
+"""Bit flags of what a robot may meet."""
 SEVERAL = 32
-"""So many bodies may be near a robot; where there are more, all are looked at."""
+"""Greatest number of bodies listed near a robot; if there are more, all bodies are tested."""
 
 
 @kernel
 def reaches(reach, bodies, velocity, way, n, period):  # type: ignore[no-untyped-def]
-    """How far the circle of each body may come from where its centre is now [m].
+    """Bounds how far the circle of each body may reach from its present centre [m].
 
     Args:
         reach: (K + M,) result; 0 where there is no body.
         bodies: (N, K + M, 7).
         velocity: (N, K, 3) of the obstacles.
-        way: (M,) what bounds the length of each robot's path [m].
-        n: which world.
+        way: (M,) upper bound on the length of each robot's path [m].
+        n: index of the world.
         period: [s].
 
     Returns:
-        The longest way of any [m], and whether an obstacle moves.
+        The longest path of any body [m], and whether an obstacle moves.
     """
     longest, moving = 0.0, False
     obstacles = velocity.shape[1]
@@ -69,21 +70,21 @@ def reaches(reach, bodies, velocity, way, n, period):  # type: ignore[no-untyped
 
 @kernel
 def find_near(near, m, reach, bodies, n, walls, grid, crowded, cells, found):  # type: ignore[no-untyped-def]
-    """What robot m of world n may meet within the period.
+    """Finds what robot m of world n may meet within the period.
 
     Args:
-        near: (M, 1 + SEVERAL) how many bodies, and which; result.
-        m: which robot.
+        near: (M, 1 + SEVERAL) number and indices of the bodies; result.
+        m: index of the robot.
         reach: see `reaches`.
         bodies: (N, K + M, 7).
-        n: which world.
+        n: index of the world.
         walls: (W, 4).
         grid: see `collision_kernels`.
         crowded: whether the bodies are in cells.
         cells, found: see `cell_kernels`.
 
     Returns:
-        A sum of the constants of the module.
+        A combination of the flags of this module.
     """
     me = bodies.shape[1] - near.shape[0] + m
     x, y, own = bodies[n, me, 0], bodies[n, me, 1], reach[me]
@@ -111,7 +112,7 @@ def find_near(near, m, reach, bodies, n, walls, grid, crowded, cells, found):  #
 
 @kernel
 def contact(body, m, meets, near, bodies, walls, grid, outlines, spare, limit):  # type: ignore[no-untyped-def]
-    """The clearance of a robot, put as `body` (7,), to all that it may meet.
+    """Returns the clearance of a robot, given as `body` (7,), to all that it may meet.
 
     Args:
         body: the robot.
@@ -119,12 +120,12 @@ def contact(body, m, meets, near, bodies, walls, grid, outlines, spare, limit): 
         bodies: (K + M, 7) of its world.
         walls: (W, 4).
         grid, spare: see `collision_kernels`.
-        outlines: corners and where each outline begins.
-        limit: what is farther is not measured [m].
+        outlines: corners, and the first corner of each outline.
+        limit: greatest clearance that is measured [m].
 
     Returns:
-        The clearance, at most `limit` [m], less than 0 where it is in something; and the body that
-        it is nearest to, or -1.
+        The clearance, at most `limit` [m], negative where it overlaps something; and the nearest
+        body, or -1.
     """
     corners, corner = outlines
     least, whom = limit, -1
@@ -152,13 +153,13 @@ def contact(body, m, meets, near, bodies, walls, grid, outlines, spare, limit): 
 
 @kernel
 def move_obstacles(bodies, start, velocity, n, time):  # type: ignore[no-untyped-def]
-    """Puts the obstacles of world n to where they are `time` after the start of the period.
+    """Moves the obstacles of world n to their poses `time` after the start of the period.
 
     Args:
         bodies: (N, K + M, 7), in place.
         start: (K, 3) poses at the start of the period.
         velocity: (N, K, 3) [m/s, m/s, rad/s] in `map`.
-        n: which world.
+        n: index of the world.
         time: [s].
     """
     for k in range(velocity.shape[1]):
@@ -172,7 +173,7 @@ def move_obstacles(bodies, start, velocity, n, time):  # type: ignore[no-untyped
 
 @kernel
 def put_body(bodies, n, k, pose):  # type: ignore[no-untyped-def]
-    """Puts body k of world n to a pose (3,)."""
+    """Places body k of world n at a pose (3,)."""
     bodies[n, k, 0], bodies[n, k, 1], bodies[n, k, 2] = pose[0], pose[1], pose[2]
     bodies[n, k, 3], bodies[n, k, 4] = math.cos(pose[2]), math.sin(pose[2])
 
@@ -187,7 +188,7 @@ def _clamp(place, side):  # type: ignore[no-untyped-def]
 
 @kernel
 def sort_bodies(bodies, n, cells):  # type: ignore[no-untyped-def]
-    """Sorts the bodies of world n into cells; about two cells for a body."""
+    """Sorts the bodies of world n into cells, about two cells per body."""
     begin, order, cell_of, frame = cells
     count, side = bodies.shape[1], int(math.sqrt(begin.shape[0] - 2))
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
@@ -216,7 +217,7 @@ def sort_bodies(bodies, n, cells):  # type: ignore[no-untyped-def]
         cell = cell_of[k] + 1
         begin[cell] -= 1
         order[begin[cell]] = k
-    # Each entry now tells where the cell before it begins, and the last one where all end.
+    # Each entry is now the start of the cell before it, and the last one the end of all cells.
     for cell in range(begin.shape[0] - 1):
         begin[cell] = begin[cell + 1]
     begin[begin.shape[0] - 1] = count
@@ -224,7 +225,7 @@ def sort_bodies(bodies, n, cells):  # type: ignore[no-untyped-def]
 
 @kernel
 def bodies_around(x, y, reach, cells, found):  # type: ignore[no-untyped-def]
-    """Writes to `found` (K,) the bodies that may come within `reach` [m] of (x, y); how many."""
+    """Writes to `found` (K,) the bodies that may be within `reach` [m] of (x, y); their number."""
     begin, order, _, frame = cells
     side = int(math.sqrt(begin.shape[0] - 2))
     reach += frame[RADIUS] + frame[MOVED]

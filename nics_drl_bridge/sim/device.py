@@ -1,8 +1,8 @@
-"""DeviceWorld: one world of a simulator as the devices in it know it, whatever moves them.
+"""DeviceWorld: one world of a simulator as seen by the devices in it, whatever moves them.
 
-How uncertain a pose by odometry is after a drive, given the noise of its twist.
+Covariance of a pose by odometry after a drive, given the noise of the measured twist.
 
-The kernel of `dead_reckoning`: covariances (M, 3, 3) of odometry after one more step.
+The kernel of `dead_reckoning`: covariances (M, 3, 3) of odometry, propagated by one step.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sensed:
-    """What one robot knows and is at a time.
+    """Measurements and true state of one robot at a time.
 
     Attributes:
         odom: (3,) pose by odometry.
-        covariance: (3, 3) of it.
+        covariance: (3, 3) of `odom`.
         twist: (3,) measured body twist.
         state: (S,) true state.
         ranges: (B,) scan.
         pose: (3,) true pose in `map`.
-        before: (3,) the same a step before.
-        period: of a step [s].
+        before: (3,) true pose one step earlier.
+        period: length of a step [s].
     """
 
     odom: Array
@@ -47,20 +47,20 @@ class Sensed:
 
     @property
     def true_twist(self) -> Array:
-        """(3,) mean of the step before."""
+        """(3,) mean true body twist over the last step."""
         return geometry.log(geometry.between(self.before, self.pose)) / self.period
 
 
 class DeviceWorld:
-    """Keeps the last command of each robot, and how far odometry may be trusted.
+    """Keeps the last command of each robot and the covariance of its odometry.
 
     Args:
-        simulator: what moves the robots.
+        simulator: moves the robots.
         model: of the robots, with the step of the simulator.
         robots: M.
 
     Attributes:
-        commands: (M, C) that the next step takes.
+        commands: (M, C) commands for the next step.
     """
 
     def __init__(self, simulator: Simulator, model: SimulatorModel, robots: int) -> None:
@@ -77,14 +77,14 @@ class DeviceWorld:
 
     @property
     def touched(self) -> list[bool]:
-        """Of each robot, whether it has touched something in this episode."""
+        """Per robot, true if it has touched something in this episode."""
         return [bool(one) for one in self._simulator.data.collided[0]]
 
     def begin(self, seed: int, starts: Array | None) -> None:
-        """Begins the episode of a seed, at x, y, heading of each robot (3 M,) if they are given.
+        """Begins the episode of a seed, at x, y, heading of each robot (3 M,) if given.
 
         Raises:
-            ConfigError: the starts are of another number of robots.
+            ConfigError: the starts are for another number of robots.
         """
         if starts is not None and starts.size != 3 * self.robots:
             raise ConfigError(
@@ -107,7 +107,7 @@ class DeviceWorld:
         self._covariance = propagate(self._covariance, odom, data.odom[0], self._added)
 
     def sensed(self, robot: int) -> Sensed:
-        """The present of one robot; the next step may write over it."""
+        """Returns the present values of one robot; the next step may overwrite them."""
         data = self._simulator.data
         return Sensed(
             data.odom[0, robot],
@@ -122,30 +122,30 @@ class DeviceWorld:
 
 
 LEAST_VARIANCE = 1e-9
-"""Of odometry without noise: a covariance of zeros would mean that it is unknown."""
+"""Variance of odometry without noise: in ROS, a covariance of zeros means unknown."""
 
 
 def variances(std: tuple[float, float]) -> Array:
-    """(3,) of a measured twist, from its linear [m/s] and its angular deviation [rad/s]."""
+    """Variances (3,) of a measured twist, from its linear [m/s] and angular [rad/s] deviation."""
     linear, angular = (max(one * one, LEAST_VARIANCE) for one in std)
     return np.array([linear, linear, angular])
 
 
 def step_covariance(std: tuple[float, float], period: float) -> Array:
-    """(3, 3) what one period [s] adds to the covariance of x, y [m] and heading [rad]."""
+    """Covariance (3, 3) that one period [s] adds to that of x, y [m] and heading [rad]."""
     return np.diag(np.maximum(variances(std) * period * period, LEAST_VARIANCE))
 
 
 def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Array) -> Array:
-    """Covariances (M, 3, 3) of poses by odometry after one more period.
+    """Propagates the covariances (M, 3, 3) of poses by odometry by one period.
 
-    An error of the heading turns the way that follows: P' = F P F^T + Q, with F the derivative of
+    A heading error rotates the motion that follows: P' = F P F^T + Q, with F the derivative of
     the new pose with respect to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4).
 
     Args:
-        covariance: (M, 3, 3) before.
-        before: (M, 3) poses by odometry before.
-        after: (M, 3) and after.
+        covariance: (M, 3, 3) before the period.
+        before: (M, 3) poses by odometry before it.
+        after: (M, 3) poses by odometry after it.
         added: (3, 3) of one period, see `step_covariance`.
     """
     after_that = np.array(covariance, np.float64)
@@ -156,11 +156,11 @@ def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Arr
 
 @kernel
 def propagate_in_place(covariance, before, after, added):  # type: ignore[no-untyped-def]
-    """P = F P F^T + Q for each robot, in place; see `dead_reckoning.propagate`."""
+    """Computes P = F P F^T + Q of each robot in place; see `dead_reckoning.propagate`."""
     for m in range(len(covariance)):
         p = covariance[m]
         u, v = before[m, 1] - after[m, 1], after[m, 0] - before[m, 0]
-        # F differs from 1 only in its last column, (u, v, 1).
+        # F differs from the identity only in its last column, (u, v, 1).
         for j in range(3):
             p[0, j] += u * p[2, j]
             p[1, j] += v * p[2, j]

@@ -2,8 +2,8 @@
 
 Compiled step of worlds whose robots are moved from outside, in two halves.
 
-What obstacles do and what robots sense are the functions of the fast simulator's own step, so that
-both are the same in a world whose robots another physics moves. Shapes are those of `kernels`.
+Obstacles move and robots sense by the functions of the fast simulator's own step, so that both are
+the same in a world whose robots are moved by another physics engine. Shapes are those of `kernels`.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Driven:
-    """What robots have done in one control period.
+    """Motion of the robots in one control period.
 
     Attributes:
         pose: (M, 3) true pose of `base_link` in `map` at the end.
         twist: (M, 3) true body twist at the end [m/s, m/s, rad/s].
         state: (M, S) at the end.
-        wheels: (M, 3) pose at the end by counting the turns of the wheels, without noise.
-        counted: (M, 3) body twist at the end by the wheels.
+        wheels: (M, 3) pose at the end by wheel odometry, without noise.
+        counted: (M, 3) body twist at the end by wheel odometry.
         touched: (M,) whether each robot touched anything.
     """
 
@@ -54,7 +54,7 @@ class DrivenSimulator:
     """One world: its scenes, moving obstacles, odometry noise and lidar, without its physics.
 
     Scenes, motion of the obstacles, noise, faults and scans are those of the FastSimulator for the
-    same seed. Odometry is what the wheels count, with the model's noise.
+    same seed. Odometry is the wheel odometry with the model's noise.
 
     Args:
         model: the robot.
@@ -63,8 +63,8 @@ class DrivenSimulator:
         renderer: see `FastSimulator`.
 
     Attributes:
-        fast: holds all data; its own `step` is not for use.
-        wheels: (M, 3) pose by counting the turns of the wheels, since the start pose.
+        fast: holds all data; do not call its `step`.
+        wheels: (M, 3) pose by wheel odometry, beginning at the start pose.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class DrivenSimulator:
         begin_period(self.fast.packed[0])
 
     def move_obstacles(self, time: float) -> Array:
-        """Puts the obstacles to where they are `time` [s] after the beginning of the period.
+        """Moves the obstacles to their poses `time` [s] after the beginning of the period.
 
         Returns:
             (K, 7) see `lidar.shapes.BODY`.
@@ -97,7 +97,7 @@ class DrivenSimulator:
         return data.bodies[0, : data.velocity.shape[1]]
 
     def end_period(self, driven: Driven) -> None:
-        """Takes over what the robots have done and measures what they sense."""
+        """Takes over the motion of the robots and measures what they sense."""
         data = self.fast.data
         data.pose[0], data.state[0] = driven.pose, driven.state
         data.collided[0] |= driven.touched.astype(np.uint8)
@@ -113,7 +113,7 @@ def begin_period(packed):  # type: ignore[no-untyped-def]
     """Sets the velocities of the obstacles for the period that begins.
 
     Args:
-        packed: see `kernels.step_worlds`; the robots stand where the period begins.
+        packed: see `kernels.step_worlds`; robots are at their poses as the period begins.
     """
     fields, scene, _, motion, room = packed.content
     pose, bodies, odom, twist = fields[0], fields[3], fields[4], fields[5]
@@ -135,11 +135,11 @@ def end_period(packed, true, before, wheels, counted):  # type: ignore[no-untype
     """Measures what the robots sense at the end of a period.
 
     Args:
-        packed: see `kernels.step_worlds`; robots and obstacles stand where the period ends.
+        packed: see `kernels.step_worlds`; all bodies are at their poses as the period ends.
         true: (N, M, 3) true twist at its end.
-        before: (N, M, 3) pose by the wheels alone at its beginning.
-        wheels: (N, M, 3) the same at its end.
-        counted: (N, M, 3) twist by the wheels at its end.
+        before: (N, M, 3) pose by wheel odometry alone at its beginning.
+        wheels: (N, M, 3) pose by wheel odometry alone at its end.
+        counted: (N, M, 3) twist by wheel odometry at its end.
     """
     fields, scene, view, motion, room = packed.content
     (
@@ -159,7 +159,7 @@ def end_period(packed, true, before, wheels, counted):  # type: ignore[no-untype
                 odom, twist, past, before[n, m], wheels, n, m, counted[n, m], noise, steps[n],
                 seeds[n], steps[n] * robots + m, age[n, m], dt, substeps, series,
             )  # fmt: skip
-            for i in range(3):  # where the wheels think that it is, is not where its lidar is
+            for i in range(3):  # the lidar scans from the true pose, not from wheel odometry
                 row[m, sensing.POSE + i] = pose[n, m, i]
                 row[m, sensing.TWIST + i] = true[n, m, i]
         if crowded:

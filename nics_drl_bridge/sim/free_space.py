@@ -1,4 +1,4 @@
-"""Where in a world, before obstacles are drawn, there is room, and what hangs together."""
+"""Connected free space of a world, before obstacles are drawn."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nics_drl_bridge.sim import space_kernels as kernels
 from nics_drl_bridge.sim.world import Goals, Starts, World, check_places
 
 CELL = 0.1
-"""Side of the cells of a field without a map [m]; a large one has larger, a small one smaller."""
+"""Side of the cells of a field without a map [m]; larger in large fields, smaller in small ones."""
 FEWEST_CELLS = 20
 MOST_CELLS = 4_000_000
 NO_MAP = (np.zeros((0, 0), np.float32), np.array([0.0, 0.0, 1.0, 0.0, 1.0]))
@@ -27,11 +27,11 @@ class Areas:
     """The free space of a world for one size of robot.
 
     Attributes:
-        static: what stands in every scene, see `space_kernels`.
-        room: free space that the centre of a cell needs, so that a disc of footprint and
+        static: everything that stands in every scene, see `space_kernels`.
+        room: free space required around the centre of a cell, so that a disc of footprint and
             clearance can move between the centres of neighbouring cells [m].
-        for_robots: (C,) cells, numbered along the rows, where a robot may begin.
-        for_anything: (C,) cells with free space.
+        for_robots: (C,) row-major indices of the cells where a robot may start.
+        for_anything: (C,) row-major indices of the cells with free space.
     """
 
     static: tuple[Any, ...]
@@ -41,17 +41,17 @@ class Areas:
 
 
 def areas_of(world: World, footprint: float) -> Areas:
-    """Finds the free space, and the areas within which a robot can move.
+    """Finds the free space and the areas within which a robot can move.
 
     A robot moves between the centres of neighbouring cells, with the clearance of the world around
-    it. Areas that are too small for any start and goal do not count.
+    it. Areas too small for a start and a goal are dropped.
 
     Args:
-        world: where.
+        world: the field and its static map.
         footprint: radius of a robot [m].
 
     Raises:
-        ConfigError: there is no room for a start and a goal, which names the key.
+        ConfigError: no room for a start and a goal; the message names the key.
     """
     check_places(world)
     cells, frame, solid = _grid_of(world)
@@ -62,7 +62,7 @@ def areas_of(world: World, footprint: float) -> Areas:
         bounds = np.array(world.extent)
         distance[~_inside(distance.shape, frame, bounds)] = 0.0
     need = footprint + world.clearance
-    # The way from centre to centre comes nearer to a corner than both ends.
+    # Between two cell centres the path is nearer to a corner than at either end.
     room = math.hypot(need, frame[4] / 2.0)
     label, _ = ndimage.label(distance >= room)
     if not label.any():
@@ -84,10 +84,10 @@ def areas_of(world: World, footprint: float) -> Areas:
 
 
 def _grid_of(world: World) -> tuple[NDArray[np.float32], NDArray[np.float64], Any]:
-    """Distances to the map (rows, columns), the frame of the cells, the map for the kernels.
+    """Returns distances to the map (rows, columns), frame of the cells, map for the kernels.
 
-    With a map they are its cells and a solid frame around it: what is not known to be free is
-    not, and neither is what lies beyond.
+    With a map the cells are the map's plus a solid border: unknown cells and everything outside
+    the map count as occupied.
     """
     if world.grid is not None:
         closed = np.pad(world.grid.cells, 1, constant_values=OCCUPIED)
@@ -107,7 +107,7 @@ def _grid_of(world: World) -> tuple[NDArray[np.float32], NDArray[np.float64], An
 
 
 def _centres(shape: tuple[int, ...], frame: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(2, rows, columns) x, y of the centres of cells [m]."""
+    """Returns x, y of the centres of the cells (2, rows, columns) [m]."""
     rows, columns = np.indices(shape) + 0.5
     return np.array(kernels.place_in.py_func(rows, columns, frame))
 
@@ -120,7 +120,7 @@ def _inside(
 
 
 def _large_enough(label: NDArray[np.int32], cell: float, least: float) -> NDArray[np.int32]:
-    """The areas that can hold two points so far apart [m]; the others become 0."""
+    """Keeps labels of areas whose bounding box has a diagonal >= `least` [m]; zeroes the others."""
     spans = [
         cell * math.hypot(*(part.stop - part.start for part in parts))
         for parts in ndimage.find_objects(label)

@@ -1,19 +1,19 @@
-"""Compiled times of impact: when within a substep does a moving body first touch another.
+"""Compiled times of impact: the first contact of a moving body with another within a substep.
 
 Conservative advancement: two features, each a corner or an edge with a radius around it, are
-looked at, then moved on by a time in which they can't meet, and so on until they touch or the
-substep is over. Along the direction between their nearest points each corner comes no nearer than
-by its velocity, and half of its greatest acceleration times the square of the time: that is exact
-to the first order, so that a body that slides along a wall or passes a corner takes a few looks.
-Nothing is passed unseen, at any speed.
+advanced by a time in which they cannot meet, again and again until they touch or the substep ends.
+Along the direction between their nearest points, a corner approaches by at most its velocity times
+the time plus half of its greatest acceleration times the time squared. The bound is exact to first
+order, so that a body sliding along a wall or passing a corner takes few iterations. No contact is
+missed, at any speed.
 
-Two features touch when they are within `SLACK` and come nearer; they do not overlap then. What
-overlaps at the outset is not for these functions, see `careful_kernels`.
+Two features touch when they are within `SLACK` and approach each other; they do not overlap then.
+Bodies that overlap at the outset are not handled here, see `careful_kernels`.
 
-Shared arguments: `world` (K + M, 7) obstacles, then robots, where the substep begins; `flights`
-(K + M, 5) how they move in it, columns below, velocities of obstacles (k < `first`) in the map and
-those of robots in the body; `outlines` corners and where each outline begins; `series` see
-`kinematics.kernels`. A body of index -1 is the map, which does not move.
+Shared arguments: `world` (K + M, 7) obstacles, then robots, as the substep begins; `flights`
+(K + M, 5) their motion in it, columns below, velocities of obstacles (k < `first`) in the map
+frame and those of robots in the body frame; `outlines` corners, and the first corner of each
+outline; `series` see `kinematics.kernels`. Body index -1 is the map, which does not move.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from nics_drl_bridge.robot.kernels import move
 from nics_drl_bridge.sim.collision_kernels import map_bound, segment_distance2
 
 VX, VY, TURN, STOP, FLIGHT = range(5)
-"""Columns of `flights`: velocity [m/s, m/s, rad/s], and when in the substep it stops [s]."""
+"""Columns of `flights`: velocity [m/s, m/s, rad/s], and time of its stop in the substep [s]."""
 TIME, WITH, OWN, OTHERS, DEPTH, AFTER, EVENT = range(7)
-"""Columns of `events`: when a robot first touches something [s]; which body; the rates of its and
-of the other's nearest point along what parts them, below 0 where they come nearer [m/s]; and how
-deep it is in something already, and after the substep, as a clearance [m]."""
+"""Columns of `events`: time of a robot's first contact [s]; the other body; the rates of its own
+and of the other's nearest point along the direction between them, negative if approaching [m/s];
+and the clearance, negative where it overlaps something, before and after the substep [m]."""
 SLACK = 1e-7
-"""Nearer than this to each other, and coming nearer, bodies touch [m]."""
+"""Bodies touch if they are nearer than this to each other and approach [m]."""
 NOTHING = 1e-12
-"""As near as this is as near as can be [m]."""
+"""Distances up to this count as zero [m]."""
 MOST_LOOKS = 2000
-"""After so many looks at one pair it counts as touching: only what spins absurdly needs more."""
+"""Iterations after which a pair counts as touching: only absurdly fast rotations need more."""
 
 
 @kernel
 def pose_at(b, time, world, flights, first, series):  # type: ignore[no-untyped-def]
-    """x, y [m], cosine and sine of the heading of a body at a time of the substep [s]."""
+    """Returns x, y [m], cosine and sine of the heading of a body at a time of the substep [s]."""
     if b < 0:
         return 0.0, 0.0, 1.0, 0.0
     time = min(time, flights[b, STOP])
@@ -58,7 +58,7 @@ def pose_at(b, time, world, flights, first, series):  # type: ignore[no-untyped-
 
 @kernel
 def velocity_at(b, time, c, s, flights, first):  # type: ignore[no-untyped-def]
-    """Velocity in the map, turn rate, and acceleration of the origin of a body at a time."""
+    """Returns velocity in the map, turn rate and acceleration of a body's origin at a time."""
     if b < 0 or time >= flights[b, STOP]:
         return 0.0, 0.0, 0.0, 0.0
     vx, vy, turn = flights[b, VX], flights[b, VY], flights[b, TURN]
@@ -78,7 +78,7 @@ def speed_at(b, time, flights):  # type: ignore[no-untyped-def]
 
 @kernel
 def _from_segment(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
-    """From the nearest point of a segment to (x, y)."""
+    """Returns the vector from the nearest point of a segment to (x, y)."""
     ex, ey, dx, dy = bx - ax, by - ay, x - ax, y - ay
     along = dx * ex + dy * ey
     if along > 0.0:
@@ -89,7 +89,7 @@ def _from_segment(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
 
 @kernel
 def _between(p, q):  # type: ignore[no-untyped-def]
-    """From the nearest point of segment q to that of segment p; zeros where they cross."""
+    """Returns the vector from the nearest point of segment q to that of p; zero if they cross."""
     ax, ay, bx, by = p
     cx, cy, dx, dy = q
     nx, ny = _from_segment(ax, ay, cx, cy, dx, dy)
@@ -115,7 +115,7 @@ def _between(p, q):  # type: ignore[no-untyped-def]
 
 @kernel
 def _root(gap, rate, bend):  # type: ignore[no-untyped-def]
-    """When gap + rate t - bend t^2 / 2 is used up, of a gap > 0."""
+    """Returns the first time t > 0 with gap + rate t - bend t^2 / 2 = 0, for a gap > 0."""
     if bend == 0.0:
         return np.inf if rate >= 0.0 else -gap / rate
     both = math.sqrt(rate * rate + 2.0 * bend * gap)
@@ -124,7 +124,7 @@ def _root(gap, rate, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def _placed(edge, x, y, c, s):  # type: ignore[no-untyped-def]
-    """An edge (ax, ay, bx, by) of a body that stands at x, y with a heading."""
+    """Returns an edge (ax, ay, bx, by) of a body at x, y, with cosine and sine of its heading."""
     ax, ay, bx, by = edge
     return x + c * ax - s * ay, y + s * ax + c * ay, x + c * bx - s * by, y + s * bx + c * by
 
@@ -137,13 +137,13 @@ def _reach(edge):  # type: ignore[no-untyped-def]
 
 @kernel
 def _next_stop(b, time, until, flights):  # type: ignore[no-untyped-def]
-    """When a body stops, if it does between two times; else the later one."""
+    """Returns the time a body stops if that is between two times, otherwise the later one."""
     return flights[b, STOP] if b >= 0 and time < flights[b, STOP] < until else until
 
 
 @kernel
 def touch(a, edge, round_a, b, other, round_b, begin, until, world, flights, first, series):  # type: ignore[no-untyped-def]  # fmt: skip
-    """When an edge of one body first touches an edge of another.
+    """Finds the time at which an edge of one body first touches an edge of another.
 
     Args:
         a, b: the bodies.
@@ -152,8 +152,8 @@ def touch(a, edge, round_a, b, other, round_b, begin, until, world, flights, fir
         begin, until: times of the substep [s].
 
     Returns:
-        The time [s], inf if not before `until`; and how fast the nearest points of either come
-        nearer [m/s], less than 0 if they do.
+        The time [s], inf if not before `until`; and the rates of the nearest point of each along
+        the direction between them [m/s], negative if it approaches.
     """
     reach_a, reach_b, time = _reach(edge), _reach(other), begin
     for _ in range(MOST_LOOKS):
@@ -204,7 +204,7 @@ def touch(a, edge, round_a, b, other, round_b, begin, until, world, flights, fir
 
 @kernel
 def _edge_of(v, begin, end, corners):  # type: ignore[no-untyped-def]
-    """Edge v of an outline, or the origin of a circle's, which has none."""
+    """Returns edge v of an outline, or the origin for a circle, which has no edges."""
     if begin == end:
         return 0.0, 0.0, 0.0, 0.0
     w = v + 1 if begin + v + 1 < end else 0
@@ -215,16 +215,16 @@ def _edge_of(v, begin, end, corners):  # type: ignore[no-untyped-def]
 
 @kernel
 def _edges(begin, end):  # type: ignore[no-untyped-def]
-    """How many edges an outline has: a segment one, and a circle counts as one without extent."""
+    """Number of edges of an outline: one for a segment, and one without extent for a circle."""
     return end - begin if end - begin > 2 else 1
 
 
 @kernel
 def _touch_edge(event, a, b, other, round_b, begin, scene):  # type: ignore[no-untyped-def]
-    """Makes `event` (EVENT,) the first touch of body a and an edge of body b, if it comes sooner.
+    """Sets `event` (EVENT,) to the first contact of body a with an edge of body b, if sooner.
 
     Args:
-        begin: from when on to look [s].
+        begin: earliest time [s].
         scene: world, flights, first, outlines, series.
     """
     world, flights, first, (corners, corner), series = scene
@@ -251,7 +251,7 @@ def _touch_edge(event, a, b, other, round_b, begin, scene):  # type: ignore[no-u
 
 @kernel
 def touch_body(event, a, b, begin, scene):  # type: ignore[no-untyped-def]
-    """As `_touch_edge`, of all of body b."""
+    """As `_touch_edge`, for all edges of body b."""
     world, flights, first, (corners, corner), series = scene
     x, y, _, _ = pose_at(a, begin, world, flights, first, series)
     ox, oy, _, _ = pose_at(b, begin, world, flights, first, series)
@@ -267,7 +267,7 @@ def touch_body(event, a, b, begin, scene):  # type: ignore[no-untyped-def]
 
 @kernel
 def touch_walls(event, a, walls, begin, scene):  # type: ignore[no-untyped-def]
-    """As `_touch_edge`, of straight walls (W, 4)."""
+    """As `_touch_edge`, for straight walls (W, 4)."""
     for w in range(walls.shape[0]):
         wall = walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
         _touch_edge(event, a, -1, wall, 0.0, begin, scene)
@@ -281,7 +281,7 @@ def _solid(distances, i, j):  # type: ignore[no-untyped-def]
 
 @kernel
 def touch_map(event, a, grid, begin, scene):  # type: ignore[no-untyped-def]
-    """As `_touch_edge`, of the sides of the solid cells of a map, see `collision_kernels`."""
+    """As `_touch_edge`, for the sides of the solid cells of a map, see `collision_kernels`."""
     world, flights, first, _, series = scene
     distances, frame = grid
     if distances.size == 0:
@@ -307,7 +307,7 @@ def touch_map(event, a, grid, begin, scene):  # type: ignore[no-untyped-def]
             for side in range(4):
                 beside = (1, 0, -1, 0)[side], (0, 1, 0, -1)[side]
                 if _solid(distances, i + beside[0], j + beside[1]):
-                    continue  # a side between two solid cells is met by nothing
+                    continue  # nothing can touch a side between two solid cells
                 u, v = (0, 1, 1, 0)[side], (1, 1, 0, 0)[side]
                 u2, v2 = (1, 1, 0, 0)[side], (1, 0, 0, 1)[side]
                 u, v, u2, v2 = (j + u) * size, (i + v) * size, (j + u2) * size, (i + v2) * size

@@ -1,18 +1,18 @@
 """Compiled motion of obstacles: one call at reset, and one per world and control period.
 
-Shared arguments: `marks` (N, K, F) what obstacles remember, and `plans`, the rows (K, P) and
+Shared arguments: `marks` (N, K, F) the obstacles' memory, and `plans`, the rows (K, P) and
 waypoints (Q, 2) of `motion.plan_arrays`; the columns of both are in `motion_layout`. `bodies`
-(N, K + M, 7), obstacles, then from index `first` the robots, see `lidar.shapes.BODY`. Of each
-obstacle counts the circle that holds it. All draws are fixed by seed, step and k alone.
+(N, K + M, 7), obstacles, then from index `first` the robots, see `lidar.shapes.BODY`. Each
+obstacle is represented by its enclosing circle. All draws depend on seed, step and k alone.
 
 Compiled pedestrians: the social force model of Helbing and Molnar (1995).
 
-"Social force model for pedestrian dynamics", Phys. Rev. E 51, 4282; the numbers of equations are
-theirs. A walker is driven towards its goal (2), repelled by others along ellipses that think
-their next step ahead (3, 4) and by walls (5), less by what is out of sight (8), and disturbed by
-a fluctuation. Bodies are discs of any size, so distances are between surfaces. The step that is
-thought ahead is that of the relative motion (Johansson, Helbing, Shukla 2007): with the other's
-alone, a walker sees a robot that stands in its way too late, and pushes against it.
+"Social force model for pedestrian dynamics", Phys. Rev. E 51, 4282; equation numbers are theirs.
+A walker is driven towards its goal (2), repelled by others along ellipses that anticipate their
+next step (3, 4) and by walls (5), less by what is out of sight (8), and disturbed by a
+fluctuation. Bodies are discs of any size, so distances are between surfaces. The anticipated step
+is that of the relative motion (Johansson, Helbing, Shukla 2007): with the other's motion alone, a
+walker reacts too late to a robot that stands in its way, and pushes against it.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from nics_drl_bridge.sim.separation_kernels import (
 )
 
 DRAWS = 64
-"""So many draws may an obstacle take in a period."""
+"""Greatest number of draws per obstacle and period."""
 TURN = 2.0
 """Greatest turn rate of an obstacle [rad/s]."""
 LOOK = 1.0
-"""A wandering obstacle looks ahead by the way of so many seconds, and its radius."""
+"""A wandering obstacle looks ahead by the distance of this time [s], plus its radius."""
 MARGIN = 0.1
 """Free space that it keeps at its sides [m]."""
 TRIES = 8
-"""So many directions it looks into in one period."""
+"""Directions that it tries in one period."""
 MOST_CORNERS = 32
-"""More waypoints than a patrol passes in a period."""
+"""Greatest number of waypoints that a patrol passes in a period."""
 
 
 @kernel(allocates=True)
@@ -56,7 +56,7 @@ def _share(seed, counter):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def begin(marks, n, bodies, plans, half, seed):  # type: ignore[no-untyped-def]
-    """Begins an episode of world n: draws the speed and the first direction of each obstacle.
+    """Begins an episode of world n: draws the speed and initial direction of each obstacle.
 
     Args:
         half: (2,) half the size of the field [m].
@@ -78,13 +78,13 @@ def begin(marks, n, bodies, plans, half, seed):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def steer(velocity, marks, n, bodies, first, speeds, plans, walls, half, seed, step, period, distances):  # type: ignore[no-untyped-def]  # fmt: skip  # noqa: E501
-    """The velocities of the obstacles of world n for one control period.
+    """Sets the velocities of the obstacles of world n for one control period.
 
-    An obstacle that moves by its velocity for the period leaves neither the field nor its side
-    of a wall, and touches no other obstacle; it does not run into a robot that keeps its velocity.
+    Moving by its velocity for the period, an obstacle neither leaves the field nor crosses a wall
+    nor touches another obstacle, and does not run into a robot that keeps its velocity.
 
     Args:
-        velocity: (N, K, 3) result [m/s, m/s, rad/s] in `map`; 0 of those that stand still.
+        velocity: (N, K, 3) result [m/s, m/s, rad/s] in `map`; 0 for those that stand still.
         speeds: (M, 2) velocity of its robots in `map` [m/s].
         walls: (W, 4).
         half: (2,) half the size of the field [m].
@@ -97,7 +97,7 @@ def steer(velocity, marks, n, bodies, first, speeds, plans, walls, half, seed, s
     count = velocity.shape[1]
     scene = (bodies[n], walls, half, distances)
     draws = (step + 1) * count
-    for k in range(count):  # walkers first: they see the velocities of the period before
+    for k in range(count):  # walkers first: they react to the velocities of the last period
         velocity[n, k, :] = 0.0
         if rows[k, at.KIND] == at.PEDESTRIAN and bodies[n, k, 5] > 0.0:
             velocity[n, k, 0], velocity[n, k, 1] = walk(
@@ -119,14 +119,14 @@ def steer(velocity, marks, n, bodies, first, speeds, plans, walls, half, seed, s
             _follow(mark, bodies[n, k], rows[k], waypoints, period, True)
         mark[at.VX], mark[at.VY] = dx / period, dy / period
         velocity[n, k, 0], velocity[n, k, 1] = mark[at.VX], mark[at.VY]
-        if dx != 0.0 or dy != 0.0:  # it looks where it goes
+        if dx != 0.0 or dy != 0.0:  # it faces the direction of motion
             turn = _wrap(math.atan2(dy, dx) - bodies[n, k, 2]) / period
             velocity[n, k, 2] = min(max(turn, -TURN), TURN)
 
 
 @kernel(allocates=True)
 def _blocked(x, y, angle, reach, here, room, k, scene):  # type: ignore[no-untyped-def]
-    """Whether something is near the way ahead, and nearer than at the outset."""
+    """True if something is near the path ahead, and nearer than at the outset."""
     for part in (0.5, 1.0):
         way = part * reach
         free, _, _ = clearance(x + way * math.cos(angle), y + way * math.sin(angle), k, scene)
@@ -137,7 +137,7 @@ def _blocked(x, y, angle, reach, here, room, k, scene):  # type: ignore[no-untyp
 
 @kernel(allocates=True)
 def _wander(mark, k, scene, seed, counter, period):  # type: ignore[no-untyped-def]
-    """Displacement of a wandering obstacle: ahead, and turning to a free direction if need be."""
+    """Displacement of a wandering obstacle: ahead, turning to a free direction if blocked."""
     body, speed = scene[0][k], mark[at.SPEED]
     x, y, radius = body[0], body[1], body[5]
     here, nx, ny = clearance(x, y, k, scene)
@@ -152,7 +152,7 @@ def _wander(mark, k, scene, seed, counter, period):  # type: ignore[no-untyped-d
         mark[at.AIM] = aim
     turn = _wrap(aim - mark[at.DIRECTION])
     mark[at.DIRECTION] = _wrap(mark[at.DIRECTION] + min(max(turn, -TURN * period), TURN * period))
-    # It slows down to turn, so that it does not run where it did not mean to.
+    # It slows down in turns, so that it does not move far off its intended direction.
     way = speed * period * max(math.cos(aim - mark[at.DIRECTION]), 0.0)
     return way * math.cos(mark[at.DIRECTION]), way * math.sin(mark[at.DIRECTION])
 
@@ -162,7 +162,7 @@ def _follow(mark, body, row, waypoints, period, keep):  # type: ignore[no-untype
     """Displacement of a patrol along its path, by the arc length of a period.
 
     Args:
-        keep: whether the waypoints that it passes are behind it for good.
+        keep: whether its progress along the waypoints is stored.
     """
     index, way, rest = int(mark[at.INDEX]), mark[at.WAY], mark[at.REST]
     x, y, left = body[0], body[1], period
@@ -185,7 +185,7 @@ def _follow(mark, body, row, waypoints, period, keep):  # type: ignore[no-untype
 
 @kernel(allocates=True)
 def _after(index, way, row):  # type: ignore[no-untyped-def]
-    """The waypoint after a waypoint, and the way along the list: 1, or -1 backwards."""
+    """Returns the next waypoint and the direction along the list: 1, or -1 for backwards."""
     count = int(row[at.COUNT])
     if row[at.LOOP] != 0.0:
         return (index + 1) % count, 1.0
@@ -195,25 +195,25 @@ def _after(index, way, row):  # type: ignore[no-untyped-def]
 
 
 NEAREST = 1e-3
-"""Least distance that a force is computed for [m]: at 0 it has no direction."""
+"""Least distance for which a force is computed [m]: at 0 it has no direction."""
 FAR = 8.0
-"""Beyond so many ranges a force is nothing."""
+"""Forces beyond this many ranges are neglected."""
 STRONGEST = 5.0
-"""Greatest acceleration [m/s^2]: people do no more, and the model's grows without bound."""
+"""Greatest acceleration [m/s^2]: people reach no more, and the model's is unbounded."""
 ARRIVED = 0.3
 """A goal is reached within this distance [m]."""
 ROOM = 0.2
 """Free space around a walker at a new goal [m]."""
 LEAST_WALK = 1.0
-"""A new goal is at least so far away [m], if such a one is found."""
+"""Least distance of a new goal [m], if such a goal is found."""
 PATIENCE = 5.0
-"""A walker gives a goal up after twice the time that the straight way takes, and so many s."""
+"""A walker gives up a goal after twice the time of the straight path plus this time [s]."""
 CANDIDATES = 16
 
 
 @kernel(allocates=True)
 def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-untyped-def]
-    """The force (3, 4) of another walker; 2 b = sqrt((|r| + |r - v dt|)^2 - (v dt)^2).
+    """Computes the force (3, 4) of another walker; 2 b = sqrt((|r| + |r - v dt|)^2 - (v dt)^2).
 
     Args:
         rx, ry: from the other to this one [m], not zero.
@@ -238,14 +238,14 @@ def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-un
 
 @kernel(allocates=True)
 def _sight(ex, ey, fx, fy, row):  # type: ignore[no-untyped-def]
-    """The weight (8) of a force on a walker that looks along e: 1, or less from behind."""
+    """Weight (8) of a force on a walker that looks along e: 1, or less from behind."""
     seen = -(ex * fx + ey * fy) >= row[at.VIEW] * math.sqrt(fx * fx + fy * fy)
     return 1.0 if seen else row[at.BEHIND]
 
 
 @kernel(allocates=True)
 def _from_bodies(k, ex, ey, bodies, marks, first, speeds, row):  # type: ignore[no-untyped-def]
-    """The forces of all other bodies on walker k: walkers, obstacles, robots."""
+    """Sums the forces of all other bodies on walker k: walkers, obstacles, robots."""
     ax, ay = 0.0, 0.0
     for j in range(bodies.shape[0]):
         if j == k or bodies[j, 5] <= 0.0:
@@ -273,7 +273,7 @@ def _from_bodies(k, ex, ey, bodies, marks, first, speeds, row):  # type: ignore[
 
 @kernel(allocates=True)
 def _from_walls(x, y, radius, walls, distances, row):  # type: ignore[no-untyped-def]
-    """The forces (5) of the nearest point of each wall, and of the static map."""
+    """Sums the forces (5) of the nearest point of each wall, and of the static map."""
     ax, ay, reach = 0.0, 0.0, row[at.WALL_RANGE]
     far = radius + FAR * reach
     for w in range(walls.shape[0]):
@@ -294,7 +294,7 @@ def _from_walls(x, y, radius, walls, distances, row):  # type: ignore[no-untyped
 
 @kernel(allocates=True)
 def _new_goal(mark, k, scene, seed, counter, step, period):  # type: ignore[no-untyped-def]
-    """Draws where walker k goes next; the last draw stands if none is free."""
+    """Draws the next goal of walker k; the last draw is kept if none is free."""
     bodies, _, half, _ = scene
     x, y, radius = bodies[k, 0], bodies[k, 1], bodies[k, 5]
     wide, deep = max(half[0] - radius - ROOM, 0.0), max(half[1] - radius - ROOM, 0.0)
@@ -312,7 +312,7 @@ def _new_goal(mark, k, scene, seed, counter, step, period):  # type: ignore[no-u
 
 @kernel(allocates=True)
 def walk(marks, k, scene, first, speeds, row, seed, counter, step, period):  # type: ignore[no-untyped-def]
-    """The velocity that walker k takes up, and its goal in its row of marks.
+    """Returns the next velocity of walker k and updates its goal in its row of marks.
 
     Args:
         marks: (K, F) of this world, columns as in `motion_layout`.

@@ -1,6 +1,6 @@
-"""How obstacles move: straight on, from waypoint to waypoint, or as people walk.
+"""Motion of obstacles: straight ahead, from waypoint to waypoint, or as people walk.
 
-Columns of the arrays that tell how obstacles move; `motion.py` says what they mean.
+Columns of the arrays for the motion of obstacles; `motion.py` explains them.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ Distances = tuple[NDArray[np.float32], Array]
 FASTEST = 10.0
 """Greatest speed of an obstacle [m/s]; beyond it a control period would be too coarse."""
 STRONGEST = 1e3
-"""Greatest of the parameters of the social force model, each in its unit."""
+"""Upper bound on the parameters of the social force model, each in its unit."""
 NO_DISTANCES: Distances = (np.full((1, 1), np.inf, np.float32), np.array([0.0, 0.0, 1.0, 0.0, 1.0]))
-"""What the kernels take where there is no static map."""
+"""Argument of the kernels where there is no static map."""
 
 
 def _fast(speed: tuple[float, float]) -> tuple[float, float]:
@@ -44,10 +44,10 @@ Speed = Annotated[tuple[float, float], AfterValidator(_fast)]
 
 
 class Wander(Schema):
-    """Straight ahead, turning to where the way is free when something is near.
+    """Moves straight ahead and turns to a free direction when something is near.
 
     Attributes:
-        speed: least and greatest; one is drawn for an episode [m/s].
+        speed: least and greatest; one is drawn per episode [m/s].
     """
 
     kind: Literal["wander"] = "wander"
@@ -55,14 +55,14 @@ class Wander(Schema):
 
 
 class Patrol(Schema):
-    """From waypoint to waypoint, and waiting where something is in the way.
+    """Moves from waypoint to waypoint and waits while something is in the way.
 
-    It begins with the way to the first one, from wherever it stands.
+    It first moves to the first waypoint, from wherever it stands.
 
     Attributes:
         waypoints: x, y in `map` [m].
         speed: [m/s].
-        loop: from the last waypoint to the first; otherwise back and forth.
+        loop: continue from the last waypoint to the first; otherwise back and forth.
         pause: at each waypoint [s].
     """
 
@@ -84,22 +84,22 @@ class Pedestrian(Schema):
     """Walks to random goals, by the social force model of Helbing and Molnar (1995).
 
     The symbols and defaults are those of "Social force model for pedestrian dynamics", Phys. Rev.
-    E 51, 4282, but for two things. The ellipses of the repulsion follow the relative velocity, as
+    E 51, 4282, with two exceptions. The ellipses of the repulsion follow the relative velocity, as
     in Johansson, Helbing and Shukla (2007), and distances are between the surfaces of the discs,
-    as in Helbing, Farkas and Vicsek (2000). The speeds are the paper's 1.34 m/s and one standard
-    deviation, 0.26 m/s, to both sides.
+    as in Helbing, Farkas and Vicsek (2000). The speeds are the paper's 1.34 m/s, plus or minus one
+    standard deviation of 0.26 m/s.
 
     Attributes:
-        speed: least and greatest desired speed; one is drawn for an episode, and the walker is
+        speed: least and greatest desired speed; one is drawn per episode, and the walker is
             never faster than the greatest [m/s].
-        relaxation: tau, in which the desired velocity is taken up [s].
+        relaxation: tau, the time constant of approaching the desired velocity [s].
         repulsion: V0 of walkers, obstacles and robots [m^2/s^2].
-        range: sigma of it [m].
+        range: sigma, the range of `repulsion` [m].
         wall_repulsion: U0 of walls [m^2/s^2].
-        wall_range: R of it [m].
-        foresight: delta t, by which the others' motion is thought ahead [s].
+        wall_range: R, the range of `wall_repulsion` [m].
+        foresight: delta t, the time by which the others' motion is extrapolated [s].
         view: 2 phi, the angle of sight [rad].
-        behind: c, how much counts what is out of sight.
+        behind: c, the weight of forces from outside the angle of sight.
         fluctuation: standard deviation of a random acceleration [m/s^2].
     """
 
@@ -120,10 +120,10 @@ Motion = Annotated[Wander | Patrol | Pedestrian, Field(discriminator="kind")]
 
 
 def plan_arrays(motions: Sequence[Wander | Patrol | Pedestrian | None]) -> Plans:
-    """What the kernels take as `plans`: obstacle k of every world moves by motion k.
+    """Returns the kernels' argument `plans`: obstacle k of every world moves by motion k.
 
     Args:
-        motions: K, None for an obstacle that stands still.
+        motions: (K), None for an obstacle that stands still.
 
     Returns:
         (K, P) rows, columns as in `motion_layout`, and (Q, 2) waypoints of all patrols [m].
@@ -149,11 +149,11 @@ def plan_arrays(motions: Sequence[Wander | Patrol | Pedestrian | None]) -> Plans
 
 
 def distance_arrays(grid: GridMap | None) -> Distances:
-    """What the kernels take as `distances`: the distance field of a static map, and its frame."""
+    """Returns the kernels' argument `distances`: distance field of a static map, and its frame."""
     return NO_DISTANCES if grid is None else (grid.distance_field, grid.arrays[1])
 
 
-# A row of a plan (K, P): how an obstacle moves.
+# A row of a plan (K, P): the motion of an obstacle.
 (
     KIND, SPEED_LOW, SPEED_HIGH, FIRST, COUNT, LOOP, PAUSE,
     RELAXATION, REPULSION, RANGE, WALL_REPULSION, WALL_RANGE, FORESIGHT, VIEW, BEHIND,
@@ -164,6 +164,6 @@ PLAN = 16
 # Values of the column KIND.
 STILL, WANDER, PATROL, PEDESTRIAN = range(4)
 
-# What an obstacle remembers, a row of marks (N, K, F).
+# Memory of an obstacle, a row of marks (N, K, F).
 SPEED, VX, VY, DIRECTION, AIM, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST = range(11)
 MARK = 11

@@ -1,10 +1,10 @@
-"""Domain randomisation: which robot, sensors and scene an episode gets, within YAML's ranges.
+"""Domain randomisation: robot, sensors and scene of an episode, drawn from ranges in YAML.
 
-Compiled draws of domain randomisation, each fixed by seed, robot and place alone.
+Compiled draws of domain randomisation, each fixed by seed, robot, group and column alone.
 
-Shared arguments: `seeds` (n,) of the episodes; `group` is what the numbers are for, one of the
-constants below. A place whose bounds are equal takes that value and draws nothing, and a group
-never shifts the draws of another.
+Shared arguments: `seeds` (n,) of the episodes; `group` is the purpose of the numbers, one of the
+constants below; `place` is a column. A column whose bounds are equal takes that value and draws
+nothing, and a group never shifts the draws of another.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ FAULT_COLUMNS = (
 
 
 def load_randomisation(name: str | Path) -> Randomisation:
-    """Loads a shipped randomisation by name (`mild`), or any by the path of its YAML file."""
+    """Loads a shipped randomisation by name (`mild`), or any other by the path of its YAML file."""
     return load_yaml(find_config(name, "randomisation"), Randomisation)
 
 
 @dataclass(frozen=True)
 class Label:
-    """A drawn number's name, and where it stands in `Draws`.
+    """Name of a drawn number and its place in `Draws`.
 
     Attributes:
-        name: for people: `kinematics.wz.speed*steering`, `action_latency_s`.
+        name: human-readable: `kinematics.wz.speed*steering`, `action_latency_s`.
         field: of `Draws`.
-        column: along the last axis; None where there is none.
-        unit: what to multiply by, such as seconds per substep.
+        column: index along the last axis; None where there is none.
+        unit: factor to multiply by, such as seconds per substep.
     """
 
     name: str
@@ -60,19 +60,19 @@ class Label:
 
 @dataclass(frozen=True)
 class Draws:
-    """What n episodes of M robots got: every number the simulator needs, drawn or the model's.
+    """Draws for n episodes of M robots: every number the simulator needs, drawn or the model's.
 
     Attributes:
         coefficient: (n, M, T) of the kept terms, in the order of `kinematics.kernels.term_arrays`.
-        delay: (n, M) from a command to its effect, the model's included [substeps].
-        age: (n, M) of scan and odometry when they are seen [substeps].
+        delay: (n, M) from a command to its effect, including the model's [substeps].
+        age: (n, M) of scan and odometry when they are observed [substeps].
         noise: (n, M, 2 + 3 + S) standard deviations: odometry, linear [m/s] and angular [rad/s],
             and the drift of x, y, heading and state after a second.
         faults: (n, M, P) of each lidar, columns as in `lidar.fault_kernels`.
         count: (n,) obstacles in the scene; None leaves it to the world.
         size: (n,) index into `Randomisation.sizes`; None where there is only one.
-        sizes: (R,) those of `Randomisation.sizes`.
-        labels: of what was drawn and may differ from episode to episode.
+        sizes: (R,) the sizes of `Randomisation.sizes`.
+        labels: of the drawn numbers that may differ from episode to episode.
     """
 
     coefficient: Array
@@ -86,7 +86,7 @@ class Draws:
     labels: tuple[Label, ...]
 
     def named(self) -> dict[str, NDArray[np.generic]]:
-        """What was drawn, by name: (n, M) of each robot, (n,) of the scene."""
+        """Returns the drawn numbers by name: (n, M) per robot, (n,) per scene."""
         named: dict[str, NDArray[np.generic]] = {}
         for label in self.labels:
             value = getattr(self, label.field)
@@ -99,17 +99,17 @@ class Draws:
 
 
 class Sampler:
-    """Draws what episodes get; a seed gives the same bits in a batch of any size.
+    """Draws the randomised numbers of episodes; a seed is bit-identical in any batch.
 
     Args:
         randomisation: the ranges.
-        model: what they are ranges around.
+        model: provides the nominal values.
         robots: M.
 
     Attributes:
         longest_delay: greatest latency of a command that may occur [substeps].
         longest_age: greatest age of an observation that may occur [substeps].
-        skews: whether a lidar may measure its beams one after the other.
+        skews: True if a lidar may measure its beams one after the other.
     """
 
     def __init__(
@@ -132,7 +132,7 @@ class Sampler:
         self._labels = tuple(self._name(model))
 
     def draw(self, seeds: ArrayLike) -> Draws:
-        """What the episodes of some seeds (n,) get."""
+        """Draws the numbers of the episodes of some seeds (n,)."""
         chosen = checked_seeds(seeds)
         shape = (len(chosen), self._robots)
         coefficient = np.empty((*shape, len(self._coefficient[0])))
@@ -186,26 +186,26 @@ def _varies(ends: bounds.Bounds, column: int) -> bool:
 
 KINEMATICS, LATENCY, ODOMETRY, LIDAR, CHOICES, OBSTACLES = range(6)
 PLACES = 1 << 20
-"""More than a group has places; the counters of two groups never meet."""
+"""More than a group has columns; the counters of two groups never collide."""
 GROUPS = 8
 
 
 @kernel(allocates=True)
 def _share(seed, robot, group, place):  # type: ignore[no-untyped-def]
-    """The draw in [0, 1) of one place."""
+    """Returns the draw in [0, 1) of one column."""
     counter = (robot * GROUPS + group) * PLACES + place
     return random.uniform(seed, random.RANDOMISATION_STREAM, counter)
 
 
 @kernel(allocates=True)
 def _between(low, high, seed, robot, group, place):  # type: ignore[no-untyped-def]
-    """A number between `low` and `high`; the very number where they are the same."""
+    """Draws a number between `low` and `high`; exactly `low` if they are equal."""
     return low if high == low else low + _share(seed, robot, group, place) * (high - low)
 
 
 @kernel(allocates=True)
 def draw_between(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
-    """Fills out (n, M, Q) evenly between low (Q,) and high (Q,)."""
+    """Fills out (n, M, Q) uniformly between low (Q,) and high (Q,)."""
     for n in range(out.shape[0]):
         for m in range(out.shape[1]):
             for q in range(out.shape[2]):
@@ -214,7 +214,7 @@ def draw_between(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def draw_whole(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
-    """Fills out (n, M, Q) with whole numbers: evenly between low and high, cut down."""
+    """Fills out (n, M, Q) with integers: uniform between low (Q,) and high (Q,), floored."""
     for n in range(out.shape[0]):
         for m in range(out.shape[1]):
             for q in range(out.shape[2]):
@@ -224,7 +224,7 @@ def draw_whole(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def draw_choice(out, column, values, seeds):  # type: ignore[no-untyped-def]
-    """Fills one column of out (n, M, P) with one of the values (V,), each as likely."""
+    """Fills one column of out (n, M, P) with one of the values (V,), all equally likely."""
     for n in range(out.shape[0]):
         for m in range(out.shape[1]):
             share = _share(seeds[n], m, CHOICES, column)

@@ -1,6 +1,6 @@
 """The ranges of domain randomisation: the schema of its YAML files.
 
-What the ranges of domain randomisation come to for one model: bounds of every drawn number.
+Bounds of every drawn number: the ranges of domain randomisation applied to one model.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from nics_drl_bridge.robot.kernels import term_arrays
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 MOST_PERIODS = 50.0
-"""Greatest latency that may be drawn: the simulator keeps so many periods."""
+"""Greatest latency that may be drawn [control periods]; the simulator stores as many."""
 MOST_OBSTACLES = 10_000
 LIDAR_CHOICES = ("skew", "too_close")
-"""Faults of which one of some words is drawn; of the others, a number."""
+"""Faults that are drawn from several words; the others are numbers."""
 
 
 GREATEST_FACTOR = 1e3
@@ -68,12 +68,12 @@ AS_IT_IS: Factor = (1.0, 1.0)
 
 
 class KinematicRanges(Schema):
-    """Factors on the coefficients of the Taylor model, drawn for each coefficient on its own.
+    """Factors on the coefficients of the Taylor model, drawn independently for each coefficient.
 
     Attributes:
         scale: for every coefficient.
-        dofs: instead of it, for the coefficients of a rate, by its name in `model.yaml` (`wz`).
-        terms: instead of both, by rate and term: `{wz: {speed*steering: [0.8, 1.2]}}`.
+        dofs: overrides `scale` for the coefficients of a rate, by its name in `model.yaml` (`wz`).
+        terms: overrides both, by rate and term: `{wz: {speed*steering: [0.8, 1.2]}}`.
     """
 
     scale: Factor = AS_IT_IS
@@ -82,12 +82,12 @@ class KinematicRanges(Schema):
 
 
 class OdometryRanges(Schema):
-    """What odometry and motion get wrong; factors on the model's levels, or levels instead.
+    """Errors of odometry and motion: factors on the model's levels, or levels instead.
 
     Attributes:
         noise: factor on the noise of the measured twist.
-        drift: factor on what the model does not explain of the motion; only a drift that the
-            recording showed can be scaled.
+        drift: factor on the part of the motion that the model does not explain; only a drift that
+            was found in the recording can be scaled.
         odom_linear: noise of the velocity [m/s], instead of the model's.
         odom_angular: noise of the yaw rate [rad/s].
         position_drift: of x and y [m/sqrt(s)].
@@ -118,7 +118,7 @@ class LidarRanges(Schema):
     Attributes:
         noise_std: see `LidarSpec` [m].
         noise_proportional, quantisation, dropout, dropout_far: [least, greatest].
-        skew, too_close: the words that may be drawn, each as likely.
+        skew, too_close: the words that may be drawn, all equally likely.
     """
 
     noise_std: Level | None = None
@@ -137,7 +137,7 @@ class LidarRanges(Schema):
         return self
 
     def numbers(self, end: int) -> dict[str, float]:
-        """The least (end 0) or the greatest (end 1) of each number that `LidarFaults` holds."""
+        """Returns the least (end 0) or greatest (end 1) of each number in `LidarFaults`."""
         spans = {name: getattr(self, name) for name in LidarFaults.model_fields}
         return {
             name: span[end]
@@ -147,12 +147,12 @@ class LidarRanges(Schema):
 
 
 class ObstacleRanges(Schema):
-    """How many obstacles a scene has, and how large they are.
+    """Number and size of the obstacles of a scene.
 
     Attributes:
         count: [least, greatest], instead of the world's.
-        size: factor on the size of every obstacle, one for a whole episode.
-        rungs: so many sizes are drawn from, evenly spaced: each is baked beforehand.
+        size: factor on the size of every obstacle, one per episode.
+        rungs: number of sizes to draw from, evenly spaced: each is baked beforehand.
     """
 
     count: tuple[int, int] | None = None
@@ -174,12 +174,12 @@ class ObstacleRanges(Schema):
 
 
 class Randomisation(Schema):
-    """What is drawn anew for every episode; what is not named stays as in model and world.
+    """Ranges that are drawn from in every episode; all else stays as in model and world.
 
     Attributes:
-        name: what users call it.
+        name: the name users refer to it by.
         kinematics: see `KinematicRanges`.
-        action_latency: on top of the model's [control periods].
+        action_latency: in addition to the model's [control periods].
         observation_latency: age of scan and odometry [control periods].
         odometry: see `OdometryRanges`.
         lidar: see `LidarRanges`.
@@ -203,13 +203,13 @@ class Randomisation(Schema):
 Array = NDArray[np.float64]
 Bounds = tuple[Array, Array]
 NOISE_NAMES = ("odom_linear", "odom_angular", "position_drift", None, "heading_drift")
-"""Columns of the noise, before those of the state; the drift of y is that of x."""
+"""Columns of the noise, before those of the state; the drift of y equals that of x."""
 CORNERS = 256
-"""So many mixtures of least and greatest factors are looked at for whether they are stable."""
+"""Number of mixtures of least and greatest factors that are checked for stability."""
 
 
 def coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bounds:
-    """Bounds (T,) of the coefficients. Raises ConfigError for a name or a range that is wrong."""
+    """Bounds (T,) of the coefficients. Raises ConfigError for an invalid name or range."""
     spans = np.tile(ranges.scale, (*model.coefficients.shape, 1))
     for dof, span in ranges.dofs.items():
         spans[_rate(dof, model, f"{where}: key 'kinematics.dofs'")] = span
@@ -247,9 +247,9 @@ def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
 
 
 def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
-    """Raises ConfigError when a state that dies out would grow for some factors.
+    """Raises ConfigError if a decaying state would grow for some factors.
 
-    Looks at the linear part of the state's step, of which no eigenvalue may pass 1.
+    Checks the linear part of the state's step: no eigenvalue may exceed 1 in magnitude.
     """
     size = model.state_size
     if not size:
@@ -273,12 +273,12 @@ def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
 
 
 def latencies(ranges: Randomisation, model: SimulatorModel) -> Bounds:
-    """Bounds (2,) of delay and age, such that cutting down the draws rounds them [substeps]."""
+    """Bounds (2,) of delay and age, such that flooring the draws rounds them [substeps]."""
     _, substeps, delay = model.timing
     spans = np.array([ranges.action_latency, ranges.observation_latency]) * substeps + 0.5
     spans[0] += delay
     same = np.floor(spans[:, 0]) == np.floor(spans[:, 1])
-    spans[same] = np.floor(spans[same])  # so that nothing is drawn
+    spans[same] = np.floor(spans[same])  # equal bounds: nothing is drawn
     return np.ascontiguousarray(spans[:, 0]), np.ascontiguousarray(spans[:, 1])
 
 
@@ -320,7 +320,7 @@ def faults(ranges: Randomisation, lidar: LidarSpec, where: str) -> Bounds:
 
 
 def choices(ranges: Randomisation) -> Iterator[tuple[int, Array]]:
-    """Columns of the faults whose value is one of some, and these values."""
+    """Yields the columns of the faults that take one of several values, and these values."""
     if ranges.lidar.skew is not None:
         values = [SKEW[word] for word in ranges.lidar.skew]
         yield fault_kernels.SKEW, np.array(values, dtype=np.float64)
@@ -330,6 +330,6 @@ def choices(ranges: Randomisation) -> Iterator[tuple[int, Array]]:
 
 
 def scene(ranges: Randomisation) -> Bounds:
-    """Bounds (2,) of number and size index, such that cutting down makes each as likely."""
+    """Bounds (2,) of number and size index, such that flooring makes all equally likely."""
     least, most = ranges.obstacles.count or (0, 0)
     return np.array([least, 0.0]), np.array([most + 1.0, len(ranges.sizes)])

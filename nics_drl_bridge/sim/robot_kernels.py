@@ -1,4 +1,4 @@
-"""Compiled motion of robots for one period: freely, and carefully where it is tight.
+"""Compiled motion of robots for one period: freely, and carefully in tight spots.
 
 Shapes are those of `kernels`.
 """
@@ -20,7 +20,7 @@ def move_freely(begin, end, pose, state, history, coefficient, delay, lanes, mot
     """Moves the robots of the worlds [begin, end) for one period as if nothing were in the way.
 
     Args:
-        begin, end: which worlds.
+        begin, end: range of the worlds.
         pose: (N, M, 3).
         state: (N, M, S).
         history: (N, M, H, C) commands, newest first.
@@ -43,7 +43,7 @@ def move_freely(begin, end, pose, state, history, coefficient, delay, lanes, mot
                 x[s, i] = state[n, m, s]
             for t in range(own.shape[0]):
                 own[t, i] = coefficient[n, m, t]
-            late[i] = delay[n, m] % substeps  # its command changes once, after so many substeps
+            late[i] = delay[n, m] % substeps  # substep in which its command changes, once
     at, used = 0, (end - begin) * robots
     while at < substeps:
         until = substeps
@@ -64,15 +64,15 @@ def move_world(  # type: ignore[no-untyped-def]
     n, skip, pose, state, history, coefficient, delay, bodies, velocity, walls, grid, collided,
     crowded, outlines, lanes, motion, cells, found, robot, room, noise, seed, step,
 ):  # fmt: skip
-    """Moves obstacles and robots of one world: freely, and carefully where it is tight.
+    """Moves obstacles and robots of one world: freely, and carefully in tight spots.
 
     Args:
-        n: which world.
+        n: index of the world.
         skip: the lane of its first robot.
         crowded: whether its bodies are to be sorted into cells.
         cells, found: see `cell_kernels`.
         robot: near (M, 1 + SEVERAL), meets (M,), way (M,), reach (K + M,), and one more: scratch.
-        noise, seed, step: of the drift, see `careful_kernels.drift_carefully`.
+        noise, seed, step: for the drift, see `careful_kernels.drift_carefully`.
         pose and others: see the functions above.
     """
     where, x = lanes[0], lanes[1]

@@ -1,12 +1,12 @@
-"""Compiled inner loops of the simulator: what moves and measures wrongly.
+"""Compiled inner loops of the simulator: noise and latency of the odometry, drift of the motion.
 
-What a robot is told may be older than the moment: `past` (N, M, R, 12) is a ring of what was true
-at the ends of the last R periods, that of step i in row i % R: true pose, true twist, pose by
-odometry, measured twist. Between two of them everything is taken to change linearly.
+Observations may be delayed: `past` (N, M, R, 12) is a ring buffer of the values at the ends of the
+last R periods, step i in row i % R: true pose, true twist, pose by odometry, measured twist.
+Between two rows, values are interpolated linearly.
 
 Shapes: N worlds, M robots, S state, R periods.
 
-Compiled inner loops of the simulator: the scans, from where and when each lidar takes them.
+Compiled inner loops of the simulator: scans from the place and time of each lidar.
 
 Shapes: N worlds, M robots, K obstacles, W walls, B beams, G slices of a sweep, R periods of `past`,
 see `sensing_kernels`.
@@ -28,7 +28,7 @@ POSE, TWIST, ODOM, MEASURED, PAST = 0, 3, 6, 9, 12
 
 @kernel
 def begin(past, n, m, pose, odom, twist):  # type: ignore[no-untyped-def]
-    """Notes what is true of a robot at the beginning of an episode."""
+    """Records the values of a robot at the beginning of an episode."""
     for i in range(3):
         past[n, m, 0, POSE + i], past[n, m, 0, TWIST + i] = pose[n, m, i], 0.0
         past[n, m, 0, ODOM + i], past[n, m, 0, MEASURED + i] = odom[n, m, i], twist[n, m, i]
@@ -36,13 +36,13 @@ def begin(past, n, m, pose, odom, twist):  # type: ignore[no-untyped-def]
 
 @kernel
 def lag_of(age, steps, rows, substeps):  # type: ignore[no-untyped-def]
-    """How old [substeps] that is which a robot is told: not from before the episode or the ring."""
+    """Age of an observation [substeps], limited to the present episode and the ring buffer."""
     return max(min(age, min(steps, rows - 1) * substeps), 0)
 
 
 @kernel
 def at_lag(past, n, m, column, lag, steps, substeps):  # type: ignore[no-untyped-def]
-    """Three columns of `past` as they were `lag` substeps before the end of period `steps`."""
+    """Returns three columns of `past`, `lag` substeps before the end of period `steps`."""
     rows = past.shape[2]
     new, share = (steps - lag // substeps) % rows, (lag % substeps) / substeps
     x, y, z = past[n, m, new, column], past[n, m, new, column + 1], past[n, m, new, column + 2]
@@ -61,7 +61,7 @@ def at_lag(past, n, m, column, lag, steps, substeps):  # type: ignore[no-untyped
 
 @kernel
 def advanced(x, y, heading, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
-    """The pose after the exact arc of a body twist; see `kinematics.kernels.move`."""
+    """Returns the pose after the exact arc of a body twist; see `kinematics.kernels.move`."""
     x, y, _, _ = move(x, y, math.cos(heading), math.sin(heading), vx, vy, turn, dt, series)
     return x, y, wrap(heading + turn)
 
@@ -71,22 +71,22 @@ def measure(  # type: ignore[no-untyped-def]
     odom, twist, past, before, pose, n, m, now, std, steps, seed, counter, age, dt, substeps,
     series,
 ):  # fmt: skip
-    """What a robot's wheels say of one period: a drifting pose and a noisy twist, maybe late.
+    """Measures a robot's odometry of one period: a drifting pose and a noisy twist, maybe delayed.
 
     Args:
         odom: (N, M, 3) odometry pose, result.
         twist: (N, M, 3) measured twist, result.
-        past: the ring, see the module; gets the row of this period.
+        past: the ring buffer, see the module; the row of this period is written.
         before: (3,) true pose at the start of the period.
         pose: (N, M, 3) true poses at its end.
-        n, m: which world and robot.
+        n, m: indices of world and robot.
         now: (3 + S,) true rates at its end.
         std: (N, M, 2 + 3 + S) standard deviation of the linear [m/s] and the angular twist
             [rad/s], then of the drift.
         steps: periods since the reset, this one included.
         seed, counter: of the random draws.
-        age: of what is told [substeps].
-        dt, substeps: [s], and substeps in a period.
+        age: of the observation [substeps].
+        dt, substeps: length of a substep [s], and substeps in a period.
         series: see `kinematics.kernels`.
     """
     rows = past.shape[2]
@@ -129,26 +129,26 @@ def measure(  # type: ignore[no-untyped-def]
 
 @kernel
 def most_drift(std, n, m, period):  # type: ignore[no-untyped-def]
-    """The greatest distance by which `drift_of` can move a robot in a period [m]."""
+    """Upper bound on the distance by which `drift_of` can move a robot in a period [m]."""
     return math.sqrt(3.0 * period) * (std[n, m, 2] + std[n, m, 3])
 
 
 @kernel
 def drift_of(state, std, n, m, seed, counter, period):  # type: ignore[no-untyped-def]
-    """What moves a robot beside its model: it grows with the root of the time.
+    """Draws the motion of a robot in addition to its model: it grows with the root of the time.
 
     Args:
         state: (N, M, S), in place.
         std: (N, M, 2 + 3 + S) of the odometry, then along x, y and heading of the body, and of
             the state, after a second.
-        n, m: which world and robot.
+        n, m: indices of world and robot.
         seed, counter: of the random draws.
         period: [s].
 
     Returns:
-        Ahead and aside [m], and turn [rad].
+        Displacement forwards and to the left [m], and turn [rad].
     """
-    # Uniform draws of this variance are cheap, and over some periods they add up to a normal one.
+    # Uniform draws of this variance are cheap; over several periods their sum is nearly normal.
     count, scale = std.shape[2] - 2, math.sqrt(12.0 * period)
     ahead = aside = turn = 0.0
     for i in range(count):
@@ -168,7 +168,7 @@ def drift_of(state, std, n, m, seed, counter, period):  # type: ignore[no-untype
 
 @kernel
 def needs_own(n, age, faults):  # type: ignore[no-untyped-def]
-    """Whether a robot of world n needs a scan that is not of its pose at the moment."""
+    """True if a robot of world n needs a delayed or skewed scan."""
     for m in range(age.shape[1]):
         if age[n, m] > 0 or faults[n, m, fault_kernels.SKEW] != 0.0:
             return True
@@ -180,15 +180,15 @@ def look_alone(  # type: ignore[no-untyped-def]
     n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, crowded, view, sensors,
     crowding, dt, substeps,
 ):  # fmt: skip
-    """Scans of world n, each robot's from its own place and time.
+    """Scans world n, each robot from its own place and time.
 
     Args:
-        n: which world.
+        n: index of the world.
         pose and others: fields of `worlds.Worlds`.
         walls: (W, 4).
         crowded: whether the bodies are in cells.
         view, sensors, crowding: see `worlds.arguments`.
-        dt, substeps: [s], and substeps in a period.
+        dt, substeps: length of a substep [s], and substeps in a period.
     """
     for m in range(pose.shape[1]):
         lag = lag_of(age[n, m], steps[n], past.shape[2], substeps)
@@ -203,11 +203,11 @@ def look_or_wait(  # type: ignore[no-untyped-def]
     n, together, pose, bodies, ranges, steps, faults, age, velocity, past, walls, crowded, view,
     sensors, crowding, dt, substeps,
 ):  # fmt: skip
-    """Scans of world n, unless `look_together` can take them; how many worlds now wait for it.
+    """Scans world n, or queues it for `look_together`; returns the number of queued worlds.
 
     Args:
-        n: which world.
-        together: how many waited before.
+        n: index of the world.
+        together: number of worlds queued before.
         pose and others: see `look_alone`.
     """
     if crowded or needs_own(n, age, faults):
@@ -222,7 +222,7 @@ def look_or_wait(  # type: ignore[no-untyped-def]
 
 @kernel
 def look_together(together, pose, bodies, ranges, first, walls, view, sensors):  # type: ignore[no-untyped-def]
-    """Scans the first `together` worlds of the list in `sensors`, as they stand."""
+    """Scans the first `together` worlds queued in `sensors`, at the present poses."""
     chosen, scan_room = sensors[1][:together], sensors[8]
     sensor, map_arrays, exact = view[0], view[1], view[2]
     scan_kernels.scan_worlds(ranges, pose, chosen, bodies, first, walls, sensor, scan_room)
@@ -232,7 +232,7 @@ def look_together(together, pose, bodies, ranges, first, walls, view, sensors): 
 
 @kernel
 def distort(low, high, ranges, faults, steps, seeds, view):  # type: ignore[no-untyped-def]
-    """Does to the scans of the worlds [low, high) what the device of each robot does to them."""
+    """Applies noise and faults of each robot's lidar to the scans of the worlds [low, high)."""
     limits, robots = view[4], ranges.shape[1]
     for n in range(low, high):
         for m in range(robots):
@@ -245,7 +245,7 @@ def _look_alone(  # type: ignore[no-untyped-def]
     n, m, lag, pose, bodies, ranges, steps, skew, velocity, past, walls, crowded, view, sensors,
     crowding, dt, substeps,
 ):  # fmt: skip
-    """Scan of one robot `lag` substeps ago, maybe skewed; see `look_alone`."""
+    """Scans from one robot `lag` substeps ago, maybe skewed; see `look_alone`."""
     _, _, _, mount, limits, sweep_time = view
     spot, slices, part, drive, none = sensors[3], sensors[4], sensors[5], sensors[6], sensors[7]
     this, beams = steps[n] % past.shape[2], ranges.shape[2]
@@ -271,7 +271,7 @@ def _look_alone(  # type: ignore[no-untyped-def]
     groups = 1 if skew == 0.0 else slices.shape[0]
     if groups > 1:
         fault_kernels.slice_poses(slices, spot[0, 0], drive, sweep_time, skew)
-    for g in range(groups):  # what is called below is large: once is enough to compile
+    for g in range(groups):  # a single call site: the functions below take long to compile
         out = scan if groups == 1 else part
         for i in range(3 if groups > 1 else 0):
             spot[0, 0, i] = slices[g, i]
@@ -286,10 +286,10 @@ def _look_alone(  # type: ignore[no-untyped-def]
 def _gather(  # type: ignore[no-untyped-def]
     n, m, lag, spot, reach, bodies, velocity, past, steps, crowded, seen, crowding, dt, substeps
 ):
-    """Copies to `seen` the bodies around a spot, where they were `lag` substeps ago; how many."""
+    """Copies to `seen` the bodies near a spot as of `lag` substeps ago; returns their number."""
     cells, found = crowding
     first = velocity.shape[1]
-    several, in_cells = bodies.shape[1], crowded and lag == 0  # the cells are of this period
+    several, in_cells = bodies.shape[1], crowded and lag == 0  # cells are of this period only
     if in_cells:
         several = crowd.bodies_around(spot[0], spot[1], reach, cells, found)
     count, ago = 0, lag * dt

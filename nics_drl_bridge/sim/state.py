@@ -1,4 +1,4 @@
-"""Worlds: all that changes in a simulation, and what its kernels take beside it."""
+"""Worlds: all mutable state of a simulation, and the other arguments of its kernels."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from nics_drl_bridge.sim.sensing_kernels import PAST
 
 Array = NDArray[np.float64]
 SLICES = 16
-"""A skewed scan is rendered in so many groups of beams."""
+"""Number of groups of beams in which a skewed scan is rendered."""
 LANES = 256
-"""So many robots move side by side: their arrays stay in the fastest cache."""
+"""Number of robots moved side by side: their arrays stay in the L1 cache."""
 CROWD = 4096
-"""From so many pairs of a robot and a body on, the bodies of a world are sorted into cells."""
+"""Least number of pairs of a robot and a body for sorting the bodies of a world into cells."""
 FEWEST_OF_A_CROWD = 8
-"""Robots: for fewer, to sort takes longer than to look at all bodies."""
+"""Least number of robots: for fewer, sorting takes longer than testing all bodies."""
 SCATTERED = 64
-"""From so many bodies in cells on, each robot is scanned among those around it; for fewer, to
-look at all of them takes less than to begin a scan for each robot."""
+"""Least number of bodies in cells for scanning each robot only among those around it; for fewer,
+testing all of them takes less time than a separate scan for each robot."""
 
 
 @dataclass(frozen=True)
 class Worlds:
-    """All that changes in a simulation; the order is that of `kernels.step_worlds`.
+    """All mutable state of a simulation; the order is that of `kernels.step_worlds`.
 
-    What begins with `coefficient`, and `faults`, are parameters of each robot: those of the
-    model unless written to, as domain randomisation does. A reset keeps them.
+    `faults`, `coefficient`, `delay`, `age` and `noise` are parameters of each robot: those of the
+    model unless overwritten, as by domain randomisation. A reset keeps them.
 
     Attributes:
         pose: (N, M, 3) true pose of `base_link` in `map`.
@@ -55,13 +55,13 @@ class Worlds:
         coefficient: (N, M, T) of the kinematic terms, in the order of
             `kinematics.kernels.term_arrays`.
         delay: (N, M) latency of the commands [substeps], at most the simulator's `longest_delay`.
-        age: (N, M) how old scan and odometry are when they are told [substeps], at most the
+        age: (N, M) age of scan and odometry when they are observed [substeps], at most the
             simulator's `longest_age`.
         noise: (N, M, 2 + 3 + S) standard deviation of the odometry, linear [m/s] and angular
             [rad/s]; and, after a second, of the drift along x, y [m], heading [rad], and state.
         velocity: (N, K, 3) of the obstacles in `map`, constant for a period [m/s, m/s, rad/s].
         past: (N, M, R, 12) of the last periods, see `sensing_kernels`.
-        marks: (N, K, F) what moving obstacles remember, see `motion_layout`.
+        marks: (N, K, F) memory of moving obstacles, see `motion_layout`.
     """
 
     pose: Array
@@ -86,14 +86,14 @@ class Worlds:
 
 @dataclass(frozen=True)
 class Sizes:
-    """How large a simulation is.
+    """Dimensions of a simulation.
 
     Attributes:
         worlds: N.
         robots: M in each.
         obstacles: K in each.
         longest_delay: greatest latency of commands [substeps].
-        longest_age: greatest age of what a robot is told [substeps].
+        longest_age: greatest age of an observation [substeps].
     """
 
     worlds: int
@@ -104,23 +104,23 @@ class Sizes:
 
     @property
     def crowded(self) -> bool:
-        """Whether it pays to sort the bodies of a world into cells."""
+        """True if it pays to sort the bodies of a world into cells."""
         pairs = self.robots * (self.robots + self.obstacles)
         return self.robots >= FEWEST_OF_A_CROWD and pairs >= CROWD
 
     @property
     def scattered(self) -> bool:
-        """Whether it pays to scan each robot among the bodies around it only."""
+        """True if it pays to scan each robot among the bodies around it only."""
         return self.crowded and self.robots + self.obstacles >= SCATTERED
 
 
 def allocate(model: SimulatorModel, sizes: Sizes) -> Worlds:
-    """The arrays of worlds before their first reset, with the parameters of the model."""
+    """Allocates the arrays of worlds before their first reset, with the model's parameters."""
     size, width = len(model.robot.state), len(model.robot.command)
     _, substeps, delay = model.timing
     shape, bodies = (sizes.worlds, sizes.robots), sizes.obstacles + sizes.robots
     noise = [*model.noise.odometry, *model.noise.simulated_drift(model.robot)]
-    # Of odd ages, one end of a period more is needed; and the newest.
+    # One row for the newest; an age within a period needs the end of the period before it, too.
     rows = -(-sizes.longest_age // substeps) + 1
     return Worlds(
         pose=np.zeros((*shape, 3)),
@@ -145,7 +145,7 @@ def allocate(model: SimulatorModel, sizes: Sizes) -> Worlds:
 
 
 def split(worlds: int, threads: int) -> tuple[slice, ...]:
-    """Contiguous parts of N worlds, as equal as can be, one for each thread."""
+    """Splits N worlds into contiguous parts of nearly equal size, one per thread."""
     edges = np.arange(min(threads, worlds) + 1) * worlds // min(threads, worlds)
     return tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(edges))
 
@@ -159,11 +159,11 @@ def arguments(
     sizes: Sizes,
     part: slice,
 ) -> tuple[Any, ...]:
-    """What the kernels take for one part: `data`, what never changes, and scratch of its own.
+    """Returns the kernels' arguments for one part: `data`, constants, and its scratch memory.
 
     Returns:
         The fields of `data`; scene: walls, map (distances, frame), outlines, whether the bodies
-        are sorted, whether that serves the scans, and `movers`: whether any obstacle moves, and
+        are sorted, whether scans use the cells, and `movers`: whether any obstacle moves, and
         plans, half size and distances of `motion_kernels`; view: the lidar's arguments, its map,
         whether it scans exactly, mount, limits, time of a sweep; motion, see
         `robot_kernels.move_freely`; and scratch, see `_scratch`.
@@ -187,18 +187,18 @@ def arguments(
 
 
 def _collision_map(grid: GridMap | None) -> tuple[NDArray[np.float32], Array]:
-    """What `collision_kernels` take as `grid`."""
+    """Returns the argument `grid` of `collision_kernels`."""
     if grid is None:
         return np.zeros((0, 0), np.float32), np.zeros(5)
     return np.ascontiguousarray(grid.distance_field), grid.arrays[1]
 
 
 def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int) -> tuple[Any, ...]:
-    """What one thread needs for itself to step so many worlds.
+    """Allocates the scratch memory of one thread for a number of worlds.
 
     Returns:
-        For the robots that move side by side; for one that moves carefully; for the robots of one
-        world; for the cells of a crowded one; for the scans.
+        Scratch for the robots that move side by side; for one that moves carefully; for the robots
+        of one world; for the cells of a crowded world; for the scans.
     """
     kinematics, robots = model.kinematics, sizes.robots
     bodies = sizes.obstacles + robots

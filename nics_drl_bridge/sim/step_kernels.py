@@ -1,11 +1,11 @@
-"""Compiled inner loops of the simulator: motion, and the step of some worlds.
+"""Compiled inner loops of the simulator: motion, and the step of a batch of worlds.
 
-What one robot does is a scalar function; the batched loops call it. Shapes: N worlds, n of them
-in one part, M robots, S state, C command, T kinematic terms, H periods of command history, K
+The motion of one robot is a scalar function, which the batched loops call. Shapes: N worlds, n of
+them in one part, M robots, S state, C command, T kinematic terms, H periods of command history, K
 obstacles, W walls, B beams, L lanes.
 
-A world comes to the same bits in whatever batch, part or thread it is: nothing is summed over
-worlds, and what is drawn at random is drawn by the world's own seed and counter.
+A world is bit-identical in any batch, part or thread: nothing is summed over worlds, and random
+numbers are drawn from the world's own seed and counter.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class PackedType(types.StructRef):  # type: ignore[misc]
 
 
 class Packed(structref.StructRefProxy):  # type: ignore[misc]
-    """All arrays of a part as one argument: to hand over a hundred took longer than a step."""
+    """All arrays of a part as one argument: passing a hundred took longer than a step."""
 
 
 structref.define_proxy(Packed, PackedType, ["content"])
@@ -40,13 +40,13 @@ structref.define_proxy(Packed, PackedType, ["content"])
 
 @kernel(allocates=True)
 def pack(content):  # type: ignore[no-untyped-def]
-    """Makes one argument of nested tuples of arrays."""
+    """Packs nested tuples of arrays into one argument."""
     return Packed(content)
 
 
 @kernel
 def _send(history, commands, begin):  # type: ignore[no-untyped-def]
-    """Puts the commands (n, M, C) of the worlds from `begin` on in front of those sent before."""
+    """Puts the commands (n, M, C) of the worlds from `begin` on at the front of the history."""
     for i in range(commands.shape[0]):
         for m in range(commands.shape[1]):
             for h in range(history.shape[2] - 1, 0, -1):
@@ -58,7 +58,7 @@ def _send(history, commands, begin):  # type: ignore[no-untyped-def]
 
 @kernel
 def _note_ways(cells, before, skip, pose, n):  # type: ignore[no-untyped-def]
-    """Tells the cells how far the robots of world n came, drift included."""
+    """Records in the cells how far the robots of world n moved, drift included."""
     for m in range(pose.shape[1]):
         dx, dy = pose[n, m, 0] - before[skip + m, 0], pose[n, m, 1] - before[skip + m, 1]
         cells[3][crowd.MOVED] = max(cells[3][crowd.MOVED], math.sqrt(dx * dx + dy * dy))
@@ -66,13 +66,13 @@ def _note_ways(cells, before, skip, pose, n):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def step_worlds(packed, commands, begin):  # type: ignore[no-untyped-def]
-    """One control period of the worlds of a part.
+    """Advances the worlds of a part by one control period.
 
     Args:
-        packed: holds the fields of `worlds.Worlds` in order, updated in place, and what
-            `worlds.arguments` says.
+        packed: the fields of `worlds.Worlds` in order, updated in place, and the others that
+            `worlds.arguments` returns.
         commands: (n, M, C).
-        begin: the first world.
+        begin: index of the first world.
     """
     fields, scene, view, motion, room = packed.content
     _step(fields, scene, view, motion, room, commands, begin)
@@ -80,7 +80,7 @@ def step_worlds(packed, commands, begin):  # type: ignore[no-untyped-def]
 
 @kernel
 def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[no-untyped-def]
-    """See `step_worlds`; no counting of references, which took longer than the step."""
+    """See `step_worlds`; without reference counting, which took longer than the step."""
     (
         pose, state, history, bodies, _, _, ranges, collided, steps, seeds, faults, coefficient,
         delay, age, noise, velocity, past, _,
@@ -118,7 +118,7 @@ def _step(fields, scene, view, motion, room, commands, begin):  # type: ignore[n
 
 @kernel(inline=True)
 def _begin_period(low, high, fields, scene, motion, room):  # type: ignore[no-untyped-def]
-    """Sets the velocities of the obstacles of the worlds [low, high), and notes the poses."""
+    """Sets the velocities of the obstacles of the worlds [low, high) and records the poses."""
     pose, bodies, odom, twist = fields[0], fields[3], fields[4], fields[5]
     steps, seeds, velocity, past, marks = fields[8], fields[9], fields[15], fields[16], fields[17]
     walls, movers, (dt, substeps), before = scene[0], scene[5], motion[4], room[4][0]
@@ -137,7 +137,7 @@ def _begin_period(low, high, fields, scene, motion, room):  # type: ignore[no-un
 
 @kernel(inline=True)
 def _measure(n, skip, fields, motion, single, before):  # type: ignore[no-untyped-def]
-    """Puts the bodies of the robots of world n to where they are, and reads their wheels."""
+    """Moves the bodies of the robots of world n to their poses and measures their odometry."""
     (
         pose, state, history, bodies, odom, twist, _, _, steps, seeds, _, coefficient,
         delay, age, noise, velocity, past, _,
@@ -181,7 +181,7 @@ def steer_world(n, velocity, marks, bodies, pose, past, step, walls, movers, see
 def begin(packed, chosen):  # type: ignore[no-untyped-def]
     """Begins episodes in the worlds `chosen` (n,), whose robots and obstacles are in place.
 
-    Their moving obstacles draw what they need, and the robots take their first scans.
+    Draws the speeds and directions of moving obstacles and takes the first scans.
     """
     fields, scene, view, _, room = packed.content
     bodies, seeds, marks = fields[3], fields[9], fields[17]
@@ -194,7 +194,7 @@ def begin(packed, chosen):  # type: ignore[no-untyped-def]
 
 @kernel
 def _look(fields, scene, view, room, chosen):  # type: ignore[no-untyped-def]
-    """Scans as the episodes begin: all stands still, so that no scan is older or skewed."""
+    """Scans as the episodes begin: everything is at rest, so no scan is delayed or skewed."""
     pose, bodies, ranges, steps, seeds, faults, velocity = (
         fields[0], fields[3], fields[6], fields[8], fields[9], fields[10], fields[15],
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What a bag holds: its topics, how many messages they have, how often, and by which clock."""
+"""Contents of a bag: its topics with their message counts, rates and clocks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nics_drl_bridge.recording.stamping import MAX_WANDER_S, SAME_CLOCK_S
 Nanoseconds = NDArray[np.int64]
 
 GAP = 3.0
-"""A silence of so many usual periods is a gap."""
+"""A silence longer than this many usual periods is a gap."""
 NO_HEADER, UNSTAMPED, UNKNOWN = "no header", "never stamped", "unknown type"
 RECORDER, FOREIGN, SEVERAL = "recorder's", "another", "several"
 
@@ -28,15 +28,17 @@ class BagTopic:
     Attributes:
         topic: its name.
         type: of its messages.
-        count: of its messages.
-        rate_hz: the inverse of the usual time between them, by their receipt; None below two.
-        first_s, last_s: receipt of the first and last one, after the start of the bag [s].
-        gaps: silences of more than three usual periods.
-        longest_gap_s: the longest time between two of them [s].
-        clock: of the stamps in their headers: the recorder's, another one, several.
-        delay_s: median of receipt minus stamp [s]; None where there are no stamps.
-        jitter_s: between the 5 % and the 95 % quantile of that [s].
-        backwards: stamps that are before the one before them.
+        count: number of messages.
+        rate_hz: inverse of the median time between receipts [Hz]; None for fewer than two
+            messages.
+        first_s, last_s: receipt of the first and last message, from the start of the bag [s].
+        gaps: number of silences of more than three usual periods.
+        longest_gap_s: longest time between two messages [s].
+        clock: of the header stamps: the recorder's, another one or several; otherwise why there
+            are no stamps.
+        delay_s: median of receipt minus stamp [s]; None without stamps.
+        jitter_s: from the 5 % to the 95 % quantile of that delay [s].
+        backwards: number of stamps earlier than their predecessor.
     """
 
     topic: str
@@ -55,14 +57,14 @@ class BagTopic:
 
 @dataclass(frozen=True)
 class BagInfo:
-    """What a bag holds.
+    """Contents of a bag.
 
     Attributes:
         path: of the bag.
         size_bytes: of all its files.
         start_ns: receipt of the first message, on the recorder's clock [ns].
-        duration_s: until that of the last one [s].
-        messages: how many there are.
+        duration_s: from that to the receipt of the last message [s].
+        messages: number of messages.
         topics: by name.
     """
 
@@ -75,7 +77,7 @@ class BagInfo:
 
 
 def bag_info(path: str | Path) -> BagInfo:
-    """Reads all of a bag, and tells what is in it.
+    """Reads a whole bag and describes its contents.
 
     Raises:
         RecordingError: it is damaged.
@@ -95,7 +97,7 @@ def bag_info(path: str | Path) -> BagInfo:
 
 
 def _received(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]:
-    """Times of receipt [ns], and receipt minus stamp [ns], or why there are no stamps."""
+    """Returns times of receipt [ns], and receipt minus stamp [ns] or why there are no stamps."""
     if not bag.knows(topic):
         return np.array([ns for ns, _ in bag.serialized(topic)], dtype=np.int64), UNKNOWN
     messages = bag.messages(topic)
@@ -112,7 +114,7 @@ def _stamps(messages: list[Message]) -> Nanoseconds | str:
 
 
 def _topic(topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str) -> BagTopic:
-    """Facts of a topic, of times since the bag's start (T,) and delays (T,), both [ns]."""
+    """Describes a topic from receipts since the bag's start (T,) and delays (T,), both [ns]."""
     clock, delay, jitter, backwards = delays if isinstance(delays, str) else "", None, None, 0
     if not isinstance(delays, str):
         low, middle, high = np.percentile(delays * S_PER_NS, (5.0, 50.0, 95.0))
@@ -134,7 +136,7 @@ def _topic(topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str)
 
 
 def clock_of(delay_s: float, jitter_s: float) -> str:
-    """Whose clock stamps are of, that lie so long before their receipt [s], give or take."""
+    """Returns the clock of stamps with the given median delay to receipt and its jitter [s]."""
     if jitter_s > MAX_WANDER_S:
         return SEVERAL
     return RECORDER if SAME_CLOCK_S[0] <= delay_s <= SAME_CLOCK_S[1] else FOREIGN

@@ -1,4 +1,4 @@
-"""Publishes a recorded bag over DDS, with the bag's own time on `/clock`."""
+"""Playback of a recorded bag over DDS, with the bag's own time on `/clock`."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ from nics_drl_bridge.recording.messages import Offer
 
 CLOCK = "/clock"
 CLOCK_PERIOD_NS = 10_000_000
-"""Of `/clock` between messages [ns of the wall]; a message is preceded by its own time as well."""
+"""Period of `/clock` between messages [ns of wall time]; it also precedes all but the first."""
 QUEUE = 100
-"""Of a topic whose publishers' quality of service the bag does not tell."""
+"""Depth for a topic whose publishers' quality of service is not in the bag."""
 NAP_S = 0.05
 PATIENCE_S = 60.0
 DISCOVERY_S = 1.0
-"""Time for subscribers to find the topics before the first message [s];"""
+"""Time for subscribers to discover the topics before the first message [s]."""
 ALONE_S = 5.0
-"""and time for a first one, after which it is played to nobody [s]."""
+"""Longest wait for a first subscriber; after it, the bag is played without one [s]."""
 
 
 @dataclass(frozen=True)
 class PlayOrder:
-    """What to play, and how.
+    """Bag to play, and options.
 
     Attributes:
-        bag: its folder or file.
-        topics: only these; all when empty.
-        rate: seconds of the bag in one of the wall's.
-        loop: begins anew at the end; time on `/clock` then jumps back.
-        clock: whether `/clock` is published; the bag's own is not played then.
-        namespace: put in front of the topics' names, but for `/clock`, `/tf`, `/tf_static`.
+        bag: folder or file of the bag.
+        topics: to play; all if empty.
+        rate: seconds of the bag per second of wall time.
+        loop: whether to start again at the end; time on `/clock` then jumps back.
+        clock: whether `/clock` is published; the bag's own is then not played.
+        namespace: put in front of the topics' names, except `/clock`, `/tf`, `/tf_static`.
         lockstep: a node that must have taken each message before the next one is sent.
         domain_id: DDS domain; the environment's by default.
     """
@@ -64,11 +64,11 @@ class PlayOrder:
 
 
 Timed = tuple[int, int, str, bytes]
-"""Time of receipt [ns], place of the topic among equal times, topic, message."""
+"""Time of receipt [ns], rank of the topic among equal times, topic, message."""
 
 
 class _Player:
-    """Publishes messages one after the other, when they are due."""
+    """Publishes messages one after another, when they are due."""
 
     def __init__(self, node: Node, order: PlayOrder, stopping: threading.Event) -> None:
         self._node, self._order, self._stopping = node, order, stopping
@@ -82,7 +82,7 @@ class _Player:
             self._barrier = node.create_client(GetParameters, service)
 
     def offer(self, topic: str, kind: str, offers: tuple[Offer, ...]) -> bool:
-        """Opens a topic; says whether its type is installed."""
+        """Opens a topic; returns False if its type is not installed."""
         found = message_type(kind)
         if found is None:
             return False
@@ -93,7 +93,7 @@ class _Player:
         return True
 
     def ready(self) -> None:
-        """Waits for the node to keep in step with, or a while for whoever listens."""
+        """Waits for the node in lock-step, or a while for subscribers."""
         began = time.monotonic()
         until = began + PATIENCE_S
         self._stopping.wait(DISCOVERY_S)
@@ -113,23 +113,23 @@ class _Player:
             self._stopping.wait(NAP_S)
 
     def _heard(self) -> bool:
-        """Whether anybody listens to any of the topics."""
+        """True if any of the topics has a subscriber."""
         return any(each.get_subscription_count() for each in self._publishers.values())
 
     def _matched(self) -> bool:
-        """Whether all subscribers that are known of have found the topics."""
+        """True if all known subscribers have found the topics."""
         return all(
             each.get_subscription_count() >= self._node.count_subscribers(each.topic_name)
             for each in self._publishers.values()
         )
 
     def finish(self) -> None:
-        """Waits until what was sent has arrived: it is lost when the publisher goes before."""
+        """Waits for delivery: messages are lost if their publisher goes before."""
         for each in self._publishers.values():
             each.wait_for_all_acked(Duration(seconds=DELIVERY_S))
 
     def play(self, messages: list[Timed]) -> int:
-        """Publishes all messages; returns how many, fewer when it is stopped."""
+        """Publishes all messages; returns their number, fewer if it is stopped."""
         first, began, sent = messages[0][0], time.monotonic_ns(), 0
         now = first
         for due, _, topic, data in messages:
@@ -152,7 +152,7 @@ class _Player:
             self._clock.publish(Clock(clock=conversions.stamp_to_ros(now_ns)))
 
     def _wait_for_peer(self) -> None:
-        """Until the peer has answered: a node takes messages before requests that came later."""
+        """Waits for the peer's answer: a node takes messages before requests that arrive later."""
         if self._barrier is None:
             return
         future = self._barrier.call_async(GetParameters.Request(names=["use_sim_time"]))
@@ -167,18 +167,18 @@ class _Player:
 def play_bag(order: PlayOrder, say: Callable[[str], None]) -> int:
     """Publishes a bag until its end, SIGINT or SIGTERM.
 
-    The messages go out as they were recorded, with the quality of service that their publishers
-    offered. `/clock` holds the times of receipt, as with `ros2 bag play --clock`.
+    The messages are published as recorded, with the quality of service that their publishers
+    offered. `/clock` gives the times of receipt, as with `ros2 bag play --clock`.
 
     Args:
         order: what to play.
-        say: is told about topics that are left out.
+        say: called with a sentence about each topic that is left out.
 
     Returns:
-        How many messages were published.
+        The number of published messages.
 
     Raises:
-        RecordingError: the bag is damaged, has no such topic, or no type of it is installed.
+        RecordingError: the bag is damaged, lacks a topic, or none of its types is installed.
         BackendError: the peer in lock-step does not answer.
     """
     stopping = threading.Event()
@@ -222,7 +222,7 @@ def _wanted(bag: BagFile, order: PlayOrder) -> list[str]:
 
 
 def _in_order(messages: Mapping[str, list[tuple[int, bytes]]]) -> Iterator[Timed]:
-    """All messages in the order of receipt, and of equal times in that of the topics' names."""
+    """Returns all messages in the order of receipt, at equal times in that of their topics."""
     each = [
         [(ns, place, topic, data) for ns, data in sorted(some, key=lambda one: one[0])]
         for place, (topic, some) in enumerate(sorted(messages.items()))
@@ -231,7 +231,7 @@ def _in_order(messages: Mapping[str, list[tuple[int, bytes]]]) -> Iterator[Timed
 
 
 def _quality(offers: tuple[Offer, ...]) -> QoSProfile:
-    """The best that the publishers offered: whoever heard one of them hears the bag."""
+    """Returns the best that the publishers offered, to match any subscriber of one of them."""
     reliable = not offers or any(offer.reliable for offer in offers)
     kept = any(offer.transient_local for offer in offers)
     return QoSProfile(

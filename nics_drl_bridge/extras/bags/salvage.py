@@ -1,8 +1,8 @@
-"""Saves what is intact of a damaged bag, and says how much is lost.
+"""Recovery of the intact messages of a damaged bag, with a count of the lost ones.
 
-Takes what is intact out of a damaged MCAP file.
+Recovery of the intact messages of a damaged MCAP file.
 
-Takes what is intact out of a damaged SQLite file of a bag.
+Recovery of the intact rows of a damaged SQLite file of a bag.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ from nics_drl_bridge.recording.messages import typestore
 from nics_drl_bridge.recording.write import Storage, bag_sink
 
 ZSTD = b"\x28\xb5\x2f\xfd"
-"""What a message begins with that was compressed on its own; one of ROS begins with 0."""
+"""First bytes of an individually compressed message; a plain ROS message begins with 0."""
 LATEST_NS = 1 << 62
 
 
 @dataclass(frozen=True)
 class Salvage:
-    """What was saved of a bag.
+    """Result of a salvage.
 
     Attributes:
-        kept: messages by topic.
-        promised: how many there were, by topic; None where nothing tells.
-        span_s: from the first message kept to the last one [s].
+        kept: number of saved messages by topic.
+        promised: original number of messages by topic; None if unknown.
+        span_s: from the first saved message to the last one [s].
     """
 
     kept: Mapping[str, int]
@@ -65,13 +65,13 @@ class Salvage:
 
     @property
     def lost(self) -> int | None:
-        """How many messages are lost; None where nothing tells."""
+        """Number of lost messages; None if unknown."""
         if self.promised is None:
             return None
         return sum(max(n - self.kept.get(topic, 0), 0) for topic, n in self.promised.items())
 
     def lines(self) -> tuple[str, ...]:
-        """One line for all, and one for each topic."""
+        """Returns one line for the whole bag and one per topic."""
         kept = sum(self.kept.values())
         if self.promised is None:
             head = f"{kept} messages are kept; how many there were, nothing in the bag tells"
@@ -90,7 +90,7 @@ class Salvage:
 
 @dataclass
 class _Found:
-    """What the files of a bag still hold."""
+    """Remaining contents of a bag's files."""
 
     kinds: dict[str, str] = field(default_factory=dict)
     definitions: dict[str, str] = field(default_factory=dict)
@@ -100,19 +100,19 @@ class _Found:
 
 
 def salvage(path: str | Path, out: str | Path, storage: Storage = "mcap") -> Salvage:
-    """Writes what is intact of a bag as a bag of its own.
+    """Writes the intact messages of a bag to a new bag.
 
-    Of an MCAP file these are all chunks whose checksum is right, or, where there are none, all
-    messages before the damage of each chunk; of an SQLite file all rows that can be read. What
-    can't be decoded is left out. It also takes the hidden folder that a killed recorder leaves.
+    From an MCAP file these are all chunks with a correct checksum, or, in chunks without one, all
+    messages before the damage; from an SQLite file all readable rows. Messages that can't be
+    decoded are dropped. The hidden folder that a killed recorder leaves is accepted too.
 
     Args:
         path: folder or file of the damaged bag.
-        out: folder to make.
+        out: folder to create.
         storage: format of the new bag.
 
     Raises:
-        RecordingError: nothing is left, or `out` is there already.
+        RecordingError: nothing is intact, or `out` exists already.
     """
     path, found = Path(path), _Found()
     for file in _files(path):
@@ -132,7 +132,7 @@ def salvage(path: str | Path, out: str | Path, storage: Storage = "mcap") -> Sal
 
 @contextmanager
 def salvaged(path: Path, wanted: bool) -> Iterator[tuple[Path, tuple[str, ...]]]:
-    """Gives the bag itself; or, if that is wanted, what is intact of it and what is to be said."""
+    """Yields the bag itself; or, if wanted, its intact part and the lines to report."""
     if not wanted:
         yield path, ()
         return
@@ -141,12 +141,12 @@ def salvaged(path: Path, wanted: bool) -> Iterator[tuple[Path, tuple[str, ...]]]
         lines = salvage(path, out).lines()
         try:
             yield out, lines
-        except RecordingError as error:  # it names the copy, of which the user knows nothing
+        except RecordingError as error:  # it names the copy, which the user does not know
             raise RecordingError(str(error).replace(str(out), str(path))) from None
 
 
 def _files(path: Path) -> list[Path]:
-    """The files of a bag; a folder that a killed recorder left holds them one deeper."""
+    """Returns the files of a bag; in the folder of a killed recorder they are one level deeper."""
     if not path.exists():
         raise RecordingError(f"{path}: no such bag; check the path.")
     files = [path] if path.is_file() else sorted(path.rglob("*"), key=_number)
@@ -160,7 +160,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _number(file: Path) -> tuple[int, str]:
-    """Orders `drive_10` after `drive_9`."""
+    """Returns a sort key that orders `drive_10` after `drive_9`."""
     digits = file.stem.rpartition("_")[2]
     return int(digits) if digits.isdecimal() else -1, str(file)
 
@@ -187,7 +187,7 @@ def _read(file: Path, found: _Found) -> None:
 
 
 def _decodable(found: _Found) -> Iterator[tuple[str, int, bytes]]:
-    """Messages of known topics, unpacked, without those that can't be decoded."""
+    """Yields the decodable messages of known topics, decompressed."""
     store = typestore()
     for topic, ns, data in found.messages:
         kind = found.kinds.get(topic)
@@ -197,7 +197,7 @@ def _decodable(found: _Found) -> Iterator[tuple[str, int, bytes]]:
             plain = _unpacked(data)
             if kind in store.fielddefs:
                 store.deserialize_cdr(plain, kind)
-        except Exception:  # noqa: BLE001, S112 - damaged bytes break the decoder in any way
+        except Exception:  # noqa: BLE001, S112 - the decoder can raise anything on damaged bytes
             continue
         yield topic, ns, plain
 
@@ -209,7 +209,7 @@ def _unpacked(data: bytes) -> bytes:
 
 
 def _promised(path: Path) -> dict[str, int] | None:
-    """How many messages of each topic there were by the bag's metadata, if they can be read."""
+    """Returns the messages per topic by the bag's metadata; None if it can't be read."""
     file = (path if path.is_dir() else path.parent) / METADATA
     try:
         data: Any = parse_yaml(read_text(file), str(file))
@@ -223,12 +223,12 @@ CHUNK_OP = bytes([CHUNK])
 
 
 class Intact(NamedTuple):
-    """What was found in a file.
+    """Intact contents of a file.
 
     Attributes:
         told: its schemas and channels.
-        messages: those that are intact.
-        promised: messages of each channel, by the file's own statistics; empty where it has none.
+        messages: the intact messages.
+        promised: messages per channel, by the file's statistics; empty if it has none.
     """
 
     told: Told
@@ -237,10 +237,10 @@ class Intact(NamedTuple):
 
 
 def intact(path: Path) -> Intact:
-    """All messages that are intact.
+    """Returns all intact messages.
 
-    A chunk with a checksum counts as a whole; of one without, what comes before the damage. Behind
-    a damage the file is searched for the next chunk.
+    A chunk with a checksum is kept as a whole or not at all; a chunk without one is kept up to its
+    damage. After damage the file is searched for the next chunk.
     """
     if path.stat().st_size <= len(MAGIC):
         return Intact(Told(), [], {})
@@ -260,20 +260,20 @@ def intact(path: Path) -> Intact:
             waiting += _cut_chunk(data, place)
             place = _next_chunk(data, place + 1, len(data))
             continue
-        # The length of a record that is no chunk may be the damage: it must not swallow one.
+        # The length of a record other than a chunk may be damaged: it must not swallow a chunk.
         swallowed = None if record.op == CHUNK else _next_chunk(data, place + 1, record.end)
         place = record.end if swallowed is None else swallowed
     return Intact(told, _messages(told, waiting), promised)
 
 
 def _inside(record: Record) -> list[Record]:
-    """The records of a chunk until its first damage."""
+    """Returns the records of a chunk before its first damage."""
     chunk = chunk_of(record)
     return _until_damage(inner_records(record), chunk.start_ns, chunk.end_ns)
 
 
 def _cut_chunk(data: memoryview, place: int) -> list[Record]:
-    """The records of a chunk that the end of the file cuts off, or whose length is wrong."""
+    """Returns the records of a plain chunk that is cut off or whose length is wrong."""
     start = place + PREFIX + 40
     if data[place] != CHUNK or start >= len(data):
         return []
@@ -287,7 +287,7 @@ def _cut_chunk(data: memoryview, place: int) -> list[Record]:
 
 
 def _until_damage(inner: Iterator[Record], first_ns: int, last_ns: int) -> list[Record]:
-    """Records in front of the first damage; messages only of the time that their chunk names."""
+    """Returns records before the first damage; messages only within the chunk's time span."""
     found: list[Record] = []
     while True:
         try:
@@ -304,7 +304,7 @@ def _until_damage(inner: Iterator[Record], first_ns: int, last_ns: int) -> list[
 
 
 def _messages(told: Told, waiting: list[Record]) -> list[Message]:
-    """Messages, once all channels are known: that of the first may stand at the end alone."""
+    """Returns messages, after reading all channels: some may be in the summary only."""
     messages = []
     for record in sorted(waiting, key=lambda each: each.op == MESSAGE):
         try:
@@ -322,7 +322,7 @@ def _promised_by_footer(record: Record) -> dict[int, int]:
 
 
 def _next_chunk(data: memoryview, start: int, end: int) -> int | None:
-    """Where the next thing stands that is a chunk by all its lengths; None if there is none."""
+    """Returns the offset of the next record with the consistent lengths of a chunk, or None."""
     file = data.obj
     if not isinstance(file, mmap):
         return None
@@ -350,17 +350,17 @@ def _looks_like_chunk(data: memoryview, place: int) -> bool:
 
 BATCH = 500
 SMALLEST_ROW = 16
-"""No message takes less room than this [bytes]: it bounds how many there can be."""
+"""Minimum size of a message [bytes], which bounds their number."""
 SMALLEST_PAGE = 512
 BESIDE = ("-wal", "-journal")
-"""Files beside a database that was not closed, which SQLite needs to put it in order."""
+"""Suffixes of the files next to an unclosed database, which SQLite needs to recover it."""
 
 Row = tuple[int, int, bytes]
 """Topic id, time of receipt [ns], message."""
 
 
 def intact_rows(path: Path) -> tuple[dict[int, tuple[str, str]], dict[str, str], list[Row]]:
-    """All rows that can be read.
+    """Reads all readable rows.
 
     Returns:
         Name and type of each topic by its id, definition of each type, and the messages.
@@ -374,7 +374,7 @@ def intact_rows(path: Path) -> tuple[dict[int, tuple[str, str]], dict[str, str],
                 shutil.copyfile(f"{path}{ending}", f"{copy}{ending}")
         with closing(sqlite3.connect(copy)) as base:
             base.text_factory = lambda raw: raw.decode("utf-8", "replace")
-            # With this, SQLite opens a file that is shorter than it should be.
+            # With this, SQLite opens a truncated file.
             base.execute("PRAGMA writable_schema = ON")
             try:
                 found = base.execute("SELECT id, name, type FROM topics").fetchall()
@@ -385,7 +385,7 @@ def intact_rows(path: Path) -> tuple[dict[int, tuple[str, str]], dict[str, str],
 
 
 def _drop_cut_page(copy: Path) -> None:
-    """Leaves whole pages only: SQLite fills one that is cut off with zeros, without a word."""
+    """Removes a truncated last page, which SQLite would silently fill with zeros."""
     with copy.open("r+b") as file:
         size = int.from_bytes(file.read(18)[16:], "big")
         size = 65536 if size == 1 else size
@@ -401,7 +401,7 @@ def _definitions(base: sqlite3.Connection) -> dict[str, str]:
 
 
 def _rows(base: sqlite3.Connection, bound: int) -> list[Row]:
-    """Messages in batches; one by one where a batch can't be read."""
+    """Reads messages in batches, or one by one if a batch can't be read."""
     ask = "SELECT id, topic_id, timestamp, data FROM messages WHERE id BETWEEN ? AND ?"
     rows: list[Row] = []
     with suppress(sqlite3.Error):

@@ -1,12 +1,12 @@
-"""What the three machines have in common: mass, friction, motors, and their MJCF.
+"""Common parts of the three machines: mass, friction, motors, and their MJCF.
 
 MuJoCo solves the contact of each wheel with the floor; nothing ties the robot to its textbook
 kinematics. Tyres are ellipsoids: a round tread touches a plane in one point, which neither jumps
 from edge to edge, as a cylinder's contact does, nor scrubs when the robot turns. Contacts have no
-friction against spinning, and nothing is dragged over the floor: in MuJoCo's elliptic cones a
-contact that slides for long pushes itself off the floor and chatters.
+torsional friction, and nothing is dragged over the floor: with MuJoCo's elliptic cones a contact
+that slides for long pushes itself off the floor and chatters.
 
-The one place that imports MuJoCo.
+The only module that imports MuJoCo.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from nics_drl_bridge.errors import ConfigError
 Array = NDArray[np.float64]
 
 TORQUE_RESERVE = 1.5
-"""Torque limit of a motor, as a multiple of what the greatest acceleration of all takes."""
+"""Torque limit of a motor, as a multiple of the torque for the maximum acceleration."""
 
 SERVO_LAG_S = 0.005
-"""Of a motor behind its set point."""
+"""Lag of a motor behind its set point."""
 
 
 @dataclass(frozen=True)
 class Physics:
-    """What a RobotSpec does not say about a machine; the mass is that of a small robot.
+    """Parameters of a machine that a RobotSpec does not have; the mass is that of a small robot.
 
     Attributes:
         timestep: of MuJoCo [s].
         mass: of the chassis with its load, without wheels [kg].
         wheel_mass: of a wheel [kg].
         friction: between tyre and floor.
-        acceleration: of the robot after the greatest step of a command [m/s^2].
-        softness: time in which a tyre pressed into the floor springs back [s].
+        acceleration: of the robot after the maximum step of a command [m/s^2].
+        softness: time constant with which a tyre pressed into the floor springs back [s].
         bearing: viscous friction of wheels that are not driven, and of rollers [N m s/rad].
-        rollers: per mecanum wheel.
+        rollers: number of rollers per mecanum wheel.
     """
 
     timestep: float = 0.001
@@ -56,14 +56,14 @@ class Physics:
 
 @dataclass(frozen=True)
 class Machine:
-    """A robot as MuJoCo takes it. Symbols: S state, U actuators, J joints.
+    """A robot in MuJoCo's form. Symbols: S state, U actuators, J joints.
 
     Attributes:
         xml: the MJCF model; its body `base_link` has the only free joint.
         height: of `base_link` above the floor when the robot stands [m].
-        joints: J names of the joints that have encoders.
-        controls: the actuators' inputs (U,) for a wanted state (S,).
-        state: the state (S,) of the joints' positions (J,) [rad] and speeds (J,) [rad/s].
+        joints: J names of the joints with encoders.
+        controls: maps a wanted state (S,) to the actuators' inputs (U,).
+        state: maps positions (J,) [rad] and speeds (J,) [rad/s] of the joints to the state (S,).
     """
 
     xml: str
@@ -77,8 +77,8 @@ class Machine:
 class Motor:
     """A motor under a velocity servo: torque = gain x (wanted - actual speed), up to a limit.
 
-    The wanted speed follows the command by a first-order lag, as the set point of a motor
-    controller does, so that the servo is stiff and the speed holds under load.
+    The wanted speed follows the command with a first-order lag, like the set point of a motor
+    controller, so that the servo is stiff and keeps its speed under load.
 
     Attributes:
         gain: [N m s/rad].
@@ -99,16 +99,16 @@ class Motor:
 
 
 def motor(inertia: float, lag: float, radius: float, step: float, physics: Physics) -> Motor:
-    """The motor with which a wheel follows its target by a lag, as far as friction allows.
+    """Motor that makes a wheel follow its target with a lag, within the limits of friction.
 
-    Wheels that spin or lock steer no robot. So the lag is longer than asked for where the
-    greatest step of the command would accelerate the robot by more than `physics.acceleration`.
+    Spinning or locked wheels do not steer, so the lag is longer than requested if the maximum step
+    of the command would accelerate the robot by more than `physics.acceleration`.
 
     Args:
-        inertia: that the motor feels at its shaft, the moving robot's share included [kg m^2].
+        inertia: at the motor's shaft, including the share of the moving robot [kg m^2].
         lag: time constant [s].
         radius: of the wheel [m].
-        step: the greatest step of the commanded speed [m/s].
+        step: maximum step of the commanded speed [m/s].
         physics: of the machine.
     """
     lag = max(lag, step / physics.acceleration)
@@ -117,13 +117,13 @@ def motor(inertia: float, lag: float, radius: float, step: float, physics: Physi
 
 
 def document(name: str, physics: Physics, height: float, robot: str, actuators: str) -> str:
-    """The MJCF of a robot on an endless floor.
+    """Builds the MJCF of a robot on an infinite floor.
 
     Args:
         name: of the model.
         physics: gives step and friction.
         height: of `base_link` above the floor [m].
-        robot: MJCF of what is in the body `base_link`.
+        robot: MJCF of the contents of the body `base_link`.
         actuators: MJCF from `</worldbody>` on.
     """
     return f"""
@@ -149,7 +149,7 @@ def document(name: str, physics: Physics, height: float, robot: str, actuators: 
 
 
 def chassis(mass: float, centre: tuple[float, float, float], size: tuple[float, ...]) -> str:
-    """A box: mass [kg], centre in `base_link` [m], full size [m]."""
+    """MJCF of a box: mass [kg], centre in `base_link` [m], full size [m]."""
     half = " ".join(f"{0.5 * s:.6g}" for s in size)
     x, y, z = centre
     return f"""
@@ -157,7 +157,7 @@ def chassis(mass: float, centre: tuple[float, float, float], size: tuple[float, 
 
 
 def wheel(name: str, radius: float, width: float, physics: Physics, damping: float = 0.0) -> str:
-    """The inside of a wheel's body: a hinge about y, a hub with the mass, a round tread."""
+    """MJCF inside a wheel's body: a hinge about y, a hub with the mass, a round tread."""
     return f"""
         <joint name="{name}" axis="0 1 0" damping="{damping}"/>
         <geom type="cylinder" mass="{physics.wheel_mass}" size="{radius:.6g} {0.5 * width:.6g}"
@@ -167,7 +167,7 @@ def wheel(name: str, radius: float, width: float, physics: Physics, damping: flo
 
 
 def load_mujoco() -> Any:
-    """The module `mujoco`.
+    """Returns the module `mujoco`.
 
     Raises:
         ConfigError: it is not installed.

@@ -1,4 +1,4 @@
-"""The machines of the three robots, made from the parameters of their RobotSpec.
+"""The machines of the three robots, built from the parameters of their RobotSpec.
 
 A mecanum wheel with real rollers, as MJCF.
 """
@@ -22,14 +22,14 @@ Parameters = dict[str, float]
 STEERING_STIFFNESS = 1.0
 """Torque of a steering servo per error [N m/rad]."""
 STEERING_TORQUE = 1.0
-"""Its limit [N m], that of a small hobby servo."""
+"""Torque limit of a steering servo [N m], that of a small hobby servo."""
 
 
 def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
-    """The machine of a robot.
+    """Builds the machine of a robot.
 
-    Beside those of the textbook, the parameters `wheel_radius` and `track` of an Ackermann
-    robot are used when the spec has them.
+    In addition to those of the textbook kinematics, the parameters `wheel_radius` and `track` of an
+    Ackermann robot are used if the spec has them.
 
     Raises:
         ConfigError: the spec names no textbook kinematics, or lacks a parameter.
@@ -45,12 +45,12 @@ def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
 
 
 def greatest_step(spec: RobotSpec) -> float:
-    """The greatest change of a speed that commands within their limits can ask for [m/s]."""
+    """Maximum step of a speed that commands within their limits can request [m/s]."""
     return max(c.max - c.min for c in spec.command if c.cmd_vel != "angular.z")
 
 
 def ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
-    """A car: rear axle with an open differential, front wheels steered by two servos.
+    """Builds a car: rear axle with an open differential, front wheels steered by two servos.
 
     `base_link` is the centre of the rear axle. One motor turns both rear wheels through a
     tendon that averages their speeds, which shares its torque as a differential does.
@@ -84,11 +84,11 @@ def ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
 
 
 def ackermann_angles(steering: float, half_ratio: float) -> tuple[float, float]:
-    """Angles of the left and the right front wheel, both at right angles to the turning centre.
+    """Steering angles of the left and right front wheels about a common turning centre.
 
     Args:
-        steering: of a wheel in the middle [rad].
-        half_ratio: half the track by the wheelbase.
+        steering: angle of a virtual wheel in the middle [rad].
+        half_ratio: half the track divided by the wheelbase.
     """
     t = np.tan(steering)
     return float(np.arctan(t / (1.0 - half_ratio * t))), float(
@@ -133,7 +133,7 @@ def _car_actuators(engine: Motor) -> str:
 
 
 def differential(p: Parameters, step: float, physics: Physics) -> Machine:
-    """Two driven wheels and a ball caster behind them; `base_link` is the axle's centre."""
+    """Builds a robot of two driven wheels and a ball caster; `base_link` is the axle's centre."""
     radius, track = p["wheel_radius"], p["track"]
     behind, ball = -0.5 * track, 0.4 * radius
     total = physics.mass + 2 * physics.wheel_mass
@@ -163,11 +163,11 @@ def differential(p: Parameters, step: float, physics: Physics) -> Machine:
 
 
 def mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
-    """Four wheels with real rollers, which carry the robot one after the other.
+    """Builds a robot of four wheels with real rollers, which carry it in turn.
 
     Friction that differs by direction would be simpler, but MuJoCo aligns it with the world or
     with a geom, not with the roller at the bottom of a turning wheel; free rollers are robust,
-    and show the small shaking of real ones.
+    and reproduce the slight vibration of real ones.
     """
     radius = p["wheel_radius"]
     total = physics.mass + 4 * physics.wheel_mass
@@ -206,16 +206,16 @@ _BUILDERS: dict[str, Callable[[Parameters, float, Physics], Machine]] = {
 
 
 THICKNESS = 0.25
-"""Radius of a roller at its middle, per radius of the wheel."""
+"""Radius of a roller at its middle, relative to the radius of the wheel."""
 ROLLER_MASS = 0.005
 
 
 def roller_size(radius: float, rollers: int) -> tuple[float, float]:
-    """Semi-axes [m] of the ellipsoids whose outline is nearest to a circle.
+    """Semi-axes [m] of ellipsoidal rollers whose outline best approximates a circle.
 
     Seen from the side, an ellipsoid at angle q from the bottom reaches
-    `(R - a) cos q + sqrt(a^2 + (b^2 - a^2) sin^2 q / 2)` below the axle. It is as long (b) as
-    makes this R at q = 0 and where the next roller takes over, at half the angle between two.
+    `(R - a) cos q + sqrt(a^2 + (b^2 - a^2) sin^2 q / 2)` below the axle. Its length b makes this R
+    at q = 0 and where the next roller takes over, at half the angle between two.
 
     Args:
         radius: R, of the wheel [m].
@@ -233,13 +233,13 @@ def roller_size(radius: float, rollers: int) -> tuple[float, float]:
 def roller_wheel(
     name: str, place: tuple[float, float], lean: int, radius: float, physics: Physics
 ) -> str:
-    """The body of a wheel: a driven hub, and free rollers at 45 degrees to its axle.
+    """MJCF of a wheel's body: a driven hub, and free rollers at 45 degrees to its axle.
 
     Args:
         name: of the wheel's joint.
         place: (x, y) of the wheel in `base_link` [m].
-        lean: +1 where the axle of the roller on the floor points forward and left, -1 where it
-            points forward and right.
+        lean: +1 if the axle of the roller on the floor points forward and left, -1 if it points
+            forward and right.
         radius: of the wheel [m].
         physics: gives masses and bearings.
     """

@@ -20,7 +20,7 @@ from nics_drl_bridge.sim.world import World
 
 
 def mujoco_simulator(node: Node, model: SimulatorModel, world: World, robots: int) -> Simulator:
-    """Robots in MuJoCo, with the lidar and on the floor that the parameters name."""
+    """Makes robots in MuJoCo, with the lidar and the floor that the parameters name."""
     declare(node, "renderer", "exact", "Lidar: baked or exact.", read_only=True)
     floor = "Friction between tyres and floor; ice has 0.1."
     friction = declare(node, "friction", 1.0, floor, low=0.01, high=2.0, read_only=True)
@@ -29,7 +29,7 @@ def mujoco_simulator(node: Node, model: SimulatorModel, world: World, robots: in
 
 
 def mujoco_node(context: Context) -> DeviceNode:
-    """The node `mujoco_node`; see `DeviceNode`."""
+    """Makes the node `mujoco_node`; see `DeviceNode`."""
     return DeviceNode("mujoco_node", context, mujoco_simulator)
 
 

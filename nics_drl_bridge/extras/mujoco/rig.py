@@ -1,6 +1,6 @@
-"""Rig: one machine among all that MuJoCo moves.
+"""Rig: one machine within a MuJoCo model.
 
-MujocoRobot: one robot on an endless floor, moved by its motors and by contact alone.
+MujocoRobot: one robot on an infinite floor, moved only by its motors and by contact.
 
 Records a drive of a robot in MuJoCo.
 """
@@ -28,7 +28,7 @@ LARGEST_TILT_RAD = 0.5
 
 @dataclass(frozen=True)
 class Reading:
-    """What is known of a robot at one time.
+    """State of a robot at one time.
 
     Attributes:
         time: since the reset [s].
@@ -44,14 +44,14 @@ class Reading:
 
 
 class Rig:
-    """Where a machine stands in the arrays of a MuJoCo model.
+    """Access to one machine in the arrays of a MuJoCo model.
 
     Args:
         spec: the robot.
         machine: its masses, motors and wheels.
-        model: of MuJoCo, holds the machine.
+        model: the MuJoCo model that contains the machine.
         prefix: of the names of the machine's parts in it.
-        number: how many machines of this kind stand before it.
+        number: number of machines of this kind before it.
     """
 
     def __init__(
@@ -68,11 +68,11 @@ class Rig:
         self._controls = slice(number * count, (number + 1) * count)
 
     def put(self, data: Any, rest: Array, pose: ArrayLike) -> None:
-        """Sets the robot down, at rest.
+        """Places the robot, at rest.
 
         Args:
-            data: of MuJoCo.
-            rest: (nq,) positions of one machine of this kind alone that stands on the floor.
+            data: MuJoCo's MjData.
+            rest: (nq,) positions of a single machine of this kind at rest on the floor.
             pose: (3,) of `base_link`.
         """
         x, y, heading = np.asarray(pose, dtype=np.float64)
@@ -85,7 +85,7 @@ class Rig:
         """Gives the motors a command (C,), clipped to its limits.
 
         Raises:
-            BackendError: it holds NaN, or has another size.
+            BackendError: the command contains NaN, or has a wrong size.
         """
         command = np.asarray(command, dtype=np.float64)
         if command.shape != (len(self.spec.command),) or not np.isfinite(command).all():
@@ -97,7 +97,7 @@ class Rig:
         data.ctrl[self._controls] = self.machine.controls(wanted)
 
     def read(self, data: Any) -> Reading:
-        """The reading now."""
+        """Returns the current reading."""
         place, velocity = data.qpos[self._place :], data.qvel[self._drift :]
         heading = _heading(place[3:7])
         ahead, aside = geometry.rotate(velocity[:2], -heading)
@@ -113,16 +113,16 @@ class Rig:
         return np.array(data.qpos[self._positions])
 
     def mean_state(self, before: Array, after: Array, duration: float) -> Array:
-        """The mean state (S,) between two readings of the encoders (J,), `duration` [s] apart."""
+        """Mean state (S,) between two encoder readings (J,), `duration` [s] apart."""
         return self.machine.state(0.5 * (before + after), (after - before) / duration)
 
     def upright(self, data: Any) -> bool:
-        """Whether the robot still stands on its wheels."""
+        """True while the robot stands on its wheels."""
         x, y = data.qpos[self._place + 4 : self._place + 6]
         return bool(1.0 - 2.0 * (x * x + y * y) > np.cos(LARGEST_TILT_RAD))
 
     def require_upright(self, data: Any) -> None:
-        """Raises BackendError when the robot has fallen over."""
+        """Raises BackendError if the robot has fallen over."""
         if not self.upright(data):
             raise BackendError(
                 f"robot {self.spec.name!r} has fallen over at {data.time:.2f} s; lower the "
@@ -144,16 +144,16 @@ class MujocoRobot:
 
     Attributes:
         spec: the robot.
-        machine: its masses, motors and wheels, as MuJoCo takes them.
+        machine: its masses, motors and wheels in MuJoCo's form.
         timestep: of MuJoCo [s].
-        rest: (nq,) positions in MuJoCo when it stands at the origin.
+        rest: (nq,) positions in MuJoCo at rest at the origin.
     """
 
     def __init__(self, spec: RobotSpec, physics: Physics | None = None) -> None:
         """Builds the robot and sets it on the floor.
 
         Raises:
-            ConfigError: MuJoCo is not installed, or the spec lacks what the machine needs.
+            ConfigError: MuJoCo is not installed, or the spec lacks a parameter of the machine.
         """
         self._mujoco = load_mujoco()
         self.spec = spec
@@ -167,7 +167,7 @@ class MujocoRobot:
         self.reset(np.zeros(3))
 
     def reset(self, pose: ArrayLike) -> Reading:
-        """Sets the robot down at a pose (3,), at rest; it has settled when the clock starts."""
+        """Places the robot at a pose (3,), at rest and settled, and restarts the clock."""
         self._mujoco.mj_resetData(self._model, self._data)
         self._rig.put(self._data, self.rest, pose)
         self._mujoco.mj_forward(self._model, self._data)
@@ -184,7 +184,7 @@ class MujocoRobot:
             The reading at the end.
 
         Raises:
-            BackendError: the robot has fallen over, or the command holds NaN.
+            BackendError: the robot has fallen over, or the command contains NaN.
         """
         self._rig.command(self._data, command)
         self._advance(duration)
@@ -192,7 +192,7 @@ class MujocoRobot:
         return self.read()
 
     def read(self) -> Reading:
-        """The reading now."""
+        """Returns the current reading."""
         return self._rig.read(self._data)
 
     def _advance(self, duration: float) -> None:
@@ -207,14 +207,14 @@ def record(
     dt: float = 0.01,
     hold: float = 0.5,
 ) -> Recording:
-    """Drives at random and records, as `textbook.record` does with the textbook's robot.
+    """Drives at random and records, as `textbook.record` does with the textbook kinematics.
 
     Args:
-        robot: is reset to the origin first.
-        rng: draws the commands, uniform within their limits, anew every `hold` seconds.
+        robot: the robot, which is reset to the origin first.
+        rng: draws new commands, uniform within their limits, every `hold` seconds.
         duration: of the drive [s].
         dt: sample period, a whole number of the robot's time steps [s].
-        hold: how long a command is held [s].
+        hold: duration of a command [s].
 
     Returns:
         Command, pose and state on one clock.

@@ -1,9 +1,9 @@
 """A scene in MuJoCo: robots with their bumpers, walls, map and obstacles.
 
-A bumper is the footprint of the RobotSpec, at the height of the axles; it touches walls, obstacles
-and the bumpers of others. Wheels touch the floor only.
+A bumper is the footprint of the RobotSpec, at the height of the axles; it collides with walls,
+obstacles and the bumpers of other robots. Wheels touch only the floor.
 
-Convex parts of outlines and rectangles of maps: MuJoCo's bodies are convex.
+Convex parts of outlines and rectangles of maps, because MuJoCo's bodies are convex.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ from nics_drl_bridge.lidar.shapes import (
 Array = NDArray[np.float64]
 
 HEIGHT = 0.5
-"""Of walls and obstacles [m]."""
+"""Height of walls and obstacles [m]."""
 THICKNESS = 0.002
-"""Of walls, which have none for the lidar [m]."""
+"""Thickness of walls, which have none for the lidar [m]."""
 BUMPER = 4
-"""The bit of MuJoCo's `contype` and `conaffinity` for what bumpers touch."""
+"""Bit of MuJoCo's `contype` and `conaffinity` for contacts of bumpers."""
 BUMPER_FRICTION = 0.3
 
 
 @dataclass(frozen=True)
 class Scenery:
-    """What stands in a world for one episode.
+    """Walls, map and obstacles of a world in one episode.
 
     Attributes:
         walls: (W, 4) x1, y1, x2, y2 [m].
         grid: a static map, if any.
         shapes: of the obstacles.
         bodies: (K, 7) obstacles as in `lidar.shapes.BODY`.
-        moving: (K,) which of them move: MuJoCo moves them as it is told (mocap), not by forces.
+        moving: (K,) True for moving obstacles, whose poses are prescribed (mocap).
     """
 
     walls: Array
@@ -58,31 +58,31 @@ class Scenery:
 
 
 def prefix_of(robot: int) -> str:
-    """Of the names of a robot's parts."""
+    """Prefix of the names of a robot's parts."""
     return f"robot_{robot}/" if robot else ""
 
 
 def obstacle_name(k: int) -> str:
-    """Of the body of obstacle k."""
+    """Name of the body of obstacle k."""
     return f"obstacle_{k}"
 
 
 def bumper_name(part: int) -> str:
-    """Of one geom of a robot's bumper."""
+    """Name of one geom of a robot's bumper."""
     return f"bumper_{part}"
 
 
 def compile_scene(
     mujoco: Any, machine: Machine, footprint: Shape, robots: int, scenery: Scenery, physics: Physics
 ) -> Any:
-    """The MuJoCo model of some robots of one kind in a scene.
+    """Compiles the MuJoCo model of robots of one kind in a scene.
 
     Args:
         mujoco: the module.
         machine: of each robot.
-        footprint: a circle, or an outline of corners.
+        footprint: a circle or a polygon.
         robots: M; the parts of robot m have names with `prefix_of(m)`.
-        scenery: what stands around.
+        scenery: walls, map and obstacles.
         physics: of the machine.
     """
     spec = mujoco.MjSpec.from_string(machine.xml)
@@ -104,7 +104,7 @@ def compile_scene(
 
 
 def bumpers(model: Any, robots: int) -> NDArray[np.int64]:
-    """(geoms,) which robot each geom of a compiled scene is a bumper of; -1 for none."""
+    """(geoms,) index of the robot whose bumper each geom of a scene belongs to; -1 for none."""
     names = [model.geom(i).name for i in range(model.ngeom)]
     own = {f"{prefix_of(m)}{bumper_name(0)}".rstrip("0"): m for m in range(robots)}
     found = [next((m for head, m in own.items() if n.startswith(head)), -1) for n in names]
@@ -119,7 +119,7 @@ class _Maker:
         self._solref = [physics.softness, 1.0]
 
     def bumper(self, base: Any, footprint: Shape) -> None:
-        """The footprint of a robot; without mass, which is the chassis's."""
+        """Adds the footprint of a robot, without mass, which belongs to the chassis."""
         half = 0.5 * float(base.pos[2])
         own = {"contype": BUMPER, "mass": 0.0}
         if isinstance(footprint, Circle):
@@ -132,13 +132,13 @@ class _Maker:
             self._prism(base, part, (-half, half), name=bumper_name(i), **own)
 
     def wall(self, body: Any, start: Array, end: Array) -> None:
-        """A straight wall between two points (2,) [m]."""
+        """Adds a straight wall between two points (2,) [m]."""
         middle, along = 0.5 * (start + end), end - start
         size = [0.5 * float(np.hypot(*along)), 0.5 * THICKNESS, 0.5 * HEIGHT]
         self._box(body, middle, float(np.arctan2(along[1], along[0])), size)
 
     def map(self, grid: GridMap) -> None:
-        """The solid cells of a map."""
+        """Adds the blocked cells of a map."""
         heading, side = grid.origin[2], grid.resolution
         for first_row, first, row, column in rectangles(grid.blocked):
             middle = grid.cell_to_world([0.5 * (first_row + row - 1), 0.5 * (first + column - 1)])
@@ -146,7 +146,7 @@ class _Maker:
             self._box(self._spec.worldbody, middle, heading, size)
 
     def obstacle(self, k: int, shape: Shape, pose: Array, moves: bool) -> None:
-        """An obstacle at a pose (3,)."""
+        """Adds an obstacle at a pose (3,)."""
         x, y, heading = pose
         body = self._spec.worldbody.add_body(
             name=obstacle_name(k), pos=[x, y, 0.0], quat=quaternion(heading), mocap=moves
@@ -169,7 +169,7 @@ class _Maker:
         )  # fmt: skip
 
     def _prism(self, body: Any, corners: Array, z: tuple[float, float], **others: Any) -> None:
-        """The space above a convex outline (v, 2), between two heights [m]."""
+        """Adds the prism over a convex outline (v, 2) between two heights [m]."""
         mesh = self._spec.add_mesh(name=f"prism_{len(self._spec.meshes)}")
         mesh.uservert = np.concatenate(
             [np.column_stack([corners, np.full(len(corners), height)]) for height in z]
@@ -182,18 +182,19 @@ class _Maker:
 
 
 def quaternion(heading: float) -> list[float]:
-    """Of a turn about the vertical [rad]: w, x, y, z."""
+    """Quaternion w, x, y, z of a rotation about the vertical [rad]."""
     return [float(np.cos(0.5 * heading)), 0.0, 0.0, float(np.sin(0.5 * heading))]
 
 
 SLIVER = 1e-9
-"""A triangle of less area is left out, in parts of the square of the outline's size."""
+"""Triangles of less area, relative to the square of the outline's size, are omitted."""
 
 
 def convex_parts(outline: Array) -> list[Array]:
-    """Convex outlines (v, 2) that together fill an outline (V, 2), given counter-clockwise.
+    """Splits an outline (V, 2), counter-clockwise, into convex outlines (v, 2) that fill it.
 
-    A convex outline is its only part, others are cut into triangles, ear by ear (Meisters 1975).
+    A convex outline is its only part; others are cut into triangles by ear clipping (Meisters
+    1975).
     """
     if len(convex_hull(outline)) == len(outline):
         return [outline]
@@ -213,7 +214,7 @@ def _area(a: Array, b: Array, c: Array) -> float:
 
 
 def _is_ear(outline: Array, rest: list[int], i: int) -> bool:
-    """Whether the corner i of `rest` can be cut off: convex, and no other corner within."""
+    """True if corner i of `rest` can be cut off: convex, with no other corner within."""
     before, here, after = rest[i - 1], rest[i], rest[(i + 1) % len(rest)]
     a, b, c = outline[before], outline[here], outline[after]
     if _area(a, b, c) <= 0.0:
@@ -225,9 +226,9 @@ def _is_ear(outline: Array, rest: list[int], i: int) -> bool:
 
 
 def rectangles(blocked: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Rectangles that together cover the blocked cells of a map and no other cell.
+    """Rectangles that together cover exactly the blocked cells of a map.
 
-    Runs along the rows; equal runs in rows that follow each other become one.
+    They are runs along the rows; equal runs in consecutive rows are merged.
 
     Args:
         blocked: (rows, columns).

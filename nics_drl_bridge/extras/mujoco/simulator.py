@@ -1,4 +1,4 @@
-"""MujocoSimulator: robots in MuJoCo in a world, behind what a FastSimulator offers."""
+"""MujocoSimulator: robots in MuJoCo in a world, with the interface of FastSimulator."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from nics_drl_bridge.sim.world import World
 Array = NDArray[np.float64]
 
 ENCODER_PERIOD_S = 0.01
-"""The wheels are counted, and moving obstacles moved on, about this often."""
+"""Approximate period of encoder readings and of updates of moving obstacles."""
 
 
 class MujocoSimulator:
-    """One world whose robots are machines in MuJoCo: motors, wheels, and contact.
+    """One world of robots in MuJoCo, with motors, wheels and contact.
 
-    Scenes, moving obstacles, lidar and the noise of odometry are those of the FastSimulator for the
-    same seed; only the robots move otherwise. They are held up by what their footprint touches.
-    Odometry integrates what the wheels turn, so it drifts where they slip. A command acts at once,
-    on motors that have their own lag: the model's latency is not added.
+    Scenes, moving obstacles, lidar and odometry noise are those of the FastSimulator for the same
+    seed; only the robots move differently. Whatever their footprint touches blocks them. Odometry
+    integrates the turns of the wheels, so it drifts if they slip. A command acts at once, on motors
+    with their own lag: the model's latency is not added.
 
     Args:
-        model: the robot, whose textbook kinematics say what machine it is; lidar, noise and
-            control period. The fitted kinematics play no part.
+        model: the robot, whose textbook kinematics select the machine; lidar, noise and control
+            period. The fitted kinematics are not used.
         world: the field and its obstacles.
         robots: M. They see and touch each other.
         renderer: of the lidar, see `FastSimulator`.
-        physics: what the RobotSpec does not say; its time step is shortened so that a control
-            period is a whole number of steps.
+        physics: parameters that the RobotSpec does not have; the time step is shortened so that a
+            control period is a whole number of steps.
 
     Attributes:
         model: as given.
@@ -50,7 +50,7 @@ class MujocoSimulator:
 
     Raises:
         ConfigError: MuJoCo is not installed, the robot names no textbook kinematics or lacks a
-            parameter of its machine, or the world has no room.
+            parameter of its machine, or the world has no free space left.
     """
 
     def __init__(
@@ -74,29 +74,29 @@ class MujocoSimulator:
 
     @property
     def data(self) -> Worlds:
-        """All that changes; its `pose`, `twist` and others are (1, M, ...), see `Worlds`."""
+        """All state; `pose`, `twist` and others are (1, M, ...), see `Worlds`."""
         return self._driven.fast.data
 
     @property
     def goals(self) -> Array:
-        """(1, M, 2) of the episode [m]."""
+        """(1, M, 2) goals of the episode [m]."""
         return self._driven.fast.goals
 
     @property
     def obstacles(self) -> Array:
-        """(1, K, 7) as they stand now, see `FastSimulator.obstacles`."""
+        """(1, K, 7) current obstacles, see `FastSimulator.obstacles`."""
         return self._driven.fast.obstacles
 
     def scenes(self, seeds: ArrayLike) -> Scenes:
-        """The scenes that `reset` would begin with for some seeds (n,)."""
+        """Scenes that `reset` would start with for seeds (n,)."""
         return self._driven.fast.scenes(seeds)
 
     def reset(self, seeds: ArrayLike, starts: ArrayLike | None = None) -> Scenes:
-        """Begins an episode; the same one as a FastSimulator of this model and world.
+        """Begins an episode, the same one as in a FastSimulator of this model and world.
 
         Args:
             seeds: (1,).
-            starts: (1, M, 3) poses to begin at instead of the scene's.
+            starts: (1, M, 3) start poses instead of the scene's.
 
         Raises:
             ConfigError: see `FastSimulator.reset`.
@@ -140,7 +140,7 @@ class MujocoSimulator:
             commands: (1, M, C) in the units and the order of the RobotSpec; clipped to its limits.
 
         Raises:
-            ConfigError: the commands have another shape.
+            ConfigError: the commands have a wrong shape.
             BackendError: a command is NaN, or a robot has fallen over.
         """
         commands = np.asarray(commands, dtype=np.float64)
@@ -184,12 +184,12 @@ class MujocoSimulator:
             self._data.mocap_quat[mocap] = scenery.quaternion(bodies[k, 2])
 
     def _touching(self) -> NDArray[np.int64]:
-        """Which robots' bumpers touch something now."""
+        """Indices of the robots whose bumpers touch something now."""
         found = self._bumper_of[self._data.contact.geom.ravel()]
         return np.asarray(found[found >= 0])
 
     def _require_sane(self) -> None:
-        """Raises BackendError for a robot that lies on its side without having been hit."""
+        """Raises BackendError for a robot that fell over without a collision, or for divergence."""
         for rig, collided in zip(self._rigs, self.data.collided[0], strict=True):
             if not collided:
                 rig.require_upright(self._data)
@@ -201,14 +201,14 @@ class MujocoSimulator:
 
 
 def divide(period: float, longest: float) -> tuple[int, int, float]:
-    """How a control period is divided.
+    """Divides a control period into time steps.
 
     Args:
-        period: [s].
-        longest: greatest time step of MuJoCo [s].
+        period: control period [s].
+        longest: maximum time step of MuJoCo [s].
 
     Returns:
-        Parts of about `ENCODER_PERIOD_S`, time steps in each, and the time step [s].
+        Number of parts of about `ENCODER_PERIOD_S`, time steps per part, and the time step [s].
     """
     parts = max(1, round(period / ENCODER_PERIOD_S))
     steps = max(1, math.ceil(period / parts / longest - 1e-6))

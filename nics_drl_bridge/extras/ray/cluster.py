@@ -1,4 +1,4 @@
-"""Which Ray cluster trains: one that runs already, or one of this machine alone."""
+"""Connection to the Ray cluster for training: a running one, or one on this machine alone."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from nics_drl_bridge.errors import ConfigError
 
 LOCAL, AUTO = "local", "auto"
 TRIED_S = 5.0
-"""How long an address is tried [s]."""
+"""Timeout of an attempt to connect to an address [s]."""
 
 
 @contextmanager
 def connected(address: str | None, runners: int | None, worlds: int) -> Iterator[int]:
-    """Connects this process with a cluster, and gives how many env runners it is to have.
+    """Connects this process to a cluster, and yields the number of env runners.
 
     Args:
         address: `auto` (the cluster that this machine is part of) or `HOST:PORT`; None starts one
             on this machine, which ends with the training.
         runners: env runners; by default one for each CPU of the cluster.
-        worlds: that they share among them.
+        worlds: number of worlds that they share.
 
     Raises:
         ConfigError: no cluster answers there, or it is too small.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    # A lost worker is no error here, and Ray's words about it would run through the progress bar.
+    # A lost worker is no error here, and Ray's messages about it would disturb the progress bar.
     os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")
     logging.getLogger("ray.rllib").setLevel(logging.CRITICAL)
     local = {"include_dashboard": False} if address is None else {}
@@ -51,7 +51,7 @@ def connected(address: str | None, runners: int | None, worlds: int) -> Iterator
 
 
 def _check_listens(address: str | None) -> None:
-    """Raises OSError where nobody listens; Ray itself would try for minutes."""
+    """Raises OSError if nothing listens at the address; Ray itself would try for minutes."""
     if address not in (None, AUTO):
         host, _, port = str(address).rpartition(":")
         socket.create_connection((host, int(port)), TRIED_S).close()

@@ -1,4 +1,4 @@
-"""Training on a Ray cluster: PPO of RLlib, with the worlds spread over its machines.
+"""Training on a Ray cluster: RLlib's PPO, with the worlds spread over its machines.
 
 Settings, normaliser, network, evaluation and policy file are those of training on one machine.
 """
@@ -54,11 +54,11 @@ from nics_drl_bridge.sim.world import World, load_world
 Array = NDArray[np.float64]
 FORMAT = "nics_drl_bridge/ray_checkpoint/1"
 VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5
-"""Of the loss, as Stable-Baselines3 has them."""
+"""Parameters of the loss, as in Stable-Baselines3."""
 SILENCE_S = 600.0
-"""Without a step from any env runner for so long [s], a run ends; it can be resumed."""
+"""A run ends after this time without a step from any env runner [s]; it can be resumed."""
 PROBE_S = 1.0
-"""How long a rollout waits for an env runner that was lost [s]; later ones ask again."""
+"""Time that a roll-out waits for a lost env runner [s]; later ones try again."""
 
 
 @contextmanager
@@ -84,23 +84,23 @@ def train_on_ray(
     resumed: bool = False,
     runners: int = 1,
 ) -> Trained:
-    """Trains one policy on the cluster that this process is connected with.
+    """Trains one policy on the cluster that this process is connected to.
 
-    An env runner whose process or machine is lost is begun anew, elsewhere where need be; until
-    then the others go on. Which steps are learned from depends on when that happens: two runs
-    with one seed agree only while nothing is lost.
+    An env runner whose process or machine is lost is restarted, if necessary on another machine;
+    the others continue meanwhile. The steps that are learned from then depend on the time of the
+    loss: two runs with one seed agree only as long as no runner is lost.
 
     Args:
         settings: what to learn.
-        seed: of all that is drawn.
-        folder: for checkpoint and TensorBoard's logs; made when missing.
-        tell: is told of the progress, after each rollout.
-        resumed: whether to go on from the checkpoint in `folder`.
-        runners: how many processes share the worlds.
+        seed: of all random numbers.
+        folder: for checkpoint and TensorBoard logs; created if missing.
+        tell: called with the progress after each roll-out.
+        resumed: True continues from the checkpoint in `folder`.
+        runners: number of processes that share the worlds.
 
     Raises:
-        ConfigError: settings that do not fit together, no checkpoint that fits them, or no env
-            runner that answers.
+        ConfigError: the settings are inconsistent, no checkpoint fits them, or no env runner
+            answers.
     """
     if settings.algorithm != "ppo":
         raise ConfigError(
@@ -125,15 +125,15 @@ def train_on_ray(
 
 @dataclass
 class Learning:
-    """A training that is going on.
+    """A training in progress.
 
     Attributes:
-        algorithm: of RLlib.
-        settings, seed, path, runners: what is learned, of which seed, where the checkpoint is, by
-            how many env runners.
+        algorithm: RLlib's.
+        settings, seed, path, runners: settings and seed of the training, path of the checkpoint,
+            number of env runners.
         steps: environment steps so far.
-        stepping_s: time in the simulator, of each env runner on average [s].
-        recent: of the last rollouts: episodes that ended, with success, with a collision.
+        stepping_s: time in the simulator, averaged over the env runners [s].
+        recent: per roll-out, for the last ones: episodes ended, successes, collisions.
     """
 
     algorithm: PPO
@@ -147,19 +147,19 @@ class Learning:
 
     @property
     def learner(self) -> Any:
-        """RLlib's learner, which is in this process."""
+        """RLlib's learner, which runs in this process."""
         return (
             self.algorithm.learner_group.foreach_learner(lambda one: one).result_or_errors[0].get()
         )
 
     @property
     def module(self) -> ActorCritic:
-        """The network that learns."""
+        """The network in training."""
         network: ActorCritic = self.learner.module[DEFAULT_MODULE_ID].unwrapped()
         return network
 
     def run(self, tell: Tell, about: dict[str, Any]) -> None:
-        """Learns until all steps are done, and keeps checkpoints."""
+        """Learns until all steps are done, and saves checkpoints."""
         logger = configure(str(self.path.parent), ["tensorboard"])
         begin = heard = time.perf_counter()
         first = saved = self.steps
@@ -186,7 +186,7 @@ class Learning:
         logger.close()
 
     def _take(self, result: Mapping[str, Any]) -> None:
-        """What a rollout of all env runners came to."""
+        """Adds the results of a roll-out of all env runners."""
         told = result.get(ENV_RUNNER_RESULTS, {})
         self.steps += int(told.get(NUM_ENV_STEPS_SAMPLED, 0))
         self.stepping_s += float(told.get(STEPPING, 0.0)) / self.runners
@@ -216,7 +216,7 @@ class Learning:
         )
 
     def save(self, about: dict[str, Any]) -> None:
-        """Keeps network and optimiser."""
+        """Saves network and optimiser."""
         content = {
             "format": FORMAT,
             "about": json.dumps(about),
@@ -227,7 +227,7 @@ class Learning:
         write_content(self.path, content)
 
     def resume(self, content: dict[str, Any]) -> None:
-        """Goes on with the network and optimiser of a checkpoint; the worlds begin anew."""
+        """Continues with network and optimiser of a checkpoint; the worlds start afresh."""
         self.steps = int(content["steps"])
         self.module.load_state_dict(content["network"])
         self.learner.get_optimizer().load_state_dict(content["optimiser"])
@@ -237,7 +237,7 @@ class Learning:
 
 
 def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -> PPO:
-    """RLlib's PPO, of which `done` steps are behind it."""
+    """RLlib's PPO, after `done` steps of the training."""
     torch.set_num_threads(settings.threads)
     model = open_model(settings.robot)
     scenes = {name: load_world(name) for name in settings.worlds}
@@ -264,7 +264,7 @@ def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -
         }
     )
     algorithm = config.build_algo()
-    Path(algorithm.logdir).rmdir()  # RLlib makes one and has nothing to put there
+    Path(algorithm.logdir).rmdir()  # RLlib creates it and leaves it empty
     return algorithm
 
 
@@ -275,7 +275,7 @@ def share_of_worlds(
     runner: int,
     runners: int,
 ) -> TrainVecEnv:
-    """The worlds of one of several env runners: every so many-th."""
+    """The worlds of env runner number `runner`: every `runners`-th."""
     names = [name for name, count in settings.worlds.items() for _ in range(count)]
     share = dict(Counter(names[runner::runners]))
     return make_train_env(settings.model_copy(update={"worlds": share}), model, scenes)
@@ -288,7 +288,7 @@ def _config(
     normaliser: tuple[Array, Array],
     spaces: tuple[gymnasium.Space[Any], gymnasium.Space[Any]],
 ) -> PPOConfig:
-    """What RLlib is to do with the settings, in its own words."""
+    """Translates the settings into RLlib's configuration."""
     chosen, left = settings.ppo, max(settings.steps - done, 1)
     rate = chosen.learning_rate
     now = rate * max(1.0 - done / settings.steps, LEAST_RATE)

@@ -1,9 +1,9 @@
 """An env runner of RLlib that steps many worlds at once.
 
-RLlib's own goes through its worlds one by one in Python in every step, which takes many times
-longer than the simulator. This one keeps arrays, and cuts them into episodes at the end.
+RLlib's own iterates over its worlds in Python in every step, which takes many times longer than
+the simulator. This one keeps arrays, and cuts them into episodes at the end.
 
-The network that learns on Ray: an actor as the policy file holds it, and a critic.
+The network for training on Ray: an actor as in the policy file, and a critic.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from nics_drl_bridge.policy.train_algorithms import Actor, layers_of
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 
 ENDED, SUCCESS, COLLISION, STEPPING = "ended", "success", "collision", "stepping_s"
-"""Names of what a runner counts: episodes, and time in the simulator [s]."""
+"""Names of a runner's metrics: numbers of episodes, and time in the simulator [s]."""
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,12 @@ class Rollout:
     """T steps of N worlds.
 
     Attributes:
-        seen: (T + 1, N, O) observations; where an episode ended, the next one's first.
-        actions, logits, logp: (T, N, ...) what was done, of which distribution, how likely it was.
+        seen: (T + 1, N, O) observations; after the end of an episode, the first of the next one.
+        actions, logits, logp: (T, N, ...) actions, parameters of their distribution, and their log
+            probabilities.
         rewards: (T, N).
-        final: (t, n) -> the last observation (O,) of the episode that ended in step t of world n,
-            and whether it only ran out of time.
+        final: (t, n) -> last observation (O,) of the episode that ended in step t of world n, and
+            True if it only ran out of time.
     """
 
     seen: NDArray[np.float32]
@@ -54,7 +55,7 @@ class Rollout:
     final: dict[tuple[int, int], tuple[NDArray[np.float32], bool]]
 
     def episodes(self) -> Iterator[SingleAgentEpisode]:
-        """The pieces of episodes in it, each of one world."""
+        """Yields the pieces of episodes in the roll-out, each of one world."""
         steps, worlds = self.rewards.shape
         cuts: list[list[int]] = [[] for _ in range(worlds)]
         for t, n in sorted(self.final):
@@ -83,17 +84,17 @@ class Rollout:
 
 
 class WorldsRunner(SingleAgentEnvRunner):
-    """Drives its share of the worlds of a training.
+    """Steps its share of the worlds of a training.
 
-    `env_config` holds `make` (a reference to a function of runner and number of runners that
+    `env_config` contains `make` (a reference to a function of runner and number of runners that
     makes a TrainVecEnv), `rollout` (T), `seed` (two numbers) and `threads`.
     """
 
     def make_env(self) -> None:
-        """Makes the worlds of this runner; each runner draws other episodes."""
+        """Makes the worlds of this runner; each runner draws different episodes."""
         chosen = self.config.env_config
         torch.set_num_threads(chosen["threads"])
-        # Arrays that Ray shares are read-only; the kernels would be compiled anew for them.
+        # Arrays shared by Ray are read-only; the kernels would be compiled again for them.
         make = copy.deepcopy(ray.get(chosen["make"]))
         self.env: TrainVecEnv = make(self.worker_index - 1, self.num_workers)
         self.num_envs = self.env.num_envs
@@ -107,7 +108,7 @@ class WorldsRunner(SingleAgentEnvRunner):
         return dict.fromkeys((INPUT_ENV_SPACES, INPUT_ENV_SINGLE_SPACES, DEFAULT_MODULE_ID), pair)
 
     def _sample(self, **kwargs: Any) -> list[SingleAgentEpisode]:
-        """What every world did in a rollout, whatever RLlib asks for: always the same number."""
+        """Runs one roll-out; its length is fixed, whatever RLlib requests."""
         steps, busy = int(self.config.env_config["rollout"]), self.env.stepping_s
         parts = [self._step(t) for t in range(steps)]
         *arrays, finals = zip(*parts, strict=True)
@@ -118,7 +119,7 @@ class WorldsRunner(SingleAgentEnvRunner):
         return list(Rollout(whole, actions, logits, logp, rewards, final).episodes())
 
     def _step(self, t: int) -> tuple[Any, ...]:
-        """One step of every world: a row of `Rollout`."""
+        """Steps every world once; returns a row of `Rollout`."""
         seen = self._seen
         out = self.module.forward_exploration({Columns.OBS: torch.as_tensor(seen)})
         logits = out[Columns.ACTION_DIST_INPUTS]
@@ -151,13 +152,13 @@ Batch = dict[str, Any]
 
 
 class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
-    """RLlib's form of `Actor` and a critic of the same widths.
+    """`Actor` and a critic of the same widths, as a module of RLlib.
 
-    `model_config` holds `hidden`, `normaliser` and `log_std`, see `Actor` and `PpoSettings`.
+    `model_config` contains `hidden`, `normaliser` and `log_std`, see `Actor` and `PpoSettings`.
     """
 
     def setup(self) -> None:
-        """Makes the layers."""
+        """Builds the layers."""
         chosen, size = self.model_config, int(self.observation_space.shape[0])
         hidden, normaliser = list(chosen["hidden"]), chosen["normaliser"]
         self.actor = Actor(self.observation_space, self.action_space, hidden, normaliser)
@@ -167,7 +168,7 @@ class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
             self.log_std = torch.nn.Parameter(spread)
 
     def get_non_inference_attributes(self) -> list[str]:
-        """What env runners need not have."""
+        """Names of the attributes that env runners do not need."""
         return ["critic"]
 
     def _forward(self, batch: Batch, **kwargs: Any) -> Batch:
