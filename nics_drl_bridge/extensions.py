@@ -1,4 +1,4 @@
-"""What other packages, and this one's own extras, add by name: entry points that are really read.
+"""Extensions by name: entry points of other packages, and of this one's own extras.
 
 A group is `nics_drl_bridge.GROUP`; `docs/extensions.md` says what each expects.
 """
@@ -43,7 +43,7 @@ def load(group: str, name: str) -> Any:
 
 
 def missing(module: str) -> str:
-    """What to say of a library that is not installed, after the name of what needs it."""
+    """A clause about a library that is not installed, to follow the name of what needs it."""
     library = module.partition(".")[0]
     if library.endswith(ROS):
         return MISSING_ROS.format(module=module)

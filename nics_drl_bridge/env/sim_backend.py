@@ -1,6 +1,6 @@
-"""SimBackend: the fast simulator in this process, with the robot's middleware or without.
+"""SimBackend: the fast simulator in this process, with or without the robot's middleware.
 
-The backends that an env drives: those by name, and a user's own.
+Backends of an env: those known by name, and user-defined ones.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ Array = NDArray[np.float64]
 class SimBackend:
     """One world of the fast simulator, in this process.
 
-    With `estimator`, scan and odometry of each robot pass through its middleware as those of the
-    nodes do, so that this backend and the one over DDS give the same numbers for the same seed
-    and commands. Without, the pose is what the wheels' odometry says: the same bits as a world of
-    the vector env, and several times faster.
+    With `estimator`, scan and odometry of each robot pass through its middleware as in the nodes,
+    so that this backend and the one over DDS give the same numbers for the same seed and commands.
+    Without it, the pose is that of the wheel odometry: bit-identical to a world of the vector env,
+    and several times faster.
 
     Args:
         model: the robot.
         world: the field.
         renderer: `baked` or `exact` lidar.
-        estimator: whether a middleware for each robot stands between simulator and env.
-        robots: M; views and commands have a leading (M,) when there are several.
+        estimator: True puts a middleware for each robot between simulator and env.
+        robots: M; views and commands have a leading (M,) if M > 1.
         simulation: further arguments of the FastSimulator.
     """
 
@@ -68,7 +68,7 @@ class SimBackend:
         """Moves the robots by one control period; see `interface.Backend`."""
         data = self.simulator.data
         if self._middlewares:
-            # By way of cmd_vel, as over ROS 2, so that both round alike.
+            # Via cmd_vel, as over ROS 2, so that both round alike.
             command = self._robot.from_cmd_vel(self._robot.to_cmd_vel(command))
         commands = command.reshape(data.pose.shape[1], -1)
         for middleware, one in zip(self._middlewares, commands, strict=False):
@@ -99,21 +99,21 @@ class SimBackend:
         return middleware.view(now)
 
     def halt(self) -> None:
-        """Nothing moves but in `step`."""
+        """Does nothing: robots only move in `step`."""
 
     def close(self) -> None:
-        """Nothing has to be freed."""
+        """Does nothing: there is nothing to free."""
 
 
 NEEDED = ("reset", "step", "close")
 
 
 class HaltedByStep:
-    """A backend that has no `halt`: a step with the command nearest to zero takes its place.
+    """Wraps a backend without `halt`, which becomes a step with the command nearest to zero.
 
     Args:
         backend: with `reset`, `step` and `close`.
-        still: (C,), or (M, C) of a team, the command.
+        still: (C,), or (M, C) for a team, the command nearest to zero.
     """
 
     def __init__(self, backend: Any, still: NDArray[np.float64]) -> None:
@@ -121,33 +121,33 @@ class HaltedByStep:
         self._told = False
 
     def reset(self, start: Start) -> RobotView:
-        """That of the backend."""
+        """Calls the backend's."""
         view: RobotView = self._backend.reset(start)
         return view
 
     def step(self, command: NDArray[np.float64]) -> tuple[RobotView, dict[str, Any]]:
-        """That of the backend."""
+        """Calls the backend's."""
         self._told = True
         told: tuple[RobotView, dict[str, Any]] = self._backend.step(command)
         return told
 
     def halt(self) -> None:
-        """Steps once with the command nearest to zero, where another one came before."""
+        """Steps once with the command nearest to zero, if there was a step since the last halt."""
         if self._told:
             self._backend.step(self._still.copy())
             self._told = False
 
     def close(self) -> None:
-        """That of the backend, which leaves a zero behind by itself."""
+        """Closes the backend, which sends a zero command itself."""
         self._backend.close()
         self._told = False
 
 
 def halting(backend: Any, still: NDArray[np.float64]) -> Backend:
-    """A user's own backend as one that can be halted.
+    """Returns a user-defined backend as one that can be halted.
 
     Raises:
-        ConfigError: it is no backend.
+        ConfigError: it is not a backend.
     """
     if isinstance(backend, Backend):
         return backend

@@ -1,1 +1,1 @@
-"""What needs an optional library or serves few; reached by entry points only."""
+"""Tools that need an optional library or serve few; reached by entry points only."""

@@ -165,7 +165,7 @@ def owner(end: Any) -> str | None:
 
 
 def offer_of(profile: QoSProfile) -> Offer:
-    """What a publisher offers, or a subscriber asks for."""
+    """Returns what a publisher offers, or a subscriber requests."""
     return Offer(
         max(profile.depth, 1),
         profile.reliability != ReliabilityPolicy.BEST_EFFORT,

@@ -1,1 +1,1 @@
-"""What a robot is: its specification, its Taylor model, its noise and delays."""
+"""The robot: its specification, its Taylor model, its noise and delays."""

@@ -1,4 +1,4 @@
-"""Records what a robot publishes, as it was sent, without touching the robot."""
+"""Recording of what a robot publishes, as sent, without touching the robot."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ ROBOT = (
 """Topics of a robot, in its namespace."""
 SHARED = ("/tf", "/tf_static", "/clock", "/diagnostics")
 LOOK_S = 0.25
-"""New topics are looked for this often [s];"""
+"""Period of the search for new topics [s]."""
 FLUSH_S = 1.0
-"""and this much is lost at most when the process is killed [s]."""
+"""Greatest span that is lost if the process is killed [s]."""
 QUEUE = 1000
 
 
 @dataclass(frozen=True)
 class BagOrder:
-    """What to record.
+    """Topics to record, and options.
 
     Attributes:
         out: folder of the bag.
-        topics: their names; those of `ROBOT` and `SHARED` when empty.
-        everything: every topic that there is.
-        namespace: of the robot; names of topics without a slash are in it.
-        duration: stops after so long [s]; None for never.
+        topics: their names; those of `ROBOT` and `SHARED` if empty.
+        everything: records every topic; with a namespace, all of it and `SHARED`.
+        namespace: of the robot; prefix of topic names without a leading slash.
+        duration: stops after this time [s]; None for never.
         storage: format of the file.
         use_sim_time: takes times of receipt from `/clock`.
     """
@@ -56,7 +56,7 @@ class BagOrder:
     use_sim_time: bool = False
 
     def wants(self, topic: str) -> bool:
-        """Whether a topic is to be recorded."""
+        """True if a topic is to be recorded."""
         space = f"/{self.namespace.strip('/')}" if self.namespace.strip("/") else ""
         if self.everything:
             return not space or topic.startswith(f"{space}/") or topic in SHARED
@@ -66,7 +66,7 @@ class BagOrder:
 
 @dataclass
 class _Heard:
-    """A topic that is listened to."""
+    """A topic with a subscription."""
 
     subscription: Subscription[Any]
     profile: tuple[bool, bool]
@@ -75,10 +75,10 @@ class _Heard:
 
 @dataclass(frozen=True)
 class Recorded:
-    """What was recorded.
+    """Result of a recording.
 
     Attributes:
-        counts: messages of each topic.
+        counts: number of messages of each topic.
         skipped: a sentence for each topic that could not be.
     """
 
@@ -87,16 +87,16 @@ class Recorded:
 
 
 class BagRecorder(QosWatch):
-    """Writes the messages of all wanted topics into a bag, serialized as they came.
+    """Writes the messages of all wanted topics into a bag, serialised as received.
 
-    A topic is asked for with the best quality of service that all its publishers offer, so that
-    none of them is left out; what they offer is kept in the bag.
+    A subscription requests the best quality of service that all publishers of its topic offer, so
+    that none of them is left out; their offers are stored in the bag.
 
     Args:
-        context: to live in.
+        context: of the node.
         order: what to record.
-        sink: where to.
-        say: is told a sentence when a topic begins or can't be recorded.
+        sink: of the bag.
+        say: called with a sentence when a topic begins or can't be recorded.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class BagRecorder(QosWatch):
                 self._listen(topic, kinds)
 
     def _listen(self, topic: str, kinds: Sequence[str]) -> None:
-        """Subscribes to a topic, or anew when a publisher came that offers less."""
+        """Subscribes to a topic, or again if a new publisher offers less."""
         publishers = self.get_publishers_info_by_topic(topic)
         if not publishers or topic in self.skipped:
             return
@@ -188,10 +188,10 @@ def record_bag(order: BagOrder, say: Callable[[str], None]) -> Recorded:
 
     Args:
         order: what to record.
-        say: is told a sentence when a topic begins or can't be recorded.
+        say: called with a sentence when a topic begins or can't be recorded.
 
     Raises:
-        BackendError: nothing was heard.
+        BackendError: nothing was received.
         RecordingError: the bag can't be written.
     """
     nodes: list[BagRecorder] = []

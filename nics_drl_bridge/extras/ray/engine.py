@@ -65,7 +65,7 @@ PROBE_S = 1.0
 def learner(
     address: str | None, env_runners: int | None, worlds: int
 ) -> Iterator[Callable[..., Trained]]:
-    """What trains one policy on a cluster, which is connected as long as this is open.
+    """Connects with a cluster, and gives the function that trains one policy on it.
 
     Args:
         address: of the cluster, see `cluster.connected`.
