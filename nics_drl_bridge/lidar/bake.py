@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import rotate
-from nics_drl_bridge.lidar import bake_kernels, intensity_kernels
-from nics_drl_bridge.lidar.sensor_models import Function, SensorModel, intensity_of, returned
+from nics_drl_bridge.lidar import bake_kernels
+from nics_drl_bridge.lidar.sensor_models import Function, SensorModel, returned
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape, describe
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import MOST_WIDE, Density, LidarTable, padding
@@ -279,22 +279,18 @@ def apply_model(
             angles of incidence.
 
     Returns:
-        The table, with a reflectance if the model yields intensities.
+        The table.
     """
     cosines = _cosines(table, grids)
     if callable(model):
         _apply_function(model, table, cosines)
         return table
-    bright = intensity_of(model)
-    reflectance = None if bright is None else np.zeros(table.rows.shape, np.float32)
     ends = _ends(table)
     for shape, (first, last) in zip(table.shapes, table.cells_of_shapes(), strict=True):
         part = slice(int(table.start[first]), int(ends[last - 1]))
         cosine = cosines[part].astype(np.float64)
         table.rows[part] = returned(model, table.rows[part], np.arccos(cosine), shape.reflectivity)
-        if bright is not None and reflectance is not None:
-            reflectance[part] = bright.reflectance(cosine, shape.reflectivity)
-    return replace(table, sensor_model=tuple(model), reflectance=reflectance)
+    return replace(table, sensor_model=tuple(model))
 
 
 def _ends(table: LidarTable) -> NDArray[np.int64]:
@@ -310,7 +306,7 @@ def _cosines(table: LidarTable, grids: Sequence[Grid]) -> NDArray[np.float32]:
         for t, turn in enumerate(grid.turns):
             begin = first + t * table.density.distances
             starts = table.start[begin : begin + table.density.distances].astype(np.int64)
-            intensity_kernels.cosines_of_turn(
+            bake_kernels.cosines_of_turn(
                 cosines,
                 np.stack([starts, grid.cell[t, :, 0], grid.cell[t, :, 1]]),
                 (corners, outlines.radii[h]),

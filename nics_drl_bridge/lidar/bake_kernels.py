@@ -131,3 +131,71 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
         beams = (angles[0], step / phases, 0.0)
         row(fine, directions, beams, corners, radius, distances[d], c, s, edges[d])
         into_phases(rows[start : start + points], fine, width, phases)
+
+
+@kernel
+def _circle(scan, directions, beams, x, radius):  # type: ignore[no-untyped-def]
+    """Cosines on a circle straight ahead, whose normal is the direction from its centre."""
+    nearest, cosines, _ = scan
+    exact_kernels.circle(nearest, directions, beams, x, 0.0, radius, np.inf)
+    for i in range(nearest.shape[0]):
+        if nearest[i] < np.inf:
+            cosine = abs((nearest[i] - directions[i, 0] * x) / radius)
+            cosines[i] = min(cosine, 1.0)
+
+
+@kernel
+def _segment(scan, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
+    """Cosines on a segment where it is nearest: the distance of its line over the range."""
+    nearest, cosines, before = scan
+    for i in range(nearest.shape[0]):
+        before[i] = nearest[i]
+    exact_kernels.segment(nearest, directions, beams, x1, y1, x2, y2)
+    ex, ey = x2 - x1, y2 - y1
+    away = np.float32(abs(x1 * ey - y1 * ex) / math.sqrt(ex * ex + ey * ey))
+    for i in range(nearest.shape[0]):
+        if nearest[i] < before[i]:
+            cosines[i] = min(away / nearest[i], np.float32(1.0))
+
+
+@kernel(allocates=True)
+def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[no-untyped-def]
+    """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it."""
+    directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
+    beams, count = (angles[0], step, 0.0), len(angles)
+    nearest, before = np.full(count, np.inf, np.float32), np.empty(count, np.float32)
+    scan = (nearest, np.zeros(count, np.float32), before)
+    if corners.shape[0] == 0:
+        _circle(scan, directions, beams, distance, radius)
+        return scan[1]
+    ax, ay = exact_kernels.turned(distance, 0.0, c, s, corners[corners.shape[0] - 1])
+    for v in range(corners.shape[0]):
+        bx, by = exact_kernels.turned(distance, 0.0, c, s, corners[v])
+        _segment(scan, directions, beams, ax, ay, bx, by)
+        ax, ay = bx, by
+    return scan[1]
+
+
+@kernel(allocates=True)
+def cosines_of_turn(cosines, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
+    """Computes the cosine of the incidence at every point of the rows of one rotation.
+
+    Beyond the edges of the shape it is that at the edge, as for the ranges.
+
+    Args:
+        cosines: (R,) float32 result, laid out as the ranges.
+        layout, shape, distances, turn, edges, step, phases: see `rows_of_turn`.
+    """
+    c, s = math.cos(turn), math.sin(turn)
+    corners, radius = shape
+    for d in range(distances.shape[0]):
+        start, begin, width = layout[0, d], layout[1, d], layout[2, d]
+        count = width * phases
+        angles = (begin * phases + np.arange(count)) * (step / phases)
+        inside = EDGE * (edges[d, 1] - edges[d, 0])
+        low, high = edges[d, 0] + inside, edges[d, 1] - inside
+        fine = incidences(angles, step / phases, corners, radius, distances[d], c, s)
+        at = np.array([low, high])
+        fine[angles < low] = incidences(at[:1], 1.0, corners, radius, distances[d], c, s)[0]
+        fine[angles > high] = incidences(at[1:], 1.0, corners, radius, distances[d], c, s)[0]
+        into_phases(cosines[start : start + count], fine, width, phases)

@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError, ModelError, nearest
-from nics_drl_bridge.lidar import intensity_kernels, scan_kernels
+from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.baked_kernels import LANES, SINGLE, WHOLE, WIDE
 from nics_drl_bridge.lidar.lookup_error import lookup_distances
-from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
-from nics_drl_bridge.lidar.sensor_models import Intensity, intensity_of
+from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import BODY, SHAPE, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable
@@ -196,68 +195,6 @@ class Scanner:
                 self.renderer == "exact", room,
             )  # fmt: skip
         return out
-
-    def intensities(
-        self,
-        ranges: ArrayLike,
-        poses: ArrayLike,
-        bodies: ArrayLike,
-        walls: ArrayLike = NO_WALLS,
-        out: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:
-        """Intensities that belong to scans: of whatever is nearest, where there is a return.
-
-        They follow from the distances and angles of the scene, also where the ranges are noisy.
-
-        Args:
-            ranges: (N, B) what `scan` gave, or a device made of it [m].
-            poses: (N, 3) see `scan`.
-            bodies: (N, K, 7) see `scan`.
-            walls: (W, 4) see `scan`.
-            out: (N, B) where to write, a new array by default.
-
-        Returns:
-            (N, B) intensities [the unit of the model's gain], 0 where a range is not finite.
-
-        Raises:
-            ConfigError: an array has another shape.
-            ModelError: the table holds no intensities, or a body is of a shape that is not in it.
-        """
-        bright = intensity_of(self.table.sensor_model)
-        if bright is None:
-            raise ModelError(
-                f"the table of the lidar {self.spec.name!r} holds no intensities; bake it with a "
-                "sensor model of the kind `intensity`."
-            )
-        poses, bodies, walls = self._scene(poses, bodies, walls)
-        out = self._result(len(poses), out)
-        ranges = np.atleast_2d(np.asarray(ranges, np.float32))
-        if ranges.shape != out.shape:
-            raise ConfigError(f"ranges {ranges.shape} must be {out.shape}, as the scans are.")
-        count, beams = bodies.shape[1], self.spec.beams
-        intensity_kernels.intensities_of_worlds(
-            out[:, None], ranges[:, None], poses[:, None], np.arange(len(poses)), bodies, -1, walls,
-            (self.arguments, self._bright_arguments), self.room(count),
-            tuple(np.empty((3, beams), np.float32)),
-            (np.empty((count, 1, 3)), np.empty((count, 1, BODY))),
-            (*np.empty((2, count, 1, beams), np.float32), np.arange(count)),
-            self._reflectivities(bright), bright.device,
-            NO_MAP if self.grid is None else self.grid.arrays, self.renderer == "exact",
-        )  # fmt: skip
-        return out
-
-    @cached_property
-    def _bright_arguments(self) -> tuple[Any, ...]:
-        """As `arguments`, with the reflectances of the table in place of its ranges."""
-        mount, directions, beams, _, baked, outlines, _ = self.arguments
-        rows = self.table.rows if self.table.reflectance is None else self.table.reflectance
-        lookup = replace(self.table, rows=rows).lookup
-        return mount, directions, beams, np.array([-1.0, np.inf]), baked, outlines, lookup
-
-    def _reflectivities(self, bright: Intensity) -> NDArray[np.float64]:
-        """(H,) of each shape."""
-        own = [shape.reflectivity for shape in self.table.shapes]
-        return np.array([bright.reflectivity if one is None else one for one in own])
 
     def _scene(self, poses: ArrayLike, bodies: ArrayLike, walls: ArrayLike) -> tuple[Array, ...]:
         """Returns poses (N, 3), bodies (N, K, 7), walls (W, 4), checked; raises as `scan` does."""

@@ -1,4 +1,4 @@
-"""Sensor models: the returns that a device loses, and the intensities of the others.
+"""Sensor models: the returns that a device loses.
 
 A sensor model is baked into the rows of a table, so that it does not slow down rendering.
 """
@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import AfterValidator, Field, TypeAdapter, field_validator, model_validator
+from pydantic import AfterValidator, Field, TypeAdapter, field_validator
 
 from nics_drl_bridge.config import Schema, load_yaml
 
@@ -64,7 +64,6 @@ class Intensity(Schema):
             surface, a retroreflector has more.
         exponent: of the cosine; 0 for no effect of the angle, more than 1 for glossy surfaces.
         threshold: weaker returns are lost [the device's unit].
-        saturation: greatest intensity that the device reports, none by default.
     """
 
     kind: Literal["intensity"] = "intensity"
@@ -72,18 +71,11 @@ class Intensity(Schema):
     reflectivity: float = Field(default=0.5, gt=0.0)
     exponent: float = Field(default=1.0, ge=0.0, le=100.0)
     threshold: float = Field(default=0.0, ge=0.0)
-    saturation: float | None = Field(default=None, gt=0.0)
 
     def __str__(self) -> str:
         """In a few words."""
         lost = f", below {self.threshold:g} nothing" if self.threshold else ""
         return f"intensity {self.gain:g} at 1 m{lost}, reflectivity {self.reflectivity:g}"
-
-    @model_validator(mode="after")
-    def _reachable(self) -> Intensity:
-        if self.saturation is not None and self.threshold > self.saturation:
-            raise ValueError("threshold must be at most saturation")
-        return self
 
     def reflectance(self, cosine: ArrayLike, reflectivity: float | None) -> NDArray[np.float64]:
         """Returns the factor (P,) without the range: reflectivity times cos(incidence)^exponent."""
@@ -102,12 +94,6 @@ class Intensity(Schema):
         """
         light = self.gain * self.reflectance(np.cos(incidence), reflectivity)
         return np.asarray(light / np.square(np.maximum(ranges, NEAREST)) < self.threshold)
-
-    @property
-    def device(self) -> NDArray[np.float64]:
-        """(4,) arguments of the kernels: gain, saturation, exponent, reflectivity of walls, map."""
-        most = math.inf if self.saturation is None else self.saturation
-        return np.array([self.gain, most, self.exponent, self.reflectivity])
 
 
 def _one_intensity(models: tuple[SensorModel, ...]) -> tuple[SensorModel, ...]:
@@ -130,11 +116,6 @@ class SensorModelFile(Schema):
 def load_sensor_models(path: str | Path) -> tuple[SensorModel, ...]:
     """Loads the sensor models of a YAML file. Raises ConfigError with file, key and fix."""
     return load_yaml(path, SensorModelFile).sensor_model
-
-
-def intensity_of(models: Sequence[SensorModel]) -> Intensity | None:
-    """Returns the model that yields intensities, or None."""
-    return next((model for model in models if isinstance(model, Intensity)), None)
 
 
 def returned(

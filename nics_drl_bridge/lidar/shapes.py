@@ -36,7 +36,7 @@ class Surface(Schema):
     """Properties of a shape's surface, common to all shapes.
 
     Attributes:
-        reflectivity: of its surface, for a lidar that yields intensities: 1 is a white diffuse
+        reflectivity: of its surface, for a sensor model of intensity: 1 is a white diffuse
             one, a retroreflector has more; by default that of the lidar's sensor model.
     """
 

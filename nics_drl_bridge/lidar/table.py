@@ -31,7 +31,7 @@ from nics_drl_bridge.lidar.baked_kernels import (
     ROUND_RADIUS,
 )
 from nics_drl_bridge.lidar.block_kernels import BLOCK
-from nics_drl_bridge.lidar.sensor_models import SENSOR_MODELS, SensorModel, intensity_of
+from nics_drl_bridge.lidar.sensor_models import SENSOR_MODELS, SensorModel
 from nics_drl_bridge.lidar.shapes import SHAPES, Circle, Outlines, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.npz import npz_bytes, npz_mapped, read_file
@@ -101,8 +101,6 @@ class LidarTable:
             initial stride for climbing; the same two for the left edge.
         rows: (R,) float32 ranges [m], padded by what one look-up can read.
         sensor_model: named models that were baked in.
-        reflectance: (R,) float32 of the surface at each point of `rows`, reflectivity times a power
-            of the cosine of the angle of incidence; only where a model yields intensities.
     """
 
     shapes: tuple[Shape, ...]
@@ -113,7 +111,6 @@ class LidarTable:
     cell: NDArray[np.int16]
     rows: NDArray[np.float32]
     sensor_model: tuple[SensorModel, ...] = ()
-    reflectance: NDArray[np.float32] | None = None
 
     @classmethod
     def without_rows(cls, spec: LidarSpec, shapes: Sequence[Shape]) -> LidarTable:
@@ -198,7 +195,7 @@ class LidarTable:
             "cell": self.cell,
             "rows": self.rows,
         }
-        return arrays if self.reflectance is None else arrays | {"reflectance": self.reflectance}
+        return arrays
 
     def cells_of_shapes(self) -> list[tuple[int, int]]:
         """Returns the first cell of each shape (H,), and the one after its last."""
@@ -293,15 +290,6 @@ class LidarTable:
         if cells and (self.start.min() < 0 or widths.min() < 1 or ends.max() > last):
             raise ValueError("a row lies outside of the table")
         self._check_corners(counts.astype(np.int64))
-        self._check_reflectance()
-
-    def _check_reflectance(self) -> None:
-        if (self.reflectance is None) != (intensity_of(self.sensor_model) is None):
-            raise ValueError("its reflectance does not belong to its sensor model")
-        if self.reflectance is not None and (
-            self.reflectance.shape != self.rows.shape or self.reflectance.dtype != np.float32
-        ):
-            raise ValueError("its reflectance does not fit its rows")
 
     def _check_corners(self, counts: NDArray[np.int64]) -> None:
         corners = np.repeat(np.diff(self.outlines.hull) // 2, counts)[:, None]

@@ -71,19 +71,16 @@ def scan_to_ros(
     ranges: NDArray[np.float32],
     time_ns: int,
     frame: str,
-    intensities: NDArray[np.float32] | None = None,
 ) -> LaserScan:
     """Returns ranges (B,) as the device's LaserScan; every header field follows from the spec.
 
-    Without intensities (B,) their field stays empty, as the message provides for.
+    Its `intensities` stay empty, as the message provides for.
     """
     message = LaserScan()
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
     for field, value in spec.header._asdict().items():
         setattr(message, field, value)
     message.ranges = array.array("f", to_device(ranges, spec).tobytes())
-    if intensities is not None:
-        message.intensities = array.array("f", np.asarray(intensities, np.float32).tobytes())
     return message
 
 

@@ -100,14 +100,6 @@ def test_ranges_keep_their_infinities_nan_and_bits():
     assert back.tobytes() == ranges.tobytes()
 
 
-def test_intensities_travel_with_the_ranges_and_without_them_the_field_is_empty():
-    ranges = np.ones(FORWARD.beams, np.float32)
-    light = np.linspace(0.0, 4.0, 2 * FORWARD.beams, dtype=np.float32)[::2]
-    message = over_the_wire(conversions.scan_to_ros(FORWARD, ranges, 0, "laser", light))
-    assert np.array_equal(np.array(message.intensities, np.float32), light)
-    assert len(conversions.scan_to_ros(FORWARD, ranges, 0, "laser").intensities) == 0
-
-
 def test_ranges_of_a_slice_are_those_of_the_slice():
     spec = LidarSpec(
         beams=3, angle_min=-1.0, angle_max=1.0, range_min=0.1, range_max=8.0, rate=10.0
