@@ -15,49 +15,52 @@ PACKAGE = "nics_drl_bridge"
 
 # From the bottom up. What stands on one line does not import each other.
 LAYERS = (
-    ("errors", "geometry", "random_kernels", "interface", "discovery"),
-    ("strict_yaml", "seeds"),
-    ("files", "npz", "config", "threads"),
-    ("kinematics", "lidar"),
-    ("calibration",),
+    ("errors", "geometry", "interface", "kernels"),
+    ("extensions", "random_kernels", "seeds", "strict_yaml"),
+    ("config", "files", "npz", "threads"),
+    ("robot",),
+    ("recording",),
+    ("identify",),
+    ("lidar",),
     ("generator",),
-    ("sim", "middleware"),
-    ("highfidelity",),
+    ("sim",),
+    ("middleware",),
     ("env",),
-    ("policy", "safety"),
+    ("policy",),
+    ("gate",),
     ("report",),
     ("nodes",),
-    ("trial",),
-    ("evaluate", "shadow"),
-    ("vehicle",),
-    ("demo", "bake_order"),
     ("commands",),
-    ("cli",),
+    ("extras",),
+)
+ORDER = "".join(
+    f"    {'  ' if level else ''}{'< ' if level else ''}{', '.join(parts)}\n"
+    for level, parts in enumerate(LAYERS)
 )
 
 # Library -> where it may be imported; * of a message package stands for any name.
 HOMES = {
-    "rclpy": ("nodes/*",),
-    "*_msgs": ("nodes/*",),
-    "std_srvs": ("nodes/*",),
-    "builtin_interfaces": ("nodes/*",),
-    "ament_index_python": ("nodes/*",),
+    "rclpy": ("nodes/*", "extras/*"),
+    "*_msgs": ("nodes/*", "extras/*"),
+    "std_srvs": ("nodes/*", "extras/*"),
+    "builtin_interfaces": ("nodes/*", "extras/*"),
+    "ament_index_python": ("nodes/*", "extras/*"),
     "filterpy": ("middleware/ekf.py",),
     "matplotlib": ("report/*", "env/rendering.py"),
     "yaml": ("strict_yaml.py",),
-    "typer": ("commands/cli.py", "commands/*"),
-    "gymnasium": ("env/*", "policy/*", "commands/episodes.py", "commands/vehicle.py"),
+    "typer": ("commands/*", "extras/*"),
+    "gymnasium": ("env/*", "policy/*", "commands/*", "extras/*"),
     "numba": ("*kernels.py",),
     "PIL": ("lidar/maps.py",),
     "llvmlite": ("*kernels.py",),
-    "mujoco": ("highfidelity/*",),
-    "torch": ("policy/train*.py",),
-    "stable_baselines3": ("policy/train*.py",),
+    "mujoco": ("extras/mujoco/*",),
+    "torch": ("policy/train*.py", "extras/ray/*"),
+    "stable_baselines3": ("policy/train*.py", "extras/ray/*"),
     "onnx": ("policy/*",),
     "onnxruntime": ("policy/*",),
     "pettingzoo": ("env/pettingzoo_env.py",),
-    "ray": ("policy/train_ray*.py",),
-    "rosbags": ("kinematics/*",),
+    "ray": ("extras/ray/*",),
+    "rosbags": ("recording/*", "extras/bags/*"),
     "threadpoolctl": ("threads.py",),
 }
 
@@ -114,6 +117,10 @@ def strangers(package: Path) -> list[str]:
                 if fnmatch(library, name) and away:
                     wrong.append(f"{place}: imports {library}")
     return wrong
+
+
+def test_the_page_on_architecture_shows_the_order():
+    assert ORDER in (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 
 
 def test_imports_run_one_way():
