@@ -88,7 +88,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             halted by a step with the command nearest to zero.
         model: a SimulatorModel, its folder, or the name of a shipped robot.
         world: a World, its YAML file, or the name of a shipped one.
-        task: a name, `path/to/file.py:ClassName`, a class, or a Task; see `env.tasks.make_task`.
+        task: a name, `path/to/file.py:ClassName`, a class, or a Task; see `env.registry.make_task`.
         task_options: further arguments of the task's class.
         estimator: True puts the robot's middleware (cache and EKF) between the simulator and the
             task. Without it, the default of `sim`, pose and twist are those of odometry and

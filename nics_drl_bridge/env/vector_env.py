@@ -140,7 +140,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     @property
     def changing(self) -> dict[str, NDArray[Any]]:
-        """The arrays that change from step to step, by name; see `env.vector_state`."""
+        """The arrays that change from step to step, by name; see `policy.train_checkpoint`."""
         own = {
             "ended": self.ended, "over": self._over, "first": self._first,
             "episode": self._episode, "starts": self._starts, "bodies": self._bodies,

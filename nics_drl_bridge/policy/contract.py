@@ -35,7 +35,7 @@ class TaskEntry(Schema):
     """The task of a policy.
 
     Attributes:
-        name: as in `env.tasks.TASKS`, or the name of a user's class.
+        name: as in `env.registry.TASKS`, or the name of a user's class.
         options: all of its options except `scan`.
         sha256: over name, options and observation.
     """

@@ -81,7 +81,7 @@ class RobotSpec(Schema):
         description: one sentence.
         textbook: the textbook kinematics for its synthetic recordings, whose structure may also
             be assumed for motion that a drive did not show.
-        parameters: of the textbook kinematics [m, s], see `kinematics.textbook`.
+        parameters: of the textbook kinematics [m, s], see `recording.textbook`.
         footprint_radius: radius of the circular footprint around `base_link` [m]; optional with a
             `footprint`, which it then circumscribes.
         footprint: corners of a polygonal footprint instead, in `base_link` [m], in either

@@ -8,7 +8,7 @@ and outlines only where the circles around both are near.
 Shared arguments: a body (7,) is as in `lidar.shapes.BODY`; `corners` (sum V, 2) and `corner`
 (H + 1,) are the outlines of all shapes, see `lidar.shapes.Outlines`: none for a circle, two
 corners for a segment. Clearances beyond `limit` [m] are not measured: the result is `limit`.
-`grid` is the map: distances (rows, columns) of `lidar.maps_grid.GridMap.distance_field`, 0 in
+`grid` is the map: distances (rows, columns) of `lidar.maps.GridMap.distance_field`, 0 in
 solid cells, and frame (5,): x, y [m], cosine, sine of its origin, resolution [m]. `spare` (F, 2) is
 scratch for the corners of the first body, at least 4.
 """

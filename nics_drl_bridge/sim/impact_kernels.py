@@ -13,7 +13,7 @@ Bodies that overlap at the outset are not handled here, see `careful_kernels`.
 Shared arguments: `world` (K + M, 7) obstacles, then robots, as the substep begins; `flights`
 (K + M, 5) their motion in it, columns below, velocities of obstacles (k < `first`) in the map
 frame and those of robots in the body frame; `outlines` corners, and the first corner of each
-outline; `series` see `kinematics.kernels`. Body index -1 is the map, which does not move.
+outline; `series` see `robot.kernels`. Body index -1 is the map, which does not move.
 """
 
 from __future__ import annotations

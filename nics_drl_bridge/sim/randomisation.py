@@ -63,7 +63,7 @@ class Draws:
     """Draws for n episodes of M robots: every number the simulator needs, drawn or the model's.
 
     Attributes:
-        coefficient: (n, M, T) of the kept terms, in the order of `kinematics.kernels.term_arrays`.
+        coefficient: (n, M, T) of the kept terms, in the order of `robot.kernels.term_arrays`.
         delay: (n, M) from a command to its effect, including the model's [substeps].
         age: (n, M) of scan and odometry when they are observed [substeps].
         noise: (n, M, 2 + 3 + S) standard deviations: odometry, linear [m/s] and angular [rad/s],

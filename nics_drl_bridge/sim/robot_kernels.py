@@ -26,7 +26,7 @@ def move_freely(begin, end, pose, state, history, coefficient, delay, lanes, mot
         history: (N, M, H, C) commands, newest first.
         coefficient: (N, M, T) of the kinematic terms.
         delay: (N, M) of the commands [substeps].
-        lanes: pose (6, L), x (V + 1, L), dq (D, L) of `kinematics.kernels.run`, coefficient
+        lanes: pose (6, L), x (V + 1, L), dq (D, L) of `robot.kernels.run`, coefficient
             (T, L) and late (L,), L >= n M; they hold the result.
         motion: dof, factors, count of the terms, series, (step [s], substeps per period).
     """

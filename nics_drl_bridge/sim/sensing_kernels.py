@@ -61,7 +61,7 @@ def at_lag(past, n, m, column, lag, steps, substeps):  # type: ignore[no-untyped
 
 @kernel
 def advanced(x, y, heading, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
-    """Returns the pose after the exact arc of a body twist; see `kinematics.kernels.move`."""
+    """Returns the pose after the exact arc of a body twist; see `robot.kernels.move`."""
     x, y, _, _ = move(x, y, math.cos(heading), math.sin(heading), vx, vy, turn, dt, series)
     return x, y, wrap(heading + turn)
 
@@ -87,7 +87,7 @@ def measure(  # type: ignore[no-untyped-def]
         seed, counter: of the random draws.
         age: of the observation [substeps].
         dt, substeps: length of a substep [s], and substeps in a period.
-        series: see `kinematics.kernels`.
+        series: see `robot.kernels`.
     """
     rows = past.shape[2]
     this = steps % rows

@@ -53,7 +53,7 @@ class Worlds:
         seeds: (N,) of the episode.
         faults: (N, M, P) faults of each robot's lidar, columns as in `lidar.fault_kernels`.
         coefficient: (N, M, T) of the kinematic terms, in the order of
-            `kinematics.kernels.term_arrays`.
+            `robot.kernels.term_arrays`.
         delay: (N, M) latency of the commands [substeps], at most the simulator's `longest_delay`.
         age: (N, M) age of scan and odometry when they are observed [substeps], at most the
             simulator's `longest_age`.

@@ -40,7 +40,7 @@ class Obstacles(Schema):
         count: number of obstacles, or [least, greatest], from which each episode draws.
         gap: free space between one of them and any other obstacle [m].
         at: fixed poses, x, y [m], heading [rad], instead of `count` at random.
-        motion: their motion, see `sim.motion`; by default they stand still.
+        motion: their motion, see `sim.obstacles`; by default they stand still.
     """
 
     shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_SHAPES)
