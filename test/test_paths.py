@@ -22,7 +22,7 @@ from nics_drl_bridge.lidar.sensor_models import load_sensor_models
 from nics_drl_bridge.lidar.shapes import load_shapes
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
-from nics_drl_bridge.middleware.playback import Estimate, write_estimate
+from nics_drl_bridge.middleware.playback import EstimatedDrive, write_estimate
 from nics_drl_bridge.policy.policy_file import load_policy, shipped
 from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.recording.readers import load_csv_folder, read_recording
@@ -87,7 +87,7 @@ def test_a_bag_is_saved_told_and_looked_through_at_either(tmp_path, kind):
 @pytest.mark.parametrize("name", ["estimate.npz", "estimate.csv"])
 def test_an_estimate_is_written_to_either(tmp_path, kind, name):
     none = np.zeros((0, 3))
-    made = Estimate(np.zeros(0, np.int64), none, none, np.zeros((0, 3, 3)), {})
+    made = EstimatedDrive(np.zeros(0, np.int64), none, none, np.zeros((0, 3, 3)), {})
     write_estimate(made, kind(tmp_path / name))
     assert (tmp_path / name).is_file()
 

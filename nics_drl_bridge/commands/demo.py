@@ -17,7 +17,7 @@ import numpy as np
 import typer
 
 from nics_drl_bridge.commands.console import WorldOption, one_sentence
-from nics_drl_bridge.commands.demo_plan import Outcome, Plan, Say
+from nics_drl_bridge.commands.demo_plan import DemoPlan, DemoResult, Say
 from nics_drl_bridge.commands.demo_policy import deploy, learn
 from nics_drl_bridge.commands.demo_report import Shown, report
 from nics_drl_bridge.commands.episodes import DDS, FAST, Trial, drive_in
@@ -68,10 +68,10 @@ def demo(
 ) -> None:
     """Goes the whole road once: generate, train, evaluate, drive over DDS, deploy, report."""
     with one_sentence():
-        from nics_drl_bridge.commands.demo_plan import Plan
+        from nics_drl_bridge.commands.demo_plan import DemoPlan
 
         robot = robot or (RECORDED if recording else QUICK_TO_LEARN)
-        plan = Plan(out, robot, world, recording, episodes, policy, train_steps)
+        plan = DemoPlan(out, robot, world, recording, episodes, policy, train_steps)
         outcome = run(plan, lambda line: typer.echo(line))
         typer.echo(outcome.line())
 
@@ -97,7 +97,7 @@ class Clock:
         self.say(f"  {name} took {self.took[name]:.0f} s")
 
 
-def run(plan: Plan, say: Say) -> Outcome:
+def run(plan: DemoPlan, say: Say) -> DemoResult:
     """Generates a simulator, trains a policy in it, drives it over DDS, and writes the report.
 
     Every process that this starts has ended when it returns or raises.
@@ -128,10 +128,10 @@ def run(plan: Plan, say: Say) -> Outcome:
     shown = Shown(model, identified, learned, summary, here, there, live, clock.took)
     page = plan.out / "report.html"
     write_text(page, report(plan, shown))
-    return Outcome(successes(here), successes(there), plan.episodes, page)
+    return DemoResult(successes(here), successes(there), plan.episodes, page)
 
 
-def _generate(plan: Plan, say: Say) -> tuple[SimulatorModel, Identified]:
+def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
     robot, world = load_robot(plan.robot), load_world(plan.world)
     source = plan.recording or _record(robot, plan.out / "recording.npz", say)
     say(f"generating a simulator of the robot {robot.name!r} from {source}")
@@ -149,7 +149,7 @@ def _record(robot: RobotSpec, path: Path, say: Say) -> Path:
     return path
 
 
-def _evaluate(plan: Plan, model: SimulatorModel, name: str, say: Say) -> Summary:
+def _evaluate(plan: DemoPlan, model: SimulatorModel, name: str, say: Say) -> Summary:
     """Drives many unseen episodes at once, without the estimator."""
     say(f"evaluating {name} in {MANY} unseen episodes, all at once")
     policy, task = open_policy(name, model)
@@ -162,7 +162,7 @@ def _evaluate(plan: Plan, model: SimulatorModel, name: str, say: Say) -> Summary
     return summary
 
 
-def _drive(place: str, what: str, plan: Plan, policy: str, say: Say) -> list[Episode]:
+def _drive(place: str, what: str, plan: DemoPlan, policy: str, say: Say) -> list[Episode]:
     """Drives the plan's episodes in one of `trial.PLACES` and reports each."""
     say(f"{what} {'in process' if place == FAST else 'over DDS in lock-step'}")
     return drive_in(

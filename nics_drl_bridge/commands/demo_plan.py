@@ -10,7 +10,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Plan:
+class DemoPlan:
     """Plan of a demo.
 
     Attributes:
@@ -43,7 +43,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class DemoResult:
     """Outcome of the demo: successes in process and over DDS, and the path of the report."""
 
     in_process: int

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from nics_drl_bridge.commands.demo_plan import Plan, Say
+from nics_drl_bridge.commands.demo_plan import DemoPlan, Say
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import BackendError, PolicyError
@@ -48,7 +48,7 @@ class Learned:
     curve: Sequence[Point] = ()
 
 
-def learn(plan: Plan, model: SimulatorModel, say: Say) -> Learned:
+def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     """Trains a policy, unless the plan names one or a module for training is not installed.
 
     Args:
@@ -73,7 +73,7 @@ def learn(plan: Plan, model: SimulatorModel, say: Say) -> Learned:
     return Learned(policy, f"None was trained, as {missing!r} is not installed: {policy!r} drives.")
 
 
-def settings_of(plan: Plan) -> TrainingSettings:
+def settings_of(plan: DemoPlan) -> TrainingSettings:
     """Settings of the demo's training, in the plan's simulator and world."""
     chosen = load_training(SETTINGS)
     changes = {
@@ -84,7 +84,7 @@ def settings_of(plan: Plan) -> TrainingSettings:
     return chosen.model_copy(update=changes)
 
 
-def _trained(plan: Plan, say: Say) -> Learned:
+def _trained(plan: DemoPlan, say: Say) -> Learned:
     from nics_drl_bridge.policy.train import (
         SeedResult,
         export,
@@ -138,7 +138,7 @@ class Live:
     path: Episode
 
 
-def deploy(plan: Plan, model: SimulatorModel, policy: str, seed: int, say: Say) -> Live:
+def deploy(plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: Say) -> Live:
     """Runs simulator, middleware, policy and gate in one scene in real time.
 
     Args:
@@ -164,7 +164,7 @@ def deploy(plan: Plan, model: SimulatorModel, policy: str, seed: int, say: Say) 
 
 
 def _nodes(
-    plan: Plan, robot: RobotSpec, policy: str, seed: int, goal: list[float]
+    plan: DemoPlan, robot: RobotSpec, policy: str, seed: int, goal: list[float]
 ) -> dict[str, dict[str, Any]]:
     """Parameters of each node, by name."""
     folder = str(plan.model)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from nics_drl_bridge.commands.demo_plan import Plan
+from nics_drl_bridge.commands.demo_plan import DemoPlan
 from nics_drl_bridge.commands.demo_policy import Learned, Live
 from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.policy.evaluation import Episode, deviation, successes
 from nics_drl_bridge.policy.evaluation_batch import Summary
-from nics_drl_bridge.policy.statistics import Estimate
+from nics_drl_bridge.policy.statistics import ConfidenceInterval
 from nics_drl_bridge.report.calibration_pictures import CAPTIONS, calibration_pictures
 from nics_drl_bridge.report.fit_pictures import accuracy
 from nics_drl_bridge.report.page import Block, Code, Picture, Table, page
@@ -47,7 +47,7 @@ class Shown:
     took: dict[str, float]
 
 
-def report(plan: Plan, shown: Shown) -> str:
+def report(plan: DemoPlan, shown: Shown) -> str:
     """Builds the page, as HTML."""
     sections: list[tuple[str, Sequence[Block]]] = [
         ("The model", _model(plan, shown)),
@@ -61,7 +61,7 @@ def report(plan: Plan, shown: Shown) -> str:
     return page("nics_drl_bridge: demo", lead, sections)
 
 
-def _model(plan: Plan, shown: Shown) -> list[Block]:
+def _model(plan: DemoPlan, shown: Shown) -> list[Block]:
     calibrated = calibration_pictures(shown.model.robot, shown.identified)
     return [
         "Generated from " + str(plan.recording or "a textbook drive") + ".",
@@ -74,7 +74,7 @@ def _model(plan: Plan, shown: Shown) -> list[Block]:
     ]
 
 
-def _policy(plan: Plan, shown: Shown) -> list[Block]:
+def _policy(plan: DemoPlan, shown: Shown) -> list[Block]:
     blocks: list[Block] = [shown.learned.how]
     if shown.learned.curve:
         caption = "Success and collisions while it explores; all episodes are new ones."
@@ -101,11 +101,11 @@ def _policy(plan: Plan, shown: Shown) -> list[Block]:
     return [*blocks, told, Table(("", "value", "95 % from", "to"), rows)]
 
 
-def _ends(estimate: Estimate) -> tuple[float, float, float]:
+def _ends(estimate: ConfidenceInterval) -> tuple[float, float, float]:
     return estimate.value, estimate.low, estimate.high
 
 
-def _episodes(plan: Plan, shown: Shown) -> list[Block]:
+def _episodes(plan: DemoPlan, shown: Shown) -> list[Block]:
     here, there = shown.here, shown.there
     rows = [
         (
@@ -126,7 +126,7 @@ def _episodes(plan: Plan, shown: Shown) -> list[Block]:
     ]
 
 
-def _deployed(plan: Plan, shown: Shown) -> list[Block]:
+def _deployed(plan: DemoPlan, shown: Shown) -> list[Block]:
     live = shown.live
     beside = [episode for episode in shown.here if episode.seed == live.path.seed]
     drawn = trajectories(

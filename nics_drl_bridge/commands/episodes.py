@@ -22,7 +22,7 @@ from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy.evaluation import Episode, drive_all
 from nics_drl_bridge.policy.policies import SUFFIX, check_name, open_policy, shipped_policies
-from nics_drl_bridge.policy.statistics import Estimate, Tally, record_of, tallies
+from nics_drl_bridge.policy.statistics import ConfidenceInterval, Tally, record_of, tallies
 from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.world import load_world
@@ -158,7 +158,7 @@ Tell = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
-class Order:
+class EvaluationOrder:
     """An order to evaluate policies.
 
     Attributes:
@@ -189,7 +189,7 @@ class Evaluated:
     tallies: Mapping[str, Tally]
 
 
-def evaluate(order: Order, say: Say, tell: Tell) -> list[Evaluated]:
+def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
     """Drives every policy through the same episodes in every place, and writes the results.
 
     Args:
@@ -225,7 +225,7 @@ def evaluate(order: Order, say: Say, tell: Tell) -> list[Evaluated]:
     return evaluated
 
 
-def model_name(order: Order) -> str:
+def model_name(order: EvaluationOrder) -> str:
     """The model that the episodes are driven with."""
     if order.model is not None:
         return order.model
@@ -237,7 +237,7 @@ def model_name(order: Order) -> str:
 
 
 def _drive(
-    order: Order, policy: str, model: str, place: str, say: Say, tell: Tell
+    order: EvaluationOrder, policy: str, model: str, place: str, say: Say, tell: Tell
 ) -> list[Episode]:
     seeds = seeds_of(order)
     trial = Trial(policy, model, order.world, seeds, order.out / "logs")
@@ -251,7 +251,7 @@ def _drive(
     return drive_in(place, trial, told, say)
 
 
-def seeds_of(order: Order) -> range:
+def seeds_of(order: EvaluationOrder) -> range:
     """Seeds of the episodes. Raises ConfigError if one is not a valid seed."""
     seeds = range(order.seed, order.seed + order.episodes)
     checked_seeds([seeds.start, seeds.stop - 1])
@@ -264,7 +264,7 @@ def picture_of(out: Path, policy: str) -> Path:
 
 
 def told_of(
-    order: Order, name: str, model: SimulatorModel, evaluated: Sequence[Evaluated]
+    order: EvaluationOrder, name: str, model: SimulatorModel, evaluated: Sequence[Evaluated]
 ) -> dict[str, Any]:
     """The evaluation as plain data, for JSON."""
     return {
@@ -316,7 +316,7 @@ def percent(share: float) -> str:
     return f"{100 * share:.4g} %"
 
 
-def _figure(estimate: Estimate) -> str:
+def _figure(estimate: ConfidenceInterval) -> str:
     return "-" if estimate.value != estimate.value else f"{estimate.value:.2f}"
 
 

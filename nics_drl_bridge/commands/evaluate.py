@@ -91,10 +91,10 @@ def evaluate(
             )  # fmt: skip
             _hardware(order, policies, yes)
         else:
-            from nics_drl_bridge.commands.episodes import Order
+            from nics_drl_bridge.commands.episodes import EvaluationOrder
 
             chosen = {"places": tuple(dict.fromkeys(places))} if places else {}
-            _evaluate(Order(policies, out, model, world, episodes or 20, seed, **chosen))
+            _evaluate(EvaluationOrder(policies, out, model, world, episodes or 20, seed, **chosen))
 
 
 def _check(

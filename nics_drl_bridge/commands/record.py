@@ -39,7 +39,7 @@ def record(
     with one_sentence():
         from nics_drl_bridge.nodes import recorder
 
-        order = recorder.Order(
+        order = recorder.RecordOrder(
             robot, out, bound, duration, speed, seed, namespace, tuple(remap or ()), topics,
             stamped, use_sim_time,
         )  # fmt: skip

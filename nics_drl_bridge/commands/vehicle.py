@@ -15,7 +15,7 @@ from nics_drl_bridge.commands.episodes import (
     LABELS,
     VEHICLE,
     Evaluated,
-    Order,
+    EvaluationOrder,
     picture_of,
     robot_of,
     told_of,
@@ -28,7 +28,7 @@ from nics_drl_bridge.policy.evaluation import Episode, drive
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.policy.statistics import tallies
 from nics_drl_bridge.report.doctor import examine
-from nics_drl_bridge.report.doctor_facts import Finding, expected_of_model
+from nics_drl_bridge.report.doctor_facts import Mismatch, expected_of_model
 from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world import load_world
@@ -98,7 +98,7 @@ def drive_vehicle(order: VehicleOrder, say: Say, ask: Say) -> Evaluated:
     shown = {LABELS[place]: some for place, some in runs.items()}
     picture = trajectories(shown, world, model.robot.footprint_radius)
     write_bytes(picture_of(order.out, order.policy), picture)
-    general = Order(
+    general = EvaluationOrder(
         (order.policy,), order.out, name, order.world, order.episodes, order.seed, tuple(runs)
     )
     told = json.dumps(told_of(general, name, model, [made]))
@@ -119,7 +119,7 @@ def _examine(order: VehicleOrder, model: SimulatorModel, say: Say) -> None:
         raise BackendError(f"the vehicle is not driven: {errors[0]}; see nics doctor for the rest.")
 
 
-def _sentence(finding: Finding) -> str:
+def _sentence(finding: Mismatch) -> str:
     return f"{finding.where}: {finding.what} ({finding.fix})"
 
 

@@ -322,7 +322,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             raise gymnasium.error.ResetNeeded("call reset() before render().")
         if self._picture is None:
             drawing = import_module("nics_drl_bridge.env.rendering")
-            self._picture = drawing.Picture(self.model, self.world, self.render_mode, RENDER_FPS)
+            self._picture = drawing.WorldPicture(
+                self.model, self.world, self.render_mode, RENDER_FPS
+            )
         poses = np.reshape(self._true_pose, (self.robots, 3))
         bodies = self.scene.bodies
         if isinstance(self._backend, SimBackend):

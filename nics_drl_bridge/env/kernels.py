@@ -72,7 +72,7 @@ def look_by_sector(shares, ranges, sensor):  # type: ignore[no-untyped-def]
     """Writes the nearest returns of sectors (S,) as shares; returns True if something is too close.
 
     Contact is judged from the beams (B,) themselves. `sensor` contains per_metre and leaves of
-    `look`, and the mapping of beams to sectors, see `canonical.Plan.arguments`.
+    `look`, and the mapping of beams to sectors, see `sectors.SectorPlan.arguments`.
     """
     per_metre, leaves, plan = sensor
     zero, one = np.float32(0.0), np.float32(1.0)

@@ -21,7 +21,7 @@ TWIST_PARTS = 3
 
 
 @dataclass(frozen=True)
-class Verdict:
+class NavigationVerdict:
     """Outcome of a step for the robots. Each is (...,) bool.
 
     Attributes:
@@ -106,10 +106,10 @@ class Navigation(Task):
         """Writes the observation into (..., B + 6), which is contiguous."""
         self._see(out, view.pose, view, memory)
 
-    def judge(self, view: RobotView, memory: Memory) -> Verdict:
+    def judge(self, view: RobotView, memory: Memory) -> NavigationVerdict:
         """Judges which robots are at their goals, and which touch something."""
         near = distance(view.pose, memory["goal"])
-        return Verdict(np.asarray(near < self.goal_radius), self.touches(view.ranges))
+        return NavigationVerdict(np.asarray(near < self.goal_radius), self.touches(view.ranges))
 
     def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
         """The terms (...,) of the reward for a step; their sum is the reward."""
@@ -135,7 +135,7 @@ class Navigation(Task):
 
     def _see(
         self, out: Observation, before: Array, view: RobotView, memory: Memory
-    ) -> tuple[Array, Verdict]:
+    ) -> tuple[Array, NavigationVerdict]:
         """Writes the observations; returns the approach to the goals [m] and the verdict."""
         lead = view.pose.shape[:-1]
         approach = np.empty(lead)
@@ -147,9 +147,9 @@ class Navigation(Task):
             view.ranges.reshape(-1, view.ranges.shape[-1]), memory["goal"].reshape(-1, 2),
             self.sensor, self.goal_radius,
         )  # fmt: skip
-        return approach, Verdict(reached, touched)
+        return approach, NavigationVerdict(reached, touched)
 
-    def _terms(self, approach: Array, verdict: Verdict) -> dict[str, Array]:
+    def _terms(self, approach: Array, verdict: NavigationVerdict) -> dict[str, Array]:
         time = np.empty_like(approach)
         time.fill(self.time_reward)
         return {
@@ -160,5 +160,5 @@ class Navigation(Task):
         }
 
     @staticmethod
-    def _facts(verdict: Verdict) -> dict[str, NDArray[Any]]:
+    def _facts(verdict: NavigationVerdict) -> dict[str, NDArray[Any]]:
         return {"is_success": verdict.reached & ~verdict.touched, "collision": verdict.touched}

@@ -24,7 +24,7 @@ WALL, STANDING, GOAL, SCAN = "#333333", "#8d99ae", "#f2c14e", "#d1495b"
 ROBOTS = ("#1f6fb2", "#2f855a", "#7a4fa3", "#b7791f", "#0f766e", "#9d174d")
 
 
-class Picture:
+class WorldPicture:
     """Picture of walls, obstacles, goals, robots and their scans, redrawn at every step.
 
     Args:

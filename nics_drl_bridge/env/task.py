@@ -20,7 +20,7 @@ from nics_drl_bridge.env.actions import Actions, action_space, discrete_commands
 from nics_drl_bridge.env.kernels import LIMIT
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.lidar.sectors import NO_PLAN, Plan, ScanLayout, plan_of
+from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, SectorPlan, plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -225,7 +225,7 @@ class Task(ABC):
         return Sight(self.lidar.angles + heading, np.array([x, y]), self.lidar.range_max)
 
     @cached_property
-    def plan(self) -> Plan:
+    def plan(self) -> SectorPlan:
         """Mapping of the lidar's beams to the sectors of `scan`; without it, one of no sectors."""
         return NO_PLAN if self.scan is None else plan_of(self.lidar, self.scan)
 

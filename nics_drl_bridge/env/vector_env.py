@@ -301,7 +301,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         if not self._pictures:
             drawing = import_module("nics_drl_bridge.env.rendering")
             self._pictures = [
-                drawing.Picture(self.model, self.world, self.render_mode, RENDER_FPS)
+                drawing.WorldPicture(self.model, self.world, self.render_mode, RENDER_FPS)
                 for _ in range(self.num_envs)
             ]
         drawn, data, bodies = [], self.simulator.data, self.simulator.obstacles

@@ -20,11 +20,11 @@ from nics_drl_bridge.identify.mounting import (
     wheel_scales,
     wheels_swapped,
 )
-from nics_drl_bridge.identify.noise import Motion, motion, pose_noise
+from nics_drl_bridge.identify.noise import TwistIntervals, motion, pose_noise
 from nics_drl_bridge.identify.signals import held, interval_means
 from nics_drl_bridge.identify.timing import (
     LONG_STEP,
-    Timing,
+    TimingEstimate,
     followed,
     fresh,
     if_certain,
@@ -100,7 +100,7 @@ def examine(recording: Recording, spec: RobotSpec) -> tuple[Calibration, Finding
     return calibration, findings
 
 
-def tracked_twists(recording: Recording) -> Motion:
+def tracked_twists(recording: Recording) -> TwistIntervals:
     """Returns twists of the tracked body over intervals as long as the pose noise requires."""
     t, pose = recording.pose.t, recording.pose.values
     bursts = repair.find_bursts(t)
@@ -122,7 +122,9 @@ def _unmoved(recording: Recording, spec: RobotSpec) -> tuple[str, ...]:
     return tuple(c.name for c, m in zip(spec.command, moved, strict=True) if not m)
 
 
-def _expected(recording: Recording, spec: RobotSpec, twists: Motion, timing: Timing) -> Array:
+def _expected(
+    recording: Recording, spec: RobotSpec, twists: TwistIntervals, timing: TimingEstimate
+) -> Array:
     """Returns the mean state (n, S) over the intervals of the twists; inferred ones at gain 1."""
     start, end = twists.start + timing.offset, twists.end + timing.offset
     if recording.state is not None:
@@ -133,7 +135,7 @@ def _expected(recording: Recording, spec: RobotSpec, twists: Motion, timing: Tim
 
 
 def _mounting(
-    recording: Recording, spec: RobotSpec, twists: Motion, timing: Timing
+    recording: Recording, spec: RobotSpec, twists: TwistIntervals, timing: TimingEstimate
 ) -> Mounting | None:
     if any(c.cmd_vel == "linear.y" for c in spec.command):
         return jackknifed(
@@ -158,7 +160,7 @@ def _mounting(
 
 
 def _by_commands(
-    recording: Recording, spec: RobotSpec, twists: Motion, timing: Timing
+    recording: Recording, spec: RobotSpec, twists: TwistIntervals, timing: TimingEstimate
 ) -> Mounting | None:
     """Estimates the mounting on an omnidirectional robot."""
     if spec.state:
@@ -222,7 +224,11 @@ def _mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration
 
 
 def _responses(
-    recording: Recording, spec: RobotSpec, twists: Motion, calibration: Calibration, timing: Timing
+    recording: Recording,
+    spec: RobotSpec,
+    twists: TwistIntervals,
+    calibration: Calibration,
+    timing: TimingEstimate,
 ) -> tuple[Response, ...]:
     """Returns the inferred states; a speed is scaled to the speed along the direction of travel."""
     if recording.state is not None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import rotate, wrap_angle
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.noise import Motion
+from nics_drl_bridge.identify.noise import TwistIntervals
 from nics_drl_bridge.identify.signals import interval_means
 from nics_drl_bridge.identify.statistics import standard_errors
 from nics_drl_bridge.identify.timing import CERTAIN
@@ -56,7 +56,7 @@ class Mounting:
     turns: bool
 
 
-def mounting_without_lateral_motion(motion: Motion, forward: Array) -> Mounting | None:
+def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> Mounting | None:
     """Estimates the mounting on a robot whose `base_link` never moves sideways.
 
     The lateral speed of the tracked point is then yaw rate x lever arm:
@@ -91,7 +91,7 @@ def mounting_without_lateral_motion(motion: Motion, forward: Array) -> Mounting 
 
 
 def _facing(
-    motion: Motion,
+    motion: TwistIntervals,
     forward: Array,
     travel: float,
     lever_x: tuple[float, float],
@@ -112,7 +112,7 @@ def _facing(
     )
 
 
-def lateral_lever(motion: Motion, rotation: float, speed: Array) -> tuple[float, float]:
+def lateral_lever(motion: TwistIntervals, rotation: float, speed: Array) -> tuple[float, float]:
     """Estimates the lever arm along y and its uncertainty [m] from a speed (n,).
 
     The speed is measured or inferred from commands. The tracked point is faster than `base_link`
@@ -128,7 +128,7 @@ def lateral_lever(motion: Motion, rotation: float, speed: Array) -> tuple[float,
     return -float(beta[1]), float(standard_errors(chi, along - chi @ beta)[1])
 
 
-def mounting_by_commands(motion: Motion, response: Array) -> Mounting | None:
+def mounting_by_commands(motion: TwistIntervals, response: Array) -> Mounting | None:
     """Estimates the mounting on an omnidirectional robot.
 
     Args:
@@ -157,11 +157,11 @@ def mounting_by_commands(motion: Motion, response: Array) -> Mounting | None:
 
 
 BLOCKS = 8
-Estimate = Callable[[Recording, Motion], Mounting | None]
+Estimate = Callable[[Recording, TwistIntervals], Mounting | None]
 
 
 def jackknifed(
-    recording: Recording, twists: Motion, offset: float, estimate: Estimate
+    recording: Recording, twists: TwistIntervals, offset: float, estimate: Estimate
 ) -> Mounting | None:
     """Estimates a mounting, with at least the uncertainty of the delete-one-block jackknife.
 
@@ -199,11 +199,11 @@ def _spread(values: Array) -> Array:
 
 
 def _without(
-    recording: Recording, twists: Motion, offset: float, begin: float, end: float
-) -> tuple[Recording, Motion]:
+    recording: Recording, twists: TwistIntervals, offset: float, begin: float, end: float
+) -> tuple[Recording, TwistIntervals]:
     """Drops the twists and the measured state between two times of the pose's clock [s]."""
     rows = (twists.end <= begin) | (twists.start >= end)
-    kept = Motion(twists.start[rows], twists.end[rows], twists.twist[rows])
+    kept = TwistIntervals(twists.start[rows], twists.end[rows], twists.twist[rows])
     state = recording.state
     if state is None:
         return recording, kept
@@ -212,7 +212,7 @@ def _without(
     return replace(recording, state=cut), kept
 
 
-def wheels_swapped(recording: Recording, twists: Motion, offset: float) -> bool | None:
+def wheels_swapped(recording: Recording, twists: TwistIntervals, offset: float) -> bool | None:
     """True if the left wheel is faster in left turns; None if the wheels do not show it."""
     if recording.wheels is None:
         return None
@@ -226,7 +226,9 @@ def wheels_swapped(recording: Recording, twists: Motion, offset: float) -> bool 
     return agreement < 0.0 if abs(agreement) > 0.5 else None
 
 
-def wheel_scales(recording: Recording, twists: Motion, calibration: Calibration) -> Calibration:
+def wheel_scales(
+    recording: Recording, twists: TwistIntervals, calibration: Calibration
+) -> Calibration:
     """Adds the scales of the wheel speeds, as far as the drive shows them."""
     if recording.wheels is None:
         return calibration

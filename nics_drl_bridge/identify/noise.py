@@ -28,7 +28,7 @@ MAX_GAP_S = 0.25
 
 
 @dataclass(frozen=True)
-class Motion:
+class TwistIntervals:
     """Twists of the tracked body over intervals.
 
     Attributes:
@@ -106,7 +106,9 @@ def _spread_at_rest(pose: Array) -> Array | None:
     return np.asarray(np.sqrt((spread[still] ** 2).mean(axis=0)))
 
 
-def motion(t: Array, pose: Array, bursts: Bursts | None, noise: tuple[float, float]) -> Motion:
+def motion(
+    t: Array, pose: Array, bursts: Bursts | None, noise: tuple[float, float]
+) -> TwistIntervals:
     """Returns twists of the tracked body over intervals long enough for the noise.
 
     Args:
@@ -121,7 +123,9 @@ def motion(t: Array, pose: Array, bursts: Bursts | None, noise: tuple[float, flo
     span = np.diff(t)
     usable = (span > 0.0) & (span < max(limit, 3.0 * float(np.median(span))))
     relative = geometry.between(pose[:-1], pose[1:])[usable]
-    return Motion(t[:-1][usable], t[1:][usable], geometry.log(relative) / span[usable, None])
+    return TwistIntervals(
+        t[:-1][usable], t[1:][usable], geometry.log(relative) / span[usable, None]
+    )
 
 
 def _stride(t: Array, pose: Array, noise: tuple[float, float]) -> int:

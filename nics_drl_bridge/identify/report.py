@@ -182,7 +182,7 @@ def _open_loop(held_out: OpenLoop | None) -> list[str]:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class CalibratedValue:
     """One estimate.
 
     Attributes:
@@ -213,7 +213,7 @@ class Estimate:
 
 def estimates(
     recording: Recording, calibration: Calibration, findings: Findings
-) -> dict[str, Estimate]:
+) -> dict[str, CalibratedValue]:
     """Returns all estimates by their names in `Calibration`."""
     return {
         **_timing(recording, calibration, findings),
@@ -224,28 +224,30 @@ def estimates(
 
 def _timing(
     recording: Recording, calibration: Calibration, findings: Findings
-) -> dict[str, Estimate]:
+) -> dict[str, CalibratedValue]:
     sigma = calibration.uncertainty
-    offset = Estimate("clock offset", None, None, "s", "pose and commands are on one clock")
+    offset = CalibratedValue("clock offset", None, None, "s", "pose and commands are on one clock")
     if "clock_offset_s" in sigma:
         value = calibration.clock_offset_s
-        offset = Estimate("clock offset", value, sigma["clock_offset_s"], "s")
+        offset = CalibratedValue("clock offset", value, sigma["clock_offset_s"], "s")
     elif findings.clocks_differ:
-        offset = Estimate("clock offset", None, None, "s", "no command changed")
+        offset = CalibratedValue("clock offset", None, None, "s", "no command changed")
     why = "no command changed"
     if "clock_offset_s" in sigma:
         why = "only its sum with the clock offset is known"
-    latency = Estimate("command latency", None, None, "s", why)
+    latency = CalibratedValue("command latency", None, None, "s", why)
     if "command_latency_s" in sigma:
         value = calibration.command_latency_s
-        latency = Estimate("command latency", value, sigma["command_latency_s"], "s")
-    bursts = Estimate("period of bursts", None, None, "s", "the poses are stamped one by one")
+        latency = CalibratedValue("command latency", value, sigma["command_latency_s"], "s")
+    bursts = CalibratedValue(
+        "period of bursts", None, None, "s", "the poses are stamped one by one"
+    )
     if calibration.burst_period_s > 0.0:
-        bursts = Estimate("period of bursts", calibration.burst_period_s, None, "s")
+        bursts = CalibratedValue("period of bursts", calibration.burst_period_s, None, "s")
     return {"clock_offset_s": offset, "command_latency_s": latency, "burst_period_s": bursts}
 
 
-def _mounting(calibration: Calibration, findings: Findings) -> dict[str, Estimate]:
+def _mounting(calibration: Calibration, findings: Findings) -> dict[str, CalibratedValue]:
     names = {
         "rotation_rad": ("rotation of base_link", calibration.rotation_rad, "rad"),
         "lever_arm_x_m": ("lever arm x", calibration.lever_arm_m[0], "m"),
@@ -258,14 +260,14 @@ def _mounting(calibration: Calibration, findings: Findings) -> dict[str, Estimat
     for key, (name, value, unit) in names.items():
         sigma = calibration.uncertainty.get(key)
         if sigma is None:
-            found[key] = Estimate(name, None, None, unit, why)
+            found[key] = CalibratedValue(name, None, None, unit, why)
         else:
             remark = "below its uncertainty: taken as zero" if value == 0.0 else ""
-            found[key] = Estimate(name, value, sigma, unit, remark)
+            found[key] = CalibratedValue(name, value, sigma, unit, remark)
     return found
 
 
-def _wheels(recording: Recording, calibration: Calibration) -> dict[str, Estimate]:
+def _wheels(recording: Recording, calibration: Calibration) -> dict[str, CalibratedValue]:
     why = "no wheel speeds were recorded"
     if recording.wheels is not None:
         why = "the wheels do not show it"
@@ -276,9 +278,9 @@ def _wheels(recording: Recording, calibration: Calibration) -> dict[str, Estimat
     found = {}
     for key, (name, value, unit) in rows.items():
         sigma = calibration.uncertainty.get(key)
-        found[key] = Estimate(name, value, sigma, unit, why if value is None else "")
+        found[key] = CalibratedValue(name, value, sigma, unit, why if value is None else "")
     swapped = calibration.wheels_swapped
     known = None if swapped is None else float(swapped)
     meaning = {None: why, True: "left and right are interchanged", False: "as named"}[swapped]
-    found["wheels_swapped"] = Estimate("swapped wheels", known, None, "", meaning)
+    found["wheels_swapped"] = CalibratedValue("swapped wheels", known, None, "", meaning)
     return found

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.identify.least_squares import minimise, uncertainty, unexplained
-from nics_drl_bridge.identify.noise import Motion
+from nics_drl_bridge.identify.noise import TwistIntervals
 from nics_drl_bridge.identify.signals import held, held_features, interval_means, lagged
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot import taylor
@@ -38,7 +38,7 @@ REGULAR = 0.8
 
 
 @dataclass(frozen=True)
-class Delay:
+class DelayEstimate:
     """An estimated delay.
 
     Attributes:
@@ -92,7 +92,7 @@ def delay_of_response(
     target: tuple[Array, Array, Array],
     centers: tuple[float, ...] = (0.0,),
     lags: Array | None = None,
-) -> Delay:
+) -> DelayEstimate:
     """Estimates the delay and the lags with which a signal follows the commands.
 
     Args:
@@ -116,7 +116,7 @@ def delay_of_response(
     found, spread = base.copy(), np.full(len(base), np.nan)
     found[free] = np.exp(theta[1:])
     spread[free] = sigma[1:] * found[free]
-    return Delay(float(theta[0]), float(sigma[0]), found, spread, explained)
+    return DelayEstimate(float(theta[0]), float(sigma[0]), found, spread, explained)
 
 
 def response_residual(
@@ -152,7 +152,7 @@ def fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
     return np.asarray(np.append(span, 0.0)[np.clip(row, 0, None)] < LONG_STEP * usual)
 
 
-def latency_of_state(command: Stream, state: Stream, spec: RobotSpec) -> Delay | None:
+def latency_of_state(command: Stream, state: Stream, spec: RobotSpec) -> DelayEstimate | None:
     """Estimates the delay with which a measured state starts to follow the commands.
 
     None if no command changed; exactly zero if zero explains the state to rounding.
@@ -181,7 +181,7 @@ def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Callable[
 
 def delay_of_pose(
     state: Stream, target: tuple[Array, Array, Array], centers: tuple[float, ...]
-) -> Delay:
+) -> DelayEstimate:
     """Estimates the delay of the pose's clock behind that of a measured state."""
     return _search_or_zero(residual_by_shift(state, target), centers)
 
@@ -202,12 +202,12 @@ def residual_by_shift(
 
 def _search_or_zero(
     residual: Callable[[Array], Array], centers: tuple[float, ...] = (0.0,)
-) -> Delay:
+) -> DelayEstimate:
     nothing = np.zeros(0)
     if np.sqrt((residual(np.zeros(1)) ** 2).mean()) < EXACT:
-        return Delay(0.0, 0.0, nothing, nothing, 1.0)
+        return DelayEstimate(0.0, 0.0, nothing, nothing, 1.0)
     theta, sigma, explained = _search(residual, centers, nothing)
-    return Delay(float(theta[0]), float(sigma[0]), nothing, nothing, explained)
+    return DelayEstimate(float(theta[0]), float(sigma[0]), nothing, nothing, explained)
 
 
 def _search(
@@ -243,7 +243,7 @@ CERTAIN = 3.0
 
 
 @dataclass(frozen=True)
-class Timing:
+class TimingEstimate:
     """Offset and latency as in `Calibration`, with lags and uncertainties.
 
     Attributes:
@@ -262,7 +262,7 @@ class Timing:
     separated: bool
 
 
-def timing_of(recording: Recording, spec: RobotSpec, twists: Motion) -> Timing:
+def timing_of(recording: Recording, spec: RobotSpec, twists: TwistIntervals) -> TimingEstimate:
     """Estimates clock offset, latency and lags as far as the recording allows."""
     if recording.state is not None:
         return _timing_of_measured_state(recording, recording.state, spec, twists)
@@ -270,32 +270,34 @@ def timing_of(recording: Recording, spec: RobotSpec, twists: Motion) -> Timing:
         nothing = np.full(len(spec.state), np.nan)
         start = recording.command.t[0] - recording.pose.t[0]
         offset = float(start) if abs(start) > 60.0 else 0.0
-        return Timing(offset, 0.0, {}, nominal_lags(spec), nothing, False)
+        return TimingEstimate(offset, 0.0, {}, nominal_lags(spec), nothing, False)
     target = (twists.start, twists.end, twists.twist)
     centers = _likely_shifts(recording)
     if recording.pose.clock == recording.command.clock:
         delay = delay_of_response(recording.command, spec, target)
         latency = if_certain(max(delay.value, 0.0), delay.sigma, MIN_TIME_S)
         sigma = {"command_latency_s": delay.sigma}
-        return Timing(0.0, latency, sigma, delay.lags, delay.lag_sigma, True)
+        return TimingEstimate(0.0, latency, sigma, delay.lags, delay.lag_sigma, True)
     wheels = _wheel_delay(recording, spec)
     delay = delay_of_response(
         recording.command, spec, target, centers, None if wheels is None else wheels.lags
     )
     if wheels is None:
         sigma = {"clock_offset_s": delay.sigma}
-        return Timing(-delay.value, 0.0, sigma, delay.lags, delay.lag_sigma, False)
+        return TimingEstimate(-delay.value, 0.0, sigma, delay.lags, delay.lag_sigma, False)
     sigma = {
         "clock_offset_s": float(np.hypot(wheels.sigma, delay.sigma)),
         "command_latency_s": wheels.sigma,
     }
     latency = max(wheels.value, 0.0)
-    return Timing(latency - delay.value, latency, sigma, wheels.lags, wheels.lag_sigma, True)
+    return TimingEstimate(
+        latency - delay.value, latency, sigma, wheels.lags, wheels.lag_sigma, True
+    )
 
 
 def _timing_of_measured_state(
-    recording: Recording, state: Stream, spec: RobotSpec, twists: Motion
-) -> Timing:
+    recording: Recording, state: Stream, spec: RobotSpec, twists: TwistIntervals
+) -> TimingEstimate:
     found = latency_of_state(recording.command, state, spec)
     step = float(np.median(np.diff(state.t)))
     sigma, latency = {}, 0.0
@@ -309,7 +311,7 @@ def _timing_of_measured_state(
         sigma["clock_offset_s"] = delay.sigma
         offset = -if_certain(delay.value, delay.sigma, MIN_TIME_S)
     nothing = np.zeros(0)
-    return Timing(offset, latency, sigma, nothing, nothing, found is not None)
+    return TimingEstimate(offset, latency, sigma, nothing, nothing, found is not None)
 
 
 def _likely_shifts(recording: Recording) -> tuple[float, ...]:
@@ -317,7 +319,7 @@ def _likely_shifts(recording: Recording) -> tuple[float, ...]:
     return 0.0, float(recording.pose.t[0] - recording.command.t[0])
 
 
-def _wheel_delay(recording: Recording, spec: RobotSpec) -> Delay | None:
+def _wheel_delay(recording: Recording, spec: RobotSpec) -> DelayEstimate | None:
     """Returns the delay of the wheels; None on another clock or if they do not follow commands."""
     wheels = recording.wheels
     if wheels is None or wheels.clock != recording.command.clock:

@@ -1,7 +1,7 @@
 """Compiled inner loops of the canonical scan: from the beams of a lidar to sectors of a layout.
 
 Ranges follow REP-117: `inf` no return, `-inf` too close, NaN unknown. Shapes: B beams, S sectors.
-`plan` is `canonical.Plan.arguments`.
+`plan` is `sectors.SectorPlan.arguments`.
 """
 
 from __future__ import annotations

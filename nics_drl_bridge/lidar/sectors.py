@@ -116,7 +116,7 @@ def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
 
 
 @dataclass(frozen=True)
-class Plan:
+class SectorPlan:
     """Assignment of the beams of one lidar to the sectors of one layout; computed once.
 
     Attributes:
@@ -151,13 +151,13 @@ class Plan:
         return out.reshape(*np.shape(ranges)[:-1], -1)
 
 
-NO_PLAN = Plan(
+NO_PLAN = SectorPlan(
     np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(2), np.zeros(5)
 )
 """Plan without sectors, for policies that observe the beams themselves."""
 
 
-def plan_of(lidar: LidarSpec, layout: ScanLayout) -> Plan:
+def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
     """Returns the plan by which a lidar fills a layout.
 
     Raises:
@@ -172,7 +172,7 @@ def plan_of(lidar: LidarSpec, layout: ScanLayout) -> Plan:
         first[s], count[s] = _beams_of(wrap_angle(angles - middle), 0.5 * layout.width + BORDER_RAD)
     left_open = 2.0 * np.pi - (lidar.angles[-1] - lidar.angles[0])
     closed = left_open <= max(COARSEST_RAD, lidar.angle_increment)
-    return Plan(
+    return SectorPlan(
         first,
         count,
         np.stack([np.cos(angles), np.sin(angles)], axis=1),

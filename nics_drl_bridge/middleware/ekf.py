@@ -12,10 +12,10 @@ from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.belief import Anchor, Belief, Foreseen, Unseen, parted
 from nics_drl_bridge.middleware.command_log import CommandLog
 from nics_drl_bridge.middleware.measurement import (
+    Acceptance,
+    Judgement,
     Kind,
     Measurement,
-    Outcome,
-    Verdict,
     pose_residual,
 )
 from nics_drl_bridge.robot.kernels import SERIES, term_arrays
@@ -220,16 +220,16 @@ class Estimator:
         expected = kernels.expect(mean, time_ns, log, self._terms)
         return Foreseen(time_ns, mean, covariance, expected)
 
-    def update_twist(self, twist: ArrayLike) -> Verdict:
+    def update_twist(self, twist: ArrayLike) -> Judgement:
         """Corrects by a measured body twist (3,) at the time of the estimate."""
         return self.correct(Measurement(Kind.TWIST, np.array(twist, dtype=np.float64)))
 
-    def update_yaw_rate(self, rate: float, std: float | None = None) -> Verdict:
+    def update_yaw_rate(self, rate: float, std: float | None = None) -> Judgement:
         """Corrects by a measured yaw rate [rad/s]."""
         noise = None if std is None else np.array([[std**2]])
         return self.correct(Measurement(Kind.YAW_RATE, np.array([rate]), noise))
 
-    def update_pose(self, pose: ArrayLike, std: ArrayLike | None = None) -> Verdict:
+    def update_pose(self, pose: ArrayLike, std: ArrayLike | None = None) -> Judgement:
         """Corrects by a measured pose (3,).
 
         Args:
@@ -239,7 +239,7 @@ class Estimator:
         noise = None if std is None else np.diag(np.asarray(std, dtype=np.float64) ** 2)
         return self.correct(Measurement(Kind.POSE, np.array(pose, dtype=np.float64), noise))
 
-    def correct(self, measurement: Measurement) -> Verdict:
+    def correct(self, measurement: Measurement) -> Judgement:
         """Corrects by a measurement at the time of the estimate, unless it is an outlier.
 
         If the robot may have moved unobserved, the odometry's pose first bridges that motion.
@@ -250,7 +250,7 @@ class Estimator:
         verdict = self._correct(measurement)
         if odom is not None:
             self.anchor(odom)
-        elif kind is Kind.POSE and verdict.outcome is not Outcome.OUTLIER:
+        elif kind is Kind.POSE and verdict.outcome is not Acceptance.OUTLIER:
             self._lost = False
         return verdict
 
@@ -265,20 +265,20 @@ class Estimator:
             self._jump(*bridged)
             self._foreseen = None
 
-    def _correct(self, measurement: Measurement) -> Verdict:
+    def _correct(self, measurement: Measurement) -> Judgement:
         kind, value, noise, _ = measurement
         noise = self._noise[kind] if noise is None else noise
         expected, derivative = self._expect(kind)
         residual = pose_residual if kind is Kind.POSE else np.subtract
         innovation = residual(value, expected)
         distance = kernels.distance(innovation, derivative, self._filter.P, noise)
-        outcome = Outcome.USED
+        outcome = Acceptance.USED
         if not distance <= GATE[kind]:
             outcome = self._surprise(kind, innovation, derivative, noise)
-        if outcome is Outcome.OUTLIER:
+        if outcome is Acceptance.OUTLIER:
             self._count(kind, self._outliers[kind] + 1)
-            return Verdict(distance, outcome)
-        if kind is Kind.POSE and outcome is Outcome.JUMP:
+            return Judgement(distance, outcome)
+        if kind is Kind.POSE and outcome is Acceptance.JUMP:
             self._jump(value, noise)
         elif (update := self._update_foreseen(kind, outcome, noise)) is not None:
             gain, self._filter.P = update
@@ -287,11 +287,11 @@ class Estimator:
             self._filter.update(
                 value, lambda _: derivative, lambda _: expected, R=noise, residual=residual
             )
-        if self._outliers[kind] and not (outcome is Outcome.JUMP and kind is Kind.TWIST):
+        if self._outliers[kind] and not (outcome is Acceptance.JUMP and kind is Kind.TWIST):
             self._count(kind, 0)
         kernels.settle(self._filter.x, self._filter.P, *self._limits)
         self._foreseen = None
-        return Verdict(distance, outcome)
+        return Judgement(distance, outcome)
 
     def _expect(self, kind: Kind) -> tuple[Array, Array]:
         """Returns the expected measurement (n,) and its derivative (n, 3 + S)."""
@@ -306,30 +306,32 @@ class Estimator:
         return (twist, derivative) if kind is Kind.TWIST else (twist[2:], derivative[2:])
 
     def _update_foreseen(
-        self, kind: Kind, outcome: Outcome, noise: Array
+        self, kind: Kind, outcome: Acceptance, noise: Array
     ) -> tuple[Array, Array] | None:
         """Returns the update computed in advance, if it is for such a measurement and belief."""
         foreseen = self._foreseen
         if foreseen is None or foreseen.mean is not self._filter.x:
             return None
-        as_tried = outcome is Outcome.USED and noise is self._noise[Kind.TWIST]
+        as_tried = outcome is Acceptance.USED and noise is self._noise[Kind.TWIST]
         return foreseen.update if kind is Kind.TWIST and as_tried else None
 
-    def _surprise(self, kind: Kind, innovation: Array, derivative: Array, noise: Array) -> Outcome:
+    def _surprise(
+        self, kind: Kind, innovation: Array, derivative: Array, noise: Array
+    ) -> Acceptance:
         """Decides on a measurement beyond its gate; that of a stuck or pushed robot is news."""
         if not (np.abs(innovation) < FARTHEST).all():
-            return Outcome.OUTLIER
+            return Acceptance.OUTLIER
         believed = self._outliers[kind] + 1 >= PATIENCE[kind]
         if kind is Kind.TWIST:
             doubt = np.maximum(self._news - np.diag(self._filter.P), 0.0)
             doubtful = self._filter.P + np.diag(doubt)
             if kernels.distance(innovation, derivative, doubtful, noise) <= GATE[kind]:
                 self._filter.P = doubtful
-                return Outcome.NEWS
+                return Acceptance.NEWS
             if believed:
                 self._filter.P = doubtful
                 self._filter.P = parted(self._filter.P)
-        return Outcome.JUMP if believed else Outcome.OUTLIER
+        return Acceptance.JUMP if believed else Acceptance.OUTLIER
 
     def _jump(self, pose: Array, noise: Array) -> None:
         """Replaces the estimated pose and its covariance."""

@@ -49,7 +49,7 @@ class Measurement(NamedTuple):
     odom: Array | None = None
 
 
-class Outcome(IntEnum):
+class Acceptance(IntEnum):
     """Outcome of a measurement.
 
     `USED`: within its gate. `NEWS`: beyond it, but plausible for a robot that is stuck or pushed;
@@ -62,7 +62,7 @@ class Outcome(IntEnum):
     OUTLIER = 3
 
 
-class Verdict(NamedTuple):
+class Judgement(NamedTuple):
     """The estimator's verdict on a measurement.
 
     Attributes:
@@ -72,7 +72,7 @@ class Verdict(NamedTuple):
     """
 
     distance: float
-    outcome: Outcome
+    outcome: Acceptance
 
 
 def checked_covariance(covariance: ArrayLike | None, size: int, least_std: float) -> Array | None:

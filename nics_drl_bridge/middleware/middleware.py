@@ -16,15 +16,15 @@ from nics_drl_bridge.middleware.measurement import (
     CMD_VEL,
     ODOM,
     SCAN,
+    Acceptance,
     Health,
     Kind,
     Measurement,
-    Outcome,
     TopicHealth,
     checked_covariance,
 )
 from nics_drl_bridge.middleware.timeline import BEFORE_START, TOO_OLD, Timeline
-from nics_drl_bridge.middleware.trail import Told, Trail
+from nics_drl_bridge.middleware.trail import ReportedPose, Trail
 
 Array = NDArray[np.float64]
 
@@ -140,7 +140,7 @@ class Middleware:
         if fault := self._stamps.fault(stamp_ns, None):
             self.cache.reject(f"{ODOM}: {fault}")
             return False
-        told = Told(stamp_ns, arrival_ns, *value)
+        told = ReportedPose(stamp_ns, arrival_ns, *value)
         if stamp_ns == self._start_ns and ODOM not in self.cache.newest:
             # At a reset the pose is known: the odometry of that time adds nothing.
             self._timeline.anchor(value[0])
@@ -153,7 +153,7 @@ class Middleware:
         self._trail.use(told)
         return True
 
-    def _measure_odometry(self, told: Told, value: tuple[Array, Array]) -> bool:
+    def _measure_odometry(self, told: ReportedPose, value: tuple[Array, Array]) -> bool:
         """Measures an odometry; True if accepted. Continues from it if the clock was set."""
         measurement = Measurement(Kind.TWIST, told.twist, odom=told.pose)
         reason = self._measure(told.stamp_ns, told.arrival_ns, measurement, value)
@@ -232,7 +232,7 @@ class Middleware:
             self.cache.take(topic, stamp_ns, arrival_ns, kept)
         return reason
 
-    def _follow_clock(self, told: Told) -> None:
+    def _follow_clock(self, told: ReportedPose) -> None:
         """Continues from an odometry to whose stamp the clock was set.
 
         Starts at the estimate after the last used odometry and adds the motion that odometry
@@ -281,9 +281,11 @@ class Middleware:
         surprises = {
             (kind, outcome): f"{kind.topic}: {outcome.name.lower()}" for kind, outcome in outcomes
         }
-        rejected = {surprises[k]: n for k, n in outcomes.items() if k[1] is Outcome.OUTLIER}
+        rejected = {surprises[k]: n for k, n in outcomes.items() if k[1] is Acceptance.OUTLIER}
         noticed = {
-            surprises[k]: n for k, n in outcomes.items() if k[1] in (Outcome.NEWS, Outcome.JUMP)
+            surprises[k]: n
+            for k, n in outcomes.items()
+            if k[1] in (Acceptance.NEWS, Acceptance.JUMP)
         }
         if self._clock_jumps:
             noticed["clock: jump"] = self._clock_jumps

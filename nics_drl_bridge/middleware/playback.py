@@ -46,7 +46,7 @@ COLUMNS = ("x", "y", "heading", "vx", "vy", "wz")
 
 
 @dataclass(frozen=True)
-class Estimate:
+class EstimatedDrive:
     """Estimates of the middleware over a drive, after each odometry that was the newest.
 
     Attributes:
@@ -70,7 +70,7 @@ class Estimate:
         return sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
 
 
-def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str]) -> Estimate:
+def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str]) -> EstimatedDrive:
     """Runs a bag through the middleware, in process.
 
     Args:
@@ -95,7 +95,7 @@ def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str])
             "no odometry of the bag could be used; look at it with `nics bag info`."
         )
     stamps, poses, twists, covariances = zip(*rows, strict=True)
-    return Estimate(
+    return EstimatedDrive(
         np.array(stamps, dtype=np.int64), np.array(poses), np.array(twists),
         np.array(covariances), dict(playback.middleware.cache.rejected),
     )  # fmt: skip
@@ -281,7 +281,7 @@ def in_order(messages: Mapping[str, list[Message]]) -> Iterator[tuple[str, Messa
         yield role, message
 
 
-def write_estimate(made: Estimate, path: str | Path) -> None:
+def write_estimate(made: EstimatedDrive, path: str | Path) -> None:
     """Writes an estimate as `.npz`, or otherwise as CSV with numbers in full precision."""
     if Path(path).suffix == ".npz":
         arrays = {

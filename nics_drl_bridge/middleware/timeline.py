@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.middleware.belief import Belief
 from nics_drl_bridge.middleware.ekf import Estimator
-from nics_drl_bridge.middleware.measurement import Kind, Measurement, Outcome, Verdict
+from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, Measurement
 
 HISTORY_NS = 1_000_000_000
 """Length of the past that may still change [ns]."""
@@ -29,7 +29,7 @@ class _Entry:
 
     moment: Moment
     measurement: Measurement | None
-    verdict: Verdict | None
+    verdict: Judgement | None
     belief: Belief
 
 
@@ -53,7 +53,7 @@ class Timeline:
     def reset(self) -> None:
         """Forgets the past; begins with the present state of the estimator."""
         self._start_ns = self._estimator.time_ns
-        self._past: Counter[tuple[Kind, Outcome]] = Counter()
+        self._past: Counter[tuple[Kind, Acceptance]] = Counter()
         self._distances: dict[Kind, float] = {}
         self.replayed = 0
         self._entries.clear()
@@ -104,7 +104,7 @@ class Timeline:
             self._rerun(place)
         return ""
 
-    def outcomes(self) -> Mapping[tuple[Kind, Outcome], int]:
+    def outcomes(self) -> Mapping[tuple[Kind, Acceptance], int]:
         """Returns the number of measurements by kind and outcome."""
         recent = Counter(
             (entry.measurement.kind, entry.verdict.outcome)

@@ -32,7 +32,7 @@ NEAR_NS = HISTORY_NS + 2 * NS_PER_S
 """Stamps farther back than this [ns] are all rejected, which `Stamps` detects."""
 
 
-class Told(NamedTuple):
+class ReportedPose(NamedTuple):
     """An odometry as received: stamp and arrival [ns], pose in `odom` (3,), body twist (3,)."""
 
     stamp_ns: int
@@ -58,20 +58,20 @@ class Trail:
 
     def reset(self) -> None:
         """Forgets all odometries."""
-        self._recent: deque[Told] = deque(maxlen=IN_STEP + 1)
-        self._refused: deque[Told] = deque(maxlen=CLOCK_JUMP)
+        self._recent: deque[ReportedPose] = deque(maxlen=IN_STEP + 1)
+        self._refused: deque[ReportedPose] = deque(maxlen=CLOCK_JUMP)
 
-    def use(self, told: Told) -> None:
+    def use(self, told: ReportedPose) -> None:
         """Records an odometry that is used."""
         self._refused.clear()
         if not self._recent or told.stamp_ns > self._recent[-1].stamp_ns:
             self._recent.append(told)
 
-    def refuse(self, told: Told) -> None:
+    def refuse(self, told: ReportedPose) -> None:
         """Records an odometry that is rejected for its stamp."""
         self._refused.append(told)
 
-    def contradicts(self, told: Told) -> bool:
+    def contradicts(self, told: ReportedPose) -> bool:
         """True if an odometry's path and arrival both show that the clock was set by a little.
 
         Such stamps look like late data, or like data after a gap.
@@ -97,12 +97,12 @@ class Trail:
             and not self._fits(last, told, stamped)
         )
 
-    def _in_step(self, before: Told, after: Told) -> bool:
+    def _in_step(self, before: ReportedPose, after: ReportedPose) -> bool:
         """True if both the arrivals and the path agree with the time between two stamps."""
         passed, waited = after.stamp_ns - before.stamp_ns, after.arrival_ns - before.arrival_ns
         return 2 * abs(waited - passed) <= passed and self._fits(before, after, passed / NS_PER_S)
 
-    def seconds(self, now: Told) -> float:
+    def seconds(self, now: ReportedPose) -> float:
         """Time since the last used odometry, by its arrival and by the stamps since [s]."""
         if not self._recent:
             return 0.0
@@ -112,7 +112,7 @@ class Trail:
         # The last used one may have been a second late; the arrivals then show too little time.
         return max(waited, min(stamped, waited + HISTORY_NS)) / NS_PER_S
 
-    def continuous(self, now: Told) -> bool:
+    def continuous(self, now: ReportedPose) -> bool:
         """True if the poses since the last used odometry form one path and follow the motion."""
         if not self._recent:
             return False
@@ -130,7 +130,7 @@ class Trail:
         )
 
     @staticmethod
-    def _time_of_way(before: Told, after: Told, standing: float) -> float:
+    def _time_of_way(before: ReportedPose, after: ReportedPose, standing: float) -> float:
         """Time [s] in which the mean twist leads between the poses; `standing` if it is at rest."""
         mean = (before.twist + after.twist) / 2.0
         if not (np.abs(mean) > STILL).any():
@@ -138,7 +138,7 @@ class Trail:
         way = geometry.log(geometry.between(before.pose, after.pose))
         return float(way @ mean / (mean @ mean))
 
-    def _fits(self, before: Told, after: Told, seconds: float) -> bool:
+    def _fits(self, before: ReportedPose, after: ReportedPose, seconds: float) -> bool:
         """True if the twists lead from one pose to the other in a time [s]."""
         mean, change = (before.twist + after.twist) / 2.0, np.abs(after.twist - before.twist)
         way = geometry.between(before.pose, after.pose)

@@ -46,7 +46,7 @@ from nics_drl_bridge.gate.state import Decision, begin
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
 from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.conversions import is_rotation
-from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
+from nics_drl_bridge.nodes.diagnostics import Condition, Diagnostics
 from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.gate_parameters import declare_gate
 from nics_drl_bridge.nodes.qos import QosWatch
@@ -167,7 +167,7 @@ class CommandGate(QosWatch):
         self._out.publish(content)
         return None
 
-    def _look(self) -> Finding:
+    def _look(self) -> Condition:
         """Returns the finding for `/diagnostics`; other publishers are reported, not prevented."""
         found = self._log.finding(self._state)
         others = self.count_publishers(self._out.topic_name) - 1

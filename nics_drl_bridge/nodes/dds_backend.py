@@ -27,7 +27,7 @@ from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.executor import HANDED_OVER
 from nics_drl_bridge.nodes.link import Link
-from nics_drl_bridge.nodes.observer import Episodes
+from nics_drl_bridge.nodes.observer import EpisodeServices
 from nics_drl_bridge.nodes.robot_topics import data_facts
 from nics_drl_bridge.sim.world import World
 
@@ -174,7 +174,7 @@ class DdsBackend:
             self._link.node.create_subscription(
                 types[topic], topic, _putter(self._mail, topic), qos.SENSOR, raw=True
             )
-        self._episodes = Episodes(self._link, simulator, model, world)
+        self._episodes = EpisodeServices(self._link, simulator, model, world)
         self._link.begin()
         try:
             self._link.wait_for_peers(self._topics, self._episodes.clients, timeout_s, ADVICE)

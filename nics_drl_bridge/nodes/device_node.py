@@ -21,9 +21,9 @@ from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Simulator
 from nics_drl_bridge.nodes import conversions, device_parameters, qos
-from nics_drl_bridge.nodes.device_parameters import Pace, RealTime, declare_device
+from nics_drl_bridge.nodes.device_parameters import RealTime, TopicPace, declare_device
 from nics_drl_bridge.nodes.device_robot import CommandInlet, Outbox, RobotPort, Transforms
-from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
+from nics_drl_bridge.nodes.diagnostics import Condition, Diagnostics
 from nics_drl_bridge.nodes.qos import QosWatch, owner
 from nics_drl_bridge.nodes.runner import declare_model
 from nics_drl_bridge.sim.device import DeviceWorld
@@ -110,7 +110,7 @@ class DeviceNode(QosWatch):
         self.create_timer(WATCH_S, self._watch, clock=steady)
         step_ns = self._time.step_ns
         self._odom_pace, self._scan_pace = (
-            Pace(period_ns, step_ns) for period_ns in (self._time.odom_ns, self._time.scan_ns)
+            TopicPace(period_ns, step_ns) for period_ns in (self._time.odom_ns, self._time.scan_ns)
         )
         self._real_time = RealTime(step_ns, self._time.rate)
         self._timer = None
@@ -139,7 +139,7 @@ class DeviceNode(QosWatch):
             )
         self._clocks |= names
 
-    def _look(self) -> Finding:
+    def _look(self) -> Condition:
         """Returns the finding for `/diagnostics`."""
         facts = {
             "mode": self._time.mode,
@@ -150,7 +150,7 @@ class DeviceNode(QosWatch):
             **self._identity,
         }
         message = "paused" if self._paused else "running"
-        return Finding(message, False, facts, self._hardware)
+        return Condition(message, False, facts, self._hardware)
 
     def _timeout_ns(self) -> int:
         return int(float(self.get_parameter("command_timeout").value or 0.0) * NS_PER_S)

@@ -30,7 +30,7 @@ NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 
 
 @dataclass(frozen=True)
-class Timing:
+class DeviceTiming:
     """Timing of a device; lock-step is exact, without any of the delays.
 
     Attributes:
@@ -120,7 +120,7 @@ def _declare_time(node: Node) -> None:
         declare(node, name, default, about, low=low, high=high, read_only=True)
 
 
-def timing(node: Node, model: SimulatorModel) -> Timing:
+def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     """Returns the timing given by the parameters; in lock-step, by the model alone."""
     mode = choice(node, "mode", MODES)
     value = {
@@ -129,14 +129,14 @@ def timing(node: Node, model: SimulatorModel) -> Timing:
     }
     if mode == LOCKSTEP:
         period = round(model.control_period * NS_PER_S)
-        return Timing(mode, 1.0, period, period, period, (0, 0), (0, 0))
+        return DeviceTiming(mode, 1.0, period, period, period, (0, 0), (0, 0))
     odom = 1.0 / value["odom_rate"] if value["odom_rate"] else model.control_period
     scan = 1.0 / (value["scan_rate"] or model.lidar.rate)
     dt = model.timing[0]
     step = common_step(dt, (odom, scan)) * dt
     step_ns, odom_ns, scan_ns = (round(seconds * NS_PER_S) for seconds in (step, odom, scan))
     late = [_late_ns(node, topic, model) for topic in ("scan", "odom")]
-    return Timing(mode, value["rate"], step_ns, odom_ns, scan_ns, *late)
+    return DeviceTiming(mode, value["rate"], step_ns, odom_ns, scan_ns, *late)
 
 
 def _late_ns(node: Node, topic: str, model: SimulatorModel) -> tuple[int, int]:
@@ -153,7 +153,7 @@ def _late_ns(node: Node, topic: str, model: SimulatorModel) -> tuple[int, int]:
     return round(least * NS_PER_S), round(jitter * NS_PER_S)
 
 
-def timed_model(node: Node, model: SimulatorModel, time: Timing) -> SimulatorModel:
+def timed_model(node: Node, model: SimulatorModel, time: DeviceTiming) -> SimulatorModel:
     """Returns the model with the step of the world and the requested latency."""
     latency = float(node.get_parameter("command_latency").value or 0.0)
     if time.lockstep:
@@ -228,7 +228,7 @@ PATIENCE_NS = NS_PER_S // 2
 """Steps missed for longer than this are not made up for [ns]."""
 
 
-class Pace:
+class TopicPace:
     """Decides when a topic is due, so that its mean rate is the requested one with any step.
 
     Args:

@@ -32,7 +32,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.lidar.spec import to_device
 from nics_drl_bridge.nodes import conversions, qos, wire
-from nics_drl_bridge.nodes.device_parameters import Frames, Timing
+from nics_drl_bridge.nodes.device_parameters import DeviceTiming, Frames
 from nics_drl_bridge.nodes.qos import owner
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, Sensed, variances
@@ -55,7 +55,7 @@ class RobotPort:
     """
 
     def __init__(
-        self, node: Node, namespace: str, model: SimulatorModel, frames: Frames, time: Timing
+        self, node: Node, namespace: str, model: SimulatorModel, frames: Frames, time: DeviceTiming
     ) -> None:
         self._model, self._time, self.frames = model, time, frames
         quality = qos.SENSOR_RELIABLE
@@ -106,7 +106,7 @@ class RobotPort:
         outbox.send(self._scans, message, now_ns, self._time.scan_late_ns)
 
 
-def scan_message(model: SimulatorModel, frame: str, time: Timing) -> LaserScan:
+def scan_message(model: SimulatorModel, frame: str, time: DeviceTiming) -> LaserScan:
     """Returns a scan whose ranges and stamp are still to be filled in."""
     free = np.full(model.lidar.beams, np.inf, np.float32)
     message = conversions.scan_to_ros(model.lidar, free, 0, frame)

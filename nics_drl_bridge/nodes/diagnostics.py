@@ -14,7 +14,7 @@ from nics_drl_bridge.nodes import qos
 PERIOD_S = 1.0
 
 
-class Finding(NamedTuple):
+class Condition(NamedTuple):
     """Condition of a node.
 
     Attributes:
@@ -39,7 +39,7 @@ class Diagnostics:
         look: returns the finding; called each time.
     """
 
-    def __init__(self, node: Node, part: str, look: Callable[[], Finding]) -> None:
+    def __init__(self, node: Node, part: str, look: Callable[[], Condition]) -> None:
         self._node, self._look = node, look
         self._name = f"{node.get_fully_qualified_name()}: {part}"
         self._topic = node.create_publisher(DiagnosticArray, "/diagnostics", qos.DIAGNOSTICS)

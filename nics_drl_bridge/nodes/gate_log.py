@@ -12,7 +12,7 @@ from rclpy.impl.rcutils_logger import RcutilsLogger
 from nics_drl_bridge.gate.black_box import BlackBox, Entry, write
 from nics_drl_bridge.gate.state import Cause, GateState
 from nics_drl_bridge.nodes.box_writer import BoxWriter
-from nics_drl_bridge.nodes.diagnostics import Finding
+from nics_drl_bridge.nodes.diagnostics import Condition
 from nics_drl_bridge.nodes.gate_parameters import GateParameters
 
 FILES_KEPT = 20
@@ -154,7 +154,7 @@ class GateLog:
         self.counters["not written"] += 1
         self._logger.error(f"the black box could not be written: {reason}")
 
-    def finding(self, state: GateState) -> Finding:
+    def finding(self, state: GateState) -> Condition:
         """Returns the finding for `/diagnostics`."""
         for failure in self._writer.failures():
             self._failed(failure)
@@ -164,7 +164,7 @@ class GateLog:
             **dict(sorted(self.counters.items())),
         }
         message = self._cause.line if self._cause else "commands pass"
-        return Finding(message, self._cause is not None, facts, self._hardware)
+        return Condition(message, self._cause is not None, facts, self._hardware)
 
     def close(self) -> None:
         """Waits briefly for files that are being written; none is left incomplete."""

@@ -13,7 +13,7 @@ from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.middleware.measurement import Health
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
+from nics_drl_bridge.nodes.diagnostics import Condition, Diagnostics
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
 from nics_drl_bridge.nodes.runner import declare, declare_model_name, run_node
@@ -78,13 +78,13 @@ class MiddlewareNode(ManagedNode):
         response.success, response.message = True, "the next odometry fixes the map frame"
         return response
 
-    def _look(self) -> Finding:
+    def _look(self) -> Condition:
         if self.state == UNCONFIGURED:
-            return Finding(self.state, warns=False, facts={})
+            return Condition(self.state, warns=False, facts={})
         health = self._topics.middleware.health(self._topics.now_ns())
         trouble = silence(health, self._topics.expected)
         message = trouble or ("receiving" if self.state == ACTIVE else self.state)
-        return Finding(message, bool(trouble), facts(health), self._hardware)
+        return Condition(message, bool(trouble), facts(health), self._hardware)
 
 
 def silence(health: Health, expected: Sequence[str]) -> str:

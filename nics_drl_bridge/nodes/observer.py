@@ -143,7 +143,7 @@ class Witness(AbstractContextManager["Witness", None]):
 LOST_S = 1.0
 
 
-class Episodes:
+class EpisodeServices:
     """The services of a simulator node that begin an episode.
 
     Args:

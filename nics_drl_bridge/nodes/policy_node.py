@@ -23,7 +23,7 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
 from nics_drl_bridge.nodes.runner import declare, declare_model_name, last_word, run_node
-from nics_drl_bridge.policy.pacing import Answer, Deadline, Pace
+from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
 
 POLLS = 0.1
@@ -93,7 +93,7 @@ class PolicyNode(ManagedNode):
         """Leaves a zero command behind."""
         last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
 
-    def _declared_pace(self, control_period: float) -> tuple[Pace, Deadline]:
+    def _declared_pace(self, control_period: float) -> tuple[ActionPace, Deadline]:
         rate, limit, patience = (
             self.get_parameter(name).value for name in ("rate", "deadline", "late_limit")
         )
@@ -103,7 +103,9 @@ class PolicyNode(ManagedNode):
                 "least 0, more than 0, and at least 1."
             )
         period = control_period if np.isnan(rate) else 1.0 / rate if rate > 0.0 else 0.0
-        return Pace(period), Deadline(0.5 * control_period if np.isnan(limit) else limit, patience)
+        return ActionPace(period), Deadline(
+            0.5 * control_period if np.isnan(limit) else limit, patience
+        )
 
     def _open_policy(self, model: SimulatorModel) -> None:
         """Opens the policy for a model, and runs it once, so that it compiles now."""

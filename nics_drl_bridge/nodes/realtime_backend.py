@@ -22,7 +22,7 @@ from nics_drl_bridge.interface import NS_PER_S, RobotView, Start
 from nics_drl_bridge.middleware.measurement import SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes.link import Link
-from nics_drl_bridge.nodes.observer import Episodes
+from nics_drl_bridge.nodes.observer import EpisodeServices
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_sensors
 from nics_drl_bridge.sim.world import World
 
@@ -80,7 +80,7 @@ class RealtimeBackend:
         try:
             declare_sensors(self._link.node)
             self._topics = RobotTopics(self._link.node, model, now_ns=time.monotonic_ns)
-            self._episodes = Episodes(self._link, chosen.simulator, model, world)
+            self._episodes = EpisodeServices(self._link, chosen.simulator, model, world)
             self._link.begin()
             clients = self._episodes.clients if chosen.vehicle is False else []
             self._link.wait_for_peers(self._topics.expected, clients, chosen.timeout_s, ADVICE)

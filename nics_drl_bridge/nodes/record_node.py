@@ -46,7 +46,7 @@ PERIOD_NS = round(PERIOD_S * NS_PER_S)
 
 
 @dataclass(frozen=True)
-class Outcome:
+class DriveResult:
     """Result of a drive.
 
     Attributes:
@@ -79,7 +79,7 @@ class RecordNode(QosWatch):
     def __init__(self, context: Context, given: Mapping[str, Any] | None = None) -> None:
         overrides = [Parameter(name, value=value) for name, value in (given or {}).items()]
         super().__init__("record_node", context=context, parameter_overrides=overrides)
-        self.outcome: Outcome | None = None
+        self.outcome: DriveResult | None = None
         self._order = declare_drive(self)
         self._drive = self._order.plan.begin()
         self._sim_time = bool(self.get_parameter("use_sim_time").value)
@@ -209,7 +209,7 @@ class RecordNode(QosWatch):
 
     def _end(self, failure: BridgeError | None, complete: bool = False) -> None:
         """Stops the robot, saves, and ends the node, however the drive ended."""
-        self.outcome = Outcome(complete, failure, None, "")
+        self.outcome = DriveResult(complete, failure, None, "")
         recording, told = None, "the robot was not moved, nothing is recorded"
         if self._ticks:
             self._halt()
@@ -217,7 +217,7 @@ class RecordNode(QosWatch):
         if not complete:
             stopped = "the robot was told to stop; " if self._ticks else ""
             told = f"{failure or 'interrupted:'} {stopped}{told}"
-        self.outcome = Outcome(complete, failure, recording, told)
+        self.outcome = DriveResult(complete, failure, recording, told)
         self.context.try_shutdown()
 
     def _halt(self) -> None:
@@ -238,7 +238,9 @@ class RecordNode(QosWatch):
         return recording, f"{self._log.seconds:.1f} s are recorded in {self._order.out}"
 
 
-def record(given: Mapping[str, Any] | None = None, args: Sequence[str] | None = None) -> Outcome:
+def record(
+    given: Mapping[str, Any] | None = None, args: Sequence[str] | None = None
+) -> DriveResult:
     """Drives and records until the end, an error, SIGINT or SIGTERM.
 
     Args:
@@ -255,7 +257,7 @@ def record(given: Mapping[str, Any] | None = None, args: Sequence[str] | None = 
         return nodes[-1]
 
     run_node(make, args, "record_node")
-    return nodes[-1].outcome or Outcome(False, None, None, "interrupted: nothing was saved")
+    return nodes[-1].outcome or DriveResult(False, None, None, "interrupted: nothing was saved")
 
 
 def main(args: list[str] | None = None) -> None:

@@ -26,7 +26,7 @@ NODE = "nics_drl_bridge.nodes.record_node"
 
 
 @dataclass(frozen=True)
-class Order:
+class RecordOrder:
     """Options of `nics record`.
 
     Attributes:
@@ -102,7 +102,7 @@ def require_ros() -> None:
         raise ConfigError(f"nics record {MISSING_ROS.format(module=error.name)}") from None
 
 
-def preview(order: Order) -> tuple[str, ...]:
+def preview(order: RecordOrder) -> tuple[str, ...]:
     """Draws the expected drive next to the recording.
 
     Returns:
@@ -120,7 +120,7 @@ def preview(order: Order) -> tuple[str, ...]:
     return (*pattern.lines(), f"its path is drawn in {picture}")
 
 
-def drive(order: Order) -> tuple[tuple[str, ...], bool]:
+def drive(order: RecordOrder) -> tuple[tuple[str, ...], bool]:
     """Drives the robot and records it.
 
     Returns:
@@ -138,7 +138,7 @@ def drive(order: Order) -> tuple[tuple[str, ...], bool]:
     return lines, outcome.complete
 
 
-def summary(recording: Recording, robot: RobotSpec, order: Order) -> tuple[str, ...]:
+def summary(recording: Recording, robot: RobotSpec, order: RecordOrder) -> tuple[str, ...]:
     """Returns lines about the robot's path, the coverage of each command, and the next step."""
     place = recording.pose.values[:, :2] - recording.pose.values[0, :2]
     path = float(np.hypot(*np.diff(place, axis=0).T).sum())

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.policy.evaluation import truly_near
-from nics_drl_bridge.policy.statistics import Estimate, mean, rate
+from nics_drl_bridge.policy.statistics import ConfidenceInterval, mean, rate
 from nics_drl_bridge.seeds import checked_seeds
 
 Array = NDArray[np.float64]
@@ -60,11 +60,11 @@ class Summary:
     """
 
     episodes: int
-    success: Estimate
-    collision: Estimate
-    time_out: Estimate
-    length: Estimate
-    time: Estimate
+    success: ConfidenceInterval
+    collision: ConfidenceInterval
+    time_out: ConfidenceInterval
+    length: ConfidenceInterval
+    time: ConfidenceInterval
 
 
 def summarise(outcomes: Outcomes, control_period: float) -> Summary:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from enum import Enum
 
 
-class Pace:
+class ActionPace:
     """Allows at most one action per period, as soon as there are data to act on.
 
     Due times are a period apart, so that jitter of the data makes it neither faster nor slower;

@@ -15,7 +15,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, RobotView
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.playback import Playback, in_order, played
-from nics_drl_bridge.policy.pacing import Pace
+from nics_drl_bridge.policy.pacing import ActionPace
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.messages import command_row
@@ -138,7 +138,7 @@ def shadow(
 def _moments(
     playback: Playback, messages: Mapping[str, list[Message]], model: SimulatorModel
 ) -> list[_Moment]:
-    pace, moments = Pace(model.control_period), list[_Moment]()
+    pace, moments = ActionPace(model.control_period), list[_Moment]()
     held: tuple[int, Array] | None = None
     acted_ns = 0
     for role, message in in_order(messages):

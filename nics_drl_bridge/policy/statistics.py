@@ -20,7 +20,7 @@ CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ConfidenceInterval:
     """A figure with its 95 % confidence interval.
 
     Attributes:
@@ -33,30 +33,30 @@ class Estimate:
     high: float
 
 
-def rate(hits: int, trials: int) -> Estimate:
+def rate(hits: int, trials: int) -> ConfidenceInterval:
     """A share of trials with Wilson's score interval (1927), valid for few trials too."""
     if trials < 1:
-        return Estimate(math.nan, 0.0, 1.0)
+        return ConfidenceInterval(math.nan, 0.0, 1.0)
     share, z = hits / trials, float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
     scale = 1.0 + z * z / trials
     middle = (share + z * z / (2.0 * trials)) / scale
     half = z / scale * math.sqrt(share * (1.0 - share) / trials + (z / (2.0 * trials)) ** 2)
     # With no hits, or hits only, rounding must not move the end away from 0 or 1.
     low = 0.0 if hits == 0 else middle - half
-    return Estimate(share, low, 1.0 if hits == trials else middle + half)
+    return ConfidenceInterval(share, low, 1.0 if hits == trials else middle + half)
 
 
-def mean(values: ArrayLike) -> Estimate:
+def mean(values: ArrayLike) -> ConfidenceInterval:
     """The mean of observations (n,) with the interval of Student's t."""
     seen = np.asarray(values, np.float64)
     if not len(seen):
-        return Estimate(math.nan, -math.inf, math.inf)
+        return ConfidenceInterval(math.nan, -math.inf, math.inf)
     middle = float(seen.mean())
     if len(seen) == 1:
-        return Estimate(middle, -math.inf, math.inf)
+        return ConfidenceInterval(middle, -math.inf, math.inf)
     quantile = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, len(seen) - 1))
     half = quantile * float(seen.std(ddof=1)) / math.sqrt(len(seen))
-    return Estimate(middle, middle - half, middle + half)
+    return ConfidenceInterval(middle, middle - half, middle + half)
 
 
 RESULTS = ("success", "collision")
@@ -80,15 +80,15 @@ class Tally:
     """
 
     episodes: int
-    success: Estimate
-    collision: Estimate
-    time_out: Estimate
-    length: Estimate
-    time: Estimate
+    success: ConfidenceInterval
+    collision: ConfidenceInterval
+    time_out: ConfidenceInterval
+    length: ConfidenceInterval
+    time: ConfidenceInterval
     same: float
-    deviation: Estimate
+    deviation: ConfidenceInterval
     greatest_deviation: float
-    believed: Estimate
+    believed: ConfidenceInterval
 
     def figures(self) -> dict[str, Any]:
         """The tally as plain data; non-finite values become null."""

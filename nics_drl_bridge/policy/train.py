@@ -30,7 +30,7 @@ from nics_drl_bridge.policy.evaluation_batch import (
     drive_worlds,
     summarise,
 )
-from nics_drl_bridge.policy.statistics import Estimate
+from nics_drl_bridge.policy.statistics import ConfidenceInterval
 from nics_drl_bridge.policy.train_algorithms import Actor, act_of, make_algorithm, observed
 from nics_drl_bridge.policy.train_checkpoint import (
     Companion,
@@ -336,9 +336,9 @@ def line_of(summary: Summary) -> str:
     return f"{rates}, path {length}, time {time} of {summary.episodes} episodes"
 
 
-def _percent(share: Estimate) -> str:
+def _percent(share: ConfidenceInterval) -> str:
     return f"{100 * share.value:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})"
 
 
-def _amount(value: Estimate, unit: str) -> str:
+def _amount(value: ConfidenceInterval, unit: str) -> str:
     return f"{value.value:.2f} {unit} ({value.low:.2f} to {value.high:.2f})"

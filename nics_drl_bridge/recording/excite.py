@@ -312,7 +312,7 @@ TWIST_UNITS = {"linear.x": "m/s", "linear.y": "m/s", "angular.z": "rad/s"}
 
 
 @dataclass(frozen=True)
-class Motion:
+class ExpectedMotion:
     """Expected motion of a robot.
 
     Attributes:
@@ -348,7 +348,7 @@ class Motion:
         return np.stack(poses, axis=1), np.stack(states, axis=1)
 
 
-def expected_motion(spec: RobotSpec) -> Motion:
+def expected_motion(spec: RobotSpec) -> ExpectedMotion:
     """Returns the motion of a robot's textbook kinematics, else its `cmd_vel` as body twist.
 
     Raises:
@@ -356,7 +356,7 @@ def expected_motion(spec: RobotSpec) -> Motion:
     """
     if spec.textbook is not None:
         book = textbook(spec)
-        return Motion(
+        return ExpectedMotion(
             len(spec.state),
             lambda state, command, t: book.respond(state, book.target(command), t),
             lambda state, _: book.twist(state),
@@ -367,6 +367,6 @@ def expected_motion(spec: RobotSpec) -> Motion:
                 f"robot {spec.name!r}: where {command.name!r} in {command.unit} leads can't be "
                 "predicted; add `textbook:` and its `parameters:` to the robot's YAML file."
             )
-    return Motion(
+    return ExpectedMotion(
         len(spec.state), lambda state, *_: state, lambda _, command: spec.to_cmd_vel(command)
     )

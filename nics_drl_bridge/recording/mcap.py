@@ -64,7 +64,7 @@ class Record(NamedTuple):
         return self.offset + PREFIX + len(self.content)
 
 
-class Schema(NamedTuple):
+class McapSchema(NamedTuple):
     """A message type: name, encoding of its definition, definition."""
 
     name: str
@@ -81,7 +81,7 @@ class Channel(NamedTuple):
     metadata: tuple[tuple[str, str], ...]
 
 
-class Message(NamedTuple):
+class McapMessage(NamedTuple):
     """A message as it was recorded."""
 
     channel: int
@@ -101,7 +101,7 @@ class Chunk(NamedTuple):
 
 
 @dataclass
-class Told:
+class McapSummary:
     """Contents of a file, gathered from the records read so far.
 
     Attributes:
@@ -111,12 +111,12 @@ class Told:
         span: first and last time [ns]; None before the first message.
     """
 
-    schemas: dict[int, Schema] = field(default_factory=dict)
+    schemas: dict[int, McapSchema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     counts: Counter[int] = field(default_factory=Counter)
     span: tuple[int, int] | None = None
 
-    def see(self, record: Record) -> Message | None:
+    def see(self, record: Record) -> McapMessage | None:
         """Registers a schema, a channel or a message; returns the message."""
         if record.op == SCHEMA:
             key, schema = schema_of(record)
@@ -198,11 +198,11 @@ def records(data: memoryview, start: int, end: int, base: int = 0) -> Iterator[R
         start += PREFIX + size
 
 
-def schema_of(record: Record) -> tuple[int, Schema]:
+def schema_of(record: Record) -> tuple[int, McapSchema]:
     """Returns id and content of a schema."""
     fields = _Fields(record)
     (key,) = fields.numbers("H")
-    schema = Schema(fields.text(), fields.text(), fields.text())
+    schema = McapSchema(fields.text(), fields.text(), fields.text())
     fields.done()
     return key, schema
 
@@ -219,11 +219,11 @@ def channel_of(record: Record) -> tuple[int, Channel]:
     return key, Channel(schema, topic, encoding, tuple(metadata))
 
 
-def message_of(record: Record) -> Message:
+def message_of(record: Record) -> McapMessage:
     """Parses a message."""
     fields = _Fields(record)
     channel, _, time_ns, _ = fields.numbers("HIQQ")
-    return Message(channel, time_ns, bytes(fields.rest()))
+    return McapMessage(channel, time_ns, bytes(fields.rest()))
 
 
 def chunk_of(record: Record) -> Chunk:

@@ -23,8 +23,8 @@ from nics_drl_bridge.recording.mcap import (
     SCHEMA,
     STATISTICS,
     DamageError,
+    McapSummary,
     Record,
-    Told,
     chunk_of,
     inner_records,
     mapped,
@@ -37,8 +37,8 @@ from nics_drl_bridge.recording.mcap import (
 class _Walk:
     """Contents found while walking through a file."""
 
-    data: Told = field(default_factory=Told)
-    summary: Told = field(default_factory=Told)
+    data: McapSummary = field(default_factory=McapSummary)
+    summary: McapSummary = field(default_factory=McapSummary)
     chunks: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
     indexed: list[tuple[int, int, int, int]] = field(default_factory=list)
     statistics: Record | None = None
@@ -104,7 +104,7 @@ def _data(walk: _Walk, record: Record) -> None:
 
 def _chunk(walk: _Walk, record: Record) -> None:
     """Walks through a chunk and keeps its messages for the index records that follow it."""
-    chunk, inside = chunk_of(record), Told(walk.data.schemas, walk.data.channels)
+    chunk, inside = chunk_of(record), McapSummary(walk.data.schemas, walk.data.channels)
     walk.places = {}
     for inner in inner_records(record):
         message = inside.see(inner)

@@ -23,7 +23,7 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drift import drift_growth, odometry_residual
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.noise import pose_residual
-from nics_drl_bridge.identify.report import Estimate, estimates
+from nics_drl_bridge.identify.report import CalibratedValue, estimates
 from nics_drl_bridge.identify.signals import interval_means
 from nics_drl_bridge.identify.timing import (
     moved_commands,
@@ -70,7 +70,9 @@ def calibration_pictures(spec: RobotSpec, identified: Identified) -> dict[str, b
     return {name: picture for name, picture in drawn.items() if picture is not None}
 
 
-def timing(spec: RobotSpec, identified: Identified, found: dict[str, Estimate]) -> bytes | None:
+def timing(
+    spec: RobotSpec, identified: Identified, found: dict[str, CalibratedValue]
+) -> bytes | None:
     """Draws the unexplained part over each shift in time, with the estimate and its uncertainty."""
     curves = timing_curves(identified.recording, spec, identified.calibration)
     if not curves:
@@ -94,7 +96,7 @@ def timing(spec: RobotSpec, identified: Identified, found: dict[str, Estimate]) 
     return png(figure)
 
 
-def bursts(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
+def bursts(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
     """Draws stamps of the poses as they arrived, and as they were spread."""
     t = identified.recording.pose.t
     groups = repair.find_bursts(t)
@@ -119,7 +121,7 @@ def bursts(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
     return png(figure)
 
 
-def mounting(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
+def mounting(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
     """Draws velocities of the tracked body and of `base_link`: rotation and lever arm as slopes."""
     rotation, lever_x, lever_y = (
         found[name] for name in ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
@@ -153,7 +155,7 @@ def _points(axes: Axes, tracked: Sequence[Array], base: Sequence[Array]) -> None
     axes.plot(*base, ".", markersize=3, color=MODEL, label="base_link")
 
 
-def wheels(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
+def wheels(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
     """Draws wheel speeds against the motion: their scale, and which wheel is the left one."""
     stream, calibration = identified.recording.wheels, identified.calibration
     if stream is None or calibration.wheel_scale is None:
@@ -183,7 +185,7 @@ def wheels(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
     return png(figure)
 
 
-def _plus_minus(estimate: Estimate) -> str:
+def _plus_minus(estimate: CalibratedValue) -> str:
     return estimate.text.replace("+-", "±")
 
 

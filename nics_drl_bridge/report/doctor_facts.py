@@ -209,7 +209,7 @@ def facts_of_bag(path: str | Path, namespace: str = "") -> Facts:
 
 
 @dataclass(frozen=True)
-class Finding:
+class Mismatch:
     """A mismatch between robot and expectation.
 
     Attributes:

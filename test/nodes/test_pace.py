@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.nodes.device_parameters import Pace, RealTime, common_step
+from nics_drl_bridge.nodes.device_parameters import RealTime, TopicPace, common_step
 
 STEP = NS_PER_S // 50
 
@@ -13,17 +13,17 @@ def due(pace, seconds, step=STEP):
 
 
 def test_where_the_step_divides_the_period_messages_are_regular():
-    assert due(Pace(NS_PER_S // 10, STEP), 1) == list(range(0, NS_PER_S, NS_PER_S // 10))
+    assert due(TopicPace(NS_PER_S // 10, STEP), 1) == list(range(0, NS_PER_S, NS_PER_S // 10))
 
 
 def test_where_it_does_not_the_mean_rate_is_still_the_asked_one():
-    times = due(Pace(round(NS_PER_S / 5.5), STEP), 20)
+    times = due(TopicPace(round(NS_PER_S / 5.5), STEP), 20)
     assert len(times) == 110
     assert all(abs(now - k * NS_PER_S / 5.5) <= STEP / 2 for k, now in enumerate(times))
 
 
 def test_after_a_reset_a_message_is_due_at_once():
-    pace = Pace(NS_PER_S, STEP)
+    pace = TopicPace(NS_PER_S, STEP)
     assert pace.due(0)
     assert not pace.due(STEP)
     pace.begin(2 * STEP)

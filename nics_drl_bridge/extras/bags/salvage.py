@@ -32,9 +32,9 @@ from nics_drl_bridge.recording.mcap import (
     PREFIX,
     STATISTICS,
     DamageError,
-    Message,
+    McapMessage,
+    McapSummary,
     Record,
-    Told,
     chunk_of,
     inner_records,
     mapped,
@@ -231,8 +231,8 @@ class Intact(NamedTuple):
         promised: messages per channel, by the file's statistics; empty if it has none.
     """
 
-    told: Told
-    messages: list[Message]
+    told: McapSummary
+    messages: list[McapMessage]
     promised: dict[int, int]
 
 
@@ -243,9 +243,9 @@ def intact(path: Path) -> Intact:
     damage. After damage the file is searched for the next chunk.
     """
     if path.stat().st_size <= len(MAGIC):
-        return Intact(Told(), [], {})
+        return Intact(McapSummary(), [], {})
     data = mapped(path)
-    told, promised, waiting = Told(), {}, []
+    told, promised, waiting = McapSummary(), {}, []
     place: int | None = len(MAGIC)
     while place is not None and place < len(data):
         try:
@@ -303,7 +303,7 @@ def _until_damage(inner: Iterator[Record], first_ns: int, last_ns: int) -> list[
         found.append(each)
 
 
-def _messages(told: Told, waiting: list[Record]) -> list[Message]:
+def _messages(told: McapSummary, waiting: list[Record]) -> list[McapMessage]:
     """Returns messages, after reading all channels: some may be in the summary only."""
     messages = []
     for record in sorted(waiting, key=lambda each: each.op == MESSAGE):
