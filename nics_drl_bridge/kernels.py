@@ -1,12 +1,12 @@
-"""`@kernel`, by which every function of the package is compiled, kept on disk, and kept up to date.
+"""`@kernel`: the one decorator by which functions are compiled, kept on disk, and kept up to date.
 
 numba keeps machine code beside the source and checks the file of the function itself. A kernel
 calls others and uses constants of others, so here the code is kept as long as nothing changed in
 any module of the package that its own module imports, directly or not. This is decided by content:
 an edit, an update and another branch compile what they must, and nothing else.
 
-Whoever waits is told: when compiling takes longer than `PATIENCE_S`, a line on standard error says
-how many kernels are compiled, and about how long that takes.
+When compiling takes longer than `PATIENCE_S`, a line on standard error says how many kernels are
+compiled, and about how long that takes.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ _IMPORT = re.compile(
     rf"|import[ \t]+({PACKAGE.name}[.\w]*))",
     re.MULTILINE,
 )
+_ALIAS = re.compile(r"\bas\s+\w+")
 
 
 @overload
@@ -121,7 +122,7 @@ def imports_of(file: Path) -> tuple[Path, ...]:
     for origin, names, plain in _IMPORT.findall(_read(file)):
         module = (origin or plain).split(".")[1:]
         found.append(module)
-        found += [[*module, name] for name in re.findall(r"\w+", names)]
+        found += [[*module, name] for name in re.findall(r"\w+", _ALIAS.sub("", names))]
     places = (PACKAGE.joinpath(*parts).with_suffix(".py") for parts in found if parts)
     return tuple(place for place in places if place.is_file())
 

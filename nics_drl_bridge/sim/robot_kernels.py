@@ -113,3 +113,21 @@ def move_world(  # type: ignore[no-untyped-def]
         n, meets, near, state, noise, seed, step, bodies, walls, grid, collided, pose, outlines,
         motion, room,
     )  # fmt: skip
+
+
+@kernel
+def propagate_in_place(covariance, before, after, added):  # type: ignore[no-untyped-def]
+    """Computes P = F P F^T + Q of each robot in place; see `device.propagate`."""
+    for m in range(len(covariance)):
+        p = covariance[m]
+        u, v = before[m, 1] - after[m, 1], after[m, 0] - before[m, 0]
+        # F differs from the identity only in its last column, (u, v, 1).
+        for j in range(3):
+            p[0, j] += u * p[2, j]
+            p[1, j] += v * p[2, j]
+        for i in range(3):
+            p[i, 0] += u * p[i, 2]
+            p[i, 1] += v * p[i, 2]
+        for i in range(3):
+            for j in range(3):
+                p[i, j] += added[i, j]

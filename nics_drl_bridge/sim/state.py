@@ -16,8 +16,8 @@ from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot.kernels import SERIES, scratch, term_arrays
 from nics_drl_bridge.sim.contact_kernels import SEVERAL
 from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT
-from nics_drl_bridge.sim.obstacles import MARK
 from nics_drl_bridge.sim.sensing_kernels import PAST
+from nics_drl_bridge.sim.separation_kernels import MARK
 
 Array = NDArray[np.float64]
 SLICES = 16
@@ -61,7 +61,7 @@ class Worlds:
             [rad/s]; and, after a second, of the drift along x, y [m], heading [rad], and state.
         velocity: (N, K, 3) of the obstacles in `map`, constant for a period [m/s, m/s, rad/s].
         past: (N, M, R, 12) of the last periods, see `sensing_kernels`.
-        marks: (N, K, F) memory of moving obstacles, see `motion_layout`.
+        marks: (N, K, F) memory of moving obstacles, see `separation_kernels`.
     """
 
     pose: Array
