@@ -19,19 +19,19 @@ from nics_drl_bridge.sim.sensing_kernels import PAST
 from nics_drl_bridge.sim.separation_kernels import MARK
 from nics_drl_bridge.sim.state import (
     Cells,
-    Grid,
+    Dynamics,
     Lanes,
-    Motion,
+    LidarView,
+    MapField,
     Movers,
     Nearby,
-    Outlines,
+    OutlineArrays,
     Part,
     Scans,
-    Scene,
     Scratch,
     Single,
     State,
-    View,
+    Surroundings,
 )
 
 Array = NDArray[np.float64]
@@ -126,9 +126,9 @@ def part_of(
     """Returns the arguments of the kernels for one part of the worlds, with scratch of its own."""
     lidar, grid = model.lidar, scanner.grid
     dt, substeps, _ = model.timing
-    outlines = Outlines(*scanner.table.outlines.arguments)
-    scene = Scene(walls, _grid(grid), outlines, sizes.crowded, sizes.scattered, movers)
-    view = View(
+    outlines = OutlineArrays(*scanner.table.outlines.arguments)
+    scene = Surroundings(walls, _grid(grid), outlines, sizes.crowded, sizes.scattered, movers)
+    view = LidarView(
         scanner.arguments,
         NO_MAP if grid is None else grid.arrays,
         scanner.renderer == "exact",
@@ -136,14 +136,14 @@ def part_of(
         np.array([lidar.range_min, lidar.range_max], dtype=np.float64),
         float(lidar.sweep_time),
     )
-    motion = Motion(term_arrays(model.kinematics), SERIES, float(dt), int(substeps))
+    motion = Dynamics(term_arrays(model.kinematics), SERIES, float(dt), int(substeps))
     return Part(state, scene, view, motion, _scratch(model, scanner, sizes, part.stop - part.start))
 
 
-def _grid(grid: GridMap | None) -> Grid:
+def _grid(grid: GridMap | None) -> MapField:
     if grid is None:
-        return Grid(np.zeros((0, 0), np.float32), np.zeros(5))
-    return Grid(np.ascontiguousarray(grid.distance_field), grid.arrays[1])
+        return MapField(np.zeros((0, 0), np.float32), np.zeros(5))
+    return MapField(np.ascontiguousarray(grid.distance_field), grid.arrays[1])
 
 
 def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int) -> Scratch:

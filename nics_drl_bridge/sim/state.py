@@ -281,6 +281,6 @@ class Part(NamedTuple):
 
     state: State
     scene: Surroundings
-    view: LidarView
+    lidar: LidarView
     motion: Dynamics
     scratch: Scratch

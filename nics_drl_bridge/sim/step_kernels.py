@@ -82,7 +82,7 @@ def step_worlds(packed: Any, commands: Array, begin: int) -> None:
         begin: the first world.
     """
     part = packed.part
-    _step(part.state, part.scene, part.view, part.motion, part.scratch, commands, begin)
+    _step(part.state, part.scene, part.lidar, part.motion, part.scratch, commands, begin)
 
 
 @kernel
@@ -176,7 +176,7 @@ def begin(packed: Any, chosen: Integers) -> None:
                 part.state.marks, n, part.state.bodies, part.scene.movers.plans,
                 part.scene.movers.half, part.state.seeds[n],
             )  # fmt: skip
-    _scan_first(part.state, part.scene, part.view, part.scratch, chosen)
+    _scan_first(part.state, part.scene, part.lidar, part.scratch, chosen)
 
 
 @kernel
@@ -233,6 +233,6 @@ def end_period(packed: Any, true: Array, before: Array, wheels: Array, counted: 
                 row[m, sensing.TWIST + i] = true[n, m, i]
         if scene.crowded:
             contacts.sort_bodies(state.bodies, n, scratch.cells)
-        waiting = sensing.scan_or_wait(n, waiting, state, scene, part.view, motion, scratch)
-    sensing.scan_together(waiting, state, scene, part.view, scratch.scans)
-    sensing.distort(0, state.pose.shape[0], state, part.view)
+        waiting = sensing.scan_or_wait(n, waiting, state, scene, part.lidar, motion, scratch)
+    sensing.scan_together(waiting, state, scene, part.lidar, scratch.scans)
+    sensing.distort(0, state.pose.shape[0], state, part.lidar)
