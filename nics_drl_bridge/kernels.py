@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from typing import Any, overload
 
 import numba
 from numba.core import event
@@ -28,7 +28,6 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 PACKAGE = Path(__file__).parent
 PATIENCE_S = 2.0
-Function = TypeVar("Function", bound=Callable[..., Any])
 KERNELS: list[Any] = []
 """Every kernel that was imported so far, as numba's dispatchers."""
 _IMPORT = re.compile(
@@ -40,17 +39,17 @@ _ALIAS = re.compile(r"\bas\s+\w+")
 
 
 @overload
-def kernel(function: Function) -> Function: ...
+def kernel(function: Callable[..., Any]) -> Any: ...
 
 
 @overload
 def kernel(
     *, allocates: bool = ..., contracts: bool = ..., inline: bool = ...
-) -> Callable[[Function], Function]: ...
+) -> Callable[[Callable[..., Any]], Any]: ...
 
 
 def kernel(
-    function: Any = None,
+    function: Callable[..., Any] | None = None,
     *,
     allocates: bool = False,
     contracts: bool = False,
@@ -69,19 +68,21 @@ def kernel(
     Returns:
         numba's dispatcher; without `function`, a decorator.
     """
-    if function is None:
-        return lambda later: kernel(later, allocates=allocates, contracts=contracts, inline=inline)
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
     options |= {} if allocates else {"_nrt": False}
     options |= {"fastmath": {"contract"}} if contracts else {}
     options |= {"forceinline": True} if inline else {}
-    compiled = numba.njit(**options)(function)
-    compiled._cache = _Cache(function)
-    KERNELS.append(compiled)
-    return compiled
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        dispatcher = numba.njit(**options)(function)
+        dispatcher._cache = _Cache(function)
+        KERNELS.append(dispatcher)
+        return dispatcher
+
+    return compiled if function is None else compiled(function)
 
 
-class _Cache(FunctionCache):
+class _Cache(FunctionCache):  # type: ignore[misc]
     """Machine code on disk, stamped with the content of all that it was compiled from."""
 
     def __init__(self, function: Callable[..., Any]) -> None:

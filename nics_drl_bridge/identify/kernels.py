@@ -71,7 +71,7 @@ def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-un
         dt: length of a step [s].
     """
     dof, coefficient = terms.dof, terms.coefficient
-    factors, count = terms.factors, terms.count
+    factors, count = terms.factors, terms.degree
     params = moved.shape[2]
     values = np.empty(dof.shape[0])
     now, before = np.zeros((3, params)), np.zeros((3, params))

@@ -40,13 +40,13 @@ class Terms(NamedTuple):
         dof: (T,) degree of freedom of each.
         coefficient: (T,), or (T, n) of n robots.
         factors: (T, order) indices into `x`; unused ones point to its last entry, which is 1.
-        count: (T,) number of factors.
+        degree: (T,) number of factors.
     """
 
     dof: NDArray[np.int64]
     coefficient: Array
     factors: NDArray[np.int64]
-    count: NDArray[np.int64]
+    degree: NDArray[np.int64]
 
 
 def term_arrays(model: TaylorModel) -> Terms:
@@ -84,7 +84,7 @@ def rates(dq, x, terms):  # type: ignore[no-untyped-def]
     dq[:] = 0.0
     for k in range(terms.dof.shape[0]):
         product = terms.coefficient[k]
-        for factor in range(terms.count[k]):
+        for factor in range(terms.degree[k]):
             product *= x[terms.factors[k, factor]]
         dq[terms.dof[k]] += product
 
@@ -184,18 +184,18 @@ def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
             rate[i] = 0.0
     for k in range(terms.dof.shape[0]):
         rate, value, one = dq[terms.dof[k]], terms.coefficient[k], x[factors[k, 0]]
-        if terms.count[k] == 1:
+        if terms.degree[k] == 1:
             for i in range(n):
                 rate[i] += own(value, i) * one[i]
-        elif terms.count[k] == 2:
+        elif terms.degree[k] == 2:
             other = x[factors[k, 1]]
             for i in range(n):
                 rate[i] += own(value, i) * one[i] * other[i]
-        elif terms.count[k] == 3:
+        elif terms.degree[k] == 3:
             other, third = x[factors[k, 1]], x[factors[k, 2]]
             for i in range(n):
                 rate[i] += own(value, i) * one[i] * other[i] * third[i]
-        elif terms.count[k] == 4:
+        elif terms.degree[k] == 4:
             other, third, last = x[factors[k, 1]], x[factors[k, 2]], x[factors[k, 3]]
             for i in range(n):
                 rate[i] += own(value, i) * one[i] * other[i] * third[i] * last[i]

@@ -52,7 +52,7 @@ def rates_at(n: int, m: int, j: int, state: State, motion: Dynamics, single: Sin
         single.x[s] = state.state[n, m, s]
     for c in range(state.history.shape[3]):
         single.x[size + c] = state.history[n, m, row, c]
-    own = Terms(terms.dof, state.coefficient[n, m], terms.factors, terms.count)
+    own = Terms(terms.dof, state.coefficient[n, m], terms.factors, terms.degree)
     rates(single.dq, single.x, own)
 
 

@@ -353,7 +353,7 @@ def touch_walls(event: Array, a: int, walls: Array, begin: float, moving: Moving
 @kernel
 def _solid(distances: Array, i: int, j: int) -> bool:
     inside = 0 <= i < distances.shape[0] and 0 <= j < distances.shape[1]
-    return inside and distances[i, j] <= 0.0
+    return inside and bool(distances[i, j] <= 0.0)
 
 
 @kernel
