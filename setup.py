@@ -111,7 +111,7 @@ setup(
     extras_require=EXTRAS,
     entry_points={
         "console_scripts": [
-            f"nics = {PACKAGE}.cli:main",
+            f"nics = {PACKAGE}.commands.cli:main",
             f"simulator_node = {PACKAGE}.nodes.start:simulator_node",
             f"mujoco_node = {PACKAGE}.nodes.start:mujoco_node",
             f"middleware_node = {PACKAGE}.nodes.start:middleware_node",
@@ -120,10 +120,14 @@ setup(
             f"record_node = {PACKAGE}.nodes.start:record_node",
         ],
         # For tools that list environments; gymnasium itself stopped reading this in 1.0.
-        "gymnasium.envs": [f"NicsBridge = {PACKAGE}.env.registration:register_envs"],
+        "gymnasium.envs": [f"NicsBridge = {PACKAGE}.env.registry:register_envs"],
         f"{PACKAGE}.backends": [
             f"sim = {PACKAGE}.env.sim_backend:SimBackend",
             f"dds = {PACKAGE}.nodes.backends:dds_backend",
         ],
+        f"{PACKAGE}.commands": [f"bag = {PACKAGE}.extras.bags.command:bag"],
+        f"{PACKAGE}.engines": [f"ray = {PACKAGE}.extras.ray.engine:learner"],
+        f"{PACKAGE}.nodes": [f"mujoco_node = {PACKAGE}.extras.mujoco.node:main"],
+        f"{PACKAGE}.salvage": [f"bag = {PACKAGE}.extras.bags.salvage:salvaged"],
     },
 )

@@ -16,7 +16,7 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.policy.evaluation_batch import FIRST_SEED, Summary, drive_worlds, summarise
 from nics_drl_bridge.policy.policies import POLICIES, open_policy, shipped_policies
-from nics_drl_bridge.policy.train_run import line_of
+from nics_drl_bridge.policy.train import line_of
 
 ROBOTS = ("differential", "ackermann", "mecanum")
 CONTROLS = {"standing": "every policy stands still"}

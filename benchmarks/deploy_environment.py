@@ -34,7 +34,7 @@ def export(folder: Path) -> tuple[Path, Path]:
     """A model's folder and a policy file with weights at random, made right here."""
     import torch
 
-    from nics_drl_bridge.env.tasks import make_task
+    from nics_drl_bridge.env.registry import make_task
     from nics_drl_bridge.generator import open_model, save_model
     from nics_drl_bridge.policy.train_export import export_policy
 

@@ -24,7 +24,7 @@ from measuring.verdict import answer, parser_of
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.sim.world import World
 
 CONTROLS = {

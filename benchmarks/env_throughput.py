@@ -36,10 +36,10 @@ from measuring.peers import (
 from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env.registration import NAVIGATION, register_envs
+from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.bake import bake
 
 CONTROLS = {
     "slow": "the speed: each env step that counts is ten",

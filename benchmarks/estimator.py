@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.calibration.noise_model import Level, Noise
 from nics_drl_bridge.generator import SimulatorModel, builtin_model
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.measurement import ODOM
-from nics_drl_bridge.middleware.trail import Told
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.middleware.middleware import Middleware
+from nics_drl_bridge.middleware.trail import ReportedPose
+from nics_drl_bridge.robot.noise import Level, Noise
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
 
@@ -105,7 +105,7 @@ class _NoNumber(Middleware):
 
 
 class _StoodStill(Middleware):
-    def _follow_clock(self, told: Told) -> None:
+    def _follow_clock(self, told: ReportedPose) -> None:
         belief = self.estimator.belief
         std = np.sqrt(np.diag(belief.covariance)[:3])
         self.estimator.reset(told.stamp_ns, belief.mean[:3], std)

@@ -19,11 +19,11 @@ from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 
 from nics_drl_bridge.config import find_config, parse_yaml, read_text
-from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
+from nics_drl_bridge.gate.inputs import Press
+from nics_drl_bridge.gate.limits import Limits
+from nics_drl_bridge.gate.state import Decision
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.safety.inputs import Press
-from nics_drl_bridge.safety.limits import Limits
-from nics_drl_bridge.safety.state import Decision
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 CONTROLS = {
     "no_limits": "the limits of the gate are a hundred times as wide",

@@ -36,9 +36,9 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 
-from nics_drl_bridge.nodes import command_gate, gate_inputs, gate_log, qos
+from nics_drl_bridge.gate.black_box import replay
+from nics_drl_bridge.nodes import command_gate, gate_log, qos
 from nics_drl_bridge.nodes.processes import free_domain_id
-from nics_drl_bridge.safety.black_box import replay
 
 CONTROLS = {
     "busy": "the gate reads each message and decides ten times",
@@ -78,7 +78,7 @@ def ill_gate(control: str, arguments: list[str]) -> None:
     if control == "busy":
         command_gate.decide = _often(command_gate.decide)
         for name in ("scan", "odometry", "estimate", "command", "e_stop"):
-            setattr(gate_inputs, name, _often(getattr(gate_inputs, name)))
+            setattr(command_gate, name, _often(getattr(command_gate, name)))
     else:
         gate_log.write = lambda *_: time.sleep(10 * HUNG_S)
         gate_log.CLOSING_S = HUNG_S

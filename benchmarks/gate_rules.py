@@ -13,7 +13,7 @@ from pathlib import Path
 
 from measuring.verdict import answer, parser_of
 
-from nics_drl_bridge.safety import arming, intake, rules, shield
+from nics_drl_bridge.gate import arming, gate, intake, shield
 
 CONTROLS = {
     "no_tests": "no test that looks at the gate's rules is run",
@@ -24,10 +24,10 @@ LEAST_RULES = 30
 TESTS, OTHER_TEST = "test/safety", "test/safety/test_settings.py"
 ROOT = Path(__file__).resolve().parents[1]
 TABLES = {
-    "stop": (rules, "STOPS", lambda rule: rule.judge.__name__),
+    "stop": (gate, "STOPS", lambda rule: rule.judge.__name__),
     "refusal": (intake, "REFUSALS", lambda rule: rule.name),
     "arming": (arming, "CHECKS", lambda check: check.__name__),
-    "shaping": (rules, "SHAPERS", lambda shaper: shaper.__name__),
+    "shaping": (gate, "SHAPERS", lambda shaper: shaper.__name__),
     "evidence": (shield, "EVIDENCE", lambda evidence: evidence.__name__),
 }
 
@@ -58,7 +58,7 @@ def _covers_nothing(config: object, state: object, now: float) -> None:
 
 def add_untested() -> None:
     """Puts a rule that no test covers into the table of stops, in this process."""
-    rules.STOPS = (*rules.STOPS, rules.Rule(_covers_nothing))
+    gate.STOPS = (*gate.STOPS, gate.Rule(_covers_nothing))
 
 
 def tests_fail_without(name: str | None, control: str, tests: str) -> bool:

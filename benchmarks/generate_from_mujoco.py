@@ -19,15 +19,14 @@ from typing import Any
 import numpy as np
 from measuring.verdict import answer, parser_of
 
-from nics_drl_bridge.calibration.identify import Identified, identify
-from nics_drl_bridge.calibration.open_loop import open_loop_error
 from nics_drl_bridge.errors import BridgeError
-from nics_drl_bridge.highfidelity.drive import record
-from nics_drl_bridge.highfidelity.robot import MujocoRobot
-from nics_drl_bridge.kinematics.kernels import SERIES, rollout, run, term_arrays
-from nics_drl_bridge.kinematics.model import TaylorModel
-from nics_drl_bridge.kinematics.recording import Recording
-from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
+from nics_drl_bridge.extras.mujoco.rig import MujocoRobot, record
+from nics_drl_bridge.identify.identify import Identified, identify
+from nics_drl_bridge.identify.open_loop import open_loop_error
+from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.robot.kernels import SERIES, rollout, run, term_arrays
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
+from nics_drl_bridge.robot.taylor import TaylorModel
 
 CONTROLS = {
     "standing": "a model that says the robot stands",

@@ -18,7 +18,7 @@ from measuring.rates import interleaved, shortest
 from measuring.scenes import BATCH, CIRCLE, OBSTACLES, SPEC, random_batch
 from measuring.verdict import answer, parser_of
 
-from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import Polygon, Segment, Shape, convex_hull
 from nics_drl_bridge.lidar.table import Density

@@ -17,7 +17,7 @@ from measuring.scenes import BATCH, CIRCLE, errors
 from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 
-from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable

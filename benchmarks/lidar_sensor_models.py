@@ -1,8 +1,7 @@
-"""Does a sensor model that is baked in slow rendering down, and what do intensities cost?
+"""Does a sensor model that is baked in slow rendering down?
 
 The mixture of Table II, 720 beams to 3 m among ten obstacles, on one thread. Ranges are rendered
-from a table without a model, with each of some models, and with the intensities of each beam as
-well; all of them in turn, in one run.
+from a table without a model, and with each of some models; all of them in turn, in one run.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from measuring.rates import interleaved, medians, shortest
 from measuring.scenes import BATCH, SCENES, SPEC, random_batch
 from measuring.verdict import answer, parser_of
 
-from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.sensor_models import IncidenceDropout, Intensity, SensorModel
 from nics_drl_bridge.lidar.table import Density
@@ -41,12 +40,12 @@ work at the same time lends more to one than to another."""
 def calls_of(
     density: Density, scans: int, control: str | None
 ) -> tuple[dict[str, Callable[[], object]], dict[str, int], dict[str, int]]:
-    """What is timed, by name: ranges of each table, and both channels.
+    """What is timed, by name: ranges of each table.
 
     Also bytes of each table, and how many beams return.
     """
     batch, calls, sizes, returns = random_batch(SHAPES, scans, 0), {}, {}, {}
-    out, light = np.empty((2, scans, SPEC.beams), np.float32)
+    out = np.empty((scans, SPEC.beams), np.float32)
     for name, model in MODELS.items():
         baked = () if control == "plain" else model
         scanner = Scanner(SPEC, bake(SPEC, SHAPES, density, baked), "baked")
@@ -56,14 +55,7 @@ def calls_of(
         returns[name] = int(np.isfinite(calls[name]()).sum())
         if control == "slow" and model:
             calls[name] = partial(twice, calls[name])
-    scan = calls["both"]
-
-    def ranges_and_intensities() -> None:
-        scan()
-        if control != "plain":
-            scanner.intensities(out, batch.lidar, bodies, out=light)
-
-    return calls | {"both, with intensities": ranges_and_intensities}, sizes, returns
+    return calls, sizes, returns
 
 
 def twice(call: Callable[[], object]) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from nics_drl_bridge.lidar import map_kernels
-from nics_drl_bridge.lidar.maps_grid import OCCUPIED, GridMap
+from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.spec import load_lidar
 
 CONTROLS = {

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
-from measuring.faulty_robot import NANO, PERIOD_S, ROBOT, SPEED
+from measuring.faulty_robot import PERIOD_S, ROBOT, SPEED
 from measuring.lossy_link import Link, NoNamespacesError, link
 from measuring.verdict import answer, parser_of
 from nav_msgs.msg import Odometry
@@ -35,6 +35,7 @@ from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.processes import NodeProcess
 from nics_drl_bridge.nodes.runner import open_context
@@ -97,7 +98,7 @@ class Stack(_End):
         command = TwistStamped(header=scan.header, twist=conversions.twist_to_ros([SPEED, 0, 0.1]))
         self._raw.publish(command)
         self._last = command.twist
-        stamp = conversions.stamp_from_ros(scan.header.stamp) / NANO
+        stamp = conversions.stamp_from_ros(scan.header.stamp) / NS_PER_S
         self.used.append((time.time(), stamp))
 
     def _repeat(self) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from measuring.evaluations import Run, evaluations
 from measuring.verdict import answer, parser_of
 
-from nics_drl_bridge.trial import DDS, FAST, LABELS, MUJOCO
+from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, MUJOCO
 
 ROBOTS = ("differential", "ackermann", "mecanum")
 WORLD, FIRST_SEED = "circles", 2_000_000

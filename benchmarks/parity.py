@@ -22,7 +22,7 @@ import numpy as np
 from measuring.standing import standing_action
 from measuring.verdict import answer, parser_of
 
-from nics_drl_bridge.env.registration import COOPERATIVE_REACHING, NAVIGATION, register_envs
+from nics_drl_bridge.env.registry import COOPERATIVE_REACHING, NAVIGATION, register_envs
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
 CONTROLS = {

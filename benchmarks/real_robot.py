@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from measuring.verdict import answer, parser_of
 
-from nics_drl_bridge.calibration.identify import Identified, identify
-from nics_drl_bridge.calibration.open_loop import HORIZON_S, open_loop_error
 from nics_drl_bridge.errors import BridgeError, RecordingError
-from nics_drl_bridge.kinematics.readers import read_recording
-from nics_drl_bridge.kinematics.recording import Recording
-from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
+from nics_drl_bridge.identify.identify import Identified, identify
+from nics_drl_bridge.identify.open_loop import HORIZON_S, open_loop_error
+from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 CONTROLS = {
     "standing": "a model that says the robot stands",

@@ -37,7 +37,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.config import dump_yaml
-from nics_drl_bridge.env.registration import NAVIGATION, register_envs
+from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 from nics_drl_bridge.sim.world import World

@@ -31,7 +31,7 @@ from measuring.braking import braking_used
 from measuring.shield_places import ADVERSARY_S, GOAL, Job, Outcome, Place
 from measuring.verdict import answer, parser_of
 
-from nics_drl_bridge.safety.state import GateConfig
+from nics_drl_bridge.gate.state import GateConfig
 
 CONTROLS = {
     "no_shield": "the shield: it is off",

@@ -31,7 +31,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.env.registration import NAVIGATION, register_envs
+from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id

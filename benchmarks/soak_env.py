@@ -23,7 +23,7 @@ from measuring.processes import use_of
 from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env.registration import NAVIGATION, register_envs
+from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 
 CONTROLS = {

@@ -16,7 +16,7 @@ from measuring.rates import interleaved, medians
 from measuring.scenes import SCENES, SPEC, Batch, batches, errors, nearest_row, scan
 from measuring.verdict import answer, parser_of
 
-from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.table import Density, LidarTable
 

@@ -12,7 +12,7 @@ import numpy as np
 from measuring.scenes import SCENES, SPEC, batches, errors, nearest_row, scan
 from measuring.verdict import answer, parser_of
 
-from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.table import Density
 
 CONTROLS = {

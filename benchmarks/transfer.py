@@ -18,7 +18,7 @@ from typing import Any
 from measuring.evaluations import Run, evaluations
 from measuring.verdict import answer, parser_of
 
-from nics_drl_bridge.trial import DDS, FAST, LABELS, MUJOCO, PLACES
+from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, MUJOCO, PLACES
 
 ROBOTS = ("differential", "ackermann", "mecanum")
 CONTROLS = {

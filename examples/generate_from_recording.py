@@ -3,9 +3,9 @@
 import numpy as np
 
 from nics_drl_bridge.generator import generate
-from nics_drl_bridge.kinematics import textbook
-from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.lidar.spec import load_lidar
+from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
 

@@ -4,23 +4,74 @@ The package generates a simulator (a fitted, pruned second-order Taylor model of
 kinematics and baked lidar tables), trains or tests a policy in it, and drives the same task
 and the same policy in process, over ROS 2 and on the vehicle.
 
-Importing this package needs neither ROS 2 nor any heavy library, and makes its environments
-known to `gymnasium.make`, now or when gymnasium is imported later.
+Importing this package needs neither ROS 2 nor any heavy library: each public name is loaded when
+it is first used. The environments are registered where Gymnasium was imported before, as by
+`gymnasium.make("nics_drl_bridge:NicsBridge/Navigation-v0")`, or when `make` is used.
 """
 
 import sys
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.env.registry import make, make_vec
+    from nics_drl_bridge.generator import generate, load_model, open_model, save_model
+    from nics_drl_bridge.policy.policy_file import load_policy
+    from nics_drl_bridge.recording.readers import read_recording
+    from nics_drl_bridge.recording.recording import load_recording, save_recording
+    from nics_drl_bridge.robot.spec import load_robot
+    from nics_drl_bridge.sim.simulator import FastSimulator
+    from nics_drl_bridge.sim.world import load_world
 
 try:
     __version__ = version("nics_drl_bridge")
 except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"
 
-__all__ = ["__version__"]
+__all__ = [
+    "FastSimulator",
+    "__version__",
+    "generate",
+    "load_model",
+    "load_policy",
+    "load_recording",
+    "load_robot",
+    "load_world",
+    "make",
+    "make_vec",
+    "open_model",
+    "read_recording",
+    "save_model",
+    "save_recording",
+]
+
+_HOMES = {
+    "FastSimulator": "sim.simulator",
+    "generate": "generator",
+    "load_model": "generator",
+    "load_policy": "policy.policy_file",
+    "load_recording": "recording.recording",
+    "load_robot": "robot.spec",
+    "load_world": "sim.world",
+    "make": "env.registry",
+    "make_vec": "env.registry",
+    "open_model": "generator",
+    "read_recording": "recording.readers",
+    "save_model": "generator",
+    "save_recording": "recording.recording",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
 
 if "gymnasium" in sys.modules:
-    import nics_drl_bridge.env.registration  # noqa: F401 - registers as it is imported
-else:
-    from nics_drl_bridge.discovery import register_on_import
-
-    register_on_import()
+    import_module("nics_drl_bridge.env.registry")  # registers as it is imported

@@ -1,4 +1,4 @@
-"""Strict configuration: YAML files that are checked against a schema.
+"""Strict configuration: YAML files checked against a schema.
 
 Every error names file, key and the nearest valid name.
 """
@@ -37,7 +37,7 @@ def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> Schema
     """Checks a mapping against a schema.
 
     Args:
-        data: what the file holds.
+        data: content of the file.
         schema: a pydantic model.
         source: the file's name, for errors.
 
@@ -45,7 +45,7 @@ def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> Schema
         The checked configuration.
 
     Raises:
-        ConfigError: the first thing that is wrong, with file, key, value and fix.
+        ConfigError: the first error, with file, key, value and fix.
     """
     try:
         found = schema.model_validate(data)
@@ -57,7 +57,7 @@ def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> Schema
 
 
 def _taken_for_numbers(given: Any, found: Any, place: str = "") -> Iterator[tuple[str, Any]]:
-    """Texts and truth values that pydantic made a number of: `true` is no length."""
+    """Yields strings and booleans that pydantic coerced to numbers: `true` is no length."""
     pairs: list[tuple[Any, Any, Any]] = []
     if isinstance(found, BaseModel) and isinstance(given, dict):
         pairs = [(k, v, getattr(found, k)) for k, v in given.items() if hasattr(found, str(k))]
@@ -72,7 +72,7 @@ def _taken_for_numbers(given: Any, found: Any, place: str = "") -> Iterator[tupl
 
 
 _SHORT = reprlib.Repr()
-"""Shows a wrong value; the whole of one made of YAML aliases may not fit into memory."""
+"""Shortens a wrong value: one made of YAML aliases may not fit into memory in full."""
 _SHORT.maxstring = _SHORT.maxother = 80
 
 
@@ -93,15 +93,15 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
         return f"the key {key!r} is missing; add it."
     message = first["msg"].removeprefix("Value error, ").rstrip(".")
     message = message[0].lower() + message[1:]
-    if not key:  # of several keys, which the message names
+    if not key:  # an error of several keys, which the message names
         return f"{message}."
     return f"key {key!r}: {message}, not {_SHORT.repr(first['input'])}."
 
 
 def _fields_at(schema: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """The field names of the model that lies at `location` inside `schema`.
+    """Field names of the model at `location` inside `schema`.
 
-    Where one of several models may stand, the location names the `kind` of the one that does.
+    In a union of models, the location names the `kind` of the one that is present.
     """
     current: Any = schema
     candidates: list[type[BaseModel]] = []
@@ -132,10 +132,10 @@ def _inner_models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def no_device(path: Path) -> Path:
-    """The path itself, unless what lies there is a device or a pipe: reading it may never end.
+    """Returns the path unless it is a device or a pipe, which may never end.
 
     Raises:
-        ConfigError: it is one.
+        ConfigError: the path is a device or a pipe.
     """
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise ConfigError(f"{path}: is a device or a pipe, not a file; copy it to one.")
@@ -143,7 +143,7 @@ def no_device(path: Path) -> Path:
 
 
 def read_text(path: str | Path, most: int = MAX_BYTES) -> str:
-    """Reads a UTF-8 file of at most so many bytes, with one sentence when that fails."""
+    """Reads a UTF-8 file of at most `most` bytes. Raises ConfigError if that fails."""
     path = Path(path)
     try:
         size = no_device(path).stat().st_size
@@ -169,7 +169,7 @@ def load_yaml(path: str | Path, schema: type[SchemaT]) -> SchemaT:
 
 
 def share_folder() -> Path:
-    """The folder that holds `config` and `launch`: the checkout, or `share/nics_drl_bridge`."""
+    """The folder that contains `config` and `launch`: the checkout, or `share/nics_drl_bridge`."""
     checkout, *others = Path(__file__).resolve().parents[1:]
     if (checkout / "config" / "robots").is_dir():
         return checkout
@@ -193,7 +193,7 @@ def find_config(name: str | Path, kind: str) -> Path:
         The file's path.
 
     Raises:
-        ConfigError: there is none, with the nearest valid name.
+        ConfigError: no such configuration; names the nearest valid one.
     """
     name = str(name)
     if name.endswith((".yaml", ".yml")):

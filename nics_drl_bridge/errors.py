@@ -1,4 +1,4 @@
-"""Errors that a user can cause and can mend.
+"""Errors that a user can cause and fix.
 
 Each carries one sentence: what was wrong, where, and what to do. The command line prints
 that sentence and exits with code 2; a library caller catches `BridgeError`.
@@ -16,16 +16,16 @@ MISSING_ROS = (
 
 
 LONGEST = 800
-"""Characters of a sentence; of a longer one the middle is left out."""
+"""Maximum length of a sentence [characters]; a longer one loses its middle."""
 LONGEST_NAME = 100
-"""Characters of a name that are compared with the known ones."""
+"""Characters of a name that are compared with the known names."""
 
 
 def shortened(text: str, most: int) -> str:
-    """A text on one line, without its middle where it is longer than `most` characters.
+    """Returns a text on one line, without its middle if it is longer than `most` characters.
 
-    What is wrong often stands within it, so nobody is shown megabytes, a line feed or what
-    moves a terminal's cursor.
+    Messages quote what the user gave, which may be megabytes or contain line feeds and control
+    characters.
     """
     if len(text) > most:
         text = f"{text[: most // 2]} ... {text[-(most // 2) :]}"
@@ -34,7 +34,7 @@ def shortened(text: str, most: int) -> str:
 
 
 class BridgeError(Exception):
-    """Base of all errors that come from what the user gave; one line of at most `LONGEST`."""
+    """Base of all errors caused by the user's input; one line of at most `LONGEST` characters."""
 
     def __init__(self, sentence: str = "") -> None:
         super().__init__(shortened(sentence, LONGEST))
@@ -45,7 +45,7 @@ class ConfigError(BridgeError):
 
 
 class RecordingError(BridgeError):
-    """A recording can't be read or holds data that can't be used."""
+    """A recording can't be read or contains unusable data."""
 
 
 class ModelError(BridgeError):
@@ -53,18 +53,18 @@ class ModelError(BridgeError):
 
 
 class FitError(BridgeError):
-    """A recording does not hold enough to fit a model."""
+    """A recording does not contain enough to fit a model."""
 
 
 class BackendError(BridgeError):
-    """A backend (simulator, ROS 2 graph, vehicle) does not answer as it must."""
+    """A backend (simulator, ROS 2 graph, vehicle) does not answer as it should."""
 
 
 class PolicyError(BridgeError):
     """A policy file can't be used, or does not fit the robot.
 
     Attributes:
-        field: what is wrong in it, as `lidar.beams`.
+        field: the faulty field, such as `lidar.beams`.
     """
 
     def __init__(self, source: str, field: str, reason: str) -> None:
@@ -77,12 +77,12 @@ class PolicyError(BridgeError):
 
 
 class StaleDataError(BackendError):
-    """No fresh data came in time.
+    """No fresh data arrived in time.
 
     Attributes:
         topic: the topic that is late.
-        age_s: seconds since its last datum, `inf` when there never was one.
-        limit_s: how old it may be [s].
+        age_s: age of its last message [s], `inf` if there never was one.
+        limit_s: maximum age [s].
     """
 
     def __init__(self, topic: str, age_s: float, limit_s: float) -> None:
@@ -102,10 +102,10 @@ class StaleDataError(BackendError):
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """A clause that names the closest of the known names, or lists them all.
+    """Returns a clause that suggests the closest known name, or lists them all.
 
     Args:
-        name: what was given.
+        name: the name as given.
         known: the valid names.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Writing files so that a reader finds the old one or the new one, whole."""
+"""Atomic writes: a reader finds either the old file or the new one, complete."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ def _fsync(path: Path) -> None:
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Writes a file through a temporary one, fsynced and renamed.
+    """Writes a file via a temporary one, fsynced and renamed.
 
     Args:
-        path: the file; its folder is made when missing.
+        path: the file; its folder is created if missing.
         data: the whole content.
     """
     write_parts(path, [data])
 
 
 def write_parts(path: str | Path, parts: Iterable[bytes]) -> None:
-    """Writes a file as `write_bytes` does, part by part, so that it is never whole in memory."""
+    """Writes a file as `write_bytes` does, but in parts: it is never entirely in memory."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -55,19 +55,18 @@ def write_parts(path: str | Path, parts: Iterable[bytes]) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Writes a UTF-8 text file through a temporary one, fsynced and renamed."""
+    """Writes a UTF-8 text file via a temporary one, fsynced and renamed."""
     write_bytes(path, text.encode())
 
 
 def check_folder(path: str | Path, marker: str) -> Path:
-    """Makes sure that `whole_folder` can make a folder, without making anything.
+    """Checks that `whole_folder` can create a folder, without creating anything.
 
     Returns:
-        The path without links: a link stays, the folder behind it is replaced.
+        The resolved path: a symbolic link stays, the folder it points to is replaced.
 
     Raises:
-        ConfigError: `path` is a file, a folder of another kind, or lies where nothing can be
-            written.
+        ConfigError: `path` is a file, a folder of another kind, or not in a writable place.
     """
     path = Path(path).resolve()
     if path.exists() and not path.is_dir():
@@ -81,10 +80,10 @@ def check_folder(path: str | Path, marker: str) -> Path:
 
 
 def check_above(path: Path) -> None:
-    """Makes sure that something can be made at a path, without making anything.
+    """Checks that a path can be created, without creating anything.
 
     Raises:
-        ConfigError: it lies where nothing can be written.
+        ConfigError: it is not in a writable place.
     """
     above = next(parent for parent in path.resolve().parents if parent.exists())
     if not above.is_dir():
@@ -95,15 +94,15 @@ def check_above(path: Path) -> None:
 
 @contextmanager
 def whole_folder(path: str | Path, marker: str) -> Iterator[Path]:
-    """Gives a temporary folder that takes the place of `path` when the block ends well.
+    """Yields a temporary folder that replaces `path` if the block succeeds.
 
     Args:
-        path: the folder to make. An existing one is replaced only if it is empty or holds
-            `marker`, so that a wrong `--out` never removes somebody's work.
-        marker: a file name that a folder of this kind always holds.
+        path: the folder to create. An existing one is replaced only if it is empty or contains
+            `marker`, so that a wrong `--out` never deletes a user's work.
+        marker: a file name that a folder of this kind always contains.
 
     Yields:
-        The temporary folder, beside `path`. After an error nothing is left of it.
+        The temporary folder, next to `path`. It is removed after an error.
 
     Raises:
         ConfigError: see `check_folder`.
@@ -121,7 +120,7 @@ def whole_folder(path: str | Path, marker: str) -> Iterator[Path]:
 
 
 def _swap(new: Path, path: Path) -> None:
-    """Puts `new` at `path`, in one step; what was there before is then removed."""
+    """Moves `new` to `path`, atomically if the system can; the previous folder is removed."""
     if path.exists() and _exchange(new, path):
         _fsync(path.parent)
         return
@@ -141,10 +140,10 @@ def _swap(new: Path, path: Path) -> None:
 
 
 def _exchange(one: Path, other: Path) -> bool:
-    """Lets two paths change places in one step, so that no moment is without either.
+    """Exchanges two paths atomically, so that neither is ever missing.
 
     Returns:
-        False where the system or the file system can't (renameat2 is Linux's).
+        False if the system or the file system can't (renameat2 is specific to Linux).
     """
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if rename is None:
@@ -159,7 +158,7 @@ def _exchange(one: Path, other: Path) -> bool:
 
 
 def sync_folder(folder: Path) -> None:
-    """Makes sure that a folder and all in it are on the disk."""
+    """Syncs a folder and everything in it to disk."""
     for file in (*folder.rglob("*"), folder):
         _fsync(file)
 
@@ -174,18 +173,18 @@ _PART = 2**20
 
 
 def sealed(data: bytes) -> bytes:
-    """Some bytes with their checksum behind them, for `check_sealed`."""
+    """Appends a checksum to data, for `check_sealed`."""
     return data + _SEAL + sha256(data).encode()
 
 
 def check_sealed(file: BinaryIO) -> None:
-    """Holds what was written as `sealed` against its checksum, without reading it at once.
+    """Verifies the checksum that `sealed` appended, without reading the whole file at once.
 
     Args:
-        file: open, at its beginning, where it is left again.
+        file: open for reading; it is left at its beginning.
 
     Raises:
-        ValueError: a bit of it has changed, or there is no checksum.
+        ValueError: the data have changed, or there is no checksum.
     """
     left = file.seek(0, os.SEEK_END) - len(_SEAL) - 64
     digest = hashlib.sha256()

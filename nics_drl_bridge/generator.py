@@ -11,24 +11,23 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from nics_drl_bridge.calibration.calibration import Calibration
-from nics_drl_bridge.calibration.fit_report import fit_report
-from nics_drl_bridge.calibration.identify import Identified, identify
-from nics_drl_bridge.calibration.noise_model import Noise
-from nics_drl_bridge.calibration.usefulness import why_useless
 from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError, FitError, ModelError
 from nics_drl_bridge.files import check_folder, sha256, whole_folder, write_bytes, write_text
-from nics_drl_bridge.kinematics import fit, textbook
-from nics_drl_bridge.kinematics.latency import Latency
-from nics_drl_bridge.kinematics.model import TaylorModel
-from nics_drl_bridge.kinematics.recording import Recording
-from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
-from nics_drl_bridge.lidar.baking import bake
-from nics_drl_bridge.lidar.budget import choose
+from nics_drl_bridge.identify import fit
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.identify import Identified, identify
+from nics_drl_bridge.identify.report import fit_report
+from nics_drl_bridge.identify.usefulness import why_useless
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
+from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.robot.noise import Latency, Noise
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
+from nics_drl_bridge.robot.taylor import TaylorModel
 
 __all__ = [
     "Noise",
@@ -50,7 +49,7 @@ BUILTIN_SEED = 0
 
 @dataclass(frozen=True)
 class SimulatorModel:
-    """All that a fast simulator needs to know of a robot.
+    """All that a fast simulator needs to know about a robot.
 
     Attributes:
         robot: names, units, order and limits of state and command.
@@ -60,7 +59,7 @@ class SimulatorModel:
         table: baked ranges of the obstacles' shapes and of the robot itself.
         noise: of sensors and motion, see `Noise`.
         control_period: time between commands [s]; a whole number of `kinematics.dt`.
-        report: how the model came about, as text for people.
+        report: how the model was made, as readable text.
         latency: of scan and odometry, where the recording showed it.
     """
 
@@ -122,7 +121,7 @@ class SimulatorModel:
 
     @property
     def fingerprint(self) -> str:
-        """Tells two models apart: the first 16 digits of a SHA-256 over all of it."""
+        """Identifies the model: the first 16 digits of the SHA-256 of `text`."""
         return sha256(self.text.encode())[:16]
 
 
@@ -151,38 +150,35 @@ def generate(
     alpha: fit.Alpha = "auto",
     assume: bool = False,
     strict: bool = False,
-    budget: int | None = None,
     anyway: bool = False,
 ) -> tuple[SimulatorModel, Identified]:
     """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
 
     Args:
         recording: a drive of the robot.
-        robot: what state and command are.
+        robot: defines state and command.
         lidar: the sensor to simulate.
         shapes: of the obstacles to bake; the robot's own footprint is added.
         order: of the Taylor model.
         alpha: pruning threshold of Eq. 2, or `auto`.
         assume: fill in from the textbook what the drive did not show, marked as assumed.
-        strict: refuse a drive that did not move every input on its own.
-        budget: greatest size of the lidar table [bytes], see `lidar.budget`; by default a table
-            of the paper's density.
-        anyway: give a model also if it predicts unseen data hardly better than that the robot
-            stands still.
+        strict: refuse a drive that did not excite every input on its own.
+        anyway: return a model even if it predicts unseen data hardly better than a standing
+            robot would.
 
     Returns:
-        The model, and all that was found out on the way.
+        The model, and everything that was identified on the way.
 
     Raises:
         RecordingError: the recording can't be used for this robot.
-        FitError: the drive does not hold enough to fit a model, or the model is of no use.
+        FitError: the drive does not contain enough to fit a model, or the model is useless.
     """
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
     reason = why_useless(identified, robot, order)
     if reason and not anyway:
         raise FitError(reason)
     shapes = (*shapes, footprint_shape(robot))
-    table = bake(lidar, shapes) if budget is None else choose(lidar, shapes, budget).table
+    table = bake(lidar, shapes)
     model = SimulatorModel(
         robot, identified.model, identified.calibration, lidar, table,
         identified.noise,
@@ -192,7 +188,7 @@ def generate(
 
 
 def footprint_shape(robot: RobotSpec) -> Circle | Polygon:
-    """What the robot fills, around its `base_link`."""
+    """Shape of the robot's footprint around its `base_link`."""
     if robot.footprint is None:
         return Circle(radius=robot.footprint_radius)
     return Polygon(points=robot.footprint)
@@ -207,7 +203,7 @@ def builtin_model(robot: str) -> SimulatorModel:
 
 
 def open_model(name: str | Path) -> SimulatorModel:
-    """A model by its folder, or by the name of a shipped robot (`ackermann`)."""
+    """Opens a model by its folder, or by the name of a shipped robot (`ackermann`)."""
     name = str(name)
     if Path(name).is_dir():
         return load_model(name)
@@ -221,19 +217,19 @@ def open_model(name: str | Path) -> SimulatorModel:
 
 
 def check_place(folder: str | Path) -> None:
-    """Makes sure, before the work of a fit, that `save_model` can write to a folder.
+    """Checks, before the work of a fit, that `save_model` can write to a folder.
 
     Raises:
-        ConfigError: the folder holds something else, or nothing can be written there.
+        ConfigError: the folder contains something else, or is not writable.
     """
     check_folder(folder, MODEL_FILE)
 
 
 def save_model(model: SimulatorModel, folder: str | Path) -> None:
-    """Writes a model as a folder, whole or not at all.
+    """Writes a model as a folder, completely or not at all.
 
     Raises:
-        ConfigError: the folder holds something else.
+        ConfigError: the folder contains something else.
     """
     with whole_folder(folder, MODEL_FILE) as temporary:
         text = f"{model.text}report_sha256: {sha256(model.report.encode())}\n"

@@ -16,7 +16,7 @@ def wrap_angle(angle: ArrayLike) -> Array:
 
 
 def rotate(vector: ArrayLike, angle: ArrayLike) -> Array:
-    """Turns plane vectors (..., 2) by angles (...) [rad], counter-clockwise."""
+    """Rotates plane vectors (..., 2) by angles (...) [rad], counter-clockwise."""
     vector, angle = np.asarray(vector, dtype=np.float64), np.asarray(angle, dtype=np.float64)
     c, s = np.cos(angle), np.sin(angle)
     x, y = vector[..., 0], vector[..., 1]

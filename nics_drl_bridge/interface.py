@@ -1,4 +1,4 @@
-"""The seams: RobotView and Backend to what learns, Simulator to what moves robots."""
+"""Interfaces: RobotView and Backend for what learns, Simulator for what moves robots."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+NS_PER_S, S_PER_NS = 1_000_000_000, 1e-9
 
 
 @dataclass(frozen=True)
@@ -21,9 +23,9 @@ class RobotView:
         twist: (..., 3) estimate of vx [m/s], vy [m/s], wz [rad/s] in `base_link`.
         ranges: (..., B) scan [m], float32, REP-117: `inf` no return, `-inf` too close,
             NaN unknown.
-        stamp_s: time of the newest datum [s].
-        scan_age_s: how old the scan is at the time of the view [s].
-        odom_age_s: how old the newest odometry is at the time of the view [s].
+        stamp_s: time stamp of the newest data [s].
+        scan_age_s: age of the scan at the time of the view [s].
+        odom_age_s: age of the newest odometry at the time of the view [s].
     """
 
     pose: NDArray[np.float64]
@@ -35,7 +37,7 @@ class RobotView:
 
 
 def stacked(views: Sequence[RobotView]) -> RobotView:
-    """Views of M robots as one with a leading (M,); the ages are the greatest."""
+    """Stacks the views of M robots into one with a leading (M,); stamp and ages are the maxima."""
     return RobotView(
         np.stack([view.pose for view in views]),
         np.stack([view.twist for view in views]),
@@ -48,11 +50,11 @@ def stacked(views: Sequence[RobotView]) -> RobotView:
 
 @dataclass(frozen=True)
 class Start:
-    """How an episode begins.
+    """Start of an episode.
 
     Attributes:
-        seed: names the episode; a simulator draws its scene and its noise from it.
-        pose: (3,) where the robot stands: x [m], y [m], heading [rad] in `map`; (M, 3) of a team.
+        seed: identifies the episode; a simulator draws scene and noise from it.
+        pose: (3,) of the robot: x [m], y [m], heading [rad] in `map`; (M, 3) for a team.
     """
 
     seed: int
@@ -61,10 +63,10 @@ class Start:
 
 @runtime_checkable
 class Backend(Protocol):
-    """Where a robot lives: a simulator in process, or whatever is behind ROS 2 topics."""
+    """Access to a robot: a simulator in process, or whatever is behind ROS 2 topics."""
 
     def reset(self, start: Start) -> RobotView:
-        """Begins an episode and returns the first view of it."""
+        """Begins an episode and returns its first view."""
         ...
 
     def step(self, command: NDArray[np.float64]) -> tuple[RobotView, dict[str, Any]]:
@@ -80,19 +82,19 @@ class Backend(Protocol):
         ...
 
     def halt(self) -> None:
-        """Leaves the robot with a zero command; the episode is over.
+        """Stops the robot with a zero command and ends the episode.
 
-        It may be called at any time: after an error of its own, twice, and after `close`.
+        It may be called at any time: after an error of the backend, twice, and after `close`.
         """
         ...
 
     def close(self) -> None:
-        """Leaves the robot with a zero command and frees everything."""
+        """Stops the robot with a zero command and frees all resources."""
         ...
 
 
 class RobotStates(Protocol):
-    """What a simulator knows of its M robots after a step; the leading 1 is its one world."""
+    """State of a simulator's M robots after a step; the leading 1 is its one world."""
 
     @property
     def pose(self) -> NDArray[np.float64]:
@@ -111,7 +113,7 @@ class RobotStates(Protocol):
 
     @property
     def odom(self) -> NDArray[np.float64]:
-        """(1, M, 3) pose by odometry, which drifts; it begins at the start pose."""
+        """(1, M, 3) pose by odometry, which starts at the start pose and drifts."""
         ...
 
     @property
@@ -131,11 +133,11 @@ class RobotStates(Protocol):
 
 
 class Simulator(Protocol):
-    """One world of M robots that anything may stand behind; `FastSimulator` is one."""
+    """One world of M robots, whatever implements it; `FastSimulator` does."""
 
     @property
     def data(self) -> RobotStates:
-        """The present; a step may write into the same arrays."""
+        """The current states; a step may overwrite the same arrays."""
         ...
 
     def reset(self, seeds: ArrayLike, *, starts: ArrayLike | None = None) -> Any:

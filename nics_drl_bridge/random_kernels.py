@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from nics_drl_bridge.kernels import kernel
 
 SCENE_STREAM = 1
 ODOMETRY_STREAM = 2
@@ -23,16 +24,16 @@ MOTION_STREAM = 8
 EPISODE_STREAM = 9
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _mix(z):  # type: ignore[no-untyped-def]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return z ^ (z >> np.uint64(31))
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def uniform(seed, stream, counter):  # type: ignore[no-untyped-def]
-    """A number in [0, 1)."""
+    """A draw from the uniform distribution over [0, 1)."""
     step = np.uint64(0x9E3779B97F4A7C15)
     z = _mix(np.uint64(seed) * step + step)
     z = _mix(z + (np.uint64(stream) + np.uint64(1)) * step)
@@ -40,16 +41,16 @@ def uniform(seed, stream, counter):  # type: ignore[no-untyped-def]
     return float(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def normal(seed, stream, counter):  # type: ignore[no-untyped-def]
     """A draw from the standard normal distribution."""
     radius = math.sqrt(-2.0 * math.log(1.0 - uniform(seed, stream, 2 * counter)))
     return radius * math.cos(2.0 * math.pi * uniform(seed, stream, 2 * counter + 1))
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def episode_seed(seed, number):  # type: ignore[no-untyped-def]
-    """The seed of an env's episode: the first is the env's own seed, the others below 2**53."""
+    """Seed of an env's episode: the first is the env's own seed, the others are below 2**53."""
     if number == 0:
         return np.int64(seed)
     return np.int64(uniform(seed, EPISODE_STREAM, number) * 9007199254740992.0)

@@ -1,4 +1,4 @@
-"""Seeds, as they are taken everywhere: whole numbers that fit into 64 bits."""
+"""Checks of seeds: non-negative integers that fit into signed 64 bits."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _SHORT.maxlong = _SHORT.maxstring = _SHORT.maxother = 40
 
 
 def checked_seeds(seeds: ArrayLike | Any, greatest: int = GREATEST_SEED) -> NDArray[np.int64]:
-    """Seeds (n,), as the kernels take them.
+    """Returns seeds (n,) as the kernels take them.
 
     Args:
-        seeds: one, or several.
-        greatest: that whoever takes them can take.
+        seeds: one or several.
+        greatest: largest allowed seed.
 
     Raises:
-        ConfigError: one is negative, too large, or no whole number.
+        ConfigError: a seed is negative, too large, or not an integer.
     """
     if isinstance(seeds, np.ndarray) and seeds.dtype == np.int64 and greatest == GREATEST_SEED:
         numbers = np.atleast_1d(seeds)
@@ -39,5 +39,5 @@ def checked_seeds(seeds: ArrayLike | Any, greatest: int = GREATEST_SEED) -> NDAr
 
 
 def _is_told(seed: object) -> bool:
-    """Whether a number is short enough to be written in decimals at all."""
+    """True unless the seed is an integer too long to be written in decimal."""
     return not isinstance(seed, int) or seed.bit_length() < 1000

@@ -1,8 +1,8 @@
-"""YAML read without surprises, and written so that it reads back.
+"""Reads YAML without surprises, and writes it so that it reads back.
 
 PyYAML alone reads `1e-3` as a string, keeps the last of two equal keys, lets a few lines of aliases
-and merge keys grow to gigabytes, and makes objects of tags. Here the first is a number, the second
-an error, the third is counted while it is read, and there are no tags.
+and merge keys grow to gigabytes, and builds objects from tags. Here the first is a number, the
+second an error, the third is counted while reading, and tags are refused.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from nics_drl_bridge.errors import ConfigError, shortened
 
 MAX_DEPTH = 32
 MAX_BYTES = 2**20
-"""Of a YAML file."""
+"""Maximum size of a YAML file."""
 MAX_VALUES = 50_000
-"""Keys, values and lists of a YAML file, where each alias counts as all that it stands for."""
+"""Maximum number of keys, values and lists; an alias counts as everything it stands for."""
 _LONGEST_PROBLEM = 200
 
 
 class _PythonEvents(yaml.reader.Reader, yaml.scanner.Scanner, yaml.parser.Parser):
-    """What libyaml does, in Python, and four times slower."""
+    """Python substitute for libyaml's parser, four times slower."""
 
     def __init__(self, text: str) -> None:
         yaml.reader.Reader.__init__(self, text)
@@ -39,7 +39,7 @@ _Events: Any = vars(yaml)["cyaml"].CParser if yaml.__with_libyaml__ else _Python
 
 
 class _Loader(Composer, _Events, SafeConstructor, Resolver):  # type: ignore[misc]
-    """YAML 1.2 numbers, no duplicate keys, no tags, and not more than can be read at once."""
+    """Loader with YAML 1.2 numbers, no duplicate keys, no tags, and limits on depth and size."""
 
     def __init__(self, text: str) -> None:
         _Events.__init__(self, text)
@@ -50,7 +50,7 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):  # type: ignore[mis
         self._sizes: dict[str, int] = {}
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """As in PyYAML, and counts."""
+        """Composes a node as PyYAML does, and counts depth and values."""
         event: Any = self.peek_event()
         before, self._depth = self._values, self._depth + 1
         self._values += self._sizes.get(event.anchor, 1) if _is_alias(event) else 1
@@ -70,7 +70,7 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):  # type: ignore[mis
         return node
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        """As in PyYAML, and refuses a key that stands twice."""
+        """Constructs a mapping as PyYAML does, but refuses duplicate keys."""
         if not isinstance(node, yaml.MappingNode):
             self._refuse(node, "`<<` must be followed by the alias of a mapping")
         seen: set[Any] = set()
@@ -104,7 +104,7 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _whole)
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes text that either `_Loader` or YAML 1.1 would take for a number."""
+    """Dumper that quotes text that either `_Loader` or YAML 1.1 would take for a number."""
 
 
 _Loader.yaml_implicit_resolvers = {
@@ -141,7 +141,7 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
         The mapping.
 
     Raises:
-        ConfigError: no YAML, a duplicate key, nothing in it, no mapping at the top, or more of it
+        ConfigError: not YAML, a duplicate key, an empty file, no mapping at the top level, or more
             than `MAX_BYTES`, `MAX_DEPTH` and `MAX_VALUES` allow.
     """
     if len(text) > MAX_BYTES:
@@ -151,7 +151,7 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
         data = _Loader(text).get_single_data()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
-        last = text.rstrip().count("\n")  # a mark may lie behind the end
+        last = text.rstrip().count("\n")  # a mark may lie beyond the end
         line = f", line {min(mark.line, last) + 1}" if mark else ""
         problem = shortened(error.problem or "not YAML", _LONGEST_PROBLEM)
         raise ConfigError(f"{source}{line}: {problem}.") from None

@@ -1,4 +1,4 @@
-"""Threads: a crew that shares the parts of one job, and one thread for small linear algebra."""
+"""Threads: a pool for the parts of one job, and a single BLAS thread for small problems."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ T = TypeVar("T")
 
 
 class Crew:
-    """Some threads that wait for work; the one that calls is one of them.
+    """A pool of threads that wait for work; the calling thread is one of them.
 
-    Python runs in one thread at a time: it helps where the work is in compiled functions that
-    let go of the interpreter (`nogil`).
+    Python runs in one thread at a time, so it helps only if the work is in compiled functions
+    that release the interpreter lock (`nogil`).
 
     Args:
-        threads: how many, the caller's included.
+        threads: number of threads, including the caller's.
     """
 
     def __init__(self, threads: int) -> None:
@@ -30,9 +30,9 @@ class Crew:
         self._process = 0
 
     def run(self, function: Callable[[T], R], parts: Sequence[T]) -> list[R]:
-        """What a function gives for each part, in their order; the caller does the first one.
+        """Returns a function's result for each part, in order; the caller runs the first part.
 
-        An exception in a part is raised after all have ended.
+        An exception in a part is raised after all parts have ended.
         """
         if self.threads == 1 or len(parts) == 1:
             return [function(part) for part in parts]
@@ -45,14 +45,14 @@ class Crew:
         return [first, *(other.result() for other in others)]
 
     def _started(self) -> ThreadPoolExecutor:
-        """The other threads; they begin with the first job, anew in a forked process."""
+        """The other threads, started with the first job and again in a forked process."""
         if self._pool is None or self._process != os.getpid():
             self._pool = ThreadPoolExecutor(self.threads - 1, thread_name_prefix="crew")
             self._process = os.getpid()
         return self._pool
 
     def __getstate__(self) -> dict[str, int]:
-        """A copy has threads of its own."""
+        """Keeps only the number of threads: a copy starts its own."""
         return {"threads": self.threads}
 
     def __setstate__(self, state: dict[str, int]) -> None:
@@ -60,10 +60,10 @@ class Crew:
 
 
 def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """Makes a function compute with one thread of BLAS, and restores their number afterwards.
+    """Limits a function to one BLAS thread, and restores their number afterwards.
 
-    A fit solves thousands of small least squares. Several threads would wait for each other at
-    each of them, which on a busy machine takes ten times as long.
+    A fit solves thousands of small least-squares problems. Several threads would synchronise at
+    each of them, which takes ten times as long on a busy machine.
     """
     limited: Callable[P, R] = threadpool_limits.wrap(limits=1, user_api="blas")(function)
     return limited

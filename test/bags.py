@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from nics_drl_bridge.kinematics import topic_roles as kinds
-from nics_drl_bridge.kinematics.bag_messages import typestore
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.recording import topic_roles as kinds
+from nics_drl_bridge.recording.messages import typestore
 
 STORE = typestore()
-NANO = 1_000_000_000
 START_S = 1_700_000_000.0
 STEP_S = 0.02
 DURATION_S = 30.0
@@ -30,14 +30,16 @@ def new(kind: str, *values: Any) -> Any:
 
 def ns(seconds: float) -> int:
     """Seconds after START_S as nanoseconds of the recorder's clock."""
-    return round(START_S) * NANO + round(seconds * NANO)
+    return round(START_S) * NS_PER_S + round(seconds * NS_PER_S)
 
 
 def header(seconds: float | None, frame: str = "world") -> Any:
     """A header stamped some seconds after START_S, or not at all."""
     stamp = 0 if seconds is None else ns(seconds)
     return new(
-        "std_msgs/Header", new("builtin_interfaces/Time", stamp // NANO, stamp % NANO), frame
+        "std_msgs/Header",
+        new("builtin_interfaces/Time", stamp // NS_PER_S, stamp % NS_PER_S),
+        frame,
     )
 
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from nics_drl_bridge.nodes.udp import domains_in_use
+from nics_drl_bridge.nodes.transport import domains_in_use
 
 DOMAINS = range(1, 102)  # above, DDS ports may collide with those that Linux hands out
 

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from nics_drl_bridge.calibration.calibration import Calibration
-from nics_drl_bridge.calibration.noise_model import Level, Noise
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kinematics.model import TaylorModel
-from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.robot.noise import Level, Noise
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim.world import World
 
 FOOTPRINT = 0.2

@@ -10,16 +10,16 @@ from bad_files import FILES, TEXTS, VALUES
 
 from nics_drl_bridge.config import MAX_BYTES, share_folder
 from nics_drl_bridge.errors import BridgeError, ConfigError
-from nics_drl_bridge.kinematics.recording import load_npz
-from nics_drl_bridge.kinematics.spec import load_robot
-from nics_drl_bridge.kinematics.topic_roles import topic_roles
+from nics_drl_bridge.gate.black_box import replay
+from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.lidar.maps import load_map
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
 from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.training_settings import load_training
-from nics_drl_bridge.safety.black_box import replay
-from nics_drl_bridge.safety.limits import load_limits
+from nics_drl_bridge.recording.recording import load_recording
+from nics_drl_bridge.recording.topic_roles import topic_roles
+from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.randomisation import load_randomisation
 from nics_drl_bridge.sim.world import load_world
 
@@ -36,7 +36,7 @@ OTHERS = {
     "policy.onnx": load_policy,
     "stop.jsonl": replay,
     "topics.yaml": topic_roles,
-    "drive.npz": load_npz,
+    "drive.npz": load_recording,
     "table.npz": LidarTable.load,
 }
 

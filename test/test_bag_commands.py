@@ -11,15 +11,15 @@ pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 import bags
 import numpy as np
 
-from nics_drl_bridge.kinematics import textbook
-from nics_drl_bridge.kinematics.bag_writer import write_bag
-from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.recording.write import write_bag
+from nics_drl_bridge.robot.spec import load_robot
 
 TIMEOUT_S = 120
 
 
 def nics(*words):
-    command = [sys.executable, "-m", "nics_drl_bridge.cli", *map(str, words)]
+    command = [sys.executable, "-m", "nics_drl_bridge.commands.cli", *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S)
 
 

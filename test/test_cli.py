@@ -13,15 +13,15 @@ import typer
 from nics_drl_bridge import __version__
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.generator import load_model
-from nics_drl_bridge.kinematics import textbook
-from nics_drl_bridge.kinematics.recording import save_recording
-from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.recording.recording import save_recording
+from nics_drl_bridge.robot.spec import load_robot
 
 MODEL_FILES = {"model.yaml", "lidar_table.npz", "report.txt"}
 
 
 def nics(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "nics_drl_bridge.cli", *map(str, words)]
+    command = [sys.executable, "-m", "nics_drl_bridge.commands.cli", *map(str, words)]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=100)
 
 
@@ -185,34 +185,6 @@ def test_what_lies_at_the_place_of_the_model_is_left_alone(drive, tmp_path):
 
 def test_a_recording_of_another_robot_is_refused(drive, tmp_path):
     refused(nics("generate", drive, "--out", "car", "--robot", "mecanum", cwd=tmp_path))
-    assert names(tmp_path) == set()
-
-
-def test_bake_writes_a_table_within_a_budget_and_no_bar_into_a_pipe(tmp_path):
-    done = nics("bake", "--world", "arena", "--budget", "200kB", "--out", "t.npz", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    assert done.stdout.endswith("table written to t.npz\n")
-    assert {"density", "expected", "size", "time"} <= set(done.stdout.split())
-    assert names(tmp_path) == {"t.npz"}
-    assert 0 < (tmp_path / "t.npz").stat().st_size <= 200_000
-
-
-def test_bake_takes_a_sensor_model(tmp_path):
-    (tmp_path / "dull.yaml").write_text("sensor_model: [{kind: intensity}]\n")
-    words = ("bake", "--world", "arena", "--distances", "5", "--sensor-model")
-    done = nics(*words, "dull.yaml", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "sensor model    intensity 1 at 1 m, reflectivity 0.5" in done.stdout
-    (tmp_path / "dull.yaml").write_text("sensor_model: [{kind: intense}]\n")
-    told = refused(nics(*words, "dull.yaml", cwd=tmp_path))
-    assert "dull.yaml: key 'sensor_model.0': unknown kind 'intense'; did you mean" in told
-
-
-def test_bake_without_shapes_or_with_nonsense_is_refused(tmp_path):
-    assert "nothing to bake" in refused(nics("bake", cwd=tmp_path))
-    wrong = ("bake", "--world", "arena", "--budget", "much")
-    assert "'much': is no size" in refused(nics(*wrong, cwd=tmp_path))
     assert names(tmp_path) == set()
 
 

@@ -55,7 +55,7 @@ class Running:
 def demo(*words: object, cwd: Path) -> Iterator[Running]:
     with claimed_domain() as domain_id:
         process = subprocess.Popen(
-            [sys.executable, "-m", "nics_drl_bridge.cli", "demo", *map(str, words)],
+            [sys.executable, "-m", "nics_drl_bridge.commands.cli", "demo", *map(str, words)],
             cwd=cwd,
             env=os.environ | {"ROS_DOMAIN_ID": str(domain_id), "PYTHONUNBUFFERED": "1"},
             stdout=subprocess.PIPE,

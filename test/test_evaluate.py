@@ -10,8 +10,8 @@ import pytest
 from domains import claimed_domain
 
 from nics_drl_bridge.config import dump_yaml
-from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.policy.policies import shipped_policies
+from nics_drl_bridge.robot.spec import load_robot
 
 PNG = b"\x89PNG"
 DEADLINE_S = 280.0
@@ -21,7 +21,7 @@ needs_nodes = pytest.mark.skipif(bool(missing), reason=f"needs {' and '.join(mis
 
 def nics(*words, cwd, domain_id=0):
     return subprocess.run(
-        [sys.executable, "-m", "nics_drl_bridge.cli", *map(str, words)],
+        [sys.executable, "-m", "nics_drl_bridge.commands.cli", *map(str, words)],
         cwd=cwd,
         env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
         capture_output=True,
@@ -101,9 +101,9 @@ def test_bad_input_ends_it_with_one_sentence(tmp_path, words, said):
 @pytest.mark.ros
 @needs_nodes
 def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monkeypatch):
-    from nics_drl_bridge import vehicle
+    from nics_drl_bridge.commands import vehicle
+    from nics_drl_bridge.nodes.observer import Witness
     from nics_drl_bridge.nodes.processes import NodeProcess
-    from nics_drl_bridge.nodes.witness import Witness
 
     limits = {
         one.name: {"min": one.min, "max": one.max, "rate": 20.0, "jerk": 400.0}

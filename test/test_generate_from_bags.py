@@ -10,14 +10,14 @@ pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 
 import bags
 
-from nics_drl_bridge.calibration.identify import identify
-from nics_drl_bridge.cli import app
+from nics_drl_bridge.commands.cli import app
 from nics_drl_bridge.generator import SimulatorModel, load_model
-from nics_drl_bridge.kinematics.bag_writer import write_bag
-from nics_drl_bridge.kinematics.readers import read_recording
-from nics_drl_bridge.kinematics.recording import save_recording
-from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
-from nics_drl_bridge.kinematics.textbook import record
+from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.recording.recording import save_recording
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.recording.write import write_bag
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 SECONDS = 30.0
 SAME = 1e-6

@@ -10,8 +10,6 @@ import pytest
 from robots import circles, direct_model, field
 
 from nics_drl_bridge import generator
-from nics_drl_bridge.calibration.calibration import Calibration
-from nics_drl_bridge.calibration.noise_model import Level
 from nics_drl_bridge.config import dump_yaml, parse_yaml
 from nics_drl_bridge.errors import BridgeError, ConfigError, ModelError
 from nics_drl_bridge.generator import (
@@ -23,7 +21,8 @@ from nics_drl_bridge.generator import (
     open_model,
     save_model,
 )
-from nics_drl_bridge.kinematics.latency import Delay, Latency
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.robot.noise import Delay, Latency, Level
 from nics_drl_bridge.sim.simulator import FastSimulator
 
 ROBOTS = ("ackermann", "differential", "mecanum")

@@ -10,54 +10,59 @@ from pathlib import Path
 
 import pytest
 
+from nics_drl_bridge import kernels
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "nics_drl_bridge"
 
 # From the bottom up. What stands on one line does not import each other.
 LAYERS = (
-    ("errors", "geometry", "random_kernels", "interface", "discovery"),
-    ("strict_yaml", "seeds"),
-    ("files", "npz", "config", "threads"),
-    ("kinematics", "lidar"),
-    ("calibration",),
+    ("errors", "geometry", "interface", "kernels"),
+    ("extensions", "random_kernels", "seeds", "strict_yaml"),
+    ("config", "files", "npz", "threads"),
+    ("robot",),
+    ("recording",),
+    ("identify",),
+    ("lidar",),
     ("generator",),
-    ("sim", "middleware"),
-    ("highfidelity",),
+    ("sim",),
+    ("middleware",),
     ("env",),
-    ("policy", "safety"),
+    ("policy",),
+    ("gate",),
     ("report",),
     ("nodes",),
-    ("trial",),
-    ("evaluate", "shadow"),
-    ("vehicle",),
-    ("demo", "bake_order"),
     ("commands",),
-    ("cli",),
+    ("extras",),
+)
+ORDER = "".join(
+    f"    {'  ' if level else ''}{'< ' if level else ''}{', '.join(parts)}\n"
+    for level, parts in enumerate(LAYERS)
 )
 
 # Library -> where it may be imported; * of a message package stands for any name.
 HOMES = {
-    "rclpy": ("nodes/*",),
-    "*_msgs": ("nodes/*",),
-    "std_srvs": ("nodes/*",),
-    "builtin_interfaces": ("nodes/*",),
-    "ament_index_python": ("nodes/*",),
+    "rclpy": ("nodes/*", "extras/*"),
+    "*_msgs": ("nodes/*", "extras/*"),
+    "std_srvs": ("nodes/*", "extras/*"),
+    "builtin_interfaces": ("nodes/*", "extras/*"),
+    "ament_index_python": ("nodes/*", "extras/*"),
     "filterpy": ("middleware/ekf.py",),
     "matplotlib": ("report/*", "env/rendering.py"),
     "yaml": ("strict_yaml.py",),
-    "typer": ("cli.py", "commands/*"),
-    "gymnasium": ("env/*", "policy/*", "trial.py", "vehicle.py"),
-    "numba": ("*kernels.py", "lidar/scanner.py"),
+    "typer": ("commands/*", "extras/*"),
+    "gymnasium": ("env/*", "policy/*", "commands/*", "extras/*"),
+    "numba": ("*kernels.py",),
     "PIL": ("lidar/maps.py",),
     "llvmlite": ("*kernels.py",),
-    "mujoco": ("highfidelity/*",),
-    "torch": ("policy/train*.py",),
-    "stable_baselines3": ("policy/train*.py",),
+    "mujoco": ("extras/mujoco/*",),
+    "torch": ("policy/train*.py", "extras/ray/*"),
+    "stable_baselines3": ("policy/train*.py", "extras/ray/*"),
     "onnx": ("policy/*",),
     "onnxruntime": ("policy/*",),
     "pettingzoo": ("env/pettingzoo_env.py",),
-    "ray": ("policy/train_ray*.py",),
-    "rosbags": ("kinematics/*",),
+    "ray": ("extras/ray/*",),
+    "rosbags": ("recording/*", "extras/bags/*"),
     "threadpoolctl": ("threads.py",),
 }
 
@@ -116,6 +121,10 @@ def strangers(package: Path) -> list[str]:
     return wrong
 
 
+def test_the_page_on_architecture_shows_the_order():
+    assert ORDER in (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+
+
 def test_imports_run_one_way():
     assert wrong_directions(ROOT / PACKAGE) == []
 
@@ -133,10 +142,10 @@ def package(tmp_path):
         "errors.py": "import numpy",
         "strict_yaml.py": "import yaml\nfrom nics_drl_bridge.errors import E",
         "config.py": "from nics_drl_bridge.strict_yaml import parse_yaml",
-        "kinematics/spec.py": "from nics_drl_bridge import config\nfrom . import model",
-        "kinematics/model.py": "",
-        "kinematics/kernels.py": "from numba import njit",
-        "sim/world.py": "from nics_drl_bridge.kinematics.spec import S",
+        "robot/spec.py": "from nics_drl_bridge import config\nfrom . import model",
+        "robot/taylor.py": "",
+        "robot/kernels.py": "from numba import njit",
+        "sim/world.py": "from nics_drl_bridge.robot.spec import S",
         "nodes/gate.py": "import rclpy.node\nfrom sensor_msgs.msg import LaserScan",
     }.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -153,16 +162,16 @@ def test_a_package_without_a_fault_passes(package):
     ("file", "line"),
     [
         ("errors.py", "from nics_drl_bridge.config import C"),
-        ("errors.py", "import nics_drl_bridge.cli"),
-        ("kinematics/model.py", "from nics_drl_bridge.sim.world import W"),
-        ("kinematics/model.py", "from nics_drl_bridge import generator"),
-        ("kinematics/model.py", "from nics_drl_bridge.lidar import spec"),
-        ("kinematics/model.py", "from ..env import navigation"),
-        ("kinematics/model.py", "from .. import cli"),
-        ("sim/world.py", "def f():\n    from nics_drl_bridge.middleware.view import M"),
+        ("errors.py", "import nics_drl_bridge.commands.cli"),
+        ("robot/taylor.py", "from nics_drl_bridge.sim.world import W"),
+        ("robot/taylor.py", "from nics_drl_bridge import generator"),
+        ("robot/taylor.py", "from nics_drl_bridge.lidar import spec"),
+        ("robot/taylor.py", "from ..env import navigation"),
+        ("robot/taylor.py", "from .. import commands"),
+        ("sim/world.py", "def f():\n    from nics_drl_bridge.middleware.middleware import M"),
         ("sim/world.py", "import importlib\nimportlib.import_module('nics_drl_bridge.nodes.gate')"),
         ("sim/world.py", "if TYPE_CHECKING:\n    from nics_drl_bridge.report import page"),
-        ("policy/act.py", "from nics_drl_bridge.safety.gate import decide"),
+        ("policy/act.py", "from nics_drl_bridge.gate.gate import decide"),
         ("nowhere/new.py", ""),
     ],
 )
@@ -179,8 +188,8 @@ def test_an_import_that_runs_up_or_sideways_is_found(package, file, line):
         ("sim/world.py", "import rclpy"),
         ("env/task.py", "def f():\n    from geometry_msgs.msg import Twist"),
         ("sim/world.py", "from yaml import safe_load"),
-        ("middleware/view.py", "import filterpy.kalman"),
-        ("kinematics/model.py", "from numba import njit"),
+        ("middleware/middleware.py", "import filterpy.kalman"),
+        ("robot/taylor.py", "from numba import njit"),
         ("lidar/table.py", "import numba as nb"),
         ("generator.py", "import matplotlib.pyplot as plt"),
         ("sim/world.py", "import gymnasium"),
@@ -199,6 +208,26 @@ def modules_after(code: str) -> set[str]:
     ask = f"import sys\n{code}\nprint(*{{name.partition('.')[0] for name in sys.modules}})"
     done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True)
     return set(done.stdout.split())
+
+
+LIGHT = {"errors.py", "geometry.py", "interface.py", "robot/taylor.py", "sim/state.py"}
+
+
+def test_kernels_import_kernels_only_so_that_no_other_edit_compiles_them_anew():
+    heavy = {}
+    for path in (ROOT / PACKAGE).rglob("*.py"):
+        if "@kernel" not in path.read_text(encoding="utf-8") or path == Path(kernels.__file__):
+            continue
+        assert path.name.endswith("kernels.py"), path
+        files, left = set(), [path]
+        while left:
+            file = left.pop()
+            if file not in files:
+                files.add(file)
+                left += kernels.imports_of(file)
+        others = {file.relative_to(kernels.PACKAGE).as_posix() for file in files} - LIGHT
+        heavy[path.name] = {name for name in others if not name.endswith("kernels.py")}
+    assert {name: found for name, found in heavy.items() if found} == {}
 
 
 def test_importing_the_package_imports_nothing_heavy():

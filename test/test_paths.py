@@ -7,6 +7,8 @@ import pytest
 
 from nics_drl_bridge.config import load_yaml, read_text, share_folder
 from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.gate.black_box import replay
+from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import (
     TABLE_FILE,
     builtin_model,
@@ -15,24 +17,21 @@ from nics_drl_bridge.generator import (
     open_model,
     save_model,
 )
-from nics_drl_bridge.kinematics.csv_reader import load_csv_folder
-from nics_drl_bridge.kinematics.drive_file import check_out, write_drive
-from nics_drl_bridge.kinematics.readers import read_recording
-from nics_drl_bridge.kinematics.recording import load_npz, save_recording
-from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
-from nics_drl_bridge.kinematics.textbook import record
-from nics_drl_bridge.kinematics.topic_roles import topic_roles
 from nics_drl_bridge.lidar.maps import load_map
 from nics_drl_bridge.lidar.sensor_models import load_sensor_models
 from nics_drl_bridge.lidar.shapes import load_shapes
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
-from nics_drl_bridge.middleware.playback import Estimate, write_estimate
+from nics_drl_bridge.middleware.playback import EstimatedDrive, write_estimate
 from nics_drl_bridge.policy.policy_file import load_policy, shipped
 from nics_drl_bridge.policy.training_settings import load_training
+from nics_drl_bridge.recording.readers import load_csv_folder, read_recording
+from nics_drl_bridge.recording.recording import load_recording, save_recording
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.recording.topic_roles import topic_roles
+from nics_drl_bridge.recording.write import check_out, write_drive
 from nics_drl_bridge.report.doctor_facts import facts_of_bag
-from nics_drl_bridge.safety.black_box import replay
-from nics_drl_bridge.safety.limits import load_limits
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.sim.randomisation import load_randomisation
 from nics_drl_bridge.sim.world import load_world
 
@@ -65,16 +64,16 @@ def test_a_drive_is_written_and_read_at_either(tmp_path, kind, name):
 def test_a_recording_is_saved_and_loaded_at_either(tmp_path, kind):
     place, drive = kind(tmp_path / "drive.npz"), record(CAR, np.random.default_rng(0), duration=5.0)
     save_recording(drive, place)
-    assert np.array_equal(load_npz(place).pose.values, drive.pose.values)
+    assert np.array_equal(load_recording(place).pose.values, drive.pose.values)
 
 
 @KINDS
 def test_a_bag_is_saved_told_and_looked_through_at_either(tmp_path, kind):
     pytest.importorskip("rosbags")
-    from nics_drl_bridge.kinematics.bag_file import is_bag
-    from nics_drl_bridge.kinematics.bag_info import bag_info
-    from nics_drl_bridge.kinematics.bag_salvage import salvage
-    from nics_drl_bridge.kinematics.bag_writer import write_bag
+    from nics_drl_bridge.extras.bags.info import bag_info
+    from nics_drl_bridge.extras.bags.salvage import salvage
+    from nics_drl_bridge.recording.bag_file import is_bag
+    from nics_drl_bridge.recording.write import write_bag
 
     place, rest = kind(tmp_path / "drive"), kind(tmp_path / "rest")
     write_bag(record(CAR, np.random.default_rng(0), duration=5.0), place, CAR)
@@ -88,7 +87,7 @@ def test_a_bag_is_saved_told_and_looked_through_at_either(tmp_path, kind):
 @pytest.mark.parametrize("name", ["estimate.npz", "estimate.csv"])
 def test_an_estimate_is_written_to_either(tmp_path, kind, name):
     none = np.zeros((0, 3))
-    made = Estimate(np.zeros(0, np.int64), none, none, np.zeros((0, 3, 3)), {})
+    made = EstimatedDrive(np.zeros(0, np.int64), none, none, np.zeros((0, 3, 3)), {})
     write_estimate(made, kind(tmp_path / name))
     assert (tmp_path / name).is_file()
 
@@ -120,7 +119,7 @@ def test_a_policy_is_loaded_from_either(kind):
 
 @KINDS
 @pytest.mark.parametrize(
-    "load", [load_csv_folder, load_npz, load_sensor_models, load_shapes, replay, topic_roles]
+    "load", [load_csv_folder, load_recording, load_sensor_models, load_shapes, replay, topic_roles]
 )
 def test_what_is_not_there_is_one_sentence_for_either(tmp_path, kind, load):
     with pytest.raises(BridgeError, match=r"gone: no such f"):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from robots import direct_model
 
+from nics_drl_bridge.commands.episodes import EvaluationOrder, seeds_of
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.evaluate import Order, seeds_of
-from nics_drl_bridge.kinematics.drive_plan import DrivePlan
-from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.recording.drive_plan import DrivePlan
+from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.seeds import GREATEST_SEED, checked_seeds
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -45,7 +45,7 @@ def test_every_seed_of_63_bits_is_taken(simulator, seed):
 
 def test_the_last_seed_of_an_evaluation_counts_too():
     with pytest.raises(ConfigError, match="seed 9223372036854775808"):
-        seeds_of(Order(["straight"], None, None, "arena", 2, GREATEST_SEED))
+        seeds_of(EvaluationOrder(["straight"], None, None, "arena", 2, GREATEST_SEED))
 
 
 def test_a_seed_is_told_shortly():

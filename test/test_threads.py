@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from nics_drl_bridge.calibration.calibrate import calibrate
-from nics_drl_bridge.calibration.curves import timing_curves
-from nics_drl_bridge.calibration.identify import identify
 from nics_drl_bridge.errors import FitError
-from nics_drl_bridge.kinematics.fit import fit
+from nics_drl_bridge.identify.calibrate import calibrate
+from nics_drl_bridge.identify.fit import fit
+from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.report.calibration_pictures import timing_curves
 from nics_drl_bridge.threads import Crew, one_blas_thread
 
 

@@ -20,13 +20,12 @@ import torch
 from numpy.typing import NDArray
 
 from measuring.gates import Gate, gate_config
-from nics_drl_bridge.env.tasks import make_task
+from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.gate import black_box
+from nics_drl_bridge.gate.inputs import Tick
 from nics_drl_bridge.generator import builtin_model, load_model, save_model
-from nics_drl_bridge.kinematics import textbook
-from nics_drl_bridge.kinematics.recording import load_npz, save_recording
-from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
 from nics_drl_bridge.policy.policy_file import load_policy
@@ -34,8 +33,9 @@ from nics_drl_bridge.policy.train import CHECKPOINT, train
 from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
 from nics_drl_bridge.policy.train_export import export_policy
 from nics_drl_bridge.policy.training_settings import TrainingSettings
-from nics_drl_bridge.safety import black_box
-from nics_drl_bridge.safety.inputs import Tick
+from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.recording.recording import load_recording, save_recording
+from nics_drl_bridge.robot.spec import load_robot
 
 LONGEST_S = 0.05
 """A writer is killed within this time after it began to write."""
@@ -82,7 +82,7 @@ def _recording() -> Artefact:
     drives = [textbook.record(robot, np.random.default_rng(seed)) for seed in (0, 1)]
 
     def version(path: Path) -> int:
-        return _which(load_npz(path).pose.values, [drive.pose.values for drive in drives])
+        return _which(load_recording(path).pose.values, [drive.pose.values for drive in drives])
 
     def write(path: Path, n: int) -> None:
         save_recording(drives[n], path)

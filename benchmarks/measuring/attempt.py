@@ -125,7 +125,7 @@ def nics(*words: object) -> Callable[[], None]:
     """An act: a command of `nics`. Raises BridgeError where it ends with its sentence."""
 
     def act() -> None:
-        from nics_drl_bridge.cli import main
+        from nics_drl_bridge.commands.cli import main
         from nics_drl_bridge.errors import BridgeError
 
         with tempfile.TemporaryFile("w+", errors="replace") as said:

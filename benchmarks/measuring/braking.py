@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from nics_drl_bridge.gate.limits import load_limits
+from nics_drl_bridge.gate.stopping import shield_config
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.safety.limits import load_limits
-from nics_drl_bridge.safety.stopping import shield_config
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
 

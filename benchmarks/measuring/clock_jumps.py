@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.sim.simulator import FastSimulator
 
 Array = NDArray[np.float64]

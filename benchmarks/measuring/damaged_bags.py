@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from nics_drl_bridge.errors import BridgeError
-from nics_drl_bridge.kinematics import textbook
-from nics_drl_bridge.kinematics.bag_file import opened
-from nics_drl_bridge.kinematics.bag_info import bag_info
-from nics_drl_bridge.kinematics.bag_salvage import salvage
-from nics_drl_bridge.kinematics.bag_writer import write_bag
-from nics_drl_bridge.kinematics.readers import read_recording
-from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.extras.bags.info import bag_info
+from nics_drl_bridge.extras.bags.salvage import salvage
+from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.recording.bag_file import opened
+from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.recording.write import write_bag
+from nics_drl_bridge.robot.spec import load_robot
 
 ROBOT = "ackermann"
 SECONDS = 8.0

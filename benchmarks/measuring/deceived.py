@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from measuring.standing import Standing
-from nics_drl_bridge import trial
-from nics_drl_bridge.cli import main
+from nics_drl_bridge.commands import episodes
+from nics_drl_bridge.commands.cli import main
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.middleware.middleware import Middleware
 
 
 def lie() -> None:
@@ -41,13 +41,13 @@ def lie() -> None:
 
 def stand() -> None:
     """From now on every policy stands still."""
-    opened = trial.open_policy
+    opened = episodes.open_policy
 
     def standing(name: str, model: Any) -> Any:
         _, task = opened(name, model)
         return Standing(task), task
 
-    trial.open_policy = standing  # type: ignore[assignment]
+    episodes.open_policy = standing  # type: ignore[assignment]
 
 
 if __name__ == "__main__":

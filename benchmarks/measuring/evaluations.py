@@ -54,7 +54,9 @@ def _evaluate(run: Run, domain: int) -> dict[str, Any]:
         "evaluate", run.policy, "--model", run.robot, "--world", run.world, "--episodes",
         run.episodes, "--seed", run.seed, "--out", run.out,
     )  # fmt: skip
-    program = ["measuring.deceived", run.control] if run.control else ["nics_drl_bridge.cli"]
+    program = (
+        ["measuring.deceived", run.control] if run.control else ["nics_drl_bridge.commands.cli"]
+    )
     paths = os.pathsep.join([str(BENCHMARKS), *filter(None, [os.environ.get("PYTHONPATH")])])
     done = subprocess.run(
         [sys.executable, "-m", *program, *map(str, words)],

@@ -12,7 +12,8 @@ from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 
-from measuring.faulty_robot import ALL, NANO, Robot
+from measuring.faulty_robot import ALL, Robot
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.processes import NodeProcess
 
@@ -73,7 +74,7 @@ def _stamp(topic: str, off_s: float, growing: bool = False) -> Injection:
         def change(message: Any) -> Any:
             sent[0] += 1
             off = off_s * (sent[0] if growing else 1)
-            stamp = conversions.stamp_from_ros(message.header.stamp) + round(off * NANO)
+            stamp = conversions.stamp_from_ros(message.header.stamp) + round(off * NS_PER_S)
             message.header.stamp = conversions.stamp_to_ros(stamp)
             return message
 
@@ -153,7 +154,7 @@ def _teleport(x: float, y: float) -> Injection:
 
 
 def _jump(seconds: int) -> Injection:
-    return lambda around: setattr(around.robot, "jump_ns", seconds * NANO)
+    return lambda around: setattr(around.robot, "jump_ns", seconds * NS_PER_S)
 
 
 def _signal(how: signal.Signals, republished: bool = False) -> Injection:

@@ -21,13 +21,13 @@ from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
 
 ROBOT, PERIOD_S, SPEED = "ackermann", 0.1, 0.5
 PATIENCE_S, MOTION_S = 60.0, 10.0
 RECENT_S = 0.15
 """The newest command must be younger, for the robot to be told to move now [s]."""
-NANO = conversions.NANO
 ALL = frozenset({"scan", "odom", "odometry/filtered", "cmd_vel_raw", "e_stop"})
 
 
@@ -125,7 +125,7 @@ class Robot:
     def _send(self) -> None:
         speed = self.heard[-1][1][0] if self.heard and not self.stuck else 0.0
         before, self._now_ns = self._now_ns, time.monotonic_ns() + self._offset_ns
-        self._x += speed * min(self._now_ns - before, NANO) / NANO
+        self._x += speed * min(self._now_ns - before, NS_PER_S) / NS_PER_S
         stamp = self._now_ns + self.jump_ns
         odometry = conversions.odometry_to_ros(
             [self._x, 0.0, 0.0], [speed, 0.0, 0.0], stamp, ("odom", "base_link"), (1e-4,) * 4

@@ -86,9 +86,8 @@ MODELS = Table(
         ("lidar_sensor_models", title, f"{{scans_per_s.{key}|.1e}}", f"{{times_as_long.{key}|.2f}}",
          f"{{times_as_long_median.{key}|.2f}}", size)
         for key, title, size in (
-            *((each, each, f"{{table_bytes.{each} x1e-6|.1f}} MB")
-              for each in ("no model", "incidence dropout", "intensity", "both")),
-            ("both, with intensities", "both, and intensities of every scan", ""),
+            (each, each, f"{{table_bytes.{each} x1e-6|.1f}} MB")
+            for each in ("no model", "incidence dropout", "intensity", "both")
         )
     ),
 )  # fmt: skip

@@ -8,15 +8,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.gate.gate import decide
+from nics_drl_bridge.gate.inputs import Arm, Command, Input, Odometry, Reset, Scan, Tick
+from nics_drl_bridge.gate.limits import load_limits
+from nics_drl_bridge.gate.state import Decision, GateConfig, begin
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.safety.gate import decide
-from nics_drl_bridge.safety.inputs import Arm, Command, Input, Odometry, Reset, Scan, Tick
-from nics_drl_bridge.safety.limits import load_limits
-from nics_drl_bridge.safety.state import Decision, GateConfig, begin
+from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
-NANO = 1_000_000_000
+Witness = Callable[[Decision, float], None]
 START_S = 1000.0
 SETTLE_PERIODS = 12
 
@@ -49,8 +50,8 @@ class Gate:
 
     def __init__(self, config: GateConfig, lidar: LidarSpec) -> None:
         self.config, self._lidar = config, lidar
-        self.witness: Callable[[Decision, float], None] | None = None
-        self.state, self.now, self.stamp_ns = begin(config), START_S, NANO
+        self.witness: Witness | None = None
+        self.state, self.now, self.stamp_ns = begin(config), START_S, NS_PER_S
 
     def give(self, given: Input) -> Decision:
         """One input now."""
@@ -61,7 +62,7 @@ class Gate:
 
     def sense(self, ranges: NDArray[np.float32], pose: Array, twist: Array) -> None:
         """Odometry and a scan arrive."""
-        self.stamp_ns = round(self.now * NANO)
+        self.stamp_ns = round(self.now * NS_PER_S)
         angles = (self._lidar.angle_min, self._lidar.angle_increment)
         self.give(Odometry(self.stamp_ns, pose.copy(), twist.copy()))
         self.give(Scan(self.stamp_ns, ranges.copy(), angles))

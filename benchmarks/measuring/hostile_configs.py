@@ -12,14 +12,14 @@ import numpy as np
 
 from measuring.attempt import Attempt, nics
 from nics_drl_bridge.config import dump_yaml, parse_yaml, share_folder
-from nics_drl_bridge.kinematics.spec import load_robot
-from nics_drl_bridge.kinematics.topic_roles import topic_roles
+from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.lidar.maps import load_map
 from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.shapes import Circle, load_shapes
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.policy.training_settings import load_training
-from nics_drl_bridge.safety.limits import load_limits
+from nics_drl_bridge.recording.topic_roles import topic_roles
+from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.randomisation import load_randomisation
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import load_world
@@ -91,7 +91,7 @@ def attempts(rng: Rng, folder: Path) -> Iterator[Attempt]:
         elif draw < 0.6:
             told, bad = _WORLDS[int(rng.integers(len(_WORLDS)))](rng)
             path.write_text(bad, encoding="utf-8")
-            act = nics("bake", "--world", path, "--out", folder / "t.npz")
+            act = nics("train", "--world", path, "--steps", "1", "--out", folder / "run")
             use = _used(_world, path) if rng.random() < 0.7 else act
             fits = told != "more than fit" or use is not act  # which nobody finds by baking
             yield Attempt("world", told, use, "bad" if fits else "any")

@@ -18,19 +18,19 @@ from measuring.attempt import Attempt, nics
 from measuring.damaged_bags import samples
 from measuring.gates import Gate, gate_config
 from nics_drl_bridge.config import dump_yaml, parse_yaml
+from nics_drl_bridge.extras.bags.info import bag_info
 from nics_drl_bridge.files import sealed, sha256
+from nics_drl_bridge.gate import black_box
+from nics_drl_bridge.gate.inputs import Tick
 from nics_drl_bridge.generator import builtin_model, load_model, save_model
-from nics_drl_bridge.kinematics import textbook
-from nics_drl_bridge.kinematics.bag_info import bag_info
-from nics_drl_bridge.kinematics.readers import read_recording
-from nics_drl_bridge.kinematics.recording import save_recording
-from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
 from nics_drl_bridge.npz import npz_bytes
 from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
-from nics_drl_bridge.safety import black_box
-from nics_drl_bridge.safety.inputs import Tick
+from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.recording.recording import save_recording
+from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import load_world
 

@@ -31,7 +31,7 @@ import numpy as np
 
 from measuring.environments import NotInstalledError, clean, python_with
 from nics_drl_bridge.env.navigation import Navigation
-from nics_drl_bridge.env.registration import MAX_EPISODE_STEPS
+from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world import World

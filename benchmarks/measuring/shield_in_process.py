@@ -7,12 +7,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from measuring.gates import NANO, Gate, gate_config
+from measuring.gates import Gate, Witness, gate_config
 from measuring.shield_places import SCAN_STEPS, STEP_S, Job, Outcome, Place
-from nics_drl_bridge.safety.inputs import Command, Input, Odometry, Scan
-from nics_drl_bridge.safety.limits import load_limits
-from nics_drl_bridge.safety.state import GateConfig
-from nics_drl_bridge.safety.stopping import shield_config
+from nics_drl_bridge.gate.inputs import Command, Input, Odometry, Scan
+from nics_drl_bridge.gate.limits import load_limits
+from nics_drl_bridge.gate.state import GateConfig
+from nics_drl_bridge.gate.stopping import shield_config
+from nics_drl_bridge.interface import NS_PER_S
 
 MOST_SCAN_LATE_S, MOST_TOLD_LATE_S = 0.29, 0.1
 """Greatest delay of a scan, or of the command behind it, to the gate; and of the gate's command to
@@ -54,14 +55,24 @@ def config_of(place: Place, shield: dict[str, float] | None) -> GateConfig:
     return gate_config(robot, place.model.lidar, shield=given)
 
 
-def drive(place: Place, config: GateConfig, jobs: Sequence[Job]) -> list[Outcome]:
-    """Drives episodes one after the other, each with a gate of its own."""
-    return [_episode(place, config, job) for job in jobs]
+def drive(
+    place: Place, config: GateConfig, jobs: Sequence[Job], witness: Witness | None = None
+) -> list[Outcome]:
+    """Drives episodes one after the other, each with a gate of its own.
+
+    Args:
+        place: the robot in its world.
+        config: of its gate.
+        jobs: the episodes.
+        witness: sees every decision of the gates, with its time.
+    """
+    return [_episode(place, config, job, witness) for job in jobs]
 
 
-def _episode(place: Place, config: GateConfig, job: Job) -> Outcome:
+def _episode(place: Place, config: GateConfig, job: Job, witness: Witness | None) -> Outcome:
     place.begin(job)
     gate, lidar = Gate(config, place.model.lidar), place.model.lidar
+    gate.witness = witness
     truth = place.truth
     gate.arm(truth.ranges, place.odom)
     rng = np.random.default_rng([11, job.seed, *place.model.robot.name.encode()])
@@ -74,7 +85,7 @@ def _episode(place: Place, config: GateConfig, job: Job) -> Outcome:
     while not place.ended:
         gate.now = begun + step * STEP_S
         if step % SCAN_STEPS == 0:
-            truth, stamp, seen = place.truth, round(gate.now * NANO), to_gate.arrival(step)
+            truth, stamp, seen = place.truth, round(gate.now * NS_PER_S), to_gate.arrival(step)
             scan = Scan(stamp, truth.ranges, (lidar.angle_min, lidar.angle_increment))
             coming += [(seen, Odometry(stamp, place.odom.copy(), truth.twist)), (seen, scan)]
             commands.append((behind.arrival(seen), Command(stamp, place.wish(truth))))

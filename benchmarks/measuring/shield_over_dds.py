@@ -28,6 +28,7 @@ from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from measuring.shield_places import SCAN_STEPS, SILENCE_S, STEP_S, Job, Outcome, Place
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 from nics_drl_bridge.nodes.runner import open_context
@@ -40,7 +41,7 @@ told: the worlds stood still meanwhile, and the running episodes are driven agai
 TRIES = 10
 """So often is an episode begun at most."""
 VARIANCES = (1e-4,) * 4
-GATE, NANO = "command_gate", conversions.NANO
+GATE = "command_gate"
 LATCHED = re.compile(r"(?:call ~/reset first: |e_stop_released: )(\w+)")
 """What a gate that refuses to be armed says of a stop that waits for a reset."""
 
@@ -251,10 +252,10 @@ def _run(
             executor.spin_once(timeout_sec=ahead)
             continue
         if -ahead > BEHIND_S:
-            began, epoch_ns = began - ahead, epoch_ns - round(ahead * NANO)
+            began, epoch_ns = began - ahead, epoch_ns - round(ahead * NS_PER_S)
             if voided := sum(lane.void() for lane in lanes):  # not while the gates start
                 held_up.add(HeldUp(1, -ahead, 0.0, voided))
-        step_ns = epoch_ns + round(step * STEP_S * NANO)
+        step_ns = epoch_ns + round(step * STEP_S * NS_PER_S)
         for index, lane in enumerate(lanes):
             lane.step(step_ns, speaks=(step + index) % SCAN_STEPS == 0)
         step += 1

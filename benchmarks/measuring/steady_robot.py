@@ -15,11 +15,12 @@ from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.nodes.wire import OdometryWriter, ScanWriter
 
-ROBOT, SPEED, NANO = "ackermann", 0.5, conversions.NANO
+ROBOT, SPEED = "ackermann", 0.5
 SCAN_HZ, ODOM_HZ = 10, 50
 PATIENCE_S = 120.0
 
@@ -85,7 +86,7 @@ class SteadyRobot:
 
     def _command(self, stamp_ns: int) -> None:
         """The policy has answered the scan before this one."""
-        ill = self.mad and stamp_ns // (NANO // 2) % 2
+        ill = self.mad and stamp_ns // (NS_PER_S // 2) % 2
         speed = float("nan") if ill else SPEED
         command = TwistStamped(twist=conversions.twist_to_ros([speed, 0.0, 0.1]))
         command.header.stamp = conversions.stamp_to_ros(self._stamp_ns)

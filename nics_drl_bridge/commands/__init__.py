@@ -1,1 +1,1 @@
-"""What `nics` can do, a module for each command."""
+"""Commands of `nics`, one module each."""

@@ -1,4 +1,4 @@
-"""What the commands share: options, one sentence for what is wrong, a bar of progress."""
+"""Shared parts of the commands: options, one-sentence errors, a table, a progress bar."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TopicOption = Annotated[
 
 
 def roles_of(options: Sequence[str]) -> dict[str, str]:
-    """Role -> topic, of options ROLE=TOPIC for a bag that is played. Raises ConfigError."""
+    """Parses options ROLE=TOPIC for playing a bag into role -> topic. Raises ConfigError."""
     from nics_drl_bridge.errors import nearest
     from nics_drl_bridge.middleware.playback import TYPES
 
@@ -48,7 +48,7 @@ def roles_of(options: Sequence[str]) -> dict[str, str]:
 
 @contextmanager
 def one_sentence() -> Iterator[None]:
-    """What the user got wrong becomes one sentence and exit code 2, never a traceback."""
+    """Turns user errors into one sentence and exit code 2, never a traceback."""
     try:
         yield
     except BridgeError as error:
@@ -61,7 +61,7 @@ def one_sentence() -> Iterator[None]:
         typer.echo(f"nics: {place}{error.strerror or error}; choose another place.", err=True)
         raise typer.Exit(EXIT_BAD_INPUT) from None
     except (KeyboardInterrupt, SystemError) as error:
-        # Ctrl-C in a compiled function comes out of it as a SystemError.
+        # Ctrl-C in a compiled function leaves it as a SystemError.
         if not isinstance(error.__cause__ or error, KeyboardInterrupt):
             raise
         typer.echo("nics: interrupted; everything that was started has ended.", err=True)
@@ -70,7 +70,7 @@ def one_sentence() -> Iterator[None]:
 
 @contextmanager
 def needs_ros(what: str) -> Iterator[None]:
-    """Around an import of the nodes: that ROS 2 is missing becomes one sentence."""
+    """Turns a failed import of the nodes, for lack of ROS 2, into a one-sentence error."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -80,7 +80,7 @@ def needs_ros(what: str) -> Iterator[None]:
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table for people; on what is no terminal no cell is cut or wrapped."""
+    """Formats a table; without a terminal no cell is cut or wrapped."""
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
@@ -100,9 +100,9 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """Gives a function that moves a bar on a terminal: what is done, how much, of how much.
+    """Yields a function that updates a bar on a terminal: description, done, total.
 
-    Where standard error is no terminal it shows nothing; a total of 0 is not known yet.
+    Shows nothing if standard error is no terminal; a total of 0 means unknown.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn

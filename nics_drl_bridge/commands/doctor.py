@@ -12,7 +12,7 @@ import typer
 from nics_drl_bridge.commands.console import needs_ros, one_sentence, table
 
 if TYPE_CHECKING:
-    from nics_drl_bridge.report.doctor_expected import Expected
+    from nics_drl_bridge.report.doctor_facts import Expected
 
 EXIT_FINDINGS = 1
 DEFAULT = "ackermann"
@@ -48,7 +48,7 @@ def doctor(
             facts = facts_of_bag(bag, namespace)
         else:
             with needs_ros("nics doctor"):
-                from nics_drl_bridge.nodes.doctor import listen
+                from nics_drl_bridge.nodes.listen import listen
             facts = listen(duration, namespace)
         findings = examine(facts, expected)
         if as_json:
@@ -68,7 +68,7 @@ def _expected(model: str | None, policy: str | None) -> Expected:
     from nics_drl_bridge.errors import ConfigError
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.policy.policy_file import load_policy
-    from nics_drl_bridge.report.doctor_expected import expected_of_model, expected_of_policy
+    from nics_drl_bridge.report.doctor_facts import expected_of_model, expected_of_policy
 
     if policy is None:
         return expected_of_model(open_model(model or DEFAULT))

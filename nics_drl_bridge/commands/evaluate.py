@@ -83,7 +83,7 @@ def evaluate(
         if shadow is not None:
             _shadow(shadow, policies, model, topic or [], place, ahead, out)
         elif hardware:
-            from nics_drl_bridge.vehicle import VehicleOrder
+            from nics_drl_bridge.commands.vehicle import VehicleOrder
 
             order = VehicleOrder(
                 policies[0], out, model, world, episodes or 1, seed, start, place, namespace,
@@ -91,10 +91,10 @@ def evaluate(
             )  # fmt: skip
             _hardware(order, policies, yes)
         else:
-            from nics_drl_bridge.evaluate import Order
+            from nics_drl_bridge.commands.episodes import EvaluationOrder
 
             chosen = {"places": tuple(dict.fromkeys(places))} if places else {}
-            _evaluate(Order(policies, out, model, world, episodes or 20, seed, **chosen))
+            _evaluate(EvaluationOrder(policies, out, model, world, episodes or 20, seed, **chosen))
 
 
 def _check(
@@ -127,7 +127,7 @@ def _point(text: str | None) -> tuple[float, float] | None:
 
 
 def _evaluate(order: Any) -> None:
-    from nics_drl_bridge.evaluate import HEADS, evaluate, line_of, rows_of
+    from nics_drl_bridge.commands.episodes import HEADS, evaluate, line_of, rows_of
 
     with progress_bar() as tell:
         evaluated = evaluate(order, lambda line: typer.echo(line, err=True), tell)
@@ -142,7 +142,7 @@ def _shadow(
     goal: tuple[float, float] | None, ahead: float, out: Path,
 ) -> None:  # fmt: skip
     from nics_drl_bridge.commands.console import roles_of
-    from nics_drl_bridge.shadow import HEADS, evaluate_shadow, rows_of
+    from nics_drl_bridge.commands.shadow import HEADS, evaluate_shadow, rows_of
 
     made = {
         policy: evaluate_shadow(bag, policy, model, roles_of(topics), goal, ahead, out)
@@ -157,9 +157,9 @@ def _shadow(
 
 def _hardware(order: Any, policies: list[str], yes: bool) -> None:
     from nics_drl_bridge.commands.console import needs_ros
+    from nics_drl_bridge.commands.episodes import HEADS, line_of, rows_of
+    from nics_drl_bridge.commands.vehicle import drive_vehicle
     from nics_drl_bridge.errors import ConfigError
-    from nics_drl_bridge.evaluate import HEADS, line_of, rows_of
-    from nics_drl_bridge.vehicle import drive_vehicle
 
     if len(policies) > 1:
         raise ConfigError(f"--hardware drives one policy at a time, not {', '.join(policies)}.")

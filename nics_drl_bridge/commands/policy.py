@@ -35,7 +35,7 @@ def info(
 
 
 def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
-    """Name and text of each line for people."""
+    """Name and text of each printed line."""
     lidar, scan, seen = facts["lidar"], facts["scan"], facts["observation"]
     turn = 180.0 / 3.141592653589793
     commands = [

@@ -7,11 +7,7 @@ from typing import Annotated
 
 import typer
 
-from nics_drl_bridge.commands.console import (
-    EXIT_INTERRUPTED,
-    RobotOption,
-    one_sentence,
-)
+from nics_drl_bridge.commands.console import EXIT_INTERRUPTED, RobotOption, one_sentence
 
 
 def record(
@@ -43,12 +39,12 @@ def record(
     with one_sentence():
         from nics_drl_bridge.nodes import recorder
 
-        order = recorder.Order(
+        order = recorder.RecordOrder(
             robot, out, bound, duration, speed, seed, namespace, tuple(remap or ()), topics,
             stamped, use_sim_time,
         )  # fmt: skip
         if not preview:
-            recorder.require_ros()  # first: where ROS 2 comes from wheels it begins Python anew
+            recorder.require_ros()  # first: with ROS 2 from wheels it restarts Python
         for line in recorder.preview(order):
             typer.echo(line)
         if preview:

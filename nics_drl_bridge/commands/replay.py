@@ -7,9 +7,7 @@ from typing import Annotated
 
 import typer
 
-from nics_drl_bridge.commands.console import (
-    one_sentence,
-)
+from nics_drl_bridge.commands.console import one_sentence
 
 
 def replay(
@@ -17,7 +15,7 @@ def replay(
 ) -> None:
     """Decides anew on what led to a stop of the gate, and tells the stops in it."""
     with one_sentence():
-        from nics_drl_bridge.safety import black_box
+        from nics_drl_bridge.gate import black_box
 
         again = black_box.replay(file)
         for line in again.story:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import shlex
 import sys
 from collections.abc import Iterator
@@ -12,9 +11,10 @@ from typing import Annotated, Any
 
 import typer
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.console import one_sentence, progress_bar
 
-ENGINES = ("sb3", "ray")
+SB3 = "sb3"
 
 
 def train(
@@ -68,7 +68,7 @@ def train(
         if resume and out is None:
             raise ConfigError("--resume needs --out, the folder of the run to go on with.")
         try:
-            from nics_drl_bridge.policy import train_run
+            from nics_drl_bridge.policy import train as train_run
         except ModuleNotFoundError as error:
             raise ConfigError(
                 f"training needs the module {error.name!r}; pip install 'nics_drl_bridge[train]'."
@@ -89,28 +89,22 @@ def train(
 def _learner(
     engine: str, address: str | None, env_runners: int | None, worlds: int
 ) -> Iterator[Any]:
-    """What trains one policy; while it is open, it is connected with its cluster."""
+    """Yields the function that trains one policy; on Ray while connected to its cluster."""
     from nics_drl_bridge.errors import ConfigError, nearest
-    from nics_drl_bridge.policy.train import train
 
-    if engine not in ENGINES:
-        raise ConfigError(f"unknown engine {engine!r}; {nearest(engine, ENGINES)}")
-    if engine == "sb3":
+    engines = (SB3, *extensions.known("engines"))
+    if engine not in engines:
+        raise ConfigError(f"unknown engine {engine!r}; {nearest(engine, engines)}")
+    if engine == SB3:
+        from nics_drl_bridge.policy.train import train as learn
+
         for name, value in (("address", address), ("env-runners", env_runners)):
             if value is not None:
                 raise ConfigError(f"--{name}: belongs to --engine ray; add that, or leave it out.")
-        yield train
+        yield learn
         return
-    try:
-        from nics_drl_bridge.policy.train_ray import train_on_ray
-        from nics_drl_bridge.policy.train_ray_cluster import connected
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"--engine ray needs the module {error.name!r}; pip install "
-            "'nics_drl_bridge[train,distributed]' into an environment of its own."
-        ) from None
-    with connected(address, env_runners, worlds) as runners:
-        yield functools.partial(train_on_ray, runners=runners)
+    with extensions.load("engines", engine)(address, env_runners, worlds) as learn:
+        yield learn
 
 
 def _run(train_run: Any, order: Any, learn: Any) -> None:

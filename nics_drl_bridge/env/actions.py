@@ -1,4 +1,4 @@
-"""Actions: from what a policy says to what a robot is told."""
+"""Actions: from the output of a policy to the command of a robot."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 Actions = Literal["continuous", "discrete"]
@@ -19,17 +19,17 @@ DRIVES = ((0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 0, -1), (-1, 0, 0), (-1, 0, 1), (
 """The seven drives of the paper's cars: stop; ahead, ahead to the left, to the right; and back.
 
 They are those of the authors' code (efc-robot/MultiVehicleEnv), as signs of `cmd_vel`: linear.x,
-linear.y, angular.z. A robot that can't reverse stands, and turns if it can do so on the spot.
+linear.y, angular.z. A robot that can't reverse stays in place, and turns if it can on the spot.
 """
 SIDEWAYS = ((0, 1, 0), (0, -1, 0))
 """Two more for a robot that moves sideways."""
 
 
 def discrete_commands(robot: RobotSpec) -> Array:
-    """(A, C) the commands that discrete actions stand for: `DRIVES` at the commands' limits.
+    """(A, C) commands of the discrete actions: `DRIVES` at the commands' limits.
 
     A robot whose commands do not name fields of `cmd_vel` gets a stop, and each command alone at
-    its greatest and its least.
+    its maximum and its minimum.
     """
     fields = [command.cmd_vel for command in robot.command]
     if None in fields:
@@ -44,22 +44,22 @@ def discrete_commands(robot: RobotSpec) -> Array:
 
 
 def still(robot: RobotSpec) -> Array:
-    """(C,) the command nearest to zero: a robot that is told it comes to rest."""
+    """(C,) the command nearest to zero, which stops a robot."""
     nearest: Array = np.clip(0.0, robot.command_low, robot.command_high)
     return nearest
 
 
 def action_space(robot: RobotSpec, actions: Actions) -> gymnasium.Space[Any]:
-    """Of one robot: Box [-1, 1] of its commands, or Discrete."""
+    """Action space of one robot: Box [-1, 1] of its commands, or Discrete."""
     if actions == "discrete":
         return gymnasium.spaces.Discrete(len(discrete_commands(robot)))
     return gymnasium.spaces.Box(-1.0, 1.0, (len(robot.command),), np.float32)
 
 
 def team_space(space: gymnasium.Space[Any], robots: int) -> gymnasium.Space[Any]:
-    """One space of M robots, one after the other: a vector, as algorithms want it.
+    """Joint space of M robots, concatenated to a vector as algorithms expect it.
 
-    Of Boxes (L,) a Box (M L,), of Discrete a MultiDiscrete (M,); that of one robot as it is.
+    Box (L,) becomes Box (M L,), Discrete becomes MultiDiscrete (M,); one robot's is unchanged.
     """
     if robots == 1:
         return space
@@ -70,7 +70,7 @@ def team_space(space: gymnasium.Space[Any], robots: int) -> gymnasium.Space[Any]
 
 
 def scaled(action: ArrayLike, robot: RobotSpec) -> Array:
-    """Commands (..., C) for continuous actions (..., C), cut to [-1, 1]."""
+    """Scales continuous actions (..., C), cut to [-1, 1], to commands (..., C)."""
     given = np.ascontiguousarray(action)
     out = np.empty(given.shape)
     width = given.shape[-1]
@@ -81,11 +81,11 @@ def scaled(action: ArrayLike, robot: RobotSpec) -> Array:
 
 
 def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray[Any]:
-    """An action as an array of its space's shape.
+    """Returns an action as an array of its space's shape.
 
     Raises:
-        gymnasium.error.InvalidAction: no numbers, of another shape, NaN, inf, or no action of that
-            number.
+        gymnasium.error.InvalidAction: not numeric, of another shape, NaN, inf, or no action of
+            that number.
     """
     try:
         given = np.asarray(action)
@@ -108,10 +108,10 @@ def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray
 
 
 def check_command(command: Any, like: Array) -> Array:
-    """A command as a task made it, which has to be of the shape of another one.
+    """Returns a task's command as an array, which must have the shape of `like`.
 
     Raises:
-        ConfigError: it is of another shape, or holds NaN or inf.
+        ConfigError: it has another shape, or contains NaN or inf.
     """
     made = np.asarray(command, np.float64)
     if made.shape != like.shape or not kernels.finite(made.reshape(1, -1)):

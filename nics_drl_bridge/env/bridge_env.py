@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.actions import check_action, check_command, still, team_space
-from nics_drl_bridge.env.backends import halting, make_backend
-from nics_drl_bridge.env.guard import halts_on_error
-from nics_drl_bridge.env.reset_arguments import check_options, check_reset
-from nics_drl_bridge.env.sim_backend import SimBackend
+from nics_drl_bridge.env.guard import check_options, check_reset, halts_on_error
+from nics_drl_bridge.env.registry import make_task
+from nics_drl_bridge.env.sim_backend import SimBackend, halting, make_backend
 from nics_drl_bridge.env.task import Episodes, Memory, Task, give, override
-from nics_drl_bridge.env.tasks import make_task
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend, RobotView, Start
@@ -44,21 +42,21 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     ## Action Space
 
-    Of one robot, `Box(-1, 1, (C,), float32)`: each command of the robot, scaled between its
+    For one robot, `Box(-1, 1, (C,), float32)`: each command of the robot, scaled between its
     limits, for the Ackermann robot speed [m/s] and steering angle [rad]; or `Discrete` with
-    `task_options={"actions": "discrete"}`, see `env.actions.DRIVES`. Of M robots, one after the
-    other, `Box(-1, 1, (M C,), float32)` or `MultiDiscrete`.
+    `task_options={"actions": "discrete"}`, see `env.actions.DRIVES`. For M robots, concatenated,
+    `Box(-1, 1, (M C,), float32)` or `MultiDiscrete`.
 
     ## Observation Space
 
-    `Box((O,), float32)`, or `Box((M O,), float32)` of a team, robot by robot, which
-    `observation.reshape(M, O)` takes apart; the docstring of the task's class (`Navigation`,
-    `CooperativeReaching`, `PursuitEvasion`) has the parts with their units. Those of the
+    `Box((O,), float32)`, or `Box((M O,), float32)` for a team, robot by robot, which
+    `observation.reshape(M, O)` separates; the docstring of the task's class (`Navigation`,
+    `CooperativeReaching`, `PursuitEvasion`) lists the parts with their units. Those of the
     navigation task, B beams:
 
     | Num | Observation | Min | Max | Unit |
     |---|---|---|---|---|
-    | 0 to B - 1 | range in shares of the greatest; 1 free, 0 too close or unknown | 0 | 1 | - |
+    | 0 to B - 1 | range as a share of the maximum; 1 free, 0 too close or unknown | 0 | 1 | - |
     | B | distance to the goal | 0 | 1000 | m |
     | B + 1, B + 2 | cosine, sine of the bearing of the goal | -1 | 1 | - |
     | B + 3, B + 4 | estimated velocity forward, left | -1000 | 1000 | m/s |
@@ -68,7 +66,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     The sum of the terms in `info["reward_terms"]`, and over the robots of a team, whose terms are
     arrays (M,). Navigation: `progress`, 1 per metre of approach; `time`, -0.01 per step;
-    `success`, 10 at the goal; `collision`, -10 at a touch.
+    `success`, 10 at the goal; `collision`, -10 at a contact.
 
     ## Starting State
 
@@ -79,26 +77,26 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     ## Episode End
 
     Terminated when the task has ended for every robot: navigation ends when the goal is nearer
-    than 0.3 m or something touches the footprint, both judged by what the robot itself knows.
-    A robot of a team that ended earlier stands still. Truncated after 300 steps, unless
+    than 0.3 m or something touches the footprint, both judged from the robot's own estimate and
+    scan. A robot of a team that ended earlier stands still. Truncated after 300 steps, unless
     `gymnasium.make` is given another `max_episode_steps`.
 
     ## Arguments
 
     Args:
-        backend: `sim`, `dds`, or an object of your own, see `interface.Backend`; one without
-            `halt` is halted by a step with the command nearest to zero.
+        backend: `sim`, `dds`, or your own object, see `interface.Backend`; one without `halt` is
+            halted by a step with the command nearest to zero.
         model: a SimulatorModel, its folder, or the name of a shipped robot.
         world: a World, its YAML file, or the name of a shipped one.
-        task: a name, `path/to/file.py:ClassName`, a class, or a Task; see `env.tasks.make_task`.
+        task: a name, `path/to/file.py:ClassName`, a class, or a Task; see `env.registry.make_task`.
         task_options: further arguments of the task's class.
-        estimator: whether the robot's middleware (cache and EKF) stands between the simulator and
-            the task. Without it, the default of `sim`, pose and twist are those of odometry: the
-            same bits as in the vector env. With it, one robot in process and one over `dds`,
+        estimator: True puts the robot's middleware (cache and EKF) between the simulator and the
+            task. Without it, the default of `sim`, pose and twist are those of odometry and
+            bit-identical to the vector env. With it, one robot in process and one over `dds`,
             which always has it, give the same numbers.
         backend_options: passed to the backend, see `SimBackend` and `DdsBackend`.
-        randomisation: what each episode draws anew: the name of a shipped one, a YAML file, or a
-            Randomisation; the drawn values are in `info["randomisation"]` of a reset.
+        randomisation: quantities drawn in each episode: the name of a shipped one, a YAML file, or
+            a Randomisation; the drawn values are in `info["randomisation"]` of a reset.
         render_mode: `rgb_array`, `human` or None.
 
     Raises:
@@ -133,7 +131,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self.memory: Memory = {}
         self.scene: Scene | None = None
         self.ended: NDArray[np.bool_] = np.zeros(self.robots, np.bool_)
-        self._view: RobotView | None = None  # always as the batch of one that a task expects
+        self._view: RobotView | None = None  # always a batch of one, as tasks expect
         self._true_pose: Array = np.zeros((self.robots, 3))
         self._shape = (1, self.robots, self.task.observation_space.shape[0])
         self._each = (1, self.robots, *(self.task.action_space.shape or ()))
@@ -151,7 +149,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     def _backend_arguments(
         self, backend: str, estimator: bool | None, randomisation: str | Randomisation | None
     ) -> dict[str, Any]:
-        """What a backend by name is told beside the user's own options."""
+        """Arguments of a backend known by name, in addition to the user's options."""
         if backend != "sim":
             if estimator is False or randomisation is not None:
                 raise ConfigError(
@@ -203,9 +201,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         return observation.reshape(-1), self._info(self._view, facts)
 
     def _rehearse(self, episodes: Episodes) -> None:
-        """Lets the task judge a step once that is never made, for a robot that may be a real one.
+        """Runs the task once on a step that is never made, because the robot may be a real one.
 
-        What a task compiles takes seconds; a robot that has a command would drive on meanwhile.
+        A task may compile code for seconds, while a robot with a command would drive on.
         """
         if self._rehearsed or isinstance(self._backend, SimBackend):
             return
@@ -222,7 +220,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         return sample_scene(self.world, self.model.robot.footprint_radius, episode, self.robots)
 
     def _drawn(self) -> dict[str, Any]:
-        """What the randomisation drew for this episode, for `info`."""
+        """Values that the randomisation drew for this episode, for `info`."""
         drawn = self._backend.simulator.drawn if isinstance(self._backend, SimBackend) else {}
         values = {name: values[0] for name, values in drawn.items()}
         named = {name: self._fact(value) if value.ndim else value for name, value in values.items()}
@@ -236,7 +234,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         observation, terms, info = self._advance(action)
         values = {name: term.tolist() for name, term in terms.items()}
         each = [0.0] * self.robots
-        for term in values.values():  # one after the other, as the vector env adds them
+        for term in values.values():  # in the order of the vector env's sum
             each = [one + another for one, another in zip(each, term, strict=True)]
         reward = each[0]
         for one in each[1:]:
@@ -251,10 +249,10 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     def advance(
         self, action: NDArray[Any]
     ) -> tuple[NDArray[np.float32], dict[str, Array], dict[str, Any]]:
-        """One control period: observations (M, O), reward terms (M,) by name, and `info`.
+        """Advances one period: observations (M, O), reward terms (M,) by name, and `info`.
 
-        `ended` (M,) says for which robots the episode is over; they get a zero command and no
-        further reward.
+        `ended` (M,) marks the robots whose episode is over; in a team they get the command nearest
+        to zero and no further reward.
         """
         return self._advance(action)
 
@@ -283,15 +281,15 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         return out[0], terms, self._info(view, facts)
 
     def halt(self) -> None:
-        """Leaves the robot with a zero command; only a reset leads back.
+        """Stops the robot with a zero command until the next reset.
 
-        Any exception that leaves `reset`, `step`, `render` or `close` has done so.
+        Any exception that leaves `reset`, `step`, `render` or `close` has done so already.
         """
         self._view = None
         self._backend.halt()
 
     def _lifted(self, view: RobotView) -> RobotView:
-        """A view as the batch of one that the task expects: leading (1, M)."""
+        """A view as a batch of one, as the task expects it: leading (1, M)."""
         lead = (1, self.robots, -1)
         return RobotView(
             view.pose.reshape(lead), view.twist.reshape(lead), view.ranges.reshape(lead),
@@ -299,7 +297,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         )  # fmt: skip
 
     def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
-        """That of the one robot, or (M, ...) of a team."""
+        """The row of a single robot, or (M, ...) of a team."""
         return rows[0] if self.robots == 1 else rows
 
     def _fact(self, values: NDArray[Any]) -> Any:
@@ -317,14 +315,16 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     @halts_on_error
     def render(self) -> Any:
-        """The world as it is, drawn from above; see Gymnasium."""
+        """Draws the current world from above; see Gymnasium."""
         if self.render_mode is None:
             return None
         if self._view is None or self.scene is None:
             raise gymnasium.error.ResetNeeded("call reset() before render().")
         if self._picture is None:
             drawing = import_module("nics_drl_bridge.env.rendering")
-            self._picture = drawing.Picture(self.model, self.world, self.render_mode, RENDER_FPS)
+            self._picture = drawing.WorldPicture(
+                self.model, self.world, self.render_mode, RENDER_FPS
+            )
         poses = np.reshape(self._true_pose, (self.robots, 3))
         bodies = self.scene.bodies
         if isinstance(self._backend, SimBackend):
@@ -333,7 +333,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     @halts_on_error
     def close(self) -> None:
-        """Leaves the robot with a zero command."""
+        """Stops the robot with a zero command and closes the window."""
         picture, self._picture = self._picture, None
         try:
             self._backend.close()
@@ -343,7 +343,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
 
 def check_render_mode(mode: str | None, metadata: dict[str, Any]) -> None:
-    """Raises ConfigError for a mode that the env does not have."""
+    """Raises ConfigError for a mode that the env does not support."""
     known = metadata["render_modes"]
     if mode is not None and mode not in known:
         raise ConfigError(f"unknown render_mode {mode!r}; {nearest(mode, known)}")

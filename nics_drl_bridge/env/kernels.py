@@ -1,9 +1,9 @@
-"""Compiled inner loops of the tasks: actions, what a robot sees, and the navigation task.
+"""Compiled inner loops of the tasks: actions, observations, and the navigation task.
 
-What one robot does is a scalar function; the batched loops call it, so that a robot alone and
-one of thousands get the same bits. Shapes: R robots of any worlds, B beams, C commands, O parts
-of an observation, the first P of them a scan. numpy's functions over a batch round its remainder
-differently from its body where they are vectorised, so that angles are turned here.
+The batched loops call a scalar function per robot, so that results are bit-identical for one robot
+and for thousands. Shapes: R robots of any worlds, B beams, C commands, O parts of an observation,
+the first P of them a scan. Bearings are computed here because numpy's vectorised functions round
+the remainder of a batch differently from its body.
 """
 
 from __future__ import annotations
@@ -11,34 +11,34 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from nics_drl_bridge.lidar.canonical_kernels import resample
+from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.sector_kernels import resample
 from nics_drl_bridge.random_kernels import episode_seed
 
 LIMIT = 1000.0
-"""Greatest distance [m], speed [m/s] and turn rate [rad/s] in an observation."""
+"""Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation."""
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def episode_seeds(seeds, numbers, out):  # type: ignore[no-untyped-def]
     """Seeds (n,) of the episodes with these numbers (n,) in envs with these seeds (n,)."""
     for i in range(seeds.shape[0]):
         out[i] = episode_seed(seeds[i], numbers[i])
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def commands(out, actions, low, high):  # type: ignore[no-untyped-def]
-    """Commands (R, C) between their limits (C,) for actions (R, C) float32, cut to [-1, 1]."""
+    """Scales actions (R, C), cut to [-1, 1], to commands (R, C) between their limits (C,)."""
     for i in range(out.shape[0]):
         for c in range(out.shape[1]):
             share = (min(max(float(actions[i, c]), -1.0), 1.0) + 1.0) / 2.0
             out[i, c] = low[c] + share * (high[c] - low[c])
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def finite(values):  # type: ignore[no-untyped-def]
-    """Whether all values (R, C) are."""
+    """True if all values (R, C) are finite."""
     for i in range(values.shape[0]):
         for c in range(values.shape[1]):
             if not math.isfinite(values[i, c]):
@@ -46,20 +46,20 @@ def finite(values):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def look(shares, ranges, per_metre, leaves):  # type: ignore[no-untyped-def]
-    """Writes a scan in shares of the greatest range; says whether something is too near.
+    """Writes a scan as shares of the maximum range; returns True if something is too close.
 
     Args:
         shares: (B,) float32, result: 1 no return, 0 too close or unknown.
         ranges: (B,) float32 [m], REP-117.
-        per_metre: 1 / greatest range [1/m], float32.
+        per_metre: 1 / maximum range [1/m], float32.
         leaves: (B,) float32 range at which each beam leaves the footprint [m].
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     hits = np.int32(0)
     for b in range(shares.shape[0]):
-        # Comparing with NaN, which is unknown, is False; -inf, too close, is nearer than all.
+        # A comparison with NaN (unknown) is False; -inf (too close) is below every range.
         share = ranges[b] * per_metre
         share = share if share > zero else zero
         shares[b] = share if share < one else one
@@ -67,12 +67,12 @@ def look(shares, ranges, per_metre, leaves):  # type: ignore[no-untyped-def]
     return hits != 0
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def look_by_sector(shares, ranges, sensor):  # type: ignore[no-untyped-def]
-    """Writes the nearest returns in sectors (S,) in shares; says whether something is too near.
+    """Writes the nearest returns of sectors (S,) as shares; returns True if something is too close.
 
-    That is judged of the beams (B,) themselves. `sensor` holds per_metre and leaves of `look`,
-    and how beams fill the sectors, see `canonical.Plan.arguments`.
+    Contact is judged from the beams (B,) themselves. `sensor` contains per_metre and leaves of
+    `look`, and the mapping of beams to sectors, see `sectors.SectorPlan.arguments`.
     """
     per_metre, leaves, plan = sensor
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -87,7 +87,7 @@ def look_by_sector(shares, ranges, sensor):  # type: ignore[no-untyped-def]
     return hits != 0
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def bearing(pose, x, y):  # type: ignore[no-untyped-def]
     """Distance [m] from a pose (3,) to a point, and cosine and sine of its bearing."""
     dx, dy = x - pose[0], y - pose[1]
@@ -99,17 +99,17 @@ def bearing(pose, x, y):  # type: ignore[no-untyped-def]
     return distance, min(max(forward, -1.0), 1.0), min(max(left, -1.0), 1.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def bearings(out, poses, points):  # type: ignore[no-untyped-def]
-    """Distance [m], cosine and sine (R, 3) of points (R, 2) as seen from poses (R, 3)."""
+    """Writes `bearing` (R, 3) of points (R, 2) from poses (R, 3)."""
     for i in range(out.shape[0]):
         distance, out[i, 1], out[i, 2] = bearing(poses[i], points[i, 0], points[i, 1])
         out[i, 0] = min(distance, LIMIT)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def looks(shares, touched, ranges, sensor):  # type: ignore[no-untyped-def]
-    """Scans of R robots: `look` for each, or `look_by_sector`; touched (R,) is the answer."""
+    """Writes scans of R robots with `look` or `look_by_sector`; touched (R,) is their result."""
     for i in range(ranges.shape[0]):
         if sensor[2][0].shape[0] == 0:
             touched[i] = look(shares[i], ranges[i], sensor[0], sensor[1])
@@ -117,19 +117,19 @@ def looks(shares, touched, ranges, sensor):  # type: ignore[no-untyped-def]
             touched[i] = look_by_sector(shares[i], ranges[i], sensor)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def navigate(out, approach, reached, touched, before, pose, twist, ranges, goals, sensor, radius):  # type: ignore[no-untyped-def]
-    """Observations of the navigation task, and what the robots came to.
+    """Writes observations and outcomes of the navigation task.
 
     Args:
         out: (R, P + 6) float32, result, see `navigation.Navigation`; P parts of a scan.
-        approach: (R,) by how much nearer the goal is than before [m], result.
-        reached, touched: (R,) bool, whether a robot is at its goal, or at something; results.
+        approach: (R,) decrease of the distance to the goal [m], result.
+        reached, touched: (R,) bool, True at the goal, or in contact; results.
         before: (R, 3) poses before the step.
         pose, twist: (R, 3).
         ranges: (R, B) float32.
         goals: (R, 2) [m].
-        sensor: see `look_by_sector`; with a plan of no sectors, beams are seen as they are.
+        sensor: see `look_by_sector`; with a plan without sectors, the beams are used directly.
         radius: of a goal [m].
     """
     parts = out.shape[1] - 6
@@ -148,17 +148,17 @@ def navigate(out, approach, reached, touched, before, pose, twist, ranges, goals
             out[i, parts + 3 + k] = min(max(twist[i, k], -LIMIT), LIMIT)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def distances(out, poses, points):  # type: ignore[no-untyped-def]
-    """Distances (R,) [m] from poses (R, 3) to points (R, 2)."""
+    """Writes distances (R,) [m] from poses (R, 3) to points (R, 2)."""
     for i in range(out.shape[0]):
         dx, dy = points[i, 0] - poses[i, 0], points[i, 1] - poses[i, 1]
         out[i] = math.sqrt(dx * dx + dy * dy)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def pair_bearings(out, poses, points):  # type: ignore[no-untyped-def]
-    """`bearing` (R, M, P, 3) of each of the points (R, P, 2) from each of the poses (R, M, 3)."""
+    """Writes `bearing` (R, M, P, 3) of each point (R, P, 2) from each pose (R, M, 3)."""
     for r in range(out.shape[0]):
         for m in range(out.shape[1]):
             for p in range(out.shape[2]):
@@ -167,9 +167,9 @@ def pair_bearings(out, poses, points):  # type: ignore[no-untyped-def]
                 out[r, m, p, 0] = min(distance, LIMIT)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def pair_distances(out, poses, points):  # type: ignore[no-untyped-def]
-    """Distances (R, M, P) [m] from poses (R, M, 3) to points (R, P, 2)."""
+    """Writes distances (R, M, P) [m] from poses (R, M, 3) to points (R, P, 2)."""
     for r in range(out.shape[0]):
         for m in range(out.shape[1]):
             for p in range(out.shape[2]):

@@ -1,4 +1,4 @@
-"""The paper's task: navigate to a goal by lidar, without touching anything (Sec. VI-B)."""
+"""The paper's task: navigation to a goal by lidar, without touching anything (Sec. VI-B)."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ TWIST_PARTS = 3
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """How a step ended. Each is (...,) bool.
+class NavigationVerdict:
+    """Outcome of a step for the robots. Each is (...,) bool.
 
     Attributes:
         reached: the robot is at the goal.
-        touched: the scan says that something is within the footprint.
+        touched: the scan shows a contact with the footprint.
     """
 
     reached: Flags
@@ -43,7 +43,7 @@ class Navigation(Task):
 
     | Num | Observation | Min | Max | Unit |
     |---|---|---|---|---|
-    | 0 to B - 1 | range in shares of the greatest; 1 free, 0 too close or unknown | 0 | 1 | - |
+    | 0 to B - 1 | range as a share of the maximum; 1 free, 0 too close or unknown | 0 | 1 | - |
     | B | distance to the goal | 0 | 1000 | m |
     | B + 1, B + 2 | cosine, sine of the bearing of the goal | -1 | 1 | - |
     | B + 3, B + 4 | estimated velocity forward, left | -1000 | 1000 | m/s |
@@ -57,7 +57,7 @@ class Navigation(Task):
     ## Rewards
 
     `progress`, 1 per metre of approach; `time`, -0.01 per step; `success`, 10 at the goal;
-    `collision`, -10 at a touch.
+    `collision`, -10 at a contact.
 
     ## Starting State
 
@@ -65,12 +65,12 @@ class Navigation(Task):
 
     ## Episode End
 
-    The goal is nearer than 0.3 m, or something touches the footprint, both judged by what the
-    robot itself knows. A touch at the goal is no success.
+    The goal is nearer than 0.3 m, or something touches the footprint, both judged from the robot's
+    own estimate and scan. A contact at the goal is no success.
 
     Attributes:
-        goal_radius: how near is there [m].
-        success_reward, collision_reward: for ending that way.
+        goal_radius: distance at which the goal is reached [m].
+        success_reward, collision_reward: for such an end.
         progress_reward: per metre of approach.
         time_reward: per step.
     """
@@ -92,7 +92,7 @@ class Navigation(Task):
         )
 
     def reset(self, episodes: Episodes) -> Memory:
-        """The goal is the one that the world drew."""
+        """Returns a memory with the goal that the world drew."""
         return {"goal": episodes.goals.copy()}
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
@@ -106,10 +106,10 @@ class Navigation(Task):
         """Writes the observation into (..., B + 6), which is contiguous."""
         self._see(out, view.pose, view, memory)
 
-    def judge(self, view: RobotView, memory: Memory) -> Verdict:
-        """Whether robots are at their goals, and whether they touch something."""
+    def judge(self, view: RobotView, memory: Memory) -> NavigationVerdict:
+        """Judges which robots are at their goals, and which touch something."""
         near = distance(view.pose, memory["goal"])
-        return Verdict(np.asarray(near < self.goal_radius), self.touches(view.ranges))
+        return NavigationVerdict(np.asarray(near < self.goal_radius), self.touches(view.ranges))
 
     def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
         """The terms (...,) of the reward for a step; their sum is the reward."""
@@ -117,26 +117,26 @@ class Navigation(Task):
         return self._terms(approach, self.judge(after, memory))
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
-        """Whether a robot is at its goal or touches something."""
+        """Returns True where a robot is at its goal or touches something."""
         verdict = self.judge(view, memory)
         return np.asarray(verdict.reached | verdict.touched)
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
-        """Whether an episode ended at the goal, or at a touch."""
+        """Success and contact of each robot."""
         return self._facts(self.judge(view, memory))
 
     def step_into(
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
     ) -> Outcome:
-        """All of the above in one pass over each scan; `out` is contiguous."""
+        """Computes all of the above in one pass over each scan; `out` is contiguous."""
         approach, verdict = self._see(out, before.pose, after, memory)
         terms = self._terms(approach, verdict)
         return Outcome(terms, verdict.reached | verdict.touched, self._facts(verdict))
 
     def _see(
         self, out: Observation, before: Array, view: RobotView, memory: Memory
-    ) -> tuple[Array, Verdict]:
-        """Writes what robots see; by how much nearer their goals are, and how they stand."""
+    ) -> tuple[Array, NavigationVerdict]:
+        """Writes the observations; returns the approach to the goals [m] and the verdict."""
         lead = view.pose.shape[:-1]
         approach = np.empty(lead)
         reached, touched = np.empty(lead, np.bool_), np.empty(lead, np.bool_)
@@ -147,9 +147,9 @@ class Navigation(Task):
             view.ranges.reshape(-1, view.ranges.shape[-1]), memory["goal"].reshape(-1, 2),
             self.sensor, self.goal_radius,
         )  # fmt: skip
-        return approach, Verdict(reached, touched)
+        return approach, NavigationVerdict(reached, touched)
 
-    def _terms(self, approach: Array, verdict: Verdict) -> dict[str, Array]:
+    def _terms(self, approach: Array, verdict: NavigationVerdict) -> dict[str, Array]:
         time = np.empty_like(approach)
         time.fill(self.time_reward)
         return {
@@ -160,5 +160,5 @@ class Navigation(Task):
         }
 
     @staticmethod
-    def _facts(verdict: Verdict) -> dict[str, NDArray[Any]]:
+    def _facts(verdict: NavigationVerdict) -> dict[str, NDArray[Any]]:
         return {"is_success": verdict.reached & ~verdict.touched, "collision": verdict.touched}

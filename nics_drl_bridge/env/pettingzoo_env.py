@@ -12,7 +12,7 @@ from pettingzoo import ParallelEnv
 
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, BridgeEnv
 from nics_drl_bridge.env.guard import halts_on_error
-from nics_drl_bridge.env.registration import MAX_EPISODE_STEPS
+from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
@@ -21,22 +21,22 @@ from nics_drl_bridge.sim.world import World
 
 Observations = dict[str, NDArray[np.float32]]
 OF_CHECKER = "options"
-"""PettingZoo's checker resets with an option of this name, which means nothing."""
+"""PettingZoo's checker resets with an option of this name, which has no meaning."""
 
 
 class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
-    """A task of a team in the fast simulator, each robot an agent of its own.
+    """A task of a team in the fast simulator; each robot is an agent.
 
     ## Description
 
     The agents are `robot_0` to `robot_<M - 1>`; the numbers are those of `BridgeEnv` with the
-    same arguments. An agent whose episode is over leaves `agents`; its robot comes to rest and
-    stands as one more obstacle.
+    same arguments. An agent whose episode is over leaves `agents`; its robot stops and becomes
+    another obstacle.
 
     ## Spaces, Rewards, Starting State, Episode End
 
     Those of one robot in the docstring of the task's class, see `CooperativeReaching` and
-    `PursuitEvasion`. `infos[agent]` holds its `reward_terms`, `pose`, `is_success`, `collision`.
+    `PursuitEvasion`. `infos[agent]` has its `reward_terms`, `pose`, `is_success`, `collision`.
     `truncations` are all True after `max_episode_steps`.
 
     ## Arguments
@@ -46,8 +46,8 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         world: a World, its YAML file, or the name of a shipped one.
         task: a name, `path/to/file.py:ClassName`, a class, or a Task.
         task_options: further arguments of the task's class.
-        max_episode_steps: after so many steps an episode is truncated.
-        randomisation: what each episode draws anew, see `BridgeEnv`.
+        max_episode_steps: an episode is truncated after this many steps.
+        randomisation: quantities drawn in each episode, see `BridgeEnv`.
         render_mode: `rgb_array`, `human` or None.
 
     Raises:
@@ -79,18 +79,18 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         self.possible_agents = [f"robot_{m}" for m in range(self.env.robots)]
         self.agents: list[str] = []
         of = self.env.task
-        # One space for each agent: a space has a generator of its own.
+        # One space for each agent: a space has its own random generator.
         self.observation_spaces = {
             name: deepcopy(of.observation_space) for name in self.possible_agents
         }
         self.action_spaces = {name: deepcopy(of.action_space) for name in self.possible_agents}
 
     def observation_space(self, agent: str) -> gymnasium.Space[Any]:
-        """Of an agent, always the same object."""
+        """Space of an agent, always the same object."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> gymnasium.Space[Any]:
-        """Of an agent, always the same object."""
+        """Space of an agent, always the same object."""
         return self.action_spaces[agent]
 
     @halts_on_error
@@ -111,17 +111,17 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
     ) -> tuple[
         Observations, dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
     ]:
-        """One control period; `actions` are those of the agents that are left; see PettingZoo.
+        """Advances one control period with the actions of the remaining agents; see PettingZoo.
 
         Raises:
-            ConfigError: an agent that is left has no action.
+            ConfigError: a remaining agent has no action.
         """
         missing = sorted(set(self.agents) - set(actions))
         if missing:
             raise ConfigError(f"no action for {', '.join(missing)}; each agent that is left acts.")
         space = self.env.task.action_space
         rest: Any = np.zeros(space.shape or (), space.dtype)
-        # Those who left are told to stand still, whatever stands here.
+        # The env stops the robots that left, whatever their action.
         joint = [actions[n] if n in self.agents else rest for n in self.possible_agents]
         told_all = joint[0] if self.env.robots == 1 else np.array(joint, space.dtype).ravel()
         observation, terms, info = self.env.advance(told_all)
@@ -142,18 +142,18 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         return seen, rewards, ended, cut, told
 
     def halt(self) -> None:
-        """Lets every robot stand still; only a reset leads back. Any exception has done so."""
+        """Stops every robot until the next reset. Any exception has done so already."""
         self.env.halt()
 
     def _told(self, info: dict[str, Any], m: int) -> dict[str, Any]:
-        """What concerns robot m of the env's `info`."""
+        """The part of the env's `info` that concerns robot m."""
         return {
             name: value if name in ("goal", "bodies") else self._of(value, m)
             for name, value in info.items()
         }
 
     def _of(self, value: Any, m: int) -> Any:
-        """Robot m's row of what is told of each robot; what is told of the world as it is."""
+        """Robot m's row of a fact per robot; a fact of the world unchanged."""
         if isinstance(value, dict):
             return {name: self._of(one, m) for name, one in value.items()}
         each = self.env.robots > 1 and isinstance(value, np.ndarray)
@@ -161,7 +161,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
 
     @halts_on_error
     def render(self) -> Any:
-        """The world as it is, drawn from above."""
+        """Draws the current world from above."""
         return self.env.render()
 
     @halts_on_error

@@ -21,23 +21,23 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PursuitEvasion(Task):
-    """P pursuers have to come near to E evaders, who have to keep away; all are of one kind.
+    """P pursuers have to get close to E evaders, who have to keep away; all robots are alike.
 
-    Of the M = P + E robots the first P pursue.
+    The first P of the M = P + E robots pursue.
 
     ## Observation Space
 
     Of one robot, `Box((B + 5 (M - 1) + 1 + 3,), float32)`, B beams or
-    sectors. All robots are in sight of each other.
+    sectors. Every robot knows the positions of all others.
 
     | Num | Observation | Min | Max | Unit |
     |---|---|---|---|---|
-    | 0 to B - 1 | range in shares of the greatest; 1 free, 0 too close or unknown | 0 | 1 | - |
+    | 0 to B - 1 | range as a share of the maximum; 1 free, 0 too close or unknown | 0 | 1 | - |
     | 5 for each other robot, in order | distance | 0 | 1000 | m |
     | | cosine, sine of the bearing | -1 | 1 | - |
-    | | whether it is on the same side | 0 | 1 | - |
-    | | whether it is out: caught, or touched something | 0 | 1 | - |
-    | then 1 | whether the robot itself pursues | 0 | 1 | - |
+    | | 1 if it is on the same side | 0 | 1 | - |
+    | | 1 if it is out: caught, or touched something | 0 | 1 | - |
+    | then 1 | 1 if the robot itself pursues | 0 | 1 | - |
     | the last 3 | estimated velocity forward, left; turn rate | -1000 | 1000 | m/s, rad/s |
 
     ## Action Space
@@ -46,12 +46,12 @@ class PursuitEvasion(Task):
 
     ## Rewards
 
-    `pursuit`: of a pursuer, 1 per metre by which it came nearer to the nearest evader that is not
-    out; of an evader, 1 per metre by which the nearest pursuer fell behind. `capture`: of every
-    pursuer 10 for each evader that is caught, of the evader -10. `time`: -0.01 per step of a
-    pursuer, 0.01 of an evader. `collision`: -10 for whoever touches something otherwise. Whoever
-    learns one side takes that side's rewards, from `info["reward_terms"]` or from the PettingZoo
-    env; the reward of the Gymnasium env is the sum over all.
+    `pursuit`: for a pursuer, 1 per metre of approach to the nearest evader that is not out; for an
+    evader, 1 per metre gained on the nearest pursuer. `capture`: 10 for every pursuer for each
+    evader that is caught, -10 for that evader. `time`: -0.01 per step for a pursuer, 0.01 for an
+    evader. `collision`: -10 for a robot that touches something otherwise. To train one side, use
+    that side's rewards, from `info["reward_terms"]` or from the PettingZoo env; the reward of the
+    Gymnasium env is the sum over all robots.
 
     ## Starting State
 
@@ -59,17 +59,17 @@ class PursuitEvasion(Task):
 
     ## Episode End
 
-    For an evader when a pursuer's middle is nearer than the capture distance; for any robot when
-    it touches something otherwise; it then stands still as one more obstacle. For all when all
-    evaders, or all pursuers, are out. A team of pursuers succeeds when it caught every evader.
+    For an evader when a pursuer's centre is nearer than the capture distance; for any robot when
+    it touches something otherwise; it then stands still as another obstacle. For all when all
+    evaders, or all pursuers, are out. The pursuers succeed when every evader is caught.
 
     Attributes:
         pursuers, evaders: P and E.
         capture_gap: free space between two footprints at which an evader is caught [m].
         capture_reward: for each capture.
-        collision_reward: for a touch.
+        collision_reward: for a contact.
         pursuit_reward: per metre.
-        time_reward: per step, of a pursuer; the opposite of an evader.
+        time_reward: per step of a pursuer; the negative of it for an evader.
     """
 
     keeps_last_scan: ClassVar[bool] = False
@@ -96,7 +96,7 @@ class PursuitEvasion(Task):
 
     @cached_property
     def pursues(self) -> Flags:
-        """(M,) which robots do."""
+        """(M,) True for pursuers."""
         return np.arange(self.robots) < self.pursuers
 
     @cached_property
@@ -109,12 +109,12 @@ class PursuitEvasion(Task):
         )
 
     def reset(self, episodes: Episodes) -> Memory:
-        """Nobody is out; `newly` is who was caught in the last step."""
+        """Returns a memory with no robot out; `newly` marks those caught in the last step."""
         none = np.zeros(episodes.starts.shape[:-1], np.bool_)
         return {"out": none, "caught": none.copy(), "newly": none.copy()}
 
     def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:
-        """Marks who is caught and who is out."""
+        """Marks the robots that are caught or out."""
         chased = self._gaps(after, memory)
         reach = 2.0 * self.robot.footprint_radius + self.capture_gap
         caught = ~self.pursues & (chased < reach) & ~memory["out"]
@@ -123,13 +123,13 @@ class PursuitEvasion(Task):
         memory["out"] |= caught | self._touches(after, memory)
 
     def _gaps(self, view: RobotView, memory: Memory) -> Array:
-        """(..., M) [m] to the nearest robot of the other side that is not out; inf: none is."""
+        """(..., M) [m] to the nearest robot of the other side that is not out; inf without one."""
         between = distances(view.pose, view.pose[..., :2])
         foe = (self.pursues[:, None] != self.pursues) & ~memory["out"][..., None, :]
         return np.asarray(np.where(foe, between, np.inf).min(axis=-1))
 
     def _touches(self, view: RobotView, memory: Memory) -> Flags:
-        """A touch that is no capture, of a robot whose episode goes on."""
+        """True for a contact that is no capture, of a robot whose episode continues."""
         return self.touches(view.ranges) & ~memory["newly"] & ~memory["out"]
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
@@ -149,7 +149,7 @@ class PursuitEvasion(Task):
 
     def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
         """The terms (..., M)."""
-        # Who was caught in this step still counts for this step.
+        # Evaders caught in this step still count for this step.
         known = {**memory, "out": memory["out"] & ~memory["newly"]}
         gap = [self._gaps(view, known) for view in (before, after)]
         free = np.isfinite(gap[0]) & np.isfinite(gap[1])
@@ -168,13 +168,13 @@ class PursuitEvasion(Task):
         return np.asarray(self.touches(view.ranges) & ~memory["newly"])
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
-        """Who is out; all are when one side has nobody left."""
+        """Returns the robots that are out; all of them when one side has none left."""
         out = memory["out"]
         over = out[..., self.pursues].all(axis=-1) | out[..., ~self.pursues].all(axis=-1)
         return np.asarray(out | np.asarray(over)[..., None])
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
-        """Whether every evader is caught, as each robot would see it; touches; captures."""
+        """Success of each robot's side, contacts, and captures (..., M)."""
         won = np.asarray(memory["caught"][..., ~self.pursues].all(axis=-1))[..., None]
         return {
             "is_success": np.asarray(won == self.pursues),

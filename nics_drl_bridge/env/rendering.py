@@ -24,14 +24,14 @@ WALL, STANDING, GOAL, SCAN = "#333333", "#8d99ae", "#f2c14e", "#d1495b"
 ROBOTS = ("#1f6fb2", "#2f855a", "#7a4fa3", "#b7791f", "#0f766e", "#9d174d")
 
 
-class Picture:
-    """Walls, bodies, goals, robots and their scans, drawn again at every step.
+class WorldPicture:
+    """Picture of walls, obstacles, goals, robots and their scans, redrawn at every step.
 
     Args:
         model: gives the footprint and the lidar.
         world: gives the walls.
-        mode: `rgb_array` or `human`, which shows a window where there is a display.
-        fps: pictures per second that `human` keeps to at most.
+        mode: `rgb_array` or `human`, which shows a window if there is a display.
+        fps: maximum number of pictures per second of `human`.
     """
 
     def __init__(self, model: SimulatorModel, world: World, mode: str, fps: int) -> None:
@@ -44,7 +44,7 @@ class Picture:
         scale = SIZE_IN / max(width, depth)
         size = (scale * width, scale * depth)
         if self._human:
-            import matplotlib.pyplot as plt  # it looks for a display, which pictures do not need
+            import matplotlib.pyplot as plt  # looks for a display, which `rgb_array` does not need
 
             self._figure = plt.figure(figsize=size, dpi=DPI)
         else:
@@ -63,12 +63,12 @@ class Picture:
 
         Args:
             poses: (M, 3) of the robots.
-            ranges: (M, B) their scans [m].
+            ranges: (M, B) scans of the robots [m].
             bodies: (K, 7) see `sim.scenes.Scene`.
             memory: of the task, with a leading 1; `goal` (1, M, 2) is drawn.
 
         Returns:
-            (H, W, 3) pixels; None when they are shown in a window.
+            (H, W, 3) pixels; None for `human`.
         """
         axes = self._axes
         axes.clear()
@@ -84,7 +84,7 @@ class Picture:
         return self._shown()
 
     def _robot(self, axes: Axes, pose: Array, ranges: NDArray[np.float32], colour: str) -> None:
-        """The footprint, where it looks, and what it sees."""
+        """Draws the footprint, the heading and the scan."""
         lidar, robot = self._model.lidar, self._model.robot
         mount = geometry.compose(pose, lidar.mount)
         there = np.isfinite(ranges)
@@ -140,7 +140,7 @@ def draw_world(axes: Axes, world: World, bodies: NDArray[np.float64]) -> None:
 
 
 def _draw_map(axes: Axes, world: World) -> None:
-    """Solid cells dark, unknown ones grey."""
+    """Draws occupied cells dark and unknown ones grey."""
     grid = world.grid
     if grid is None:
         return

@@ -1,4 +1,7 @@
-"""SimBackend: the fast simulator in this process, with the robot's middleware or without."""
+"""SimBackend: the fast simulator in this process, with or without the robot's middleware.
+
+Backends of an env: those known by name, and user-defined ones.
+"""
 
 from __future__ import annotations
 
@@ -7,31 +10,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge import extensions
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import RobotView, Start, stacked
+from nics_drl_bridge.interface import NS_PER_S, Backend, RobotView, Start, stacked
 from nics_drl_bridge.lidar.scanner import Renderer
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
-NANO = 1_000_000_000
 
 
 class SimBackend:
     """One world of the fast simulator, in this process.
 
-    With `estimator`, scan and odometry of each robot pass through its middleware as those of the
-    nodes do, so that this backend and the one over DDS give the same numbers for the same seed
-    and commands. Without, the pose is what the wheels' odometry says: the same bits as a world of
-    the vector env, and several times faster.
+    With `estimator`, scan and odometry of each robot pass through its middleware as in the nodes,
+    so that this backend and the one over DDS give the same numbers for the same seed and commands.
+    Without it, the pose is that of the wheel odometry: bit-identical to a world of the vector env,
+    and several times faster.
 
     Args:
         model: the robot.
         world: the field.
         renderer: `baked` or `exact` lidar.
-        estimator: whether a middleware for each robot stands between simulator and env.
-        robots: M; views and commands have a leading (M,) when there are several.
+        estimator: True puts a middleware for each robot between simulator and env.
+        robots: M; views and commands have a leading (M,) if M > 1.
         simulation: further arguments of the FastSimulator.
     """
 
@@ -47,7 +51,7 @@ class SimBackend:
         self._robot = model.robot
         self.simulator = FastSimulator(model, world, robots=robots, renderer=renderer, **simulation)
         self._middlewares = [Middleware(model) for _ in range(robots if estimator else 0)]
-        self._period_ns = round(model.control_period * NANO)
+        self._period_ns = round(model.control_period * NS_PER_S)
         self._row: Any = (0, 0) if robots == 1 else 0
         self._now_ns = 0
 
@@ -64,7 +68,7 @@ class SimBackend:
         """Moves the robots by one control period; see `interface.Backend`."""
         data = self.simulator.data
         if self._middlewares:
-            # By way of cmd_vel, as over ROS 2, so that both round alike.
+            # Via cmd_vel, as over ROS 2, so that both round alike.
             command = self._robot.from_cmd_vel(self._robot.to_cmd_vel(command))
         commands = command.reshape(data.pose.shape[1], -1)
         for middleware, one in zip(self._middlewares, commands, strict=False):
@@ -95,7 +99,72 @@ class SimBackend:
         return middleware.view(now)
 
     def halt(self) -> None:
-        """Nothing moves but in `step`."""
+        """Does nothing: robots only move in `step`."""
 
     def close(self) -> None:
-        """Nothing has to be freed."""
+        """Does nothing: there is nothing to free."""
+
+
+NEEDED = ("reset", "step", "close")
+
+
+class HaltedByStep:
+    """Wraps a backend without `halt`, which becomes a step with the command nearest to zero.
+
+    Args:
+        backend: with `reset`, `step` and `close`.
+        still: (C,), or (M, C) for a team, the command nearest to zero.
+    """
+
+    def __init__(self, backend: Any, still: NDArray[np.float64]) -> None:
+        self._backend, self._still = backend, still
+        self._told = False
+
+    def reset(self, start: Start) -> RobotView:
+        """Calls the backend's."""
+        view: RobotView = self._backend.reset(start)
+        return view
+
+    def step(self, command: NDArray[np.float64]) -> tuple[RobotView, dict[str, Any]]:
+        """Calls the backend's."""
+        self._told = True
+        told: tuple[RobotView, dict[str, Any]] = self._backend.step(command)
+        return told
+
+    def halt(self) -> None:
+        """Steps once with the command nearest to zero, if there was a step since the last halt."""
+        if self._told:
+            self._backend.step(self._still.copy())
+            self._told = False
+
+    def close(self) -> None:
+        """Closes the backend, which sends a zero command itself."""
+        self._backend.close()
+        self._told = False
+
+
+def halting(backend: Any, still: NDArray[np.float64]) -> Backend:
+    """Returns a user-defined backend as one that can be halted.
+
+    Raises:
+        ConfigError: it is not a backend.
+    """
+    if isinstance(backend, Backend):
+        return backend
+    missing = [name for name in NEEDED if not callable(getattr(backend, name, None))]
+    if missing:
+        raise ConfigError(
+            f"backend of type {type(backend).__name__}: has no {', no '.join(missing)}; see "
+            "interface.Backend."
+        )
+    return HaltedByStep(backend, still)
+
+
+def make_backend(name: str, model: SimulatorModel, world: World, **options: Any) -> Backend:
+    """A backend by the name under which it is registered, see `extensions`.
+
+    Raises:
+        ConfigError: unknown name, or its library is missing.
+    """
+    made: Backend = extensions.load("backends", name)(model, world, **options)
+    return made

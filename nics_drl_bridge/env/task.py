@@ -1,4 +1,7 @@
-"""Task: what a robot is to do, written once for one robot over ROS 2 and thousands in arrays."""
+"""Task: the job of a robot, written once for one robot over ROS 2 and thousands in arrays.
+
+Ranges below which a lidar return means contact with the robot.
+"""
 
 from __future__ import annotations
 
@@ -14,30 +17,29 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.env.actions import Actions, action_space, discrete_commands, scaled
-from nics_drl_bridge.env.contact import contact_ranges
 from nics_drl_bridge.env.kernels import LIMIT
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.lidar.canonical import NO_PLAN, Plan, ScanLayout, plan_of
+from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, SectorPlan, plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Memory = dict[str, NDArray[Any]]
-"""What a task remembers of an episode: name -> array with leading (n, M), or (n,) of the world."""
+"""Memory of a task during an episode: name -> array with leading (n, M), or (n,) per world."""
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """Episodes as they begin, of n worlds with M robots.
+    """Episodes at their start, in n worlds with M robots.
 
     Attributes:
         seeds: (n,) of each episode. All that a task draws must follow from them, see
             `random_kernels.uniform`.
-        starts: (n, M, 3) where the robots stand: x [m], y [m], heading [rad] in `map`.
-        goals: (n, M, 2) free places that the world drew, one for each robot [m].
+        starts: (n, M, 3) poses of the robots: x [m], y [m], heading [rad] in `map`.
+        goals: (n, M, 2) free points that the world drew, one per robot [m].
     """
 
     seeds: NDArray[np.int64]
@@ -47,11 +49,11 @@ class Episodes:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a step came to. All arrays have the leading dimensions of the view.
+    """Outcome of a step. All arrays have the leading dimensions of the view.
 
     Attributes:
         terms: name -> term of the reward; their sum is the reward.
-        ended: whether the episode has ended for a robot.
+        ended: True where the episode has ended for a robot.
         info: further facts by name, for `info`.
     """
 
@@ -62,12 +64,12 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Sight:
-    """What the parts of a scan in an observation mean.
+    """Meaning of the scan parts of an observation.
 
     Attributes:
-        angles: (P,) of each part, counter-clockwise, in `base_link` [rad].
-        origin: (2,) where they are seen from, in `base_link` [m].
-        range_max: what a share of 1 stands for [m].
+        angles: (P,) direction of each part, counter-clockwise, in `base_link` [rad].
+        origin: (2,) origin of the rays, in `base_link` [m].
+        range_max: range that a share of 1 stands for [m].
     """
 
     angles: Array
@@ -79,23 +81,22 @@ class Sight:
 class Task(ABC):
     """Observation, action, reward and end of a task: pure functions over leading dimensions.
 
-    Subclass it as a frozen dataclass and write `observation_space`, `reset`, `observation`,
-    `reward` and `end`; `docs/tasks.md` leads through one. Every view has the leading dimensions
-    (n, M): n worlds of M robots. A task of one robot that works element by element also serves
-    the view () of a robot over ROS 2. Whatever is computed per element must not depend on n:
-    use `bearing` and `distance` instead of numpy's functions of angles.
+    Subclass it as a frozen dataclass and implement `observation_space`, `reset`, `observation`,
+    `reward` and `end`; `docs/tasks.md` walks through an example. Every view has the leading
+    dimensions (n, M): n worlds of M robots. A task of one robot that works element by element also
+    accepts the view () of a robot over ROS 2. Results per element must not depend on n: use
+    `bearing` and `distance` instead of numpy's trigonometric functions.
 
     Attributes:
         robot: gives commands, their limits, and the footprint.
-        lidar: what gives the scan.
+        lidar: gives the scan.
         actions: `continuous` (Box) or `discrete` (the paper's drives, see `actions.DRIVES`).
-        contact_margin: a return this close to the footprint counts as a touch [m].
-        scan: the sectors that observations hold instead of the lidar's beams, so that they mean
-            the same for any lidar; None holds the beams as they are. Touches are always judged
-            of the beams.
-        keeps_last_scan: whether `before.ranges` is wanted in `reward`, `update` or `step_into`;
-            without it they are the new ones, which spares a copy.
-        shown: names of the memory that `info` always holds.
+        contact_margin: a return this close to the footprint counts as a contact [m].
+        scan: sectors that observations contain instead of the lidar's beams, so that they mean the
+            same for any lidar; None keeps the beams. Contact is always judged from the beams.
+        keeps_last_scan: True if `reward`, `update` or `step_into` use `before.ranges`; otherwise
+            these may be the new ranges, which saves a copy.
+        shown: names of memory arrays that `info` always contains.
     """
 
     keeps_last_scan: ClassVar[bool] = True
@@ -115,44 +116,44 @@ class Task(ABC):
 
     @property
     def robots(self) -> int:
-        """M, robots in each world."""
+        """M, the number of robots in each world."""
         return 1
 
     @property
     @abstractmethod
     def observation_space(self) -> gymnasium.spaces.Box:
-        """Of one robot, float32 and finite; see `box`."""
+        """Observation space of one robot, float32 and finite; see `box`."""
 
     @cached_property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Of one robot."""
+        """Action space of one robot."""
         return action_space(self.robot, self.actions)
 
     @abstractmethod
     def reset(self, episodes: Episodes) -> Memory:
-        """What is to be remembered of episodes that begin; the arrays become the env's own."""
+        """Returns the memory of episodes that begin; the env takes ownership of the arrays."""
 
     @abstractmethod
     def observation(self, view: RobotView, memory: Memory) -> Observation:
-        """What each robot sees, (..., O) float32."""
+        """Returns the observation of each robot, (..., O) float32."""
 
     @abstractmethod
     def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
-        """The terms (...) of the reward for a step."""
+        """Returns the terms (...) of the reward for a step."""
 
     @abstractmethod
     def end(self, view: RobotView, memory: Memory) -> Flags:
-        """Whether the episode is over for each robot, (...). A team ends with its last one."""
+        """Returns True where a robot's episode is over, (...). A team ends with its last robot."""
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
-        """Facts for `info`; `is_success` and `collision` are what an evaluation reads."""
+        """Returns facts for `info`; an evaluation reads `is_success` and `collision`."""
         return {}
 
     def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:  # noqa: B027
-        """Brings the memory up to date after a step, in place, before anything is judged."""
+        """Updates the memory after a step, in place, before anything is computed from it."""
 
     def command(self, action: ArrayLike) -> Array:
-        """The command (..., C) of an action: (..., C) continuous, or (...) discrete."""
+        """Returns the command (..., C) of an action: (..., C) continuous, or (...) discrete."""
         if self.actions == "discrete":
             return np.asarray(self._commands[np.asarray(action)])
         return scaled(action, self.robot)
@@ -164,9 +165,9 @@ class Task(ABC):
     def step_into(
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
     ) -> Outcome:
-        """All that a step comes to, the observation written into `out`.
+        """Returns the outcome of a step and writes the observation into `out`.
 
-        A task overrides it where one pass over the scan gives several of them.
+        Override it if one pass over the scan gives several of these results.
         """
         self.update(before, after, memory)
         self.observe_into(out, after, memory)
@@ -177,10 +178,10 @@ class Task(ABC):
     def _commands(self) -> Array:
         return discrete_commands(self.robot)
 
-    # What tasks are made of.
+    # Building blocks of tasks.
 
     def box(self, low: ArrayLike, high: ArrayLike) -> gymnasium.spaces.Box:
-        """The space of a scan in shares (P parts), then of parts with these limits."""
+        """Returns the space of a scan in shares (P parts) followed by parts with these limits."""
         parts = self.scan_parts
         low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
         return gymnasium.spaces.Box(
@@ -190,14 +191,14 @@ class Task(ABC):
         )
 
     def free_share(self, ranges: NDArray[np.float32]) -> Observation:
-        """Ranges (..., B) in shares (..., P): 1 no return, 0 too close or unknown.
+        """Returns ranges (..., B) as shares (..., P): 1 no return, 0 too close or unknown.
 
-        A share is one of the lidar's greatest range, or of that of the layout `scan`.
+        Shares are relative to the maximum range of the lidar, or of the layout `scan`.
         """
         return self._look(ranges)[0]
 
     def touches(self, ranges: NDArray[np.float32]) -> Flags:
-        """Whether a scan (..., B) says that something is within the footprint, (...)."""
+        """Returns True where a scan (..., B) shows a contact with the footprint, (...)."""
         return self._look(ranges)[1]
 
     def _look(self, ranges: NDArray[np.float32]) -> tuple[Observation, Flags]:
@@ -211,12 +212,12 @@ class Task(ABC):
 
     @property
     def scan_parts(self) -> int:
-        """P, parts of an observation that are a scan: sectors of `scan`, or beams."""
+        """P, the number of scan parts of an observation: sectors of `scan`, or beams."""
         return self.lidar.beams if self.scan is None else self.scan.sectors
 
     @cached_property
     def sight(self) -> Sight:
-        """What these parts mean."""
+        """Meaning of the scan parts."""
         if self.scan is not None:
             layout = self.scan
             return Sight(layout.angles, np.array(layout.viewpoint), layout.range_max)
@@ -224,13 +225,13 @@ class Task(ABC):
         return Sight(self.lidar.angles + heading, np.array([x, y]), self.lidar.range_max)
 
     @cached_property
-    def plan(self) -> Plan:
-        """How the lidar's beams fill the sectors of `scan`; of no sectors without one."""
+    def plan(self) -> SectorPlan:
+        """Mapping of the lidar's beams to the sectors of `scan`; without it, one of no sectors."""
         return NO_PLAN if self.scan is None else plan_of(self.lidar, self.scan)
 
     @cached_property
     def sensor(self) -> tuple[Any, ...]:
-        """What the kernels take: `per_metre`, `contact_ranges`, and the plan's arrays."""
+        """Arguments of the kernels: `per_metre`, `contact_ranges`, and the plan's arrays."""
         return self.per_metre, self.contact_ranges, self.plan.arguments
 
     @cached_property
@@ -245,10 +246,10 @@ class Task(ABC):
 
 
 def bearing(pose: ArrayLike, points: ArrayLike) -> Array:
-    """Points (..., 2) as seen from poses (..., 3): distance [m], cosine, sine of the bearing.
+    """Returns distance [m], cosine and sine of the bearing of points (..., 2) from poses (..., 3).
 
-    The leading dimensions are broadcast. A point where the robot stands lies straight ahead; a
-    distance is cut at `kernels.LIMIT`.
+    The leading dimensions are broadcast. A point at the robot's position lies straight ahead;
+    distances are cut at `kernels.LIMIT`.
     """
     poses, places, shape = _rows(pose, points)
     out = np.empty((len(poses), 3))
@@ -257,7 +258,7 @@ def bearing(pose: ArrayLike, points: ArrayLike) -> Array:
 
 
 def distance(pose: ArrayLike, points: ArrayLike) -> Array:
-    """Distances (...) [m] from poses (..., 2 or 3) to points (..., 2); leads are broadcast."""
+    """Returns distances (...) [m] from poses (..., 2 or 3) to points (..., 2), broadcast."""
     poses, places, shape = _rows(pose, points)
     out = np.empty(len(poses))
     kernels.distances(out, poses, places)
@@ -279,22 +280,22 @@ def _rows(pose: ArrayLike, points: ArrayLike) -> tuple[Array, Array, tuple[int, 
 
 
 def limited(twist: Array) -> Array:
-    """A twist (..., 3) cut at `kernels.LIMIT`, so that observations stay in their space."""
+    """Cuts a twist (..., 3) at `kernels.LIMIT`, so that observations stay in their space."""
     return np.minimum(np.maximum(twist, -LIMIT), LIMIT)
 
 
 def override(memory: Memory, options: Mapping[str, Any] | None) -> None:
-    """Puts what `reset(options=...)` gives for a memory's name into all of its rows."""
+    """Writes values of `reset(options=...)` into all rows of the memory arrays that they name."""
     for name, rows in memory.items():
         if options and name in options:
             give(rows, name, options[name])
 
 
 def give(rows: NDArray[Any], name: str, value: Any) -> None:
-    """Puts what `reset(options=...)` gives for a name into rows (n, ...).
+    """Writes the value of an option of `reset(options=...)` into rows (n, ...).
 
     Raises:
-        ConfigError: it has another shape, or holds NaN or inf.
+        ConfigError: the value has a wrong shape, or contains NaN or inf.
     """
     try:
         given = np.asarray(value)
@@ -309,3 +310,43 @@ def give(rows: NDArray[Any], name: str, value: Any) -> None:
     rows[...] = given
     if not np.isfinite(rows).all():
         raise ConfigError(f"reset option {name!r}, {value!r}: must be finite.")
+
+
+def contact_ranges(robot: RobotSpec, lidar: LidarSpec, margin: float) -> NDArray[np.float32]:
+    """Range at which each beam leaves the footprint and a margin around it.
+
+    Args:
+        robot: gives the footprint, round or a polygon.
+        lidar: gives the mount and the beams.
+        margin: [m].
+
+    Returns:
+        (B,) [m]; -inf where a beam does not cross the footprint.
+    """
+    x, y, heading = lidar.mount
+    angles = lidar.angles + heading
+    ray = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    if robot.footprint is None:
+        leaves = _leaves_circle(ray, np.array([x, y]), robot.footprint_radius + margin)
+    else:
+        leaves = _leaves_outline(ray, np.array(robot.footprint) - [x, y]) + margin
+    return leaves.astype(np.float32)
+
+
+def _leaves_circle(ray: Array, start: Array, radius: float) -> Array:
+    along = ray @ start
+    rest = radius * radius - start @ start + along * along
+    return np.where(rest >= 0.0, np.sqrt(np.maximum(rest, 0.0)) - along, -np.inf)
+
+
+def _leaves_outline(ray: Array, corners: Array) -> Array:
+    """(B,) distances at which rays (B, 2) from the origin last cross an outline (V, 2)."""
+    edge = np.roll(corners, -1, axis=0) - corners
+    turned = np.stack([-edge[:, 1], edge[:, 0]], axis=-1)
+    steep = ray @ turned.T  # (B, V) of each ray and side
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away = np.sum(corners * turned, axis=-1) / steep
+        where = (away[..., None] * ray[:, None] - corners) * edge
+        share = where.sum(axis=-1) / np.sum(edge * edge, axis=-1)
+    crossed = (steep != 0.0) & (away >= 0.0) & (share >= -1e-9) & (share <= 1.0 + 1e-9)
+    return np.asarray(np.where(crossed, away, -np.inf).max(axis=1))

@@ -1,17 +1,29 @@
-"""What tasks of several robots share: who sees whom and what, (..., M, P)."""
+"""Helpers for tasks of several robots: bearings and distances of all pairs, (..., M, P).
+
+Cooperative reaching: a team has to reach several goals, each with any of its robots.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
+from nics_drl_bridge.env.kernels import LIMIT
+from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Task, limited
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.interface import RobotView
 
 Array = NDArray[np.float64]
 
 
 def seen(pose: Array, points: Array) -> Array:
-    """Points (..., P, 2) as each robot (..., M, 3) sees them, (..., M, P, 3); see `bearing`."""
+    """Bearings (..., M, P, 3) of points (..., P, 2) from each robot (..., M, 3); see `bearing`."""
     robots, places, shape = _batched(pose, points)
     out = np.empty((len(robots), robots.shape[1], places.shape[1], 3))
     kernels.pair_bearings(out, robots, places)
@@ -19,7 +31,7 @@ def seen(pose: Array, points: Array) -> Array:
 
 
 def distances(pose: Array, points: Array) -> Array:
-    """From each robot (..., M, 3) to each point (..., P, 2): (..., M, P) [m]."""
+    """Distances (..., M, P) [m] from each robot (..., M, 3) to each point (..., P, 2)."""
     robots, places, shape = _batched(pose, points)
     out = np.empty((len(robots), robots.shape[1], places.shape[1]))
     kernels.pair_distances(out, robots, places)
@@ -35,18 +47,149 @@ def _batched(pose: Array, points: Array) -> tuple[Array, Array, tuple[int, ...]]
 
 
 def others(of_all: Array) -> Array:
-    """Each robot's row of the others, (..., M, M - 1, F) of (..., M, M, F): no diagonal."""
+    """Drops the diagonal of (..., M, M, F): each robot's row of the others, (..., M, M - 1, F)."""
     count = of_all.shape[-2]
     lead, width = of_all.shape[:-3], of_all.shape[-1]
-    # Without its first, a row of all pairs has a diagonal entry after every `count` others.
+    # Without its first entry, the flat row of pairs has a diagonal one after every `count` others.
     flat = of_all.reshape(*lead, count * count, width)[..., 1:, :]
     kept = flat.reshape(*lead, count - 1, count + 1, width)[..., :-1, :]
     return np.asarray(kept.reshape(*lead, count, count - 1, width))
 
 
 def total(values: Array) -> Array:
-    """Sums (...) over the last axis, one after the other: the same bits for every batch."""
+    """Sums over the last axis to (...), in order: bit-identical for every batch size."""
     summed = values[..., 0].copy()
     for k in range(1, values.shape[-1]):
         summed += values[..., k]
     return np.asarray(summed)
+
+
+@dataclass(frozen=True)
+class CooperativeReaching(Task):
+    """M robots have to reach M goals; a goal counts for all as soon as one robot was there.
+
+    ## Observation Space
+
+    Of one robot, `Box((B + 4 M + 3 (M - 1) + 3,), float32)`, B beams or
+    sectors. The robots share their positions.
+
+    | Num | Observation | Min | Max | Unit |
+    |---|---|---|---|---|
+    | 0 to B - 1 | range as a share of the maximum; 1 free, 0 too close or unknown | 0 | 1 | - |
+    | 4 for each goal | distance | 0 | 1000 | m |
+    | | cosine, sine of the bearing | -1 | 1 | - |
+    | | 1 if it has been reached | 0 | 1 | - |
+    | 3 for each other robot, in order | distance | 0 | 1000 | m |
+    | | cosine, sine of the bearing | -1 | 1 | - |
+    | the last 3 | estimated velocity forward, left; turn rate | -1000 | 1000 | m/s, rad/s |
+
+    ## Action Space
+
+    Of one robot as in navigation: `Box(-1, 1, (C,), float32)`, or `Discrete`.
+
+    ## Rewards
+
+    For each robot: `progress`, 1 per metre of decrease in the distance from each open goal to its
+    nearest robot, shared by the team; `time`, -0.01 per step; `reached`, 10 for each goal that is
+    reached, shared by the team; `collision`, -10 for the robot that touches something.
+
+    ## Starting State
+
+    Obstacles, starts and goals are drawn by the world. Memory: `goal` (M, 2) [m], `reached` (M,).
+
+    ## Episode End
+
+    For a robot when it touches something; it then stands still as another obstacle. For all
+    when the last goal is reached.
+
+    Attributes:
+        robots: M.
+        goal_radius: distance at which a goal is reached [m].
+        reached_reward: of the team, for each goal.
+        collision_reward: of a robot, for a contact.
+        progress_reward: per metre of approach.
+        time_reward: per step.
+    """
+
+    keeps_last_scan: ClassVar[bool] = False
+    shown: ClassVar[tuple[str, ...]] = ("goal",)
+
+    robots: int = 3
+    goal_radius: float = 0.3
+    reached_reward: float = 10.0
+    collision_reward: float = -10.0
+    progress_reward: float = 1.0
+    time_reward: float = -0.01
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.robots < 2:
+            raise ConfigError(f"task option robots={self.robots}: a team has at least 2.")
+
+    @cached_property
+    def observation_space(self) -> gymnasium.spaces.Box:
+        """Box of one robot's observation."""
+        place, low = [LIMIT, 1.0, 1.0], [0.0, -1.0, -1.0]
+        mates = self.robots - 1
+        return self.box(
+            [*[*low, 0.0] * self.robots, *low * mates, *[-LIMIT] * 3],
+            [*[*place, 1.0] * self.robots, *place * mates, *[LIMIT] * 3],
+        )
+
+    def reset(self, episodes: Episodes) -> Memory:
+        """Returns a memory with no goal reached; `newly` marks those reached in the last step."""
+        goals = episodes.goals.copy()
+        none = np.zeros(goals.shape[:-1], np.bool_)
+        return {"goal": goals, "reached": none, "newly": none.copy()}
+
+    def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:
+        """Marks the goals that a robot is at."""
+        there = (distances(after.pose, memory["goal"]) < self.goal_radius).any(axis=-2)
+        memory["newly"][...] = there & ~memory["reached"]
+        memory["reached"] |= there
+
+    def observation(self, view: RobotView, memory: Memory) -> Observation:
+        """The observation (..., M, O) of views (..., M)."""
+        goals = seen(view.pose, memory["goal"])
+        reached = np.broadcast_to(memory["reached"][..., None, :, None], (*goals.shape[:-1], 1))
+        lead = view.pose.shape[:-1]
+        parts = [
+            self.free_share(view.ranges),
+            np.concatenate([goals, reached], axis=-1).reshape(*lead, -1),
+            others(seen(view.pose, view.pose[..., :2])).reshape(*lead, -1),
+            limited(view.twist),
+        ]
+        return np.concatenate(parts, axis=-1, dtype=np.float32, casting="same_kind")
+
+    def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
+        """The terms (..., M)."""
+        lead = after.pose.shape[:-1]
+        gaps = [distances(view.pose, memory["goal"]).min(axis=-2) for view in (before, after)]
+        # A goal just reached still pays its last approach.
+        open_goals = ~memory["reached"] | memory["newly"]
+        approach = np.where(open_goals, gaps[0] - gaps[1], 0.0)
+        share = 1.0 / self.robots
+        newly = total(memory["newly"].astype(np.float64))
+        return {
+            "progress": np.broadcast_to(
+                self.progress_reward * share * total(approach)[..., None], lead
+            ).copy(),
+            "time": np.full(lead, self.time_reward),
+            "reached": np.broadcast_to(self.reached_reward * share * newly[..., None], lead).copy(),
+            "collision": self.collision_reward * self.touches(after.ranges),
+        }
+
+    def end(self, view: RobotView, memory: Memory) -> Flags:
+        """Returns True where a robot touches something, or all goals are reached."""
+        done = np.asarray(memory["reached"].all(axis=-1))[..., None]
+        return np.asarray(self.touches(view.ranges) | done)
+
+    def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
+        """Success of the team, contacts, and the goals that have been reached (..., M)."""
+        all_reached = np.asarray(memory["reached"].all(axis=-1))[..., None]
+        done = np.broadcast_to(all_reached, view.pose.shape[:-1])
+        return {
+            "is_success": done.copy(),
+            "collision": self.touches(view.ranges),
+            "reached": memory["reached"].copy(),
+        }

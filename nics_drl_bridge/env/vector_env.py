@@ -12,16 +12,17 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env import vector_info
+from nics_drl_bridge.env import vector_rows
 from nics_drl_bridge.env.actions import check_action, still, team_space
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
+from nics_drl_bridge.env.guard import check_options, check_reset
 from nics_drl_bridge.env.kernels import episode_seeds
-from nics_drl_bridge.env.reset_arguments import check_options, check_reset
-from nics_drl_bridge.env.sim_backend import NANO
+from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, give, override
-from nics_drl_bridge.env.tasks import make_task
-from nics_drl_bridge.env.vector_facts import EVERY, Rows, VectorFacts
-from nics_drl_bridge.env.vector_parts import (
+from nics_drl_bridge.env.vector_rows import (
+    EVERY,
+    Rows,
+    VectorFacts,
     chosen_worlds,
     flat,
     joined,
@@ -30,7 +31,7 @@ from nics_drl_bridge.env.vector_parts import (
     over_robots,
 )
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.interface import NS_PER_S, RobotView
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.sim.randomisation import Randomisation
@@ -48,15 +49,15 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     ## Description
 
     Task, spaces, rewards and ends are those of `BridgeEnv` with `backend="sim"`, and so are the
-    numbers: world i of `reset(seed=s)` goes through the same bits as the single env of
-    `reset(seed=s + i)`, in its later episodes too, at any `num_envs` and number of threads.
+    numbers: world i of `reset(seed=s)` is bit-identical to the single env of `reset(seed=s + i)`,
+    in later episodes too, for any `num_envs` and number of threads.
 
     ## Spaces, Rewards, Starting State, Episode End
 
     Those of `BridgeEnv` with a leading (N,). `info` is what Gymnasium's `SyncVectorEnv` makes of
-    the single envs: each entry an array (N, ...) beside its mask `_name`. `reset` takes
+    the single envs: each entry an array (N, ...) with its mask `_name`. `reset` takes
     `options={"start": ..., "goal": ...}` for all worlds that it resets, and with
-    `options={"reset_mask": (N,) bool}` it resets those only.
+    `options={"reset_mask": (N,) bool}` it resets only those.
 
     ## Arguments
 
@@ -66,14 +67,14 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         world: a World, its YAML file, or the name of a shipped one.
         task: a name, `path/to/file.py:ClassName`, a class, or a Task.
         task_options: further arguments of the task's class.
-        max_episode_steps: after so many steps an episode is truncated.
-        autoreset_mode: `NextStep` (an ended world begins anew in the next step, whose action it
+        max_episode_steps: an episode is truncated after this many steps.
+        autoreset_mode: `NextStep` (an ended world is reset in the next step, whose action it
             ignores) or `SameStep` (at once; the last observation is in `info["final_obs"]`).
-        copy: whether what `step` returns is the caller's own. False reuses the observation's
-            array in the next step.
+        copy: True if the caller may keep what `step` returns. False reuses the array of the
+            observation in the next step.
         renderer: `baked` or `exact` lidar.
         threads: of the simulator; the numbers do not depend on it.
-        randomisation: what each episode draws anew, see `BridgeEnv`.
+        randomisation: quantities drawn in each episode, see `BridgeEnv`.
         render_mode: `rgb_array`, of every world, or None.
 
     Raises:
@@ -101,7 +102,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         randomisation: str | Randomisation | None = None,
         render_mode: str | None = None,
     ) -> None:
-        self._pictures: list[Any] = []  # what `close` needs, also where something below is refused
+        self._pictures: list[Any] = []  # `close` needs it even if the rest raises
         check_render_mode(render_mode, self.metadata)
         self.num_envs, self.render_mode = num_envs, render_mode
         self._limit, self.copy = max_episode_steps, copy
@@ -120,7 +121,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         )
         self._each = (num_envs, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
-        self._facts = VectorFacts(self.simulator, round(self.model.control_period * NANO))
+        self._facts = VectorFacts(self.simulator, round(self.model.control_period * NS_PER_S))
         self._allocate()
 
     def _allocate(self) -> None:
@@ -135,16 +136,16 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._starts: Array = np.zeros((count, robots, 3))
         self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
         self.memory: Memory = {}
-        self.ready = False  # not after an exception either, which leaves worlds between two steps
+        self.ready = False  # False after an exception too, which leaves worlds between two steps
 
     @property
     def changing(self) -> dict[str, NDArray[Any]]:
-        """The arrays that change from step to step, by name; see `env.vector_state`."""
+        """The arrays that change from step to step, by name; see `policy.train_checkpoint`."""
         own = {
             "ended": self.ended, "over": self._over, "first": self._first,
             "episode": self._episode, "starts": self._starts, "bodies": self._bodies,
         }  # fmt: skip
-        data = {f"data.{name}": rows for name, rows in vars(self.simulator.data).items()}
+        data = {f"data.{name}": rows for name, rows in self.simulator.data._asdict().items()}
         return {**own, **data, "goals": self.simulator.goals}
 
     def reset(
@@ -156,9 +157,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """Begins an episode in every world; world i takes its seeds from `seed + i`.
 
         Raises:
-            ConfigError: wrong number of seeds, one that is negative or too great, a wrong mask, or
+            ConfigError: wrong number of seeds, one that is negative or too large, a wrong mask, or
                 an option that the task does not have.
-            ResetNeeded: some worlds alone, where all need it: at first and after an exception.
+            ResetNeeded: some worlds are reset where all need it: at first and after an exception.
         """
         check_reset(seed, options, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
@@ -168,20 +169,20 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         seeds, fresh = named_seeds(seed, chosen, self._episode < 0, self.np_random)
         self.ready = False
         self._first[fresh], self._episode[fresh] = seeds[fresh], -1
-        if not chosen.all():  # the others see what they saw
+        if not chosen.all():  # the others keep their observation
             self.task.observe_into(self._out, self._view(slice(None)), self.memory)
         rows = np.flatnonzero(chosen)
         self._begin(rows, self._out, options)
         infos: dict[str, Any] = {}
         facts = self._known(rows) | self._facts.beginnings(self._starts, self._bodies, rows)
-        vector_info.put_rows(infos, facts, rows, self.num_envs)
+        vector_rows.put_rows(infos, facts, rows, self.num_envs)
         self.ready = True
         return flat(self._out.copy() if self.copy else self._out), infos
 
     def _begin(
         self, worlds: NDArray[np.intp], out: Observation, options: dict[str, Any] | None = None
     ) -> None:
-        """Begins the next episode in some worlds and writes what they see into their rows."""
+        """Begins the next episode in some worlds and writes their observations into their rows."""
         if not len(worlds):
             return
         self._episode[worlds] += 1
@@ -205,7 +206,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         out[worlds] = self.task.observation(self._view(worlds), fresh)
 
     def _view(self, rows: Rows) -> RobotView:
-        """The robots (n, M) of some worlds as their odometry knows them."""
+        """View of the robots (n, M) of some worlds, with poses by odometry."""
         data = self.simulator.data
         return RobotView(data.odom[rows], data.twist[rows], data.ranges[rows], 0.0, 0.0, 0.0)
 
@@ -218,7 +219,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         given = check_action(actions, self.action_space, "actions").reshape(self._each)
         self.ready = False
         out = np.empty_like(self._out) if self.copy else self._out
-        begun = self._over.copy()  # these ignore their action and begin anew
+        begun = self._over.copy()  # these ignore their action and are reset
         outcome = joined(
             self.simulator.run_parts(lambda part: self._advance(part, given[part], out, begun))
         )
@@ -239,9 +240,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def _advance(
         self, part: slice, actions: NDArray[Any], out: Observation, begun: Flags
     ) -> Outcome:
-        """One control period of the worlds of a part; what they see goes into their rows.
+        """Advances the worlds of a part by one control period and writes their observations.
 
-        Those in `begun` (N,) begin anew instead.
+        Those in `begun` (N,) are reset instead.
         """
         data, ended = self.simulator.data, self.ended[part]
         command = self.task.command(actions)
@@ -266,13 +267,13 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def _end_at_once(
         self, out: Observation, over: Flags, facts: dict[str, Any], infos: dict[str, Any]
     ) -> None:
-        """SAME_STEP: the worlds that ended begin anew; what they ended with goes into `infos`."""
+        """SAME_STEP: resets the worlds that ended; `infos` gets their last observation and info."""
         rows = np.flatnonzero(over)
         if len(rows):
-            infos.update(vector_info.finals(flat(out), rows))
+            infos.update(vector_rows.finals(flat(out), rows))
             final: dict[str, Any] = {}
-            known = self._known(rows) | vector_info.rows_of(facts, rows)
-            vector_info.put_rows(final, known, rows, self.num_envs)
+            known = self._known(rows) | vector_rows.rows_of(facts, rows)
+            vector_rows.put_rows(final, known, rows, self.num_envs)
             infos["final_info"], infos["_final_info"] = final, over.copy()
             self.simulator.run_parts(
                 lambda part: self._begin(part.start + np.flatnonzero(over[part]), out)
@@ -280,27 +281,27 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._tell(infos, facts, over)
 
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
-        """Puts into `infos` what is known of every world, and how those in `begun` began."""
-        vector_info.put_all(infos, self._known(), np.zeros_like(begun))
+        """Adds to `infos` the facts of every world, and the beginnings of those in `begun`."""
+        vector_rows.put_all(infos, self._known(), np.zeros_like(begun))
         rows = np.flatnonzero(begun)
         if len(rows) < self.num_envs:
-            vector_info.put_all(infos, facts, begun)
+            vector_rows.put_all(infos, facts, begun)
         if len(rows):
             beginnings = self._facts.beginnings(self._starts, self._bodies, rows)
-            vector_info.put_rows(infos, beginnings, rows, self.num_envs)
+            vector_rows.put_rows(infos, beginnings, rows, self.num_envs)
 
     def _known(self, rows: Rows = EVERY) -> dict[str, Any]:
         shown = {name: self.memory[name] for name in self.task.shown}
         return self._facts.known(shown, rows)
 
     def render(self) -> tuple[Any, ...] | None:
-        """A picture of every world; see Gymnasium."""
+        """Draws every world; see Gymnasium."""
         if self.render_mode is None:
             return None
         if not self._pictures:
             drawing = import_module("nics_drl_bridge.env.rendering")
             self._pictures = [
-                drawing.Picture(self.model, self.world, self.render_mode, RENDER_FPS)
+                drawing.WorldPicture(self.model, self.world, self.render_mode, RENDER_FPS)
                 for _ in range(self.num_envs)
             ]
         drawn, data, bodies = [], self.simulator.data, self.simulator.obstacles

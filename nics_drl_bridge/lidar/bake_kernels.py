@@ -1,27 +1,27 @@
-"""Compiled inner loops of baking: a shape on the lidar's main axis, scanned beforehand."""
+"""Compiled inner loops of baking: scans of a shape on the lidar's main axis."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-from numba import njit
 
-from nics_drl_bridge.lidar import kernels
+from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar import exact_kernels
 
 EDGE = 1e-6
-"""So far within an edge, as a part of the whole width, is its range taken."""
+"""Ranges at an edge are taken this far inside it, as a share of the whole width."""
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[no-untyped-def]
-    """Outermost directions of a shape straight ahead, and the corners that make them.
+    """Computes the outermost directions of a shape straight ahead, and their corners.
 
     Args:
-        hull: (V, 2) of its convex hull [m]; unused for a circle.
+        hull: (V, 2) corners of its convex hull [m]; unused for a circle.
         radius: of a circle [m], 0 for another shape.
         distances: (D,) of its origin [m].
-        turns: (T,) its rotation [rad].
+        turns: (T,) rotations of the shape [rad].
         edges: (T, D, 2) result: right and left edge [rad].
         hints: (T, D, 2) result: index of the corner at each.
     """
@@ -33,11 +33,11 @@ def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[n
                 edges[t, d, 0], edges[t, d, 1] = -half, half
                 hints[t, d] = 0
                 continue
-            rx, ry = kernels.turned(distances[d], 0.0, c, s, hull[0])
+            rx, ry = exact_kernels.turned(distances[d], 0.0, c, s, hull[0])
             lx, ly = rx, ry
             right = left = 0
             for v in range(1, hull.shape[0]):
-                x, y = kernels.turned(distances[d], 0.0, c, s, hull[v])
+                x, y = exact_kernels.turned(distances[d], 0.0, c, s, hull[v])
                 if rx * y - ry * x < 0.0:
                     rx, ry, right = x, y, v
                 if lx * y - ly * x > 0.0:
@@ -46,24 +46,24 @@ def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[n
             hints[t, d, 0], hints[t, d, 1] = right, left
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untyped-def]
     """Range to a shape straight ahead in one direction [rad]; see `row`."""
     ray, out = np.empty((1, 2)), np.full(1, np.inf, np.float32)
     ray[0, 0], ray[0, 1] = math.cos(angle), math.sin(angle)
     beams = (angle, 1.0, 0.0)
     if corners.shape[0] == 0:
-        kernels.circle(out, ray, beams, distance, 0.0, radius, np.inf)
+        exact_kernels.circle(out, ray, beams, distance, 0.0, radius, np.inf)
     else:
-        kernels.polygon(out, ray, beams, distance, 0.0, cos, sin, corners)
+        exact_kernels.polygon(out, ray, beams, distance, 0.0, cos, sin, corners)
         if not np.isfinite(out[0]):  # a wall seen edge-on
             for v in range(corners.shape[0]):
-                x, y = kernels.turned(distance, 0.0, cos, sin, corners[v])
+                x, y = exact_kernels.turned(distance, 0.0, cos, sin, corners[v])
                 out[0] = min(out[0], math.hypot(x, y))
     return out[0]
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # type: ignore[no-untyped-def]
     """Ranges (P,) of a shape straight ahead, continued beyond its edges.
 
@@ -74,13 +74,13 @@ def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # 
         radius: of a circle [m].
         distance: of its origin [m].
         cos, sin: of its rotation.
-        edge: (2,) its right and left edge [rad].
+        edge: (2,) right and left edge [rad].
     """
     fine[:] = np.inf
     if corners.shape[0] == 0:
-        kernels.circle(fine, directions, beams, distance, 0.0, radius, np.inf)
+        exact_kernels.circle(fine, directions, beams, distance, 0.0, radius, np.inf)
     else:
-        kernels.polygon(fine, directions, beams, distance, 0.0, cos, sin, corners)
+        exact_kernels.polygon(fine, directions, beams, distance, 0.0, cos, sin, corners)
     count = fine.shape[0]
     first = min(max(math.ceil((edge[0] - beams[0]) / beams[1]), 0), count - 1)
     last = max(min(math.floor((edge[1] - beams[0]) / beams[1]), count - 1), 0)
@@ -88,7 +88,7 @@ def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # 
         first += 1
     while last > first and not np.isfinite(fine[last]):
         last -= 1
-    if not np.isfinite(fine[first]):  # thinner than the points: seen by none
+    if not np.isfinite(fine[first]):  # thinner than the spacing of the points: hit by none
         fine[:] = along((edge[0] + edge[1]) / 2.0, corners, radius, distance, cos, sin)
         return
     inside = EDGE * (edge[1] - edge[0])
@@ -96,22 +96,22 @@ def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # 
     fine[last + 1 :] = along(edge[1] - inside, corners, radius, distance, cos, sin)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def into_phases(rows, fine, width, phases):  # type: ignore[no-untyped-def]
-    """Sorts points (width * phases,) so that those of one phase stand together."""
+    """Sorts points (width * phases,) so that those of one phase are contiguous."""
     for phase in range(phases):
         for k in range(width):
             rows[phase * width + k] = fine[k * phases + phase]
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
-    """All rows of one rotation.
+    """Computes all rows of one rotation.
 
     Args:
         rows: (R,) float32 result: the table's ranges [m].
-        layout: (3, D) where each row begins in `rows`, its first beam from the bearing, and its
-            width in beams.
+        layout: (3, D) index in `rows` of the begin of each row, its first beam relative to the
+            bearing, and its width in beams.
         shape: corners and radius, see `row`.
         distances: (D,) [m].
         turn: rotation [rad].
@@ -131,3 +131,71 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
         beams = (angles[0], step / phases, 0.0)
         row(fine, directions, beams, corners, radius, distances[d], c, s, edges[d])
         into_phases(rows[start : start + points], fine, width, phases)
+
+
+@kernel
+def _circle(scan, directions, beams, x, radius):  # type: ignore[no-untyped-def]
+    """Cosines on a circle straight ahead, whose normal is the direction from its centre."""
+    nearest, cosines, _ = scan
+    exact_kernels.circle(nearest, directions, beams, x, 0.0, radius, np.inf)
+    for i in range(nearest.shape[0]):
+        if nearest[i] < np.inf:
+            cosine = abs((nearest[i] - directions[i, 0] * x) / radius)
+            cosines[i] = min(cosine, 1.0)
+
+
+@kernel
+def _segment(scan, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
+    """Cosines on a segment where it is nearest: the distance of its line over the range."""
+    nearest, cosines, before = scan
+    for i in range(nearest.shape[0]):
+        before[i] = nearest[i]
+    exact_kernels.segment(nearest, directions, beams, x1, y1, x2, y2)
+    ex, ey = x2 - x1, y2 - y1
+    away = np.float32(abs(x1 * ey - y1 * ex) / math.sqrt(ex * ex + ey * ey))
+    for i in range(nearest.shape[0]):
+        if nearest[i] < before[i]:
+            cosines[i] = min(away / nearest[i], np.float32(1.0))
+
+
+@kernel(allocates=True)
+def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[no-untyped-def]
+    """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it."""
+    directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
+    beams, count = (angles[0], step, 0.0), len(angles)
+    nearest, before = np.full(count, np.inf, np.float32), np.empty(count, np.float32)
+    scan = (nearest, np.zeros(count, np.float32), before)
+    if corners.shape[0] == 0:
+        _circle(scan, directions, beams, distance, radius)
+        return scan[1]
+    ax, ay = exact_kernels.turned(distance, 0.0, c, s, corners[corners.shape[0] - 1])
+    for v in range(corners.shape[0]):
+        bx, by = exact_kernels.turned(distance, 0.0, c, s, corners[v])
+        _segment(scan, directions, beams, ax, ay, bx, by)
+        ax, ay = bx, by
+    return scan[1]
+
+
+@kernel(allocates=True)
+def cosines_of_turn(cosines, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
+    """Computes the cosine of the incidence at every point of the rows of one rotation.
+
+    Beyond the edges of the shape it is that at the edge, as for the ranges.
+
+    Args:
+        cosines: (R,) float32 result, laid out as the ranges.
+        layout, shape, distances, turn, edges, step, phases: see `rows_of_turn`.
+    """
+    c, s = math.cos(turn), math.sin(turn)
+    corners, radius = shape
+    for d in range(distances.shape[0]):
+        start, begin, width = layout[0, d], layout[1, d], layout[2, d]
+        count = width * phases
+        angles = (begin * phases + np.arange(count)) * (step / phases)
+        inside = EDGE * (edges[d, 1] - edges[d, 0])
+        low, high = edges[d, 0] + inside, edges[d, 1] - inside
+        fine = incidences(angles, step / phases, corners, radius, distances[d], c, s)
+        at = np.array([low, high])
+        fine[angles < low] = incidences(at[:1], 1.0, corners, radius, distances[d], c, s)[0]
+        fine[angles > high] = incidences(at[1:], 1.0, corners, radius, distances[d], c, s)[0]
+        into_phases(cosines[start : start + count], fine, width, phases)

@@ -1,11 +1,11 @@
-"""Compiled inner loops of the baked lidar: look up (Eq. 3); `fuse_kernels` does the rest.
+"""Compiled inner loops of the baked lidar: table look-up (Eq. 3); see also `fuse_kernels`.
 
-The bodies in sight of several scans go through some passes together, each a short loop without
-branches: nearly all the time of a look-up is waiting, for a memory or after a wrong guess of a
-branch, and so the waiting of one body overlaps with the work on the next. What one pass finds
-out the next ones read from lanes: one array of each kind of number, in which every quantity has
-`LANES` places of its own at a fixed offset, so that LLVM sees that they do not overlap. What a
-pass makes of a body depends on that body only, so that a scan is the same in any batch.
+The visible bodies of several scans go through a number of passes together, each a short loop
+without branches: nearly all the time of a look-up goes into cache misses and branch mispredictions,
+and so the latency of one body overlaps with the work on the next. Passes hand on their results in
+lanes: one array per number type, in which every quantity has `LANES` places at a fixed offset, so
+that LLVM can prove that they do not overlap. The result for a body depends on that body only, so
+that a scan is identical in any batch.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from nics_drl_bridge.lidar.map_memory_kernels import get, peek, put
+from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.map_kernels import get, peek, put
 
 LANES = 144
-"""So many bodies go through the passes together: a multiple of `BLOCK`, and few enough that the
-scans that they belong to stay in the nearest cache."""
+"""Number of bodies that go through the passes together: a multiple of `BLOCK`, and few enough that
+their scans stay in the L1 cache."""
 WIDE, SINGLE, WHOLE = 20, 8, 15
-"""Quantities in double and single precision and in whole numbers."""
+"""Numbers of quantities in double precision, in single precision and in integers."""
 X, Y, TURN, COS, SIN, RADIUS, AHEAD, AT, ROUND, MIDDLE, RIGHT, LEFT = (k * LANES for k in range(12))
 """Of a body: offset from the lidar, heading, cos, sin, radius; the bearing of beam 0 in the world
-and where the scan begins in memory; radius of a circle or 0; bearing and silhouettes in beams."""
+and the index of the scan in memory; radius of a circle or 0; bearing and silhouettes in beams."""
 RIGHT_X, RIGHT_Y, RIGHT_X2, RIGHT_Y2, LEFT_X, LEFT_Y, LEFT_X2, LEFT_Y2 = (
     k * LANES for k in range(12, 20)
 )
@@ -36,10 +36,10 @@ SHAPE, CELL, HULL, CLIMB, START, PLACE, START2, PLACE2, BEGIN, HITS, BACK = (
     k * LANES for k in range(11)
 )
 NEAR, NEAR2, FAR, FAR2 = (k * LANES for k in range(11, 15))
-"""The cell and the next one, packed as in the table; the span of beams; where the points begin."""
+"""The cell and the next one, packed as in the table; the span of beams; indices of the points."""
 PER_METRE, ROTATIONS, PARTS_PER_ROTATION, FIRST_CELL, CELLS_PER_PART = range(5)
 HULL_END, CORNERS_PER_PART, CORNERS, ROUND_RADIUS, ABOUT = range(5, 10)
-"""What the kernels know of a shape, see `table.LidarTable.lookup`; so many numbers."""
+"""Parameters of a shape in the kernels, see `table.LidarTable.lookup`, and their number."""
 PER_TURN = 0.5 / math.pi
 ATAN = tuple(
     np.float32(factor)
@@ -56,26 +56,26 @@ ATAN = tuple(
 )
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+@kernel(contracts=True, inline=True)
 def in_sight(found, begin, end, bodies, n, me, scan, range_max, baked, wide, whole):  # type: ignore[no-untyped-def]
-    """First pass: packs the bodies in sight of one scan into the lanes.
+    """First pass: packs the bodies within range of one scan into the lanes.
 
     Args:
-        found: how many lanes are taken.
-        begin, end: which bodies; there are lanes for all of them.
+        found: number of lanes in use.
+        begin, end: range of the bodies; there are lanes for all of them.
         bodies: (N, K, 7), see `shapes.BODY`.
-        n: which world.
+        n: index of the world.
         me: the body that carries the lidar, or -1.
         scan: x and y of the lidar in the world [m], the bearing of beam 0 [rad], and the index
-            of its range from where the ranges begin.
+            of its range in the array of the ranges.
         range_max: [m].
-        baked: (H, 2) squares of the distances between which a shape is looked up [m^2]: inf where
-            it never is.
+        baked: (H, 2) squares of the distances between which a shape is looked up [m^2]; inf if it
+            never is.
         wide, whole: lanes.
 
     Returns:
-        How many lanes are taken now, and how many bodies in sight are not looked up: within
-        their circle, or not between the distances of their shape.
+        Number of lanes in use, and number of bodies within range that are not looked up: the lidar
+        is within their circle, or not between the distances of their shape.
     """
     n, left = np.uintp(n), 0
     sx, sy, ahead, at = scan
@@ -102,9 +102,9 @@ def in_sight(found, begin, end, bodies, n, me, scan, range_max, baked, wide, who
     return found, left
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def left_out(bodies, n, k, me, sx, sy, range_max, baked):  # type: ignore[no-untyped-def]
-    """Whether body k is in sight, but not looked up; see `in_sight`."""
+    """True if body k is within range but not looked up; see `in_sight`."""
     dx, dy, radius = bodies[n, k, 0] - sx, bodies[n, k, 1] - sy, bodies[n, k, 5]
     d2 = dx * dx + dy * dy
     reach = range_max + radius
@@ -113,9 +113,9 @@ def left_out(bodies, n, k, me, sx, sy, range_max, baked):  # type: ignore[no-unt
     return seen and (d2 < radius * radius or d2 < baked[h, 0] or d2 > baked[h, 1])
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+@kernel(contracts=True, inline=True)
 def arctan2_single(y, x):  # type: ignore[no-untyped-def]
-    """As `kernels.arctan2` in single precision, within 2e-7 rad."""
+    """Like `kernels.arctan2`, in single precision, within 2e-7 rad."""
     ax, ay = abs(x), abs(y)
     ratio = min(ax, ay) / max(ax, ay)
     s = ratio * ratio
@@ -132,9 +132,9 @@ def arctan2_single(y, x):  # type: ignore[no-untyped-def]
     return math.copysign(r, y)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def directions(padded, wide, single):  # type: ignore[no-untyped-def]
-    """Second pass: distance and bearing in the world of each."""
+    """Second pass: distance and bearing in the world of each body."""
     for k in range(padded):
         x, y = get(wide, k + X), get(wide, k + Y)
         put(single, k + ALONG, np.float32(x))
@@ -145,12 +145,11 @@ def directions(padded, wide, single):  # type: ignore[no-untyped-def]
         put(single, k + BEARING, arctan2_single(get(single, k + ACROSS), get(single, k + ALONG)))
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def cells_of(padded, distances, about, wide, single, whole):  # type: ignore[no-untyped-def]
-    """Third pass: which cell each looks up, and where its hull begins.
+    """Third pass: the table cell of each body, and the first corner of its hull.
 
-    The numbers are kept within the table whatever they are: a heading may be none, and lanes that
-    nobody took hold what was there before.
+    All indices are clamped to the table: a heading may be NaN, and unused lanes contain old values.
     """
     zero, last = np.int32(0), np.int32(distances - 2)
     for k in range(padded):
@@ -171,12 +170,12 @@ def cells_of(padded, distances, about, wide, single, whole):  # type: ignore[no-
         put(wide, k + ROUND, peek(about, h + ROUND_RADIUS))
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def fetch(found, cells, hulls, wide, whole):  # type: ignore[no-untyped-def]
-    """Fourth pass: the only one that waits for the cells, and does nothing else.
+    """Fourth pass: loads the cells, the only pass with these cache misses.
 
     Args:
-        found: how many lanes are taken.
+        found: number of lanes in use.
         cells: (cells * 4,) int32, see `table.LidarTable.lookup`.
         hulls: (2 * corners,), see `shapes.Outlines`.
         wide, whole: lanes.
@@ -190,7 +189,7 @@ def fetch(found, cells, hulls, wide, whole):  # type: ignore[no-untyped-def]
         put(whole, k + PLACE2, cells[np.uintp(cell + 5)])
         right, left = cells[np.uintp(cell + 2)], cells[np.uintp(cell + 3)]
         other, other2 = np.int32(right >> 16), np.int32(left >> 16)
-        put(whole, k + CLIMB, np.int32(other | other2))  # below zero if one of them is
+        put(whole, k + CLIMB, np.int32(other | other2))  # negative if either is
         corner = 2 * np.int64(skip + (right & 0xFFFF))
         put(wide, k + RIGHT_X, hulls[np.uintp(corner)])
         put(wide, k + RIGHT_Y, hulls[np.uintp(corner + 1)])
@@ -205,19 +204,19 @@ def fetch(found, cells, hulls, wide, whole):  # type: ignore[no-untyped-def]
         put(wide, k + LEFT_Y2, hulls[np.uintp(corner + 1)])
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+@kernel(contracts=True, inline=True)
 def seen_from(d2, cos, sin, x, y):  # type: ignore[no-untyped-def]
-    """A corner (x, y) of a hull as (along, across) the bearing, times the distance.
+    """Returns a corner (x, y) of a hull along and across the bearing, times the distance.
 
-    `d2` is the square of the distance, `cos` and `sin` are of the heading against the bearing,
-    times the distance.
+    `d2` is the square of the distance; `cos` and `sin` are those of the heading relative to the
+    bearing, times the distance.
     """
     return d2 + cos * x - sin * y, sin * x + cos * y
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def silhouettes(padded, wide, single):  # type: ignore[no-untyped-def]
-    """Fifth pass: the two silhouettes as (along, across), of two corners the outer one."""
+    """Fifth pass: the two silhouettes as (along, across), each from the outer of two corners."""
     for k in range(padded):
         x, y, c, s = get(wide, k + X), get(wide, k + Y), get(wide, k + COS), get(wide, k + SIN)
         d2, cos, sin = x * x + y * y, c * x + s * y, s * x - c * y
@@ -237,20 +236,20 @@ def silhouettes(padded, wide, single):  # type: ignore[no-untyped-def]
         put(single, k + ACROSS2, np.float32(radius if radius > 0.0 else ay))
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def outermost(hulls, skip, corners, first, stride, d2, cos, sin, side):  # type: ignore[no-untyped-def]
     """Climbs along a hull to its right (side 1) or left (-1) silhouette, as (along, across).
 
-    Seen from outside, the direction of the corners rises and falls once around the hull: the best
-    corner among its neighbours is the best of all. Only shapes of many corners need it, nearby.
+    Seen from outside, the direction of the corners rises and falls once around the hull, so that a
+    local optimum is the global one. Only shapes with many corners need it, at short distances.
 
     Args:
         hulls: (2 * corners,) of all hulls, see `shapes.Outlines`.
-        skip, corners: the hull begins at this corner and has so many.
+        skip, corners: index of the hull's first corner, and number of its corners.
         first: the corner to begin at.
-        stride: to begin with, a power of 2.
+        stride: initial stride, a power of 2.
         d2, cos, sin: of the shape, see `seen_from`.
-        side: which.
+        side: 1 or -1.
     """
     best = first
     one = 2 * (skip + best)
@@ -271,9 +270,9 @@ def outermost(hulls, skip, corners, first, stride, d2, cos, sin, side):  # type:
     return x, y
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+@kernel(contracts=True, inline=True)
 def climb(k, about, cells, hulls, wide, single, whole):  # type: ignore[no-untyped-def]
-    """Replaces the silhouettes of one body for which the cell names no two corners."""
+    """Replaces the silhouettes of one body that the two corners of its cell do not determine."""
     x, y, c, s = get(wide, k + X), get(wide, k + Y), get(wide, k + COS), get(wide, k + SIN)
     d2, cos, sin = x * x + y * y, c * x + s * y, s * x - c * y
     cell, skip = np.int64(get(whole, k + CELL)) * 4, np.int64(get(whole, k + HULL))

@@ -1,7 +1,7 @@
 """The innermost step of the baked lidar, in vector instructions of LLVM: a block of beams.
 
-Written out, as what LLVM makes of a plain loop has checks and remainders around it that take as
-long as the loop: a span is two or three blocks long. All indices must be within the arrays.
+Written out, because LLVM surrounds a plain loop with checks and remainder loops that take as long
+as the loop itself: a span is two or three blocks long. All indices must be within the arrays.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numba import types
 from numba.extending import intrinsic
 
 BLOCK = 16
-"""So many beams are fused at once."""
+"""Number of beams fused at once."""
 WHOLE = ir.IntType(32)
 SINGLES = ir.VectorType(ir.FloatType(), BLOCK)
 WHOLES = ir.VectorType(WHOLE, BLOCK)
@@ -21,12 +21,12 @@ INF = float("inf")
 
 
 def _address(context: Any, builder: Any, array: Any, value: Any, index: Any) -> Any:
-    """Of a number in an array, counted from where the array begins."""
+    """Address of an element of an array, by its index from the begin of the array."""
     return builder.gep(context.make_array(array)(context, builder, value).data, [index])
 
 
 def _all(builder: Any, number: Any, kind: Any) -> Any:
-    """A vector that holds one number everywhere."""
+    """Broadcasts one number to a vector."""
     nothing = ir.Constant(kind, ir.Undefined)
     one = builder.insert_element(nothing, number, WHOLE(0))
     return builder.shuffle_vector(one, nothing, ir.Constant(WHOLES, [0] * BLOCK))
@@ -38,7 +38,7 @@ def _blend(builder: Any, one: Any, other: Any, weight: Any) -> Any:
 
 
 def _limited(builder: Any, value: Any, low: Any, high: Any) -> Any:
-    """Too far is `inf`, too close is `-inf`."""
+    """Applies the range limits: too far becomes `inf`, too close `-inf`."""
     nothing, close = (ir.Constant(SINGLES, [end] * BLOCK) for end in (INF, -INF))
     value = builder.select(builder.fcmp_ordered("<=", value, high), value, nothing)
     return builder.select(builder.fcmp_ordered(">=", value, low), value, close)
@@ -50,14 +50,14 @@ def lower_block(typing, ranges, at, rows, points, skip, weights, limits, within)
 
     Args:
         ranges: float32 array.
-        at: index from where it begins, of the first beam of the first block.
+        at: index of the first beam of the first block.
         rows: (R,) float32.
         points: indices of the first point in the near row, of the next one, and of both in the far
             row, for the first block.
         skip: beams before this block.
         weights: float32 of the next points, and of the far row.
         limits: float32 range_min, range_max.
-        within: int32 place of the first beam that is hit, and how many are.
+        within: int32 place of the first beam that is hit, and number of beams hit.
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -109,7 +109,7 @@ def lower_beam(typing, ranges, at, value):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def prefetch(typing, array, index):  # type: ignore[no-untyped-def]
-    """Asks for array[index] to be in the cache soon; the index may be any."""
+    """Prefetches array[index] into the cache; the index may be out of bounds."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         address = _address(context, builder, signature.args[0], args[0], args[1])

@@ -1,9 +1,9 @@
-"""Compiled faults of a lidar: what a real device does to the ranges that it should measure.
+"""Compiled faults of a lidar: deviations of a real device from the exact ranges.
 
-The order is that of the device: skew (the beams look from different poses), geometry (the
-scanner), then what is too close, noise, quantisation and dropouts, by `distort`. The faults of
-one robot are a row (P,) of numbers, so that each robot of a batch may have its own; a fault
-whose numbers are 0 costs nothing and draws nothing.
+The order is that of the device: skew (beams are measured from different poses), geometry (the
+scanner), then returns that are too close, noise, quantisation and dropouts, by `distort`. The
+faults of one robot are a row (P,) of numbers, so that each robot of a batch may have its own; a
+fault whose numbers are 0 takes no time and draws nothing.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from nics_drl_bridge import random_kernels as random
+from nics_drl_bridge.kernels import kernel
 
-# Columns of a row of faults; `faults.LidarFaults` says what they mean.
+# Columns of a row of faults; `faults.LidarFaults` explains them.
 NOISE_STD, NOISE_PROPORTIONAL, DROPOUT, DROPOUT_FAR, TOO_CLOSE, QUANTISATION, SKEW = range(7)
 PARAMETERS = 7
 
@@ -26,19 +26,19 @@ AS_MINUS_INF, AS_RANGE_MIN, AS_NO_RETURN, AS_GHOST = range(4)
 CLOCKWISE, AT_ONCE, COUNTER_CLOCKWISE = -1, 0, 1
 
 ROUNDING = 1e-9
-"""Of a multiple of the quantisation step, in metres."""
+"""Rounding error of a multiple of the quantisation step [m]."""
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-def]
-    """Does to one exact scan what the device does to it.
+    """Applies the faults of the device to one exact scan.
 
     Args:
         ranges: (B,) float32, REP-117, in place [m].
         limits: range_min and range_max [m]; a return stays within them.
         faults: (P,) see the columns above.
         seed: of the random draws.
-        counter: of the scan; the same seed and counter give the same bits in any batch.
+        counter: of the scan; for equal seed and counter the result is bit-identical in any batch.
     """
     if faults[TOO_CLOSE] != AS_MINUS_INF:
         _too_close(ranges, limits, faults[TOO_CLOSE], seed, counter)
@@ -50,7 +50,7 @@ def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-d
         _drop(ranges, limits, faults[DROPOUT], faults[DROPOUT_FAR], seed, counter)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _too_close(ranges, limits, behaviour, seed, counter):  # type: ignore[no-untyped-def]
     count = ranges.shape[0]
     for i in range(count):
@@ -65,7 +65,7 @@ def _too_close(ranges, limits, behaviour, seed, counter):  # type: ignore[no-unt
             ranges[i] = limits[0] + draw * (limits[1] - limits[0])
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _noise(ranges, limits, std, proportional, seed, counter):  # type: ignore[no-untyped-def]
     count = ranges.shape[0]
     for i in range(count):
@@ -75,7 +75,7 @@ def _noise(ranges, limits, std, proportional, seed, counter):  # type: ignore[no
             ranges[i] = min(max(noisy, limits[0]), limits[1])
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _quantise(ranges, limits, step):  # type: ignore[no-untyped-def]
     for i in range(ranges.shape[0]):
         if np.isfinite(ranges[i]):
@@ -87,7 +87,7 @@ def _quantise(ranges, limits, step):  # type: ignore[no-untyped-def]
             ranges[i] = value
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _drop(ranges, limits, share, far, seed, counter):  # type: ignore[no-untyped-def]
     count = ranges.shape[0]
     for i in range(count):
@@ -98,9 +98,9 @@ def _drop(ranges, limits, share, far, seed, counter):  # type: ignore[no-untyped
                 ranges[i] = np.inf
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
-    """The pose `ago` seconds before a pose, at a constant body twist, along the exact arc.
+    """Computes the pose `ago` seconds earlier at a constant body twist, along the exact arc.
 
     Args:
         out: (3,) result; its heading is not wrapped.
@@ -110,7 +110,7 @@ def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
     """
     turn = -twist[2] * ago
     half = 0.5 * turn
-    # The chord of the arc, which points half the turn away: |chord| = arc * sin(half) / half.
+    # The chord of the arc is rotated by half the turn: |chord| = arc * sin(half) / half.
     chord = 1.0 - half * half / 6.0 if abs(half) < 1e-4 else math.sin(half) / half
     c, s = math.cos(pose[2] + half), math.sin(pose[2] + half)
     x, y = -twist[0] * ago * chord, -twist[1] * ago * chord
@@ -119,20 +119,20 @@ def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
     out[2] = pose[2] + turn
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def slice_poses(out, pose, twist, sweep, direction):  # type: ignore[no-untyped-def]
-    """Where the robot was when each of G equal groups of beams was measured.
+    """Computes the poses of the robot at which G equal groups of beams were measured.
 
-    Group g holds the beams from `g * B // G` to `(g + 1) * B // G`; its pose is that of the
-    middle of its time. The sweep ends at `pose`: the newest beam is the last one, or beam 0
-    of a device that turns clockwise.
+    Group g consists of the beams from `g * B // G` to `(g + 1) * B // G`; its pose is that of the
+    middle of its interval. The sweep ends at `pose`: the newest beam is the last one, or beam 0
+    for a device that turns clockwise.
 
     Args:
         out: (G, 3) result; headings are not wrapped.
         pose: (3,) at the end of the sweep.
         twist: (3,) body twist during the sweep.
-        sweep: from the first beam to the last [s].
-        direction: of the column SKEW.
+        sweep: duration from the first beam to the last [s].
+        direction: a value of the column SKEW.
     """
     count = out.shape[0]
     for g in range(count):

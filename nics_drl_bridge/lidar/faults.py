@@ -1,4 +1,4 @@
-"""LidarFaults: what a real device does to its ranges, each fault off by default."""
+"""LidarFaults: the faults of a real device's ranges, each off by default."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ SKEW: dict[Skew, int] = {
 
 
 class LidarFaults(Schema):
-    """The faults of a device, beside the `noise_std` of its LidarSpec.
+    """The faults of a device, in addition to the `noise_std` of its LidarSpec.
 
     They act in this order: skew, geometry, too_close, noise, quantisation, dropout.
 
     Attributes:
-        skew: `none` measures all beams at once; otherwise the device turns this way while the
-            robot moves, and its newest beam is of the time of the scan.
-        too_close: what a return nearer than range_min becomes: `minus_inf` (REP-117), the value
+        skew: `none` measures all beams at once; otherwise the device turns in this direction while
+            the robot moves, and its newest beam is measured at the time of the scan.
+        too_close: report for a return nearer than range_min: `minus_inf` (REP-117), the value
             `range_min`, `no_return`, or a `ghost` anywhere within the limits.
-        noise_proportional: standard deviation per metre of range, on top of noise_std.
+        noise_proportional: standard deviation per metre of range, added to noise_std.
         quantisation: returns are multiples of it [m].
         dropout: probability that a return is lost and reported as no return.
-        dropout_far: added to it in proportion to the square of the range, in full at range_max:
-            less light comes back from afar.
+        dropout_far: added to `dropout` in proportion to the square of the range, in full at
+            range_max: less light returns from afar.
     """
 
     skew: Skew = "none"
@@ -61,7 +61,7 @@ class LidarFaults(Schema):
         return self
 
     def parameters(self, noise_std: float) -> Array:
-        """The row (P,) that the kernels take, see `fault_kernels`."""
+        """Returns the kernels' row (P,), see `fault_kernels`."""
         row = np.zeros(kernels.PARAMETERS)
         row[kernels.NOISE_STD] = noise_std
         row[kernels.NOISE_PROPORTIONAL] = self.noise_proportional
@@ -80,7 +80,7 @@ def distort(
     seed: int,
     counter: int,
 ) -> NDArray[np.float32]:
-    """One exact scan as the device reports it; skew is not part of it.
+    """Returns one exact scan as the device reports it, without skew.
 
     Args:
         ranges: (B,) REP-117 [m].
@@ -90,7 +90,7 @@ def distort(
         counter: of the scan; the next scan takes the next one.
 
     Returns:
-        (B,) a new scan.
+        A new scan (B,).
     """
     out = np.array(ranges, np.float32)
     row = np.asarray(parameters, dtype=np.float64)
@@ -101,14 +101,14 @@ def distort(
 def slice_poses(
     pose: ArrayLike, twist: ArrayLike, sweep_time: float, slices: int, skew: Skew
 ) -> Array:
-    """Where the robot was when each of G equal groups of beams was measured.
+    """Returns the poses of the robot at which G equal groups of beams were measured.
 
     Args:
         pose: (3,) at the end of the sweep.
         twist: (3,) body twist during the sweep.
-        sweep_time: from the first beam to the last [s], see `LidarSpec.sweep_time`.
+        sweep_time: duration from the first beam to the last [s], see `LidarSpec.sweep_time`.
         slices: G.
-        skew: which way the device turns.
+        skew: direction in which the device turns.
 
     Returns:
         (G, 3) poses in the order of the beams.
@@ -121,23 +121,23 @@ def slice_poses(
 
 
 def slice_edges(beams: int, slices: int) -> NDArray[np.int64]:
-    """(G + 1,) first beam of each of G slices, and B."""
+    """Returns the first beam of each of G slices, and B (G + 1,)."""
     return np.arange(slices + 1, dtype=np.int64) * beams // slices
 
 
 def scan_skewed(
     render: Callable[[Array], NDArray[np.float32]], poses: Array
 ) -> NDArray[np.float32]:
-    """A scan whose groups of beams were measured from different poses.
+    """Returns a scan whose groups of beams are measured from different poses.
 
-    It renders each pose in full: a reference, not the fast way.
+    Each pose is rendered in full: a slow reference.
 
     Args:
-        render: the scan (B,) from a pose (3,).
+        render: returns the scan (B,) from a pose (3,).
         poses: (G, 3) of `slice_poses`.
 
     Returns:
-        (B,) of each slice the beams that belong to it.
+        The scan (B,), each beam from the pose of its slice.
     """
     scans = [render(pose) for pose in poses]
     edges = slice_edges(len(scans[0]), len(poses))

@@ -1,7 +1,7 @@
-"""Compiled inner loops of the baked lidar: the rows that were looked up are fused (Eq. 4).
+"""Compiled inner loops of the baked lidar: fusion of the rows that were looked up (Eq. 4).
 
-Two rows, of the grid distances on both sides of the true one, are blended, and in each the two
-points on both sides of a beam. Which beams hit follows from the true silhouette, not from a row:
+The two rows at the grid distances on either side of the true one are blended, and in each the two
+points on either side of a beam. The beams that hit follow from the true silhouette, not from a row:
 a silhouette on the wrong side of a beam is by far the largest error of a plain look-up.
 """
 
@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.baked_kernels import (
     ACROSS,
     ACROSS2,
@@ -45,17 +45,17 @@ from nics_drl_bridge.lidar.baked_kernels import (
     silhouettes,
 )
 from nics_drl_bridge.lidar.block_kernels import BLOCK, lower_beam, lower_block, prefetch
-from nics_drl_bridge.lidar.map_memory_kernels import get, peek, put
+from nics_drl_bridge.lidar.map_kernels import get, peek, put
 
 SOON = 8
-"""The rows of the body so many places on are asked for."""
+"""Prefetch distance: the rows of the body this many lanes ahead are prefetched."""
 ABOVE_ZERO = 2.0**24
-"""Added before a number is cut to a whole one, so that it is rounded down."""
+"""Added before truncation to an integer, so that numbers are rounded down."""
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def spans(padded, beams, wide, single):  # type: ignore[no-untyped-def]
-    """Sixth pass: bearing and both silhouettes in beams, the right one within the first turn."""
+    """Sixth pass: bearing and both silhouettes in beams, the right one in the first turn."""
     per_beam = 1.0 / beams[1]
     turn = 2.0 * math.pi * per_beam
     per_turn = 1.0 / turn
@@ -71,17 +71,17 @@ def spans(padded, beams, wide, single):  # type: ignore[no-untyped-def]
         put(wide, k + LEFT, middle + high)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+@kernel(contracts=True, inline=True)
 def aim(k, count, shift, wide, single, whole):  # type: ignore[no-untyped-def]
-    """Seventh pass, of one body: which beams are hit, and where in `rows` their points begin.
+    """Seventh pass, for one body: the beams that are hit, and the indices of their points.
 
-    The span is fused in whole blocks, two at least: most need no more, and to guess how many
-    blocks there are would fail at every other body. Where they would reach beyond the last of
-    `count` beams, they begin so many beams sooner, `BACK`.
+    The span is fused in whole blocks, at least two: most need no more, and a varying number of
+    blocks would mean a branch misprediction for every other body. Where the blocks would extend
+    beyond the last of `count` beams, they begin `BACK` beams earlier.
     """
     zero, one, block = np.int32(0), np.int32(1), np.int32(BLOCK)
     first, last, middle = get(wide, k + RIGHT), get(wide, k + LEFT), get(wide, k + MIDDLE)
-    begin = np.int32(first)  # to convert is faster than to round up or down
+    begin = np.int32(first)  # conversion is faster than rounding up or down
     begin = np.int32(max(np.int32(begin + np.int32(first > begin)), zero))
     hits = np.int32(min(np.int32(last), np.int32(count - one)) - begin + one)
     phases = np.int32(one << shift)
@@ -109,16 +109,16 @@ def aim(k, count, shift, wide, single, whole):  # type: ignore[no-untyped-def]
     put(whole, k + FAR2, np.int32(far - phase * width2 + one if last_phase else far + width2))
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def aims(padded, count, shift, wide, single, whole):  # type: ignore[no-untyped-def]
     """Seventh pass, see `aim`."""
     for k in range(padded):
         aim(k, count, shift, wide, single, whole)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"}, forceinline=True)
+@kernel(contracts=True, inline=True)
 def lower(ranges, k, limits, rows, wide, single, whole):  # type: ignore[no-untyped-def]
-    """Last pass, of one body: lowers the beams of its span to the blended rows of its cell."""
+    """Last pass, for one body: lowers the beams of its span to the blended rows of its cell."""
     begin, hits, back = get(whole, k + BEGIN), get(whole, k + HITS), get(whole, k + BACK)
     near, near2 = np.int64(get(whole, k + NEAR)), np.int64(get(whole, k + NEAR2))
     far, far2 = np.int64(get(whole, k + FAR)), np.int64(get(whole, k + FAR2))
@@ -133,7 +133,7 @@ def lower(ranges, k, limits, rows, wide, single, whole):  # type: ignore[no-unty
         lower_block(ranges, at, rows, points, BLOCK, weights, limits, (back, hits))
         for j in range(2 * BLOCK, hits, BLOCK):
             lower_block(ranges, at, rows, points, j, weights, limits, (back, hits))
-    else:  # no block fits: few beams, or a span at the last ones and the table's first row
+    else:  # no block fits: few beams, or a span at the last beams and the table's first row
         for j in range(back, back + hits):
             value, other = peek(rows, near + j), peek(rows, far + j)
             value += weights[0] * (peek(rows, near2 + j) - value)
@@ -144,9 +144,9 @@ def lower(ranges, k, limits, rows, wide, single, whole):  # type: ignore[no-unty
             lower_beam(ranges, at + j, value)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+@kernel(contracts=True)
 def fuse(found, ranges, beams, limits, rows, shift, wide, single, whole):  # type: ignore[no-untyped-def]
-    """Last pass: all spans, and once more those over the seam of the turn."""
+    """Last pass: all spans, and a second time those across the seam of the turn."""
     turn, count = 2.0 * math.pi / beams[1], np.int32(ranges.shape[2])
     within = np.float32(limits[0]), np.float32(limits[1])
     for k in range(found):
@@ -164,12 +164,12 @@ def fuse(found, ranges, beams, limits, rows, shift, wide, single, whole):  # typ
             lower(ranges, k, within, rows, wide, single, whole)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def look_up(found, ranges, beams, limits, lookup, room):  # type: ignore[no-untyped-def]
     """All passes after the first: fuses the bodies on the lanes into their scans.
 
     Args:
-        found: how many lanes are taken.
+        found: number of lanes in use.
         ranges: (N, M, B) in place.
         beams, limits, lookup: see `scanner.Scanner.arguments`.
         room: see `scanner.Scanner.room`.

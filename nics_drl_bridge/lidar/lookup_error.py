@@ -1,4 +1,4 @@
-"""At which distances a shape may be looked up: what the renderer `auto` decides by."""
+"""Distances at which a shape may be looked up, measured for the renderer `auto`."""
 
 from __future__ import annotations
 
@@ -12,20 +12,19 @@ from nics_drl_bridge.lidar.shapes import place
 
 Array = NDArray[np.float64]
 RINGS, PLACES, BANDS, SEED = 13, 256, 8, 0
-"""Rings around the lidar that a shape is put into, times in each, and bands of range that the
-errors are sorted into: both grow by the same factor from one to the next."""
+"""Rings around the lidar in which a shape is placed, placements in each, and bands of range into
+which the errors are sorted; rings and bands grow geometrically. Last, the seed."""
 TOUCHING = 1e-3
-"""The nearest ring ends this far from the shape's circle, in parts of the lidar's range."""
+"""Outer distance of the nearest ring from the shape's circle, as a share of the lidar's range."""
 OUTLIER = 0.3
-"""No beam may be found that is off by more than this [m]."""
+"""Greatest allowed error of any beam [m]."""
 DEVIATIONS = 2.0
-"""A squared error may be so many of its standard deviations greater than what was found: rare beams
-make most of it."""
+"""Safety margin on the measured squared error, in standard deviations: rare beams dominate it."""
 SLANT = np.radians(1.5)
-"""So nearly along an edge the lidar looks where outliers are looked for [rad]."""
+"""Greatest angle between line of sight and an edge in the search for outliers [rad]."""
 NARROWEST = 0.1
-"""A stretch of distances narrower than this part of the lidar's range is not looked up over: few
-places in it say too little."""
+"""Least width of an interval of distances that is looked up, as a share of the lidar's range:
+narrower ones have too few samples."""
 NO_WALLS = np.zeros((0, 4))
 
 
@@ -37,25 +36,25 @@ def lookup_distances(
     radius: float,
     greatest: float,
 ) -> tuple[float, float]:
-    """The distances between which looking a shape up has an RMSE of no more than `greatest`.
+    """Finds the distances between which looking up a shape has an RMSE of at most `greatest`.
 
-    That is so in each ring of distances between them, and in each band of ranges over all these
-    rings, and no beam is off by more than `OUTLIER`: long thin shapes err where they are near and
-    seen at a slant, and what is far errs where a beam grazes it, which an error over all the
-    lidar's range hides. Only beams count that return when looked up and in truth: which beams hit
-    follows from the silhouette, and is exact. Where the shape stands is the same for all shapes.
+    This is required in each ring of distances between them and in each band of ranges over all
+    these rings, and no beam may be off by more than `OUTLIER`: long thin shapes err when near and
+    seen at a slant, and distant ones where a beam grazes them, which an error over the whole range
+    would hide. Only beams with a return both in the look-up and in the exact scan count: the beams
+    that hit follow from the silhouette, which is exact. Placements are the same for all shapes.
 
     Args:
         exact: `Scanner.arguments` of that renderer.
-        baked: the same of this one.
+        baked: `Scanner.arguments` of the renderer `baked`.
         room: see `scanner.Scanner.room`.
         shape: its index in the table.
         radius: of the shape [m].
         greatest: RMSE [m].
 
     Returns:
-        Least and greatest distance from the lidar to the shape's origin [m]; the least is inf if it
-        may not be looked up.
+        Least and greatest distance from the lidar to the shape's origin [m]; both inf if it may not
+        be looked up.
     """
     (low, high), (corners, corner) = exact[3], exact[5]
     outline = corners[corner[shape] : corner[shape + 1]]
@@ -79,7 +78,7 @@ def lookup_distances(
 
 
 def _widest(rings: Array, squares: Array, counts: Array, greatest: Array) -> tuple[float, float]:
-    """The edges of the widest stretch of rings in which all errors are small, if it is wide."""
+    """Edges of the widest interval of rings in which all errors are small, or inf if too narrow."""
     best, width = (np.inf, np.inf), NARROWEST * (rings[-1] - rings[0])
     for i in range(RINGS):
         for j in range(i + 1, RINGS + 1):
@@ -90,12 +89,12 @@ def _widest(rings: Array, squares: Array, counts: Array, greatest: Array) -> tup
 
 
 def _small(squares: Array, counts: Array, greatest: float) -> bool:
-    """Whether an RMSE is small in each ring and in each band, beyond what chance has in it.
+    """True if the RMSE is small in each ring and in each band, with a margin for chance.
 
     Args:
         squares: (R, P, B) sums of squared errors of R rings, P places in each and B bands.
-        counts: (R, P, B) of how many beams.
-        greatest: RMSE.
+        counts: (R, P, B) numbers of beams.
+        greatest: RMSE [m].
     """
     rings = squares.sum(axis=2), counts.sum(axis=2)
     bands = squares.reshape(-1, BANDS).T, counts.reshape(-1, BANDS).T
@@ -111,7 +110,7 @@ def _small(squares: Array, counts: Array, greatest: float) -> bool:
 def _scans(
     bodies: Array, exact: tuple[Any, ...], baked: tuple[Any, ...], room: tuple[NDArray[Any], ...]
 ) -> tuple[Array, Array]:
-    """(P, B) ranges to one body (P, 1, 7) in each of P places: computed, and looked up."""
+    """Ranges (P, B) to one body (P, 1, 7) in each of P places: exact, and looked up."""
     mount, directions = exact[0], exact[1]
     robots = np.tile([-mount[0], -mount[1], 0.0], (PLACES, 1, 1))  # the lidar is at the origin
     scans = np.empty((2, PLACES, 1, len(directions)), np.float32)
@@ -123,7 +122,7 @@ def _scans(
 
 
 def _around(exact: tuple[Any, ...], between: Array, seed: int) -> Array:
-    """(PLACES, 3) poses of a body in the view of the lidar, between two distances."""
+    """Draws poses (PLACES, 3) of a body in the lidar's field of view, between two distances."""
     rng, (mount, _, beams) = np.random.default_rng(seed), exact[:3]
     distance = rng.uniform(between[0], between[1], PLACES)
     bearing = mount[2] + beams[0] + rng.uniform(0.0, beams[1] * beams[3], PLACES)
@@ -132,10 +131,10 @@ def _around(exact: tuple[Any, ...], between: Array, seed: int) -> Array:
 
 
 def _slanted(poses: Array, outline: Array, seed: int) -> Array:
-    """Poses at which the lidar, at the origin, is nearly on the line of an edge.
+    """Draws poses at which the lidar, at the origin, is nearly on the line of an edge.
 
-    There a beam may run along the edge, and a look-up be off by its length: too rarely to be found
-    among any poses, and too much to be left out.
+    There a beam may run along the edge, and a look-up be off by its length: too rare to occur among
+    random poses, and too large to be ignored.
     """
     rng = np.random.default_rng(seed)
     along = np.roll(outline, -1, axis=0) - outline

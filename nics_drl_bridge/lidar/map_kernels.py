@@ -1,45 +1,56 @@
 """Compiled inner loops of static maps: the ranges of one scan in a grid of solid squares.
 
-Both ways below find the same ranges. `ray` walks from cell to cell in float64 (Amanatides and
+Both methods below find the same ranges. `ray` walks from cell to cell in float64 (Amanatides and
 Woo, 1987). `map_into` jumps over free squares: for each free cell and each of the four quadrants
 of directions, the bake stores the side of the largest free square that begins at the cell and
 opens towards the quadrant (an anisotropic chessboard distance; Sramek and Kaufman, 2000). A beam
-that stays within its quadrant can't leave the square other than through its two far sides, and
-these lie on the lines of the grid. So a jump ends where a walk would have come, and no range is
-blended or rounded to a cell.
+within its quadrant can only leave the square through its two far sides, which lie on grid lines.
+So a jump ends where a walk would, and no range is blended or rounded to a cell.
 
-`map_into` moves `LANES` beams at once in float32 and relative to the cell of the lidar: ranges are
-right to 3e-7 of themselves. A beam that passes the corner of a cell within 1e-6 of a cell may
-be taken to pass on its other side.
+`map_into` moves `LANES` beams at once in float32 and relative to the cell of the lidar: the
+relative error of a range is at most 3e-7. A beam that passes the corner of a cell within 1e-6 of a
+cell may pass on its other side.
 
-`map_arrays`, of `maps.GridMap.arrays`: squares (rows + 2, columns + 2) uint32, one byte per
-quadrant, 0 in cells that stop a beam and in the frame of one cell around the map; frame (5,):
+`map_arrays`, of `maps_grid.GridMap.arrays`: squares (rows + 2, columns + 2) uint32, one byte per
+quadrant, 0 in cells that stop a beam and in the border of one cell around the map; frame (5,):
 x, y [m], cosine and sine of the origin in the world, resolution [m].
+
+Reads and writes that declare to LLVM that lanes never overlap the map.
+
+The map is any array that is only read: a grid map, or a lidar table. With plain indexing, LLVM must
+assume that writing to a lane may change the map that another lane is about to read, and does not
+vectorise the loops over lanes in `map_kernels` and `baked_kernels`. The instructions carry scoped
+alias metadata: reads of the map belong to one scope, and accesses to lanes declare that they are
+not in it. All indices must be within the array and not negative.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
-from nics_drl_bridge.lidar.map_memory_kernels import get, peek, put
+from nics_drl_bridge.kernels import kernel
 
 LANES = 48
-"""Beams that move together: some vector registers wide, to hide the latency of the look-ups."""
+"""Beams that move together: several vector registers wide, to hide the latency of the look-ups."""
 LONGEST = 255
-"""Side of the largest square that a byte holds [cells]."""
+"""Side of the largest square that fits in a byte [cells]."""
 FLOATS, INTS = 7, 6
 PARALLEL = np.float32(1e-12)
-"""Least component of a direction: the inverse stays finite."""
+"""Least component of a direction: its inverse stays finite."""
 SLACK = 1.0 + 1e-6
 """A return at exactly range_max must not be lost to rounding; `finish` decides."""
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def free_squares(blocked):  # type: ignore[no-untyped-def]
-    """The bake: squares (rows + 2, columns + 2) of a map (rows, columns), see the module."""
+    """Bakes the squares (rows + 2, columns + 2) of a map (rows, columns), see the module."""
     rows, columns = blocked.shape
     side = np.zeros((rows + 2, columns + 2), np.int32)
     squares = np.zeros((rows + 2, columns + 2), np.uint32)
@@ -59,29 +70,29 @@ def free_squares(blocked):  # type: ignore[no-untyped-def]
     return squares
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def _line(at, step, cell):  # type: ignore[no-untyped-def]
-    """Cells along a beam to where it leaves `cell`, along one axis."""
+    """Distance along a beam to where it leaves `cell` along one axis [cells]."""
     if step == 0.0:
         return np.inf
     return (cell + (1 if step > 0.0 else 0) - at) / step
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def _entry(at, step, size):  # type: ignore[no-untyped-def]
-    """Cells along a beam to where it comes into and goes out of [0, size], along one axis."""
+    """Distances along a beam to where it enters and leaves [0, size] along one axis [cells]."""
     if step == 0.0:
         return (-np.inf, np.inf) if 0.0 <= at < size else (np.inf, -np.inf)
     one, other = -at / step, (size - at) / step
     return min(one, other), max(one, other)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def ray(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
     """Exact distance [cells] from (u, v) to the boundary of the solid cells, `inf` beyond `limit`.
 
-    From a free place it is where the beam comes into a solid cell, from a place in a solid cell
-    where it comes out again. What is outside the map is free.
+    From a free place this is where the beam enters a solid cell, from within a solid cell where it
+    leaves it. Everything outside the map is free.
     """
     rows, columns = squares.shape[0] - 2, squares.shape[1] - 2
     x, y, t = math.floor(u), math.floor(v), 0.0
@@ -114,16 +125,16 @@ def ray(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
             return t
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def to_grid(sx, sy, c, s, frame):  # type: ignore[no-untyped-def]
-    """Place [cells] and cosine, sine of the lidar in the grid."""
+    """Returns position [cells] and cosine, sine of the lidar in the grid."""
     dx, dy = sx - frame[0], sy - frame[1]
     u = (frame[2] * dx + frame[3] * dy) / frame[4]
     v = (frame[2] * dy - frame[3] * dx) / frame[4]
     return u, v, c * frame[2] + s * frame[3], s * frame[2] - c * frame[3]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def exact_map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays, room):  # type: ignore[no-untyped-def]
     """Fuses a map into a scan (B,) from (sx, sy, c, s), cell by cell in float64; see `ray`."""
     squares, frame = map_arrays
@@ -139,17 +150,17 @@ def exact_map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays, 
             out[i] = value
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays, room):  # type: ignore[no-untyped-def]
     """Fuses a map into a scan (B,) float32 from (sx, sy, c, s), by jumps; see the module.
 
     Args:
         out: (B,) ranges [m]; each becomes the lesser of itself and the range to the map.
         directions: (B, 2) cosine and sine of each beam, in the frame of the lidar.
-        beams: see `kernels`; here for the family's sake.
-        sx, sy: place of the lidar in the world [m].
+        beams: see `kernels`; unused, for a uniform signature.
+        sx, sy: position of the lidar in the world [m].
         c, s: cosine and sine of its heading.
-        range_max: farther is not looked [m].
+        range_max: end of the search [m].
         map_arrays: see the module; arrays of size 0 are no map.
         room: see `scanner.Scanner.room`.
     """
@@ -175,13 +186,13 @@ def map_into(out, directions, beams, sx, sy, c, s, range_max, map_arrays, room):
         _finish(out[first:last], floats, ints, x, y, columns - 2, rows - 2, limit, frame[4])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def _start(floats, ints, directions, u, v, c, s, columns):  # type: ignore[no-untyped-def]
-    """Puts beams into the lanes, each mirrored so that it goes right and up.
+    """Puts beams into the lanes, each mirrored so that it points right and up.
 
-    `floats` holds LANES times each of: direction x, y, its inverses, place in the cell of the
-    lidar x, y, and distance [cells]. `ints`: column and row from the lidar, what one column and
-    one row add to the index of a cell, the quadrant's bits, and whether the lane still goes.
+    `floats` has LANES places for each of: direction x, y, its inverses, position in the cell of the
+    lidar x, y, and distance [cells]. `ints`: column and row relative to the lidar, index increments
+    of one column and one row, the quadrant's bit shift, and 1 while the lane is moving.
     """
     c, s, u, v = np.float32(c), np.float32(s), np.float32(u), np.float32(v)
     one, none = np.float32(1.0), np.float32(0.0)
@@ -213,9 +224,9 @@ def _start(floats, ints, directions, u, v, c, s, columns):  # type: ignore[no-un
             ints[n * LANES + k] = ints[n * LANES + count - 1]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def _jump(floats, ints, flat, here, limit):  # type: ignore[no-untyped-def]
-    """Moves each lane to the end of the free square that it is in; whether any moved."""
+    """Moves each lane to the end of its free square; True if any moved."""
     here = np.int32(here)
     for k in range(LANES):
         x, y = get(ints, k), get(ints, LANES + k)
@@ -232,7 +243,7 @@ def _jump(floats, ints, flat, here, limit):  # type: ignore[no-untyped-def]
         y_line = (np.float32(y_side) - v) * get(floats, 3 * LANES + k)
         sideways = x_line < y_line
         ahead = x_line if sideways else y_line
-        # Never back across a line: rounding might move a lane to and fro for ever.
+        # Never back across a line: rounding might move a lane back and forth forever.
         x_new = max(np.int32(u + get(floats, k) * ahead), x)
         y_new = max(np.int32(v + get(floats, LANES + k) * ahead), y)
         goes = (side > np.int32(0)) & (t < limit)
@@ -246,9 +257,9 @@ def _jump(floats, ints, flat, here, limit):  # type: ignore[no-untyped-def]
     return moved > 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel(allocates=True)
 def _finish(out, floats, ints, x, y, columns, rows, limit, resolution):  # type: ignore[no-untyped-def]
-    """Fuses the lanes that ended at a solid cell, not in the frame around the map."""
+    """Fuses the lanes that ended at a solid cell, not in the border around the map."""
     x, y, columns, rows = np.int32(x), np.int32(y), np.int32(columns), np.int32(rows)
     resolution = np.float32(resolution)
     for k in range(out.shape[0]):
@@ -258,3 +269,51 @@ def _finish(out, floats, ints, x, y, columns, rows, limit, resolution):  # type:
         t = floats[6 * LANES + k]
         value = resolution * t if hit & (t < limit) else np.float32(np.inf)
         out[k] = min(out[k], value)
+
+
+def _scope(builder: Any) -> Any:
+    """Returns the alias scope of the map, as metadata of the module being compiled."""
+    module = builder.module
+    domain = module.add_metadata([ir.MetaDataString(module, "nics.map.domain")])
+    scope = module.add_metadata([ir.MetaDataString(module, "nics.map"), domain])
+    return module.add_metadata([scope])
+
+
+def _address(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    array = context.make_array(signature.args[0])(context, builder, args[0])
+    return builder.gep(array.data, [args[1]])
+
+
+def _load(belonging: str) -> Callable[..., Any]:
+    """Returns a function that generates a read; `belonging` is its relation to the map's scope."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        value = builder.load(_address(context, builder, signature, args))
+        value.set_metadata(belonging, _scope(builder))
+        return value
+
+    return generate
+
+
+@intrinsic
+def peek(typing, array, index):  # type: ignore[no-untyped-def]
+    """Reads array[index] of the map (C-contiguous, 1-d), which is not written meanwhile."""
+    return array.dtype(array, types.int64), _load("alias.scope")
+
+
+@intrinsic
+def get(typing, array, index):  # type: ignore[no-untyped-def]
+    """Reads array[index] of lanes (C-contiguous, 1-d), which do not overlap the map."""
+    return array.dtype(array, types.int64), _load("noalias")
+
+
+@intrinsic
+def put(typing, array, index, value):  # type: ignore[no-untyped-def]
+    """Sets array[index] = value in lanes (C-contiguous, 1-d), which do not overlap the map."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        store = builder.store(args[2], _address(context, builder, signature, args))
+        store.set_metadata("noalias", _scope(builder))
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, array.dtype), generate

@@ -1,44 +1,150 @@
-"""Static maps from files, as Nav2's map_server reads them."""
+"""GridMap: a static map of square cells, with the queries of lidar and simulator.
+
+Static maps from files, as Nav2's map_server reads them.
+"""
 
 from __future__ import annotations
 
 import struct
 import warnings
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from pydantic import Field, field_validator, model_validator
+from scipy import ndimage
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError, nearest
-from nics_drl_bridge.lidar.maps_grid import FREE, NO_MAP, OCCUPIED, UNKNOWN, GridMap
+from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.shapes import Coordinate, Heading
+
+FREE, OCCUPIED, UNKNOWN = 0, 100, -1
+NO_MAP: tuple[NDArray[Any], NDArray[Any]] = (np.zeros((0, 0), np.uint32), np.zeros(0))
+"""Argument of the kernels without a map."""
+
+
+@dataclass(frozen=True, eq=False)
+class GridMap:
+    """A static map. Cells are solid squares or free; everything outside is free.
+
+    Attributes:
+        cells: (rows, columns) int8 as in `nav_msgs/OccupancyGrid`: 0 free, 100 occupied, -1
+            unknown, else probability of occupancy [%]. Row 0 has the lowest y of the map and is the
+            last row of its image.
+        resolution: side of a cell [m].
+        origin: x [m], y [m], heading [rad] of the outer corner of cell (0, 0) in the world.
+        unknown_stops: whether cells that are neither free nor occupied stop a beam.
+        occupied_from: least value of occupied cells; 100 as in Nav2's static layer.
+    """
+
+    cells: NDArray[np.int8]
+    resolution: float
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    unknown_stops: bool = False
+    occupied_from: int = OCCUPIED
+
+    @cached_property
+    def free(self) -> NDArray[np.bool_]:
+        """(rows, columns) cells that are known to be free."""
+        return np.asarray(self.cells == FREE)
+
+    @cached_property
+    def blocked(self) -> NDArray[np.bool_]:
+        """(rows, columns) cells that stop a beam."""
+        occupied = self.cells >= self.occupied_from
+        return np.asarray(~self.free if self.unknown_stops else occupied)
+
+    @cached_property
+    def arrays(self) -> tuple[NDArray[np.uint32], NDArray[np.float64]]:
+        """The argument `map_arrays` of `map_kernels`; baked on first use."""
+        x, y, heading = self.origin
+        frame = np.array([x, y, np.cos(heading), np.sin(heading), self.resolution])
+        return map_kernels.free_squares(self.blocked), frame
+
+    def world_to_cell(self, points: ArrayLike) -> NDArray[np.int64]:
+        """Returns row and column (..., 2) of points (..., 2) x, y [m]; may be outside the map."""
+        x, y, heading = self.origin
+        d = np.asarray(points, dtype=np.float64) - (x, y)
+        c, s = np.cos(heading), np.sin(heading)
+        place = np.stack([c * d[..., 1] - s * d[..., 0], c * d[..., 0] + s * d[..., 1]], axis=-1)
+        return np.floor(place / self.resolution).astype(np.int64)
+
+    def cell_to_world(self, cells: ArrayLike) -> NDArray[np.float64]:
+        """Returns the centres (..., 2) x, y [m] of cells (..., 2) row, column."""
+        x, y, heading = self.origin
+        place = (np.asarray(cells, dtype=np.float64) + 0.5) * self.resolution
+        c, s = np.cos(heading), np.sin(heading)
+        across, up = place[..., 1], place[..., 0]
+        return np.stack([x + c * across - s * up, y + s * across + c * up], axis=-1)
+
+    @cached_property
+    def distance_field(self) -> NDArray[np.float32]:
+        """(rows, columns) distance from each cell's centre to the nearest blocked square [m].
+
+        Exact, 0 in blocked cells and `inf` if nothing is blocked. A disc around the centre touches
+        nothing if its radius is less. Off the centres the distance differs by at most the offset.
+        """
+        if not self.blocked.any():
+            return np.full(self.cells.shape, np.inf, np.float32)
+        rows, columns = self.cells.shape
+        # At half the cell size, centres and corners are points of one lattice, and the point of a
+        # square nearest to a lattice point is one too.
+        clear = np.ones((2 * rows + 1, 2 * columns + 1), bool)
+        at, to = np.nonzero(self.blocked)
+        for down in range(3):
+            for right in range(3):
+                clear[2 * at + down, 2 * to + right] = False
+        steps = ndimage.distance_transform_edt(clear)[1::2, 1::2]
+        return np.asarray(steps * (self.resolution / 2.0), dtype=np.float32)
+
+    def reachable(self, start: ArrayLike, radius: float) -> NDArray[np.bool_]:
+        """Finds the cells whose centres a disc can reach from a start through free cells.
+
+        It moves between the centres of neighbouring cells (four each) and stays in the map.
+
+        Args:
+            start: (2,) x, y [m].
+            radius: of the disc [m].
+
+        Returns:
+            (rows, columns), all False if the disc does not fit at the cell of the start.
+        """
+        fits = self.free & (self.distance_field > radius)
+        row, column = self.world_to_cell(start)
+        inside = 0 <= row < fits.shape[0] and 0 <= column < fits.shape[1]
+        if not inside or not fits[row, column]:
+            return np.zeros_like(fits)
+        labels, _ = ndimage.label(fits)
+        return np.asarray(labels == labels[row, column])
+
 
 __all__ = ["FREE", "NO_MAP", "OCCUPIED", "UNKNOWN", "GridMap", "MapFile", "load_map"]
 
 MAX_CELLS = 64_000_000
 MAX_BYTES = 4 * MAX_CELLS + 2**20
-"""Of an image; what is longer is none, and not opened."""
+"""Greatest size of an image file; larger files are not opened."""
 FORMATS = {"PPM": (".pgm", ".pnm", ".ppm", ".pbm"), "PNG": (".png",), "BMP": (".bmp",)}
 LUMA = np.array([0.212656, 0.715158, 0.072186])
-"""Brightness of red, green, blue (Rec. 709), as ImageMagick weighs them for Nav2."""
+"""Luma weights of red, green, blue (Rec. 709), as used by ImageMagick for Nav2."""
 
 
 class MapFile(Schema):
     """The keys of a map's YAML file, those of Nav2's map_server.
 
     Attributes:
-        image: its path, absolute or from the folder of the YAML file.
+        image: its path, absolute or relative to the folder of the YAML file.
         resolution: side of a pixel [m].
         origin: x [m], y [m], heading [rad] of the lower left corner of the image in the world.
         negate: 0 or 1; whether white is occupied, rather than black.
-        occupied_thresh: pixels at least this dark, of 1, are occupied.
-        free_thresh: pixels at most this dark are free.
-        mode: `trinary`: free, occupied, else unknown. `scale`: what lies between the thresholds
-            becomes 0 to 100 %. `raw`: pixels of 0 to 100 are the percentage itself.
+        occupied_thresh: pixels of at least this darkness, from 0 to 1, are occupied.
+        free_thresh: pixels of at most this darkness are free.
+        mode: `trinary`: free, occupied, else unknown. `scale`: pixels between the thresholds
+            become 0 to 100 %. `raw`: pixels from 0 to 100 are the percentage itself.
     """
 
     image: str = Field(min_length=1)
@@ -67,13 +173,13 @@ class MapFile(Schema):
 def load_map(
     name: str | Path, unknown_stops: bool = False, occupied_from: int = OCCUPIED
 ) -> GridMap:
-    """Loads a shipped map by name (`room`), or any by the path of its YAML file.
+    """Loads a shipped map by name (`room`), or any other by the path of its YAML file.
 
-    Cells come out as those of Nav2's map_server: thresholds belong to what they name, colours
-    count by their brightness (Rec. 709) in 256 steps, and pixels that are not opaque are unknown
-    unless the mode is `raw`. (Older releases of Nav2 average red, green, blue, and alpha into
-    the darkness, and leave pixels exactly on a threshold unknown; grey maps without alpha differ in
-    the latter only.)
+    Cells equal those of Nav2's map_server: pixels exactly on a threshold are occupied or free,
+    colours count by their brightness (Rec. 709) in 256 steps, and pixels that are not opaque are
+    unknown unless the mode is `raw`. (Older releases of Nav2 average red, green, blue, and alpha
+    into the darkness, and leave pixels exactly on a threshold unknown; grey maps without alpha
+    differ in the latter only.)
 
     Args:
         name: of the map, or path.
@@ -84,7 +190,7 @@ def load_map(
         The map.
 
     Raises:
-        ConfigError: the YAML file or the image is missing, wrong or too large.
+        ConfigError: the YAML file or the image is missing, invalid or too large.
     """
     path = find_config(name, "maps")
     file = load_yaml(path, MapFile)
@@ -96,16 +202,16 @@ def load_map(
 def cells_of(
     grey: NDArray[np.uint8], opaque: NDArray[np.bool_] | None, file: MapFile
 ) -> NDArray[np.int8]:
-    """Cells of an image (rows, columns), in its own order of rows.
+    """Returns the cells of an image (rows, columns), in the image's order of rows.
 
     Args:
         grey: brightness of each pixel.
-        opaque: whether each is; None when the image has no alpha channel.
+        opaque: True for opaque pixels; None if the image has no alpha channel.
         file: thresholds and mode.
     """
     if file.mode == "raw":
         return np.where(grey <= OCCUPIED, grey, UNKNOWN).astype(np.int8)
-    # In float32, as Nav2 compares: 0.6 and the pixel 102 are equal there.
+    # In float32, as in Nav2: 0.6 and the pixel 102 are equal there.
     bright = grey.astype(np.float32) / np.float32(255.0)
     dark = bright if file.negate else np.float32(1.0) - bright
     low, high = np.float32(file.free_thresh), np.float32(file.occupied_thresh)
@@ -121,11 +227,11 @@ def cells_of(
 
 
 def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """Brightness (rows, columns) of an image and, if it has an alpha channel, what is opaque.
+    """Reads brightness (rows, columns) of an image and, if it has an alpha channel, its opacity.
 
     Args:
         path: of a PGM (binary or plain, 8 or 16 bit), PNG or BMP file.
-        source: the YAML file's name, for errors.
+        source: name of the YAML file, for error messages.
 
     Raises:
         ConfigError: it is missing, not such an image, damaged or too large.
@@ -165,7 +271,7 @@ def _check_size(size: tuple[int, int], path: Path) -> None:
 
 
 def _pixels(image: Image.Image) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    if image.mode in ("I", "F") or image.mode.startswith("I;"):  # 16 bit, of 65535
+    if image.mode in ("I", "F") or image.mode.startswith("I;"):  # 16 bit, up to 65535
         grey = np.asarray(image).astype(np.float64) / 257.0
         return np.floor(grey + 0.5).astype(np.uint8), None
     if image.mode in ("1", "L") and not image.has_transparency_data:

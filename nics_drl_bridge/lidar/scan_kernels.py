@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import baked_kernels as baking
-from nics_drl_bridge.lidar import fuse_kernels, kernels, map_kernels
+from nics_drl_bridge.lidar import exact_kernels, fuse_kernels, map_kernels
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # type: ignore[no-untyped-def]
-    """Scans of the robots of some worlds.
+    """Scans from the robots of some worlds.
 
-    Bodies that are looked up wait on the lanes until these are full, while the next scans begin:
-    the minimum does not mind in which order. All arrays are taken out of their tuples once, here:
-    to do so for each scan took as long as the look-ups.
+    Bodies to be looked up are collected in the lanes until these are full, across scans: the
+    minimum does not depend on the order. All arrays are unpacked from their tuples once, here:
+    doing so for each scan took as long as the look-ups.
 
     Args:
-        ranges: (N, M, B) result, whose beams stand one after the other.
+        ranges: (N, M, B) result, with contiguous beams.
         poses: (N, M, 3) of `base_link` in the world.
-        chosen: (n,) which worlds.
+        chosen: (n,) indices of the worlds.
         bodies: (N, K, 7), see `shapes.BODY`.
-        first: the body that robot 0 is, the others follow; -1 when robots are no bodies.
+        first: index of the body of robot 0, the others follow; -1 if robots are not bodies.
         walls: (W, 4) x1, y1, x2, y2 [m], the same in every world.
         sensor: see `scanner.Scanner.arguments`.
         room: see `scanner.Scanner.room`.
@@ -35,9 +34,9 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
     of_world, of_robot = ranges.strides[0] // 4, ranges.strides[1] // 4
     for n in chosen:
         for m in range(poses.shape[1]):
-            kernels.clear(ranges, n, m)
+            exact_kernels.clear(ranges, n, m)
             me = first + m if first >= 0 else -1
-            sx, sy, heading = kernels.sensor_pose(poses, n, m, mount)
+            sx, sy, heading = exact_kernels.sensor_pose(poses, n, m, mount)
             scan = sx, sy, heading + beams[0], float(n * of_world + m * of_robot)
             begin, missed = 0, 0
             while begin < count:
@@ -54,24 +53,24 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # t
                 c, s = math.cos(heading), math.sin(heading)
                 for k in range(count if missed > 0 else 0):
                     if baking.left_out(bodies, n, k, me, sx, sy, high, baked):
-                        kernels.body_into(
+                        exact_kernels.body_into(
                             out, directions, beams, sx, sy, c, s, bodies[n, k], corners, corner,
                             high,
                         )  # fmt: skip
-                near = kernels.walls_into(out, directions, beams, sx, sy, c, s, walls, high)
+                near = exact_kernels.walls_into(out, directions, beams, sx, sy, c, s, walls, high)
                 if near > 0 or missed > 0:
-                    kernels.finish(out, limits[0], high)
+                    exact_kernels.finish(out, limits[0], high)
     fuse_kernels.look_up(found, ranges, beams, limits, lookup, room)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@kernel
 def add_map(ranges, poses, chosen, sensor, map_arrays, exact, room):  # type: ignore[no-untyped-def]
     """Fuses a static map into the scans of some worlds.
 
     Args:
         ranges: (N, M, B) scans, in place.
         poses: (N, M, 3) of `base_link` in the world.
-        chosen: (n,) which worlds.
+        chosen: (n,) indices of the worlds.
         sensor: see `scanner.Scanner.arguments`.
         map_arrays: see `maps_grid.GridMap.arrays`.
         exact: whether to walk from cell to cell.
@@ -80,7 +79,7 @@ def add_map(ranges, poses, chosen, sensor, map_arrays, exact, room):  # type: ig
     mount, directions, beams, limits = sensor[0], sensor[1], sensor[2], sensor[3]
     for n in chosen:
         for m in range(poses.shape[1]):
-            sx, sy, _, c, s = kernels.to_sensor(poses, n, m, mount)
+            sx, sy, _, c, s = exact_kernels.to_sensor(poses, n, m, mount)
             out = ranges[n, m]
             if exact:
                 map_kernels.exact_map_into(
@@ -90,4 +89,4 @@ def add_map(ranges, poses, chosen, sensor, map_arrays, exact, room):  # type: ig
                 map_kernels.map_into(
                     out, directions, beams, sx, sy, c, s, limits[1], map_arrays, room
                 )
-            kernels.finish(out, limits[0], limits[1])
+            exact_kernels.finish(out, limits[0], limits[1])

@@ -1,4 +1,4 @@
-"""One call for a batch of scans, exact or baked."""
+"""Scanner: a batch of scans in one call, exact or baked."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError, ModelError, nearest
-from nics_drl_bridge.lidar import intensity_kernels, scan_kernels
+from nics_drl_bridge.lidar import scan_kernels
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.baked_kernels import LANES, SINGLE, WHOLE, WIDE
-from nics_drl_bridge.lidar.baking import bake
 from nics_drl_bridge.lidar.lookup_error import lookup_distances
-from nics_drl_bridge.lidar.maps_grid import NO_MAP, GridMap
-from nics_drl_bridge.lidar.sensor_models import Intensity, intensity_of
+from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import BODY, SHAPE, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable
@@ -28,12 +27,12 @@ Room = tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.int32]]
 Array = NDArray[np.float64]
 NO_WALLS = np.zeros((0, 4))
 GREATEST_ERROR = 0.01
-"""A shape is looked up by `auto` from the distance on where its ranges have no greater RMSE [m]."""
+"""The renderer `auto` looks a shape up at distances where its ranges have at most this RMSE [m]."""
 _MEASURED: dict[tuple[Any, ...], tuple[float, float]] = {}
-"""What `lookup_distances` found, by all that it depends on."""
+"""Cached results of `lookup_distances`, by everything they depend on."""
 WIDEST_BEAMS = 0.2
-"""Beams farther apart than this are scanned exactly by `auto`: there are few, and a row of so few
-points says little [rad]."""
+"""Beams farther apart than this are scanned exactly by `auto`: there are few, and rows of so few
+points are inaccurate [rad]."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +41,13 @@ class Scanner:
 
     Attributes:
         spec: the lidar.
-        table: of the shapes that may stand around.
-        renderer: `baked` looks every shape up; `exact` computes every ray; `auto` looks up but for
-            shapes larger than the range, in whose circle the lidar nearly always is, for what errs
-            by more than `GREATEST_ERROR` (any shape that is very near; long thin ones and deep
-            notches farther away, or anywhere), and for beams wider than `WIDEST_BEAMS`. Straight
-            walls and a body in whose circle the lidar is are computed in all.
-        grid: a static map that stands in every world, if any.
+        table: of the shapes that may occur.
+        renderer: `baked` looks up every shape; `exact` computes every ray; `auto` looks up, except
+            shapes larger than the range, in whose circle the lidar nearly always is, shapes with
+            an error of more than `GREATEST_ERROR` (any shape that is very near; long thin ones and
+            deep notches farther away, or anywhere), and beams wider than `WIDEST_BEAMS`. All
+            renderers compute straight walls, and a body in whose circle the lidar is.
+        grid: a static map of every world, if any.
     """
 
     spec: LidarSpec
@@ -84,7 +83,7 @@ class Scanner:
 
     @cached_property
     def arguments(self) -> tuple[Any, ...]:
-        """What the kernels take as `sensor`.
+        """The argument `sensor` of the kernels.
 
         Mount (3,), directions (B, 2), beams (angle_min, angle_increment, 1 for a full circle,
         B), limits (range_min, range_max), squares of the distances between which each shape is
@@ -115,7 +114,7 @@ class Scanner:
         return np.asarray(np.square(between))
 
     def _lookup_distances(self, shape: int) -> tuple[float, float]:
-        """Of one shape [m], see `lookup_distances`; measured once per process."""
+        """Distances of one shape [m], see `lookup_distances`; measured once per process."""
         radius, table = float(self.table.outlines.radii[shape]), self.table
         key = (
             self.spec.model_dump_json(), table.shapes[shape], table.density,
@@ -129,9 +128,9 @@ class Scanner:
         return _MEASURED[key]
 
     def room(self, bodies: int) -> Room:
-        """Scratch that one thread needs to scan a world, of however many bodies.
+        """Returns the scratch memory of one thread for a world with any number of bodies.
 
-        Of doubles, singles and whole numbers; what looks up in maps needs fewer than these.
+        Arrays of float64, float32 and int32; map look-ups need less than these.
         """
         return (
             np.zeros(WIDE * LANES),
@@ -140,7 +139,7 @@ class Scanner:
         )
 
     def place(self, shapes: Sequence[Shape], poses: ArrayLike) -> NDArray[np.float64]:
-        """Bodies (..., K, 7) of K shapes at poses (..., K, 3): x, y [m], heading [rad].
+        """Returns bodies (..., K, 7) of K shapes at poses (..., K, 3): x, y [m], heading [rad].
 
         Raises:
             ModelError: a shape is not in the table.
@@ -150,7 +149,7 @@ class Scanner:
         return place(poses, self.table.outlines.radii[index], index)
 
     def _require_known(self, index: NDArray[np.float64]) -> None:
-        """Raises ModelError where the kernels would read beyond the table."""
+        """Raises ModelError if the kernels would read beyond the table."""
         known = len(self.table.shapes)
         if index.size and not (index.min() >= 0 and index.max() < known):
             raise ModelError(
@@ -165,25 +164,25 @@ class Scanner:
         walls: ArrayLike = NO_WALLS,
         out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """Scans of several robots, each in a world of its own.
+        """Scans from several robots, each in a separate world.
 
         Args:
             poses: (N, 3) of `base_link` in the world.
-            bodies: (N, K, 7) what `place` gave.
+            bodies: (N, K, 7) from `place`.
             walls: (W, 4) x1, y1, x2, y2 [m], the same in every world.
-            out: (N, B) where to write, a new array by default.
+            out: (N, B) result array, a new one by default.
 
         Returns:
             (N, B) ranges [m]: `inf` no return, `-inf` too close (REP-117).
 
         Raises:
-            ConfigError: an array has another shape.
+            ConfigError: an array has a wrong shape.
             ModelError: a body is of a shape that is not in the table.
         """
         poses, bodies, walls = self._scene(poses, bodies, walls)
         out = self._result(len(poses), out)
         if not (out.flags.c_contiguous or out.strides[1] == out.itemsize):
-            out[:] = self.scan(poses, bodies, walls)  # the kernels need beams one after the other
+            out[:] = self.scan(poses, bodies, walls)  # the kernels need contiguous beams
             return out
         worlds = np.arange(len(poses))
         room = self.room(bodies.shape[1])
@@ -197,70 +196,8 @@ class Scanner:
             )  # fmt: skip
         return out
 
-    def intensities(
-        self,
-        ranges: ArrayLike,
-        poses: ArrayLike,
-        bodies: ArrayLike,
-        walls: ArrayLike = NO_WALLS,
-        out: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:
-        """Intensities that belong to scans: of whatever is nearest, where there is a return.
-
-        They follow from the distances and angles of the scene, also where the ranges are noisy.
-
-        Args:
-            ranges: (N, B) what `scan` gave, or a device made of it [m].
-            poses: (N, 3) see `scan`.
-            bodies: (N, K, 7) see `scan`.
-            walls: (W, 4) see `scan`.
-            out: (N, B) where to write, a new array by default.
-
-        Returns:
-            (N, B) intensities [the unit of the model's gain], 0 where a range is not finite.
-
-        Raises:
-            ConfigError: an array has another shape.
-            ModelError: the table holds no intensities, or a body is of a shape that is not in it.
-        """
-        bright = intensity_of(self.table.sensor_model)
-        if bright is None:
-            raise ModelError(
-                f"the table of the lidar {self.spec.name!r} holds no intensities; bake it with a "
-                "sensor model of the kind `intensity`."
-            )
-        poses, bodies, walls = self._scene(poses, bodies, walls)
-        out = self._result(len(poses), out)
-        ranges = np.atleast_2d(np.asarray(ranges, np.float32))
-        if ranges.shape != out.shape:
-            raise ConfigError(f"ranges {ranges.shape} must be {out.shape}, as the scans are.")
-        count, beams = bodies.shape[1], self.spec.beams
-        intensity_kernels.intensities_of_worlds(
-            out[:, None], ranges[:, None], poses[:, None], np.arange(len(poses)), bodies, -1, walls,
-            (self.arguments, self._bright_arguments), self.room(count),
-            tuple(np.empty((3, beams), np.float32)),
-            (np.empty((count, 1, 3)), np.empty((count, 1, BODY))),
-            (*np.empty((2, count, 1, beams), np.float32), np.arange(count)),
-            self._reflectivities(bright), bright.device,
-            NO_MAP if self.grid is None else self.grid.arrays, self.renderer == "exact",
-        )  # fmt: skip
-        return out
-
-    @cached_property
-    def _bright_arguments(self) -> tuple[Any, ...]:
-        """As `arguments`, with the reflectances of the table in place of its ranges."""
-        mount, directions, beams, _, baked, outlines, _ = self.arguments
-        rows = self.table.rows if self.table.reflectance is None else self.table.reflectance
-        lookup = replace(self.table, rows=rows).lookup
-        return mount, directions, beams, np.array([-1.0, np.inf]), baked, outlines, lookup
-
-    def _reflectivities(self, bright: Intensity) -> NDArray[np.float64]:
-        """(H,) of each shape."""
-        own = [shape.reflectivity for shape in self.table.shapes]
-        return np.array([bright.reflectivity if one is None else one for one in own])
-
     def _scene(self, poses: ArrayLike, bodies: ArrayLike, walls: ArrayLike) -> tuple[Array, ...]:
-        """Poses (N, 3), bodies (N, K, 7) and walls (W, 4). Raises what `scan` raises."""
+        """Returns poses (N, 3), bodies (N, K, 7), walls (W, 4), checked; raises as `scan` does."""
         poses = np.atleast_2d(np.asarray(poses, dtype=np.float64))
         bodies = np.asarray(bodies, dtype=np.float64)
         if bodies.size == 0:
@@ -278,7 +215,7 @@ class Scanner:
         return poses, bodies, walls
 
     def _result(self, scans: int, out: NDArray[np.float32] | None) -> NDArray[np.float32]:
-        """(N, B) where to write. Raises ConfigError where `out` is another kind of array."""
+        """Returns the result array (N, B). Raises ConfigError if `out` does not fit."""
         shape = (scans, self.spec.beams)
         out = np.empty(shape, np.float32) if out is None else out
         if out.shape != shape or out.dtype != np.float32:
@@ -292,7 +229,7 @@ def make_scanner(
     renderer: Renderer = "auto",
     grid: GridMap | None = None,
 ) -> Scanner:
-    """A scanner with a table for the given shapes, baked now if need be, and a static map.
+    """Returns a scanner with a table for the shapes, baked now if needed, and a static map.
 
     Raises:
         ConfigError: the renderer is unknown, or the table would be too large.

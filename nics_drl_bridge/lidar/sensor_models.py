@@ -1,7 +1,6 @@
-"""Sensor models: which returns a device loses, and how bright it reports the others.
+"""Sensor models: the returns that a device loses.
 
-A sensor model is baked into the rows of a table, so that rendering ranges costs what it costs
-without one.
+A sensor model is baked into the rows of a table, so that it does not slow down rendering.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import AfterValidator, Field, TypeAdapter, field_validator, model_validator
+from pydantic import AfterValidator, Field, TypeAdapter, field_validator
 
 from nics_drl_bridge.config import Schema, load_yaml
 
@@ -25,7 +24,7 @@ NEAREST = 1e-3
 
 
 class IncidenceDropout(Schema):
-    """Nothing comes back from a surface that is met too obliquely, as from polished metal.
+    """Loses returns at oblique incidence, as from polished metal.
 
     Attributes:
         greatest_incidence: between the ray and the normal of the surface [rad].
@@ -48,24 +47,23 @@ class IncidenceDropout(Schema):
     def lost(
         self, ranges: Ranges, incidence: NDArray[np.float64], reflectivity: float | None
     ) -> NDArray[np.bool_]:
-        """(P,) which of the points return nothing; see `Intensity.lost`."""
+        """True for the points (P,) without a return; see `Intensity.lost`."""
         return np.asarray(incidence > self.greatest_incidence)
 
 
 class Intensity(Schema):
-    """How much light comes back: `gain * reflectivity * cos(incidence)^exponent / range^2`.
+    """Intensity of a return: `gain * reflectivity * cos(incidence)^exponent / range^2`.
 
-    That is the range equation of a laser for a diffuse surface that is wider than the beam, in
-    free air: Jelalian, Laser Radar Systems (1992); in this form Hoefle and Pfeifer, Correction of
-    laser scanning intensity data (2007), with the exponent 1 of Lambert's law.
+    This is the laser range equation for a diffuse surface that is wider than the beam, in clear
+    air: Jelalian, Laser Radar Systems (1992); in this form Hoefle and Pfeifer, Correction of laser
+    scanning intensity data (2007), with the exponent 1 of Lambert's law.
 
     Attributes:
-        gain: intensity of a white surface, met at right angles at 1 m [the device's unit].
-        reflectivity: of walls, of static maps and of shapes that name none: 1 is a white diffuse
+        gain: intensity of a white surface at normal incidence at 1 m [the device's unit].
+        reflectivity: of walls, static maps and shapes without their own: 1 is a white diffuse
             surface, a retroreflector has more.
-        exponent: of the cosine; 0 where the angle is no matter, more than 1 for glossy surfaces.
-        threshold: a return that is less intense is lost [the device's unit].
-        saturation: greatest intensity that the device reports, none by default.
+        exponent: of the cosine; 0 for no effect of the angle, more than 1 for glossy surfaces.
+        threshold: weaker returns are lost [the device's unit].
     """
 
     kind: Literal["intensity"] = "intensity"
@@ -73,42 +71,29 @@ class Intensity(Schema):
     reflectivity: float = Field(default=0.5, gt=0.0)
     exponent: float = Field(default=1.0, ge=0.0, le=100.0)
     threshold: float = Field(default=0.0, ge=0.0)
-    saturation: float | None = Field(default=None, gt=0.0)
 
     def __str__(self) -> str:
         """In a few words."""
         lost = f", below {self.threshold:g} nothing" if self.threshold else ""
         return f"intensity {self.gain:g} at 1 m{lost}, reflectivity {self.reflectivity:g}"
 
-    @model_validator(mode="after")
-    def _reachable(self) -> Intensity:
-        if self.saturation is not None and self.threshold > self.saturation:
-            raise ValueError("threshold must be at most saturation")
-        return self
-
     def reflectance(self, cosine: ArrayLike, reflectivity: float | None) -> NDArray[np.float64]:
-        """(P,) what does not depend on the range: reflectivity times cos(incidence)^exponent."""
+        """Returns the factor (P,) without the range: reflectivity times cos(incidence)^exponent."""
         white = self.reflectivity if reflectivity is None else reflectivity
         return np.asarray(white * np.power(np.asarray(cosine, np.float64), self.exponent))
 
     def lost(
         self, ranges: Ranges, incidence: NDArray[np.float64], reflectivity: float | None
     ) -> NDArray[np.bool_]:
-        """(P,) which of the points return too little.
+        """True for the points (P,) whose return is below the threshold.
 
         Args:
             ranges: (P,) [m].
             incidence: (P,) between the ray and the normal of the surface [rad].
-            reflectivity: of the surface, None where it names none.
+            reflectivity: of the surface, None for that of the model.
         """
         light = self.gain * self.reflectance(np.cos(incidence), reflectivity)
         return np.asarray(light / np.square(np.maximum(ranges, NEAREST)) < self.threshold)
-
-    @property
-    def device(self) -> NDArray[np.float64]:
-        """(4,) what the kernels take: gain, saturation, exponent, reflectivity of walls and map."""
-        most = math.inf if self.saturation is None else self.saturation
-        return np.array([self.gain, most, self.exponent, self.reflectivity])
 
 
 def _one_intensity(models: tuple[SensorModel, ...]) -> tuple[SensorModel, ...]:
@@ -129,13 +114,8 @@ class SensorModelFile(Schema):
 
 
 def load_sensor_models(path: str | Path) -> tuple[SensorModel, ...]:
-    """The sensor models of a YAML file. Raises ConfigError with file, key and fix."""
+    """Loads the sensor models of a YAML file. Raises ConfigError with file, key and fix."""
     return load_yaml(path, SensorModelFile).sensor_model
-
-
-def intensity_of(models: Sequence[SensorModel]) -> Intensity | None:
-    """The model that yields intensities, if any does."""
-    return next((model for model in models if isinstance(model, Intensity)), None)
 
 
 def returned(
@@ -144,7 +124,7 @@ def returned(
     incidence: NDArray[np.float64],
     reflectivity: float | None,
 ) -> Ranges:
-    """Ranges (P,) with `inf` where any of the models loses the return; see `Intensity.lost`."""
+    """Returns ranges (P,) with `inf` where any model loses the return; see `Intensity.lost`."""
     for model in models:
         ranges = np.where(model.lost(ranges, incidence, reflectivity), np.float32(np.inf), ranges)
     return ranges

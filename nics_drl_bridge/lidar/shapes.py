@@ -1,4 +1,4 @@
-"""The shapes of obstacles and footprints, and the arrays that the kernels know them by."""
+"""Shapes of obstacles and footprints, and their arrays for the kernels."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from nics_drl_bridge.errors import ModelError
 Array = NDArray[np.float64]
 MOST_CORNERS = 16_384
 MOST_SHAPES = 1_000
-"""Of one file, or of one group of obstacles."""
+"""Greatest number of shapes in one file, or in one group of obstacles."""
 SMALLEST, LARGEST = 1e-6, 1e4
-"""Extent of a shape [m]: nothing smaller is seen, nothing larger fits into a world."""
+"""Extent of a shape [m]: anything smaller is invisible, anything larger does not fit in a world."""
 SAME_PLACE = 1e-9
-"""Corners this near to each other, in parts of the shape's radius, coincide."""
+"""Corners within this distance, as a share of the shape's radius, coincide."""
 
 
 FARTHEST = 1e8
-"""Greatest coordinate in a map [m], as UTM has them."""
+"""Greatest coordinate in a map [m], enough for UTM."""
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 Heading = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Place = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
@@ -33,10 +33,10 @@ Size = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 
 
 class Surface(Schema):
-    """What the lidar may know of any shape beside its outline.
+    """Properties of a shape's surface, common to all shapes.
 
     Attributes:
-        reflectivity: of its surface, for a lidar that yields intensities: 1 is a white diffuse
+        reflectivity: of its surface, for a sensor model of intensity: 1 is a white diffuse
             one, a retroreflector has more; by default that of the lidar's sensor model.
     """
 
@@ -60,7 +60,7 @@ class Circle(Surface):
 
 
 class Rectangle(Surface):
-    """A square, a box, a strip: around its own origin, along its own axes.
+    """A rectangle centred at its own origin, along its own axes.
 
     Attributes:
         size: length along x and width along y [m].
@@ -89,10 +89,10 @@ class Rectangle(Surface):
 
 
 class Polygon(Surface):
-    """Any outline of straight edges, convex or concave; the last corner joins the first.
+    """An outline of straight edges, convex or concave; the last corner is joined to the first.
 
     Attributes:
-        points: corners in the shape's own frame, either way round [m].
+        points: corners in the shape's own frame, in either orientation [m].
     """
 
     kind: Literal["polygon"] = "polygon"
@@ -161,7 +161,7 @@ class ShapeFile(Schema):
 
 
 def load_shapes(path: str | Path) -> tuple[Shape, ...]:
-    """The shapes of a YAML file. Raises ConfigError with file, key and fix."""
+    """Loads the shapes of a YAML file. Raises ConfigError with file, key and fix."""
     return load_yaml(path, ShapeFile).shapes
 
 
@@ -178,11 +178,11 @@ def _reach(outline: Array) -> float:
 
 
 def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
-    """Puts shapes into a world.
+    """Places shapes in a world.
 
     Args:
         poses: (..., 3) x, y [m], heading [rad] of each shape's own frame.
-        radii: (...) of each shape [m]; 0 where there is none.
+        radii: (...) of each shape [m]; 0 for an absent one.
         shapes: (...) index of each shape.
 
     Returns:
@@ -191,16 +191,16 @@ def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
     poses = np.asarray(poses, dtype=np.float64)
     bodies = np.empty((*poses.shape[:-1], BODY))
     bodies[..., :3] = poses
-    with np.errstate(invalid="ignore"):  # what is turned by infinity is nowhere, and not seen
+    with np.errstate(invalid="ignore"):  # a body with an infinite heading is NaN, and not visible
         bodies[..., COS], bodies[..., SIN] = np.cos(poses[..., 2]), np.sin(poses[..., 2])
     bodies[..., RADIUS], bodies[..., SHAPE] = radii, shapes
     return bodies
 
 
 def convex_hull(points: Array) -> Array:
-    """(P, 2) corners of the convex hull, counter-clockwise, without those on its edges.
+    """Returns the corners (P, 2) of the convex hull, counter-clockwise, without collinear ones.
 
-    The monotone chain of Andrew (1979).
+    Andrew's monotone chain (1979).
     """
     ordered = sorted({(float(x), float(y)) for x, y in points})
     if len(ordered) < 3:
@@ -222,7 +222,7 @@ def convex_hull(points: Array) -> Array:
 
 
 def rotational_order(outline: Array, hull: Array) -> int:
-    """How often a shape looks the same in one turn: a square 4 times, most shapes once."""
+    """Order of the rotational symmetry of a shape: 4 for a square, 1 for most shapes."""
     if len(outline) < 3:
         return 1
     tolerance = SAME_PLACE * _reach(outline)
@@ -242,15 +242,15 @@ def rotational_order(outline: Array, hull: Array) -> int:
 
 @dataclass(frozen=True)
 class Outlines:
-    """Some shapes as flat arrays.
+    """A set of shapes as flat arrays.
 
     Attributes:
-        shapes: H of them.
+        shapes: the H shapes.
         corners: (sum V, 2) corners of all outlines, one after the other [m].
-        corner: (H + 1,) where each outline begins in `corners`; a circle has none.
-        hulls: corners of all convex hulls, each written twice, so that an index may run over
-            its end; a circle has its centre.
-        hull: (H + 1,) where each hull begins in `hulls`.
+        corner: (H + 1,) index in `corners` of each outline's first corner; a circle has none.
+        hulls: corners of all convex hulls, each stored twice, so that an index may run past its
+            end; a circle has its centre.
+        hull: (H + 1,) index in `hulls` of each hull's first corner.
         radii: (H,) [m].
         orders: (H,) rotational order.
     """
@@ -265,7 +265,7 @@ class Outlines:
 
     @classmethod
     def of(cls, shapes: Sequence[Shape]) -> Outlines:
-        """The arrays of some shapes."""
+        """Creates the arrays of some shapes."""
         outlines = [shape.outline for shape in shapes]
         hulls = [convex_hull(o) if len(o) else np.zeros((1, 2)) for o in outlines]
         orders = [rotational_order(o, h) for o, h in zip(outlines, hulls, strict=True)]
@@ -283,16 +283,16 @@ class Outlines:
 
     @property
     def concave(self) -> NDArray[np.bool_]:
-        """(H,) whether an outline has corners that are not on its hull."""
+        """(H,) True for outlines with corners that are not on their hull."""
         return np.asarray(np.diff(self.corner) > np.diff(self.hull) // 2)
 
     @property
     def arguments(self) -> tuple[Array, NDArray[np.int64]]:
-        """What the exact kernels need: corners, and where each outline begins."""
+        """Arguments of the exact kernels: corners, and the first corner of each outline."""
         return self.corners, self.corner
 
     def index_of(self, shape: Shape) -> int:
-        """Where a shape stands. Raises ModelError when it is none of them."""
+        """Returns the index of a shape. Raises ModelError if it is not among them."""
         try:
             return self.shapes.index(shape)
         except ValueError:
@@ -303,7 +303,7 @@ class Outlines:
 
 
 def describe(shape: Shape) -> str:
-    """A shape in a few words."""
+    """Describes a shape in a few words."""
     surface = "" if shape.reflectivity is None else f", reflectivity {shape.reflectivity:g}"
     return f"{_outline_in_words(shape)}{surface}"
 

@@ -1,4 +1,12 @@
-"""LidarSpec: the one home of a lidar's beams, limits and header fields."""
+"""LidarSpec: the single definition of a lidar's beams, limits and header fields.
+
+Conversion of ranges between a device's convention and the package's own, which is REP-117.
+
+In the package, `inf` is no return, `-inf` too close, NaN an invalid measurement, and everything
+else lies within the limits. Devices differ; `LidarSpec.no_return` names the convention, and only
+this module handles it. Limits are compared in float32, as in the message: 0.16 m is a little less
+there, and still a return.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +15,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
@@ -20,14 +28,14 @@ NoReturn = Literal["inf", "zero", "nan", "range_max"]
 
 
 class ScanHeader(NamedTuple):
-    """The fields of a LaserScan that follow from the lidar, by their names there.
+    """The fields of a LaserScan that follow from the lidar, with their names in the message.
 
     Attributes:
         angle_min: of the first beam [rad].
-        angle_max: of the last beam, also of a full circle [rad].
+        angle_max: of the last beam, also for a full circle [rad].
         angle_increment: between neighbouring beams [rad].
-        time_increment: between neighbouring beams [s]; 0 where all are measured at once,
-            negative where the device turns clockwise.
+        time_increment: between neighbouring beams [s]; 0 if all are measured at once,
+            negative if the device turns clockwise.
         scan_time: between scans [s].
         range_min: nearest return [m].
         range_max: farthest return [m].
@@ -50,7 +58,7 @@ class LidarSpec(Schema):
     measured twice.
 
     Attributes:
-        name: what users call it.
+        name: the name users refer to it by.
         beams: B.
         angle_min: of the first beam, in the frame of the lidar [rad].
         angle_max: of the last beam, or of the end of the circle [rad].
@@ -60,10 +68,10 @@ class LidarSpec(Schema):
         mount: x [m], y [m], heading [rad] of `laser` in `base_link`.
         noise_std: standard deviation of a range [m].
         frame: id of the lidar's own frame.
-        no_return: what the device puts on the wire where nothing came back: `inf` (REP-117),
-            `zero`, `nan` or `range_max`. Inside the package it is `inf`; see `lidar.rep117`.
-        faults: what else the device does to its ranges.
-        sensor_model: what it makes of the surfaces that it meets, baked into its tables.
+        no_return: the device's value for no return: `inf` (REP-117), `zero`, `nan` or
+            `range_max`. In the package it is `inf`; see `lidar.rep117`.
+        faults: further faults of the device's ranges.
+        sensor_model: effects of the surfaces on its returns, baked into its tables.
     """
 
     name: str = "lidar"
@@ -96,7 +104,7 @@ class LidarSpec(Schema):
 
     @property
     def full_circle(self) -> bool:
-        """Whether the beams go all around."""
+        """True if the beams cover a full circle."""
         return self.angle_max - self.angle_min > 2.0 * np.pi - FULL_CIRCLE_TOLERANCE
 
     @property
@@ -127,12 +135,12 @@ class LidarSpec(Schema):
 
     @property
     def sweep_time(self) -> float:
-        """Time that a device which turns once per scan spends on its beams [s]."""
+        """Duration of all beams of a device that turns once per scan [s]."""
         return self.beam_time * self.beams
 
     @cached_property
     def header(self) -> ScanHeader:
-        """Every field of a LaserScan but stamp, frame and ranges."""
+        """The fields of a LaserScan except stamp, frame and ranges."""
         return ScanHeader(
             angle_min=float(self.angles[0]),
             angle_max=float(self.angles[-1]),
@@ -145,10 +153,45 @@ class LidarSpec(Schema):
 
     @property
     def fault_parameters(self) -> NDArray[np.float64]:
-        """The faults of this lidar as the row (P,) that the kernels take."""
+        """The faults of this lidar as the kernels' row (P,)."""
         return self.faults.parameters(self.noise_std)
 
 
 def load_lidar(name: str | Path) -> LidarSpec:
-    """Loads a shipped lidar by name (`paper`), or any by the path of its YAML file."""
+    """Loads a shipped lidar by name (`paper`), or any other by the path of its YAML file."""
     return load_yaml(find_config(name, "lidars"), LidarSpec)
+
+
+Ranges = NDArray[np.float32]
+
+
+def to_device(ranges: ArrayLike, spec: LidarSpec) -> Ranges:
+    """Converts ranges (..., B) of the package to the device's convention.
+
+    Only `inf` is replaced. For a device that cannot report `-inf`, set `LidarFaults.too_close`.
+    """
+    out = np.array(ranges, dtype=np.float32)
+    if spec.no_return != "inf":
+        value = {"zero": 0.0, "nan": np.nan, "range_max": spec.range_max}[spec.no_return]
+        out[out == np.inf] = value
+    return out
+
+
+def from_device(values: ArrayLike, spec: LidarSpec) -> Ranges:
+    """Converts ranges (..., B) of a device to those of the package.
+
+    A finite value below range_min means that something is too close, unless it is the device's
+    value for no return: it must not be taken for free space. If a device reports NaN for no return,
+    invalid measurements cannot be distinguished from it.
+    """
+    out = np.array(values, dtype=np.float32)
+    low, high = np.float32(spec.range_min), np.float32(spec.range_max)
+    if spec.no_return == "zero":
+        out[out == 0.0] = np.inf
+    elif spec.no_return == "nan":
+        out[np.isnan(out)] = np.inf
+    elif spec.no_return == "range_max":
+        out[out == high] = np.inf
+    out[out > high] = np.inf
+    out[out < low] = -np.inf
+    return out

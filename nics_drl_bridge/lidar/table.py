@@ -1,4 +1,4 @@
-"""LidarTable: the rows of every shape, at every distance and rotation (Sec. IV-B)."""
+"""LidarTable: the baked rows of every shape, at every distance and rotation (Sec. IV-B)."""
 
 from __future__ import annotations
 
@@ -31,30 +31,26 @@ from nics_drl_bridge.lidar.baked_kernels import (
     ROUND_RADIUS,
 )
 from nics_drl_bridge.lidar.block_kernels import BLOCK
-from nics_drl_bridge.lidar.sensor_models import (
-    SENSOR_MODELS,
-    SensorModel,
-    intensity_of,
-)
+from nics_drl_bridge.lidar.sensor_models import SENSOR_MODELS, SensorModel
 from nics_drl_bridge.lidar.shapes import SHAPES, Circle, Outlines, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.npz import npz_bytes, npz_mapped, read_file
 
 FORMAT = "nics_drl_bridge/lidar_table/3"
 POINT_ANGLE = 0.01
-"""By default the points of a row are no farther apart, as far as `MOST_PHASES` go [rad]."""
+"""Greatest default angle between the points of a row, as far as `MOST_PHASES` allows [rad]."""
 MOST_PHASES = 8
 MOST_WIDE = 0xFFFF
-"""So many beams one row can have."""
+"""Greatest number of beams in a row."""
 
 
 class Density(Schema):
-    """How finely a table is sampled.
+    """Sampling density of a table.
 
     Attributes:
-        distances: grid distances, from the shape's own radius to out of range.
-        rotations: grid rotations in a full turn; a shape that looks the same after a part of a
-            turn is baked for that part only.
+        distances: number of grid distances, from the shape's own radius to out of range.
+        rotations: number of grid rotations in a full turn; a shape with rotational symmetry is
+            baked for one period only.
         phases: points per beam, 1, 2, 4 or 8; see `for_beams`.
     """
 
@@ -64,7 +60,7 @@ class Density(Schema):
 
     @classmethod
     def for_beams(cls, beam_angle: float) -> Density:
-        """The default for beams so far apart [rad]: few beams need several points each."""
+        """Returns the default for an angle between beams [rad]; wide ones need several points."""
         wanted = math.ceil(math.log2(max(beam_angle / POINT_ANGLE, 1.0)))
         return cls(phases=min(2**wanted, MOST_PHASES))
 
@@ -77,37 +73,34 @@ class Density(Schema):
 
 
 def padding(beam_angle: float) -> int:
-    """How many numbers one look-up can read from where a row begins: half a turn, and a block.
+    """Greatest number of values that a look-up reads from the begin of a row.
 
-    A shape that the lidar is outside of covers less.
+    Half a turn, as a shape that does not enclose the lidar covers less, and a block.
     """
     return math.ceil(math.pi / beam_angle) + 1 + BLOCK
 
 
 @dataclass(frozen=True)
 class LidarTable:
-    """The ranges that shapes give, as rows over angle, for a grid of distance and rotation.
+    """Ranges of shapes as rows over angle, on a grid of distances and rotations.
 
-    A cell is one grid distance at one grid rotation. Its row holds only the directions that the
-    shape can cover until the next cells, as many times as there are phases: the points of one
-    phase stand one beam apart, so that the beams of a scan find theirs one after the other.
+    A cell is one grid distance at one grid rotation. Its row has only the directions that the
+    shape can cover up to the next cells, once for each phase: the points of one phase are one beam
+    apart, so that those for the beams of a scan are contiguous.
 
     Attributes:
-        shapes: H of them.
+        shapes: the H shapes.
         density: of the grid.
         beam_angle: angle between the beams that it was baked for [rad].
-        grid: (H, 3) greatest grid distance [m], grid rotations in the part of a turn after which
-            the shape looks the same, first cell.
-        start: (cells,) int32 where each row begins in `rows`.
-        cell: (cells, 6) int16 first beam of the row from the bearing, its width in beams (without
-            a sign, see `widths`); a corner
-            of the hull that can be the right edge within the cell, and the same corner, or the one
-            other that can be it, or minus the stride with which to look around when there are
-            more; the same two for the left edge.
-        rows: (R,) float32 ranges [m]; longer than its rows by what one look-up can read.
+        grid: (H, 3) greatest grid distance [m], grid rotations in one period of the shape's
+            rotational symmetry, first cell.
+        start: (cells,) int32 index in `rows` of the begin of each row.
+        cell: (cells, 6) int16 first beam of the row relative to the bearing; its width in beams
+            (unsigned, see `widths`); a corner of the hull that can be the right edge within the
+            cell; the only other such corner, or the same one, or, if there are more, minus the
+            initial stride for climbing; the same two for the left edge.
+        rows: (R,) float32 ranges [m], padded by what one look-up can read.
         sensor_model: named models that were baked in.
-        reflectance: (R,) float32 of the surface at each point of `rows`, reflectivity times a power
-            of the cosine of the angle of incidence; only where a model yields intensities.
     """
 
     shapes: tuple[Shape, ...]
@@ -118,11 +111,10 @@ class LidarTable:
     cell: NDArray[np.int16]
     rows: NDArray[np.float32]
     sensor_model: tuple[SensorModel, ...] = ()
-    reflectance: NDArray[np.float32] | None = None
 
     @classmethod
     def without_rows(cls, spec: LidarSpec, shapes: Sequence[Shape]) -> LidarTable:
-        """Shapes that are only scanned exactly: for a lidar of any beams, and at no cost."""
+        """Creates a table of shapes that are only scanned exactly: without limits or baking."""
         shapes = tuple(dict.fromkeys(shapes))
         grid = np.ones((len(shapes), 3))
         grid[:, 0] = [spec.range_max + 2.0 * shape.radius for shape in shapes]
@@ -139,12 +131,12 @@ class LidarTable:
 
     @property
     def has_rows(self) -> bool:
-        """Whether its shapes can be looked up."""
+        """True if its shapes can be looked up."""
         return len(self.cell) > 0 or not self.shapes
 
     @property
     def widths(self) -> NDArray[np.int64]:
-        """(cells,) of the rows, in beams."""
+        """(cells,) widths of the rows, in beams."""
         return self.cell[:, 1].astype(np.int64) & MOST_WIDE
 
     @cached_property
@@ -154,12 +146,13 @@ class LidarTable:
 
     @cached_property
     def lookup(self) -> tuple[Any, ...]:
-        """What the kernels take.
+        """The argument `lookup` of the kernels.
 
         Flat (H * ABOUT,) numbers of each shape: cells per metre; rotations in a full turn, 0 for a
-        circle; parts of a turn after which it looks the same per rotation; first cell; cells per
+        circle; parts (periods of the rotational symmetry) per grid rotation; first cell; cells per
         part; the corner after the hull's last; corners per part; corners; radius of a circle [m],
-        0 for others. Then the distances, the cells, the rows, log2 of the phases, and the hulls.
+        0 for others. Then the number of distances, the cells, the rows, log2 of the phases, and the
+        hulls.
         """
         outlines, distances = self.outlines, self.density.distances
         parts, rotations = outlines.orders, self.grid[:, 1]
@@ -173,17 +166,17 @@ class LidarTable:
         about[:, HULL_END] = outlines.hull[:-1] + corners
         about[:, CORNERS_PER_PART], about[:, CORNERS] = corners // parts, corners
         about[:, ROUND_RADIUS] = np.where(round_, outlines.radii, 0.0)
-        missing = max(2 * BLOCK - padding(self.beam_angle), 0)  # two blocks are read at least
+        missing = max(2 * BLOCK - padding(self.beam_angle), 0)  # at least two blocks are read
         rows = np.append(self.rows, np.zeros(missing, np.float32)) if missing else self.rows
         shift = self.density.phases.bit_length() - 1
         return about.ravel(), distances, self._packed, rows, shift, outlines.hulls.ravel()
 
     @property
     def _packed(self) -> NDArray[np.int32]:
-        """(cells * 4,) `start` and `cell`, two numbers in one, so that one cache line holds both.
+        """(cells * 4,) `start` and `cell`, packed so that both share a cache line.
 
-        Where the row begins; its first beam and its width; the other and the first corner of the
-        right edge; those of the left one.
+        Begin of the row; its first beam and its width; the other and the first corner of the right
+        edge; those of the left edge.
         """
         cell = self.cell.astype(np.int32)
         pairs = (cell[:, [0, 3, 5]] << 16) | (cell[:, [1, 2, 4]] & MOST_WIDE)
@@ -202,16 +195,16 @@ class LidarTable:
             "cell": self.cell,
             "rows": self.rows,
         }
-        return arrays if self.reflectance is None else arrays | {"reflectance": self.reflectance}
+        return arrays
 
     def cells_of_shapes(self) -> list[tuple[int, int]]:
-        """(H,) first cell of each shape, and the one after its last."""
+        """Returns the first cell of each shape (H,), and the one after its last."""
         counts = (self.grid[:, 1] * self.density.distances).astype(np.int64)
         ends = np.cumsum(counts)
         return list(zip((ends - counts).tolist(), ends.tolist(), strict=True))
 
     def dump(self) -> bytes:
-        """The table as the content of an `.npz` file that can be mapped."""
+        """Returns the table as the content of an `.npz` file that can be memory-mapped."""
         about = np.frombuffer(self._about().encode(), np.uint8)
         return npz_bytes({"about": about, **self._arrays}, packed=False)
 
@@ -227,7 +220,7 @@ class LidarTable:
         return json.dumps(about | {"crc32": self._crc32(json.dumps(about))})
 
     def _crc32(self, about: str) -> int:
-        """Tells whether anything of the table was damaged."""
+        """Checksum over the whole table, to detect damage."""
         crc = zlib.crc32(about.encode())
         for array in self._arrays.values():
             crc = zlib.crc32(np.ascontiguousarray(array).data, crc)
@@ -235,14 +228,15 @@ class LidarTable:
 
     @classmethod
     def load(cls, path: str | Path, checksum: str | None = None) -> LidarTable:
-        """Maps a table that `dump` made into memory; processes that do so share it.
+        """Memory-maps a table written by `dump`; processes share the memory.
 
         Args:
             path: of the file.
             checksum: SHA-256 that the file must have, in hexadecimal.
 
         Raises:
-            ModelError: the file can't be read, is another one, damaged, or no table.
+            ModelError: the file cannot be read, does not match its checksum, is damaged, or is not
+                a lidar table.
         """
         path = Path(path)
         try:
@@ -276,7 +270,7 @@ class LidarTable:
         return table
 
     def _check(self) -> None:
-        """Raises ValueError when the kernels would read beyond an array."""
+        """Raises ValueError if the kernels would read beyond an array."""
         arrays: tuple[NDArray[Any], ...] = (self.grid, self.start, self.cell, self.rows)
         if [array.dtype for array in arrays] != [np.float64, np.int32, np.int16, np.float32]:
             raise ValueError("an array has another type of number")
@@ -296,15 +290,6 @@ class LidarTable:
         if cells and (self.start.min() < 0 or widths.min() < 1 or ends.max() > last):
             raise ValueError("a row lies outside of the table")
         self._check_corners(counts.astype(np.int64))
-        self._check_reflectance()
-
-    def _check_reflectance(self) -> None:
-        if (self.reflectance is None) != (intensity_of(self.sensor_model) is None):
-            raise ValueError("its reflectance does not belong to its sensor model")
-        if self.reflectance is not None and (
-            self.reflectance.shape != self.rows.shape or self.reflectance.dtype != np.float32
-        ):
-            raise ValueError("its reflectance does not fit its rows")
 
     def _check_corners(self, counts: NDArray[np.int64]) -> None:
         corners = np.repeat(np.diff(self.outlines.hull) // 2, counts)[:, None]

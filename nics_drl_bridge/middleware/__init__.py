@@ -1,1 +1,1 @@
-"""What stands between a robot's topics and whoever asks for its view. Knows no ROS."""
+"""The middleware between a robot's topics and the users of its view. Independent of ROS."""

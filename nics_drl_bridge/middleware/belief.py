@@ -1,20 +1,27 @@
-"""What the filter holds at a time, and what it foresees."""
+"""State of the filter at a time, and its prediction.
+
+Bounds on the motion of a robot while none of its data could be used.
+"""
 
 from __future__ import annotations
 
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge import geometry
+from nics_drl_bridge.generator import SimulatorModel
+
 Array = NDArray[np.float64]
 
 
 class Anchor(NamedTuple):
-    """The newest odometry, and what the filter held after it.
+    """The newest odometry, and the state of the filter after it.
 
     Attributes:
-        time_ns: of it [ns].
+        time_ns: of the odometry [ns].
         odom: (3,) its pose in `odom`.
         mean: (3 + S,) see `Belief`.
         covariance: (3 + S, 3 + S).
@@ -27,15 +34,15 @@ class Anchor(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """All that the filter holds at a time; its arrays are never changed in place.
+    """Complete state of the filter at a time; its arrays are never modified in place.
 
     Attributes:
         time_ns: of the belief [ns].
         mean: (3 + S,) x [m], y [m], heading [rad] in `map`, then the state of the RobotSpec.
         covariance: (3 + S, 3 + S).
-        outliers: how many of each kind came in a row.
+        outliers: number of consecutive outliers of each kind.
         anchor: the newest odometry; None before the first.
-        lost: whether the robot may have driven unseen since the anchor.
+        lost: True if the robot may have moved unobserved since the anchor.
     """
 
     time_ns: int
@@ -47,10 +54,10 @@ class Belief(NamedTuple):
 
 
 class Foreseen(NamedTuple):
-    """What a prediction comes to: time [ns], mean, covariance, and the twist to measure then.
+    """Result of a prediction: time [ns], mean, covariance, and the expected twist measurement.
 
-    And where there was time for it, what such a measurement makes of it, whatever its value: the
-    gain (3 + S, 3) and the covariance after it.
+    If computed in advance, `update` is the gain (3 + S, 3) and the covariance after such a
+    measurement, which do not depend on its value.
     """
 
     time_ns: int
@@ -61,7 +68,106 @@ class Foreseen(NamedTuple):
 
 
 def parted(covariance: Array) -> Array:
-    """A copy of a covariance (3 + S, 3 + S) in which pose and state tell nothing of each other."""
+    """Returns a copy of a covariance (3 + S, 3 + S) with pose and state uncorrelated."""
     copied = np.array(covariance)
     copied[:3, 3:], copied[3:, :3] = 0.0, 0.0
     return copied
+
+
+JITTER_S = 0.2
+"""Uncertainty of the unobserved time: transmission takes longer now and then [s]."""
+MARGIN = 1.2
+"""Factor by which odometry, through noise or slip, may exceed the greatest speed."""
+LEVELS, MOST_CORNERS = 3, 4096
+"""Values tried per variable for the greatest speed, and greatest number of combinations."""
+
+
+def greatest_twist(model: SimulatorModel) -> tuple[float, float]:
+    """Greatest speed [m/s] and turn rate [rad/s] of a model within the ranges of its RobotSpec."""
+    ranges = [(v.min, v.max) for v in (*model.robot.state, *model.robot.command)]
+    levels = LEVELS if LEVELS ** len(ranges) <= MOST_CORNERS else 2
+    values = [np.linspace(low, high, levels) for low, high in ranges]
+    if levels ** len(ranges) > MOST_CORNERS:
+        low, high = np.array(ranges).T
+        tried = np.random.default_rng(0).uniform(low, high, (MOST_CORNERS, len(ranges)))
+    else:
+        tried = np.array(list(product(*values)))
+    twist = model.kinematics.rates(tried)[:, :3]
+    return float(np.hypot(twist[:, 0], twist[:, 1]).max()), float(np.abs(twist[:, 2]).max())
+
+
+class Unseen:
+    """Bounds the unobserved motion of a robot, and bridges it by odometry.
+
+    Args:
+        model: of the robot.
+        process: (3 + S, 3 + S) growth of the filter's covariance per second.
+        noise: (3, 3) of the twist that odometry measures.
+        news: (3 + S,) variance of the state after possible news, see `Outcome`; 0 for the pose.
+
+    Attributes:
+        walk: (3,) variance that a pose by odometry gains in a second [m^2, m^2, rad^2].
+    """
+
+    def __init__(self, model: SimulatorModel, process: Array, noise: Array, news: Array) -> None:
+        self._news = news
+        self._fastest = greatest_twist(model)
+        # Odometry integrates its twists, so their noise is a random walk with a step each period.
+        self.walk = np.diag(process)[:3] + np.diag(noise) * model.control_period
+
+    def reach(self, seconds: float) -> tuple[float, float]:
+        """Greatest distance [m] and turn [rad] in a time, by the greatest speeds."""
+        speed, rate = self._fastest
+        longest = max(seconds, 0.0) + JITTER_S
+        return speed * longest, min(rate * longest, np.pi)
+
+    def doubted(self, covariance: Array, seconds: float) -> Array:
+        """Covariance (3 + S, 3 + S) after a time in which the robot may have driven anywhere.
+
+        x, y and heading are uniformly distributed within reach.
+        """
+        doubted, (far, turned) = parted(covariance), self.reach(seconds)
+        variance = np.maximum(self._news, np.diag(doubted))
+        variance[:3] = np.diag(doubted)[:3] + np.array([far, far, turned]) ** 2 / 3.0
+        np.fill_diagonal(doubted, variance)
+        return doubted
+
+    def bridged(self, anchor: Anchor, odom: Array, seconds: float) -> tuple[Array, Array] | None:
+        """Bridges unobserved motion by odometry.
+
+        Args:
+            anchor: the odometry and estimate before.
+            odom: (3,) pose in `odom` now.
+            seconds: between the two [s].
+
+        Returns:
+            Pose (3,) and its covariance (3, 3); None if the motion is beyond reach: odometry was
+            restarted, or jumped.
+        """
+        moved = geometry.between(anchor.odom, odom)
+        far, turned = self.reach(seconds)
+        if not (np.hypot(*moved[:2]) <= MARGIN * far and abs(moved[2]) <= MARGIN * turned):
+            return None
+        pose = geometry.compose(anchor.mean[:3], moved)
+        along = pose[:2] - anchor.mean[:2]
+        lever = np.array([-along[1], along[0]])
+        derivative = np.eye(3)
+        derivative[:2, 2] = lever
+        before = derivative @ anchor.covariance[:3, :3] @ derivative.T
+        return pose, before + self._drift(lever, far, max(seconds, 0.0))
+
+    def _drift(self, lever: Array, far: float, seconds: float) -> Array:
+        """Covariance (3, 3) that a pose by odometry gains in a time, on a path with `lever` (2,).
+
+        A heading error that grows along the path rotates the rest of it: on a straight path with a
+        third of its variance at the end. A path that was not straight may have led aside, at most
+        as far as the greatest speed allows; Thrun et al., Probabilistic Robotics, Sec. 5.4.
+        """
+        position, heading = max(self.walk[:2]) * seconds, self.walk[2] * seconds
+        aside = max(far * far - float(lever @ lever), 0.0) / 4.0
+        added = np.zeros((3, 3))
+        added[:2, :2] = heading / 3.0 * (np.outer(lever, lever) + aside * np.eye(2))
+        added[:2, :2] += position * np.eye(2)
+        added[:2, 2] = added[2, :2] = heading / 2.0 * lever
+        added[2, 2] = heading
+        return added

@@ -11,7 +11,7 @@ ROOM = 128
 
 
 class CommandLog:
-    """Holds since when each command is in effect; before the first, the robot has none: zero.
+    """Commands with the times at which they take effect; before the first, the command is zero.
 
     Args:
         width: of a command, C.
@@ -24,7 +24,7 @@ class CommandLog:
 
     @property
     def arrays(self) -> Log:
-        """Since when [ns] (K,), commands (K, C), and how many of the rows are in use."""
+        """Times at which they take effect [ns] (K,), commands (K, C), and number of used rows."""
         return self._effective, self._commands, self._count
 
     def clear(self) -> None:
@@ -34,20 +34,20 @@ class CommandLog:
         self._count = 1
 
     def keep(self, command: ArrayLike) -> None:
-        """Forgets all commands but this one (C,), taken to have been in effect ever since."""
+        """Forgets all commands but this one (C,), which counts as always in effect."""
         self.clear()
         self._commands[0] = command
 
     def add(self, effective_ns: int, command: ArrayLike, needed_ns: int) -> bool:
-        """Notes a command (C,).
+        """Adds a command (C,).
 
         Args:
-            effective_ns: since when it is in effect [ns].
+            effective_ns: time at which it takes effect [ns].
             command: in the units and the order of the RobotSpec.
-            needed_ns: what was in effect before this time [ns] may be forgotten.
+            needed_ns: commands superseded before this time [ns] may be forgotten.
 
         Returns:
-            False when there is one of that very time already, which stays.
+            False if there already is one of exactly that time, which is kept.
         """
         if self._count == len(self._effective):
             self._make_room(needed_ns)
@@ -65,7 +65,7 @@ class CommandLog:
         return True
 
     def _make_room(self, needed_ns: int) -> None:
-        """Drops what no longer counts, and doubles the room if that is not enough."""
+        """Drops commands that are no longer needed; doubles the capacity if that is not enough."""
         used = self._effective[: self._count]
         first = max(int(np.searchsorted(used, needed_ns, side="right")) - 1, 0)
         kept = slice(first, self._count)
@@ -76,5 +76,5 @@ class CommandLog:
             self._commands = np.zeros((2 * size, commands.shape[1]))
         self._count = len(effective)
         self._effective[: self._count], self._commands[: self._count] = effective, commands
-        # Whatever came before the first one kept is taken to have been like it.
+        # The first command kept counts as in effect at all earlier times.
         self._effective[0] = np.iinfo(np.int64).min

@@ -7,56 +7,56 @@ from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kinematics.kernels import SERIES, term_arrays
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.middleware import kernels
-from nics_drl_bridge.middleware.belief import Anchor, Belief, Foreseen, parted
+from nics_drl_bridge.middleware.belief import Anchor, Belief, Foreseen, Unseen, parted
 from nics_drl_bridge.middleware.command_log import CommandLog
 from nics_drl_bridge.middleware.measurement import (
+    Acceptance,
+    Judgement,
     Kind,
     Measurement,
-    Outcome,
-    Verdict,
     pose_residual,
 )
-from nics_drl_bridge.middleware.unseen import Unseen
+from nics_drl_bridge.robot.kernels import SERIES, term_arrays
 
 Array = NDArray[np.float64]
 
 LEAST_POSE_DRIFT = 2e-3
-"""No model is trusted to be off by less than this after a second [m or rad / sqrt(s)],"""
+"""Lower bound on the model's pose error after a second [m or rad / sqrt(s)]."""
 LEAST_STATE_DRIFT = 5e-3
-"""nor, of a state, by less than this share of its range [1 / sqrt(s)]."""
+"""Lower bound on the model's state error, as a share of the state's range [1 / sqrt(s)]."""
 LEAST_TWIST_STD = 1e-3
-"""A twist is never trusted more than this [m/s, rad/s],"""
+"""Lower bound on the standard deviation of a twist [m/s, rad/s]."""
 LEAST_POSE_STD = 1e-3
-"""nor is a pose [m, rad]."""
+"""Lower bound on the standard deviation of a pose [m, rad]."""
 GYRO_STD = 0.02
-"""Of a yaw rate whose message does not say [rad/s]: a cheap gyro with its bias."""
+"""Standard deviation of a yaw rate without a covariance [rad/s]: a cheap gyro with its bias."""
 GATE = {Kind.TWIST: 16.27, Kind.YAW_RATE: 10.83, Kind.POSE: 16.27}
-"""A measurement whose squared, normalised innovation exceeds this, once in a thousand, is a
-surprise. (99.9 % of chi-squared with three degrees of freedom, or one.)"""
+"""Gate on the squared, normalised innovation, exceeded once in a thousand measurements. (99.9 % of
+chi-squared with three degrees of freedom, or one.)"""
 PATIENCE: dict[Kind, float] = {Kind.TWIST: 3, Kind.YAW_RATE: np.inf, Kind.POSE: 5}
-"""So many outliers in a row are believed. A gyro never is: odometry says what the robot does."""
+"""Number of consecutive outliers after which they are believed. A gyro never is: odometry has
+precedence."""
 NEWS = 0.5
-"""A robot that is stuck or pushed may be off by this share of its state's range."""
+"""Possible error of the state of a robot that is stuck or pushed, as a share of its range."""
 REACHABLE = 2.0
-"""No state or command is believed beyond so many times its range: the model means nothing there."""
+"""States and commands are limited to this many times their range: the model is invalid beyond."""
 FARTHEST = 1e8
-"""Nothing that is off by more than this [m, rad, m/s, rad/s] is ever believed."""
+"""Innovations beyond this [m, rad, m/s, rad/s] are never believed."""
 START_STD = 1e-3
-"""How well the pose is known at a reset [m, rad]."""
+"""Standard deviation of the pose at a reset [m, rad]."""
 ANYWHERE = (100.0, 100.0, np.pi)
-"""How well odometry alone tells where a robot is in the map of a pose sensor [m, rad]."""
+"""Standard deviation of the pose in the map of a pose sensor, by odometry alone [m, rad]."""
 LONGEST_GAP_S = 10.0
-"""What the robot does in a longer silence is not predicted: it may have driven anywhere."""
-NANO = 1_000_000_000
+"""Longest gap that is predicted [s]: in a longer one, the robot may have driven anywhere."""
 
 
 class Estimator:
     """Pose and state of one robot, predicted by the fitted model, corrected by measurements.
 
-    Time is an integer of nanoseconds, so that the same messages give the same numbers to the
-    bit. Measurements count at the time of the estimate; `replay` puts late ones in their place.
+    Time is in integer nanoseconds, so that the results of the same messages are bit-identical.
+    Measurements apply at the time of the estimate; `replay` inserts late ones at their time.
 
     Args:
         model: its kinematics predict, its drift is the Q and its sensors' noise the R of the
@@ -66,8 +66,8 @@ class Estimator:
     def __init__(self, model: SimulatorModel) -> None:
         self._terms = term_arrays(model.kinematics)
         dt, _, delay = model.timing
-        self._timing = round(dt * NANO), round(LONGEST_GAP_S * NANO)
-        self._delay_ns = round(dt * delay * NANO)
+        self._timing = round(dt * NS_PER_S), round(LONGEST_GAP_S * NS_PER_S)
+        self._delay_ns = round(dt * delay * NS_PER_S)
         size = len(model.robot.state)
         reach = np.array([v.max - v.min for v in model.robot.state])
         least = np.concatenate([np.full(3, LEAST_POSE_DRIFT), LEAST_STATE_DRIFT * reach])
@@ -91,12 +91,12 @@ class Estimator:
         self.reset(0, np.zeros(3))
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
-        """Begins at a pose (3,), standing still, with a zero command.
+        """Begins at a pose (3,), at rest, with a zero command.
 
         Args:
-            time_ns: when [ns].
+            time_ns: of the reset [ns].
             pose: x [m], y [m], heading [rad] in `map`.
-            std: how well it is known [m, rad]: one number, or (3,).
+            std: standard deviation of the pose [m, rad]: one number, or (3,).
         """
         mean, deviation = np.zeros(self._filter.dim_x), np.full(self._filter.dim_x, START_STD)
         mean[:3], deviation[:3] = pose, std
@@ -104,30 +104,30 @@ class Estimator:
         self._log.clear()
 
     def anchor(self, odom: Array) -> None:
-        """Notes the pose (3,) in `odom` of the present."""
+        """Records the present pose (3,) in `odom`."""
         self._anchor = Anchor(self.time_ns, odom, self._filter.x, self._filter.P)
 
     def lose(self, time_ns: int, seconds: float, continuous: bool, command: Array) -> None:
-        """Goes on from the last odometry at a time to which the clock was set.
+        """Continues from the last odometry at a time to which the clock was set.
 
         The robot may have driven anywhere within reach since.
 
         Args:
-            time_ns: when [ns].
-            seconds: since that odometry.
-            continuous: whether the next odometry's pose tells how far it came.
-            command: (C,) that it follows now.
+            time_ns: the new time [ns].
+            seconds: since that odometry [s].
+            continuous: whether the next odometry's pose can bridge the motion since.
+            command: (C,) now in effect.
         """
         anchor = self._anchor or Anchor(0, np.zeros(3), self._filter.x, self._filter.P)
         covariance = self.unseen.doubted(anchor.covariance, seconds)
         known = self._anchor is not None and continuous
-        since = anchor._replace(time_ns=time_ns - round(seconds * NANO)) if known else None
+        since = anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S)) if known else None
         self.belief = Belief(time_ns, anchor.mean, covariance, (0, 0, 0), since, True)
         self._log.keep(np.minimum(np.maximum(command, self._least), self._most))
 
     @property
     def belief(self) -> Belief:
-        """What the filter holds; to be set again when the past has changed."""
+        """State of the filter; set to an earlier one when the past has changed."""
         kept = self._filter.x, self._filter.P, self._outliers, self._anchor, self._lost
         return Belief(self.time_ns, *kept)
 
@@ -144,26 +144,26 @@ class Estimator:
 
     @property
     def twist_covariance(self) -> Array:
-        """(3, 3) of the body twist that pose and state stand for."""
+        """(3, 3) of the body twist that follows from pose and state."""
         _, derivative = self._expect(Kind.TWIST)
         spread: Array = derivative @ self._filter.P @ derivative.T
         return spread + LEAST_TWIST_STD**2 * np.eye(3)
 
     def effective_ns(self, stamp_ns: int) -> int:
-        """When a command that was sent at a time takes effect [ns]."""
+        """Time at which a command sent at `stamp_ns` takes effect [ns]."""
         return stamp_ns + self._delay_ns
 
     def command(self, stamp_ns: int, command: ArrayLike, needed_ns: int | None = None) -> bool:
-        """Notes a command (C,) sent at a time; it takes effect one latency later.
+        """Adds a command (C,) sent at a time; it takes effect one latency later.
 
         Args:
             stamp_ns: when it was sent [ns].
             command: in the units and the order of the RobotSpec.
-            needed_ns: earliest time [ns] that the estimate may be set back to; by default it may
-                not.
+            needed_ns: earliest time [ns] that the estimate may be set back to; by default that of
+                the estimate.
 
         Returns:
-            False when there is one of that very time, which stays.
+            False if there already is one of exactly that time, which is kept.
         """
         needed_ns = self.time_ns if needed_ns is None else needed_ns
         self._foreseen = None
@@ -171,10 +171,10 @@ class Estimator:
         return self._log.add(self.effective_ns(stamp_ns), possible, needed_ns)
 
     def at(self, time_ns: int) -> tuple[Array, Array]:
-        """Pose (3,) and body twist (3,) expected at a time, without moving the estimate.
+        """Predicts pose (3,) and body twist (3,) at a time, without moving the estimate.
 
-        Data that arrive later, with earlier stamps, still count in full. At a time before the
-        estimate's the answer is that of the estimate.
+        Data that arrive later, with earlier stamps, still count in full. For a time before the
+        estimate's, the estimate itself is returned.
         """
         mean, twist = kernels.look_ahead(
             self._filter.x, self.time_ns, time_ns,
@@ -192,10 +192,10 @@ class Estimator:
         self.time_ns, self._filter.x, self._filter.P, *_ = self._foreseen
 
     def foresee(self, time_ns: int) -> None:
-        """Does now what `predict` to that time, and a twist measured then, would do.
+        """Computes in advance the prediction to a time and the update by a twist measured then.
 
-        They then only take it over. For whoever has time now and none when the data come; the
-        estimate is the same to the bit.
+        `predict` and `correct` then only take over the results, which saves time when the data
+        arrive; the estimate is bit-identical.
         """
         self._foreseen = None
         if time_ns > self.time_ns:
@@ -203,7 +203,7 @@ class Estimator:
             self._foreseen = foreseen._replace(update=self._try(foreseen))
 
     def _try(self, foreseen: Foreseen) -> tuple[Array, Array]:
-        """Gain, and covariance afterwards, of a measured twist; neither depends on its value."""
+        """Returns gain and updated covariance for a measured twist, independent of its value."""
         trial, (twist, derivative) = self._trial, foreseen.expected
         trial.x, trial.P = foreseen.mean, foreseen.covariance
         trial.update(twist, lambda _: derivative, lambda _: twist, R=self._noise[Kind.TWIST])
@@ -216,33 +216,33 @@ class Estimator:
             self._timing, log, self._terms, SERIES,
         )  # fmt: skip
         if time_ns - self.time_ns > self._timing[1]:
-            covariance = self.unseen.doubted(covariance, (time_ns - self.time_ns) / NANO)
+            covariance = self.unseen.doubted(covariance, (time_ns - self.time_ns) / NS_PER_S)
         expected = kernels.expect(mean, time_ns, log, self._terms)
         return Foreseen(time_ns, mean, covariance, expected)
 
-    def update_twist(self, twist: ArrayLike) -> Verdict:
+    def update_twist(self, twist: ArrayLike) -> Judgement:
         """Corrects by a measured body twist (3,) at the time of the estimate."""
         return self.correct(Measurement(Kind.TWIST, np.array(twist, dtype=np.float64)))
 
-    def update_yaw_rate(self, rate: float, std: float | None = None) -> Verdict:
+    def update_yaw_rate(self, rate: float, std: float | None = None) -> Judgement:
         """Corrects by a measured yaw rate [rad/s]."""
         noise = None if std is None else np.array([[std**2]])
         return self.correct(Measurement(Kind.YAW_RATE, np.array([rate]), noise))
 
-    def update_pose(self, pose: ArrayLike, std: ArrayLike | None = None) -> Verdict:
+    def update_pose(self, pose: ArrayLike, std: ArrayLike | None = None) -> Judgement:
         """Corrects by a measured pose (3,).
 
         Args:
             pose: x [m], y [m], heading [rad] in `map`.
-            std: (3,) its standard deviations; those of the model's pose sensor when None.
+            std: (3,) its standard deviations; those of the model's pose sensor if None.
         """
         noise = None if std is None else np.diag(np.asarray(std, dtype=np.float64) ** 2)
         return self.correct(Measurement(Kind.POSE, np.array(pose, dtype=np.float64), noise))
 
-    def correct(self, measurement: Measurement) -> Verdict:
+    def correct(self, measurement: Measurement) -> Judgement:
         """Corrects by a measurement at the time of the estimate, unless it is an outlier.
 
-        Where the robot may have driven unseen, the odometry's pose first tells how far.
+        If the robot may have moved unobserved, the odometry's pose first bridges that motion.
         """
         kind, odom = measurement.kind, measurement.odom
         if self._lost and odom is not None:
@@ -250,35 +250,35 @@ class Estimator:
         verdict = self._correct(measurement)
         if odom is not None:
             self.anchor(odom)
-        elif kind is Kind.POSE and verdict.outcome is not Outcome.OUTLIER:
+        elif kind is Kind.POSE and verdict.outcome is not Acceptance.OUTLIER:
             self._lost = False
         return verdict
 
     def _bridge(self, odom: Array) -> None:
-        """Puts the estimate where odometry says that the robot came, if it can have come there."""
+        """Moves the estimate by the odometry since the anchor, if that is within reach."""
         anchor, self._lost = self._anchor, False
         if anchor is None:
             return
-        seconds = (self.time_ns - anchor.time_ns) / NANO
+        seconds = (self.time_ns - anchor.time_ns) / NS_PER_S
         bridged = self.unseen.bridged(anchor, odom, seconds)
         if bridged is not None:
             self._jump(*bridged)
             self._foreseen = None
 
-    def _correct(self, measurement: Measurement) -> Verdict:
+    def _correct(self, measurement: Measurement) -> Judgement:
         kind, value, noise, _ = measurement
         noise = self._noise[kind] if noise is None else noise
         expected, derivative = self._expect(kind)
         residual = pose_residual if kind is Kind.POSE else np.subtract
         innovation = residual(value, expected)
         distance = kernels.distance(innovation, derivative, self._filter.P, noise)
-        outcome = Outcome.USED
+        outcome = Acceptance.USED
         if not distance <= GATE[kind]:
             outcome = self._surprise(kind, innovation, derivative, noise)
-        if outcome is Outcome.OUTLIER:
+        if outcome is Acceptance.OUTLIER:
             self._count(kind, self._outliers[kind] + 1)
-            return Verdict(distance, outcome)
-        if kind is Kind.POSE and outcome is Outcome.JUMP:
+            return Judgement(distance, outcome)
+        if kind is Kind.POSE and outcome is Acceptance.JUMP:
             self._jump(value, noise)
         elif (update := self._update_foreseen(kind, outcome, noise)) is not None:
             gain, self._filter.P = update
@@ -287,14 +287,14 @@ class Estimator:
             self._filter.update(
                 value, lambda _: derivative, lambda _: expected, R=noise, residual=residual
             )
-        if self._outliers[kind] and not (outcome is Outcome.JUMP and kind is Kind.TWIST):
+        if self._outliers[kind] and not (outcome is Acceptance.JUMP and kind is Kind.TWIST):
             self._count(kind, 0)
         kernels.settle(self._filter.x, self._filter.P, *self._limits)
         self._foreseen = None
-        return Verdict(distance, outcome)
+        return Judgement(distance, outcome)
 
     def _expect(self, kind: Kind) -> tuple[Array, Array]:
-        """What a sensor should measure (n,), and its derivative (n, 3 + S)."""
+        """Returns the expected measurement (n,) and its derivative (n, 3 + S)."""
         if kind is Kind.POSE:
             return self._filter.x[:3], self._observe_pose
         if self._foreseen is not None and self._foreseen.mean is self._filter.x:
@@ -306,33 +306,35 @@ class Estimator:
         return (twist, derivative) if kind is Kind.TWIST else (twist[2:], derivative[2:])
 
     def _update_foreseen(
-        self, kind: Kind, outcome: Outcome, noise: Array
+        self, kind: Kind, outcome: Acceptance, noise: Array
     ) -> tuple[Array, Array] | None:
-        """What was tried in advance, if it was for such a measurement of the present belief."""
+        """Returns the update computed in advance, if it is for such a measurement and belief."""
         foreseen = self._foreseen
         if foreseen is None or foreseen.mean is not self._filter.x:
             return None
-        as_tried = outcome is Outcome.USED and noise is self._noise[Kind.TWIST]
+        as_tried = outcome is Acceptance.USED and noise is self._noise[Kind.TWIST]
         return foreseen.update if kind is Kind.TWIST and as_tried else None
 
-    def _surprise(self, kind: Kind, innovation: Array, derivative: Array, noise: Array) -> Outcome:
-        """What to make of a measurement beyond its gate; a robot that is stuck makes news."""
+    def _surprise(
+        self, kind: Kind, innovation: Array, derivative: Array, noise: Array
+    ) -> Acceptance:
+        """Decides on a measurement beyond its gate; that of a stuck or pushed robot is news."""
         if not (np.abs(innovation) < FARTHEST).all():
-            return Outcome.OUTLIER
+            return Acceptance.OUTLIER
         believed = self._outliers[kind] + 1 >= PATIENCE[kind]
         if kind is Kind.TWIST:
             doubt = np.maximum(self._news - np.diag(self._filter.P), 0.0)
             doubtful = self._filter.P + np.diag(doubt)
             if kernels.distance(innovation, derivative, doubtful, noise) <= GATE[kind]:
                 self._filter.P = doubtful
-                return Outcome.NEWS
+                return Acceptance.NEWS
             if believed:
                 self._filter.P = doubtful
                 self._filter.P = parted(self._filter.P)
-        return Outcome.JUMP if believed else Outcome.OUTLIER
+        return Acceptance.JUMP if believed else Acceptance.OUTLIER
 
     def _jump(self, pose: Array, noise: Array) -> None:
-        """Takes a pose for the pose."""
+        """Replaces the estimated pose and its covariance."""
         self._filter.P = parted(self._filter.P)
         mean = np.array(self._filter.x)
         mean[:3], self._filter.P[:3, :3] = pose, noise
@@ -345,6 +347,6 @@ class Estimator:
 
 
 def _widened(low: Array, high: Array) -> tuple[Array, Array]:
-    """Limits (n,), as far apart as the filter believes in."""
+    """Returns the limits (n,) widened to the range that the filter accepts."""
     center, half = (high + low) / 2.0, REACHABLE * (high - low) / 2.0
     return center - half, center + half

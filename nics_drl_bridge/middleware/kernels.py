@@ -5,23 +5,25 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from nics_drl_bridge.kinematics.kernels import advance, rates, wrap
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.robot.kernels import advance, rates, wrap
 
-NANO = 1_000_000_000
 RUNAWAY = 1e9
-"""No pose or state is ever so far [m, rad, its unit], nor changes by so many times its cause."""
+"""Bound on poses and states [m, rad, its unit] and on their derivatives; beyond, the model has
+diverged."""
 LEAST_PIVOT = 1e-12
-"""A variable is never known better than this share of its variance, given those before it,"""
+"""Lower bound on a variable's variance given those before it, as a share of its own variance."""
 LEAST_VARIANCE = 1e-18
-"""nor better than this."""
+"""Absolute lower bound on that variance."""
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
-    """Derivative (3 + S, V) of `rates` by X."""
-    dof, coefficient, factors, count = terms
+    """Computes the derivative (3 + S, V) of `rates` with respect to X."""
+    dof, coefficient = terms.dof, terms.coefficient
+    factors, count = terms.factors, terms.degree
     jacobian[:] = 0.0
     for k in range(dof.shape[0]):
         for f in range(count[k]):
@@ -32,7 +34,7 @@ def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
             jacobian[dof[k], factors[k, f]] += product
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def predict(mean, transition, command, dt, steps, terms, series):  # type: ignore[no-untyped-def]
     """Moves the mean (3 + S) by `steps` steps of `dt` under one command (C,), in place.
 
@@ -66,9 +68,9 @@ def predict(mean, transition, command, dt, steps, terms, series):  # type: ignor
             mean[3 + i] += dt * dq[3 + i]
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def twist_of(mean, command, terms):  # type: ignore[no-untyped-def]
-    """Body twist (3,) and its derivative (3, 3 + S) at a mean (3 + S) under a command (C,)."""
+    """Body twist (3,) and its derivative (3, 3 + S) for a mean (3 + S) and a command (C,)."""
     size, width = mean.shape[0] - 3, command.shape[0]
     x, dq = np.ones(size + width + 1), np.zeros(3 + size)
     jacobian, derivative = np.zeros((3 + size, size + width)), np.zeros((3, 3 + size))
@@ -79,9 +81,9 @@ def twist_of(mean, command, terms):  # type: ignore[no-untyped-def]
     return dq[:3].copy(), derivative
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def in_effect(effective, count, time):  # type: ignore[no-untyped-def]
-    """Which command is in effect just before a time: the last that took effect earlier."""
+    """Index of the command in effect just before a time: the last that took effect earlier."""
     low, high = 0, count
     while low < high:
         middle = (low + high) // 2
@@ -92,18 +94,18 @@ def in_effect(effective, count, time):  # type: ignore[no-untyped-def]
     return max(low - 1, 0)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def carry(mean, transition, begin, end, timing, log, terms, series):  # type: ignore[no-untyped-def]
     """Moves a mean (3 + S) from one time to another, command by command, in place.
 
-    Where the model runs away, as none does within its range, the robot is taken to have stood
-    still, too.
+    Over a gap that is too long, the pose is kept and the state set to zero. The same is done if
+    the model diverges, which none does within its range.
 
     Args:
         mean, transition, terms, series: see `predict`.
         begin, end: times [ns].
-        timing: the model's step, and the silence over which nothing is predicted [ns].
-        log: since when each command is in effect [ns] (K,), the commands (K, C), how many.
+        timing: the model's step, and the longest gap that is predicted [ns].
+        log: times at which the commands take effect [ns] (K,), the commands (K, C), their number.
     """
     step, longest = timing
     effective, commands, count = log
@@ -117,27 +119,27 @@ def carry(mean, transition, begin, end, timing, log, terms, series):  # type: ig
         if k + 1 < count and effective[k + 1] < end:
             until = effective[k + 1]
         steps, rest = (until - now) // step, (until - now) % step
-        predict(mean, transition, commands[k], step / NANO, steps, terms, series)
+        predict(mean, transition, commands[k], step / NS_PER_S, steps, terms, series)
         if rest > 0:
-            predict(mean, transition, commands[k], rest / NANO, 1, terms, series)
+            predict(mean, transition, commands[k], rest / NS_PER_S, 1, terms, series)
         now, k = until, k + 1
     if not (np.all(np.abs(mean) < RUNAWAY) and np.all(np.abs(transition) < RUNAWAY)):
         mean[:3], mean[3:] = before, 0.0
         transition[:] = np.eye(mean.shape[0])
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def forecast(mean, covariance, process, begin, end, timing, log, terms, series):  # type: ignore[no-untyped-def]
-    """Mean and covariance at a later time; `process` (3 + S, 3 + S) grows with every second."""
+    """Predicts mean and covariance at a later time; `process` (3 + S, 3 + S) is per second."""
     moved, transition = mean.copy(), np.eye(mean.shape[0])
     carry(moved, transition, begin, end, timing, log, terms, series)
-    spread = transition @ covariance @ transition.T + process * ((end - begin) / NANO)
+    spread = transition @ covariance @ transition.T + process * ((end - begin) / NS_PER_S)
     return moved, (spread + spread.T) * 0.5
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def look_ahead(mean, begin, end, timing, log, terms, series):  # type: ignore[no-untyped-def]
-    """Mean (3 + S) and body twist (3,) at a time; the present one when that is earlier."""
+    """Predicts mean (3 + S) and body twist (3,) at a time; the present ones if that is earlier."""
     moved = mean.copy()
     if end > begin:
         carry(moved, np.eye(mean.shape[0]), begin, end, timing, log, terms, series)
@@ -146,27 +148,27 @@ def look_ahead(mean, begin, end, timing, log, terms, series):  # type: ignore[no
     return moved, twist_of(moved, command, terms)[0]
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def expect(mean, now, log, terms):  # type: ignore[no-untyped-def]
-    """The body twist (3,) to measure at the time of the mean, and its derivative (3, 3 + S)."""
+    """Expected body twist (3,) at the time of the mean, and its derivative (3, 3 + S)."""
     effective, commands, count = log
     return twist_of(mean, commands[in_effect(effective, count, now)], terms)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def distance(innovation, derivative, covariance, noise):  # type: ignore[no-untyped-def]
-    """Squared, normalised innovation (Mahalanobis): chi-squared when the filter is right."""
+    """Squared, normalised innovation (Mahalanobis): chi-squared if the filter is consistent."""
     spread = derivative @ covariance @ derivative.T + noise
     return innovation @ np.linalg.solve(spread, innovation)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def settle(mean, covariance, low, high):  # type: ignore[no-untyped-def]
-    """Brings an estimate to where it can be, in place.
+    """Restores the constraints of an estimate, in place.
 
-    The heading comes into [-pi, pi), the state within its limits (S,), the covariance is made
-    symmetric. Where rounding left a pivot of its Cholesky factor at nothing, the variance is
-    raised to what makes it positive.
+    The heading is wrapped to [-pi, pi), the state clipped to its limits (S,), the covariance made
+    symmetric. Where rounding left a pivot of its Cholesky factor too small, the variance is raised
+    to make it positive.
     """
     size = mean.shape[0]
     mean[2] = wrap(mean[2])

@@ -1,14 +1,18 @@
-"""What a sensor says about a robot, and what the estimator makes of it."""
+"""Measurements of a robot's sensors, and the estimator's verdicts on them.
+
+Health of a robot's topics, as reported by the diagnostics.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.kinematics.kernels import wrap
+from nics_drl_bridge.robot.kernels import wrap
 
 Array = NDArray[np.float64]
 
@@ -16,7 +20,7 @@ SCAN, ODOM, CMD_VEL, POSE, IMU = "scan", "odom", "cmd_vel", "pose", "imu"
 
 
 class Kind(IntEnum):
-    """What is measured; of measurements with the same stamp, the lower kind counts first."""
+    """Kind of measurement; of measurements with equal stamps, the lower kind is applied first."""
 
     TWIST = 0
     YAW_RATE = 1
@@ -24,7 +28,7 @@ class Kind(IntEnum):
 
     @property
     def topic(self) -> str:
-        """Where it comes from."""
+        """Topic of the measurement."""
         return (ODOM, IMU, POSE)[self]
 
 
@@ -32,11 +36,11 @@ class Measurement(NamedTuple):
     """One measurement.
 
     Attributes:
-        kind: what is measured.
+        kind: the measured quantity.
         value: (3,) body twist vx, vy [m/s], wz [rad/s]; (1,) yaw rate [rad/s]; or (3,) pose
             x, y [m], heading [rad] in `map`.
-        noise: covariance of the value, (3, 3) or (1, 1); the model's when None.
-        odom: (3,) pose in `odom` that came with a twist; it bridges what was not seen.
+        noise: covariance of the value, (3, 3) or (1, 1); the model's if None.
+        odom: (3,) pose in `odom` that came with a twist; it bridges unobserved motion.
     """
 
     kind: Kind
@@ -45,11 +49,11 @@ class Measurement(NamedTuple):
     odom: Array | None = None
 
 
-class Outcome(IntEnum):
-    """What became of a measurement.
+class Acceptance(IntEnum):
+    """Outcome of a measurement.
 
-    `USED`: within its gate. `NEWS`: beyond it, but what a robot that is stuck or pushed would
-    do; used. `JUMP`: beyond it so often in a row that it is believed. `OUTLIER`: refused.
+    `USED`: within its gate. `NEWS`: beyond it, but plausible for a robot that is stuck or pushed;
+    used. `JUMP`: beyond it so many times in a row that it is believed. `OUTLIER`: rejected.
     """
 
     USED = 0
@@ -58,31 +62,32 @@ class Outcome(IntEnum):
     OUTLIER = 3
 
 
-class Verdict(NamedTuple):
-    """What the estimator makes of a measurement.
+class Judgement(NamedTuple):
+    """The estimator's verdict on a measurement.
 
     Attributes:
-        distance: squared, normalised innovation; about the size of the value when all is well.
-        outcome: whether it was used.
+        distance: squared, normalised innovation; close to the number of components of the value
+            if the filter is consistent.
+        outcome: whether and how it was used.
     """
 
     distance: float
-    outcome: Outcome
+    outcome: Acceptance
 
 
 def checked_covariance(covariance: ArrayLike | None, size: int, least_std: float) -> Array | None:
-    """A covariance (size, size) that may enter the filter.
+    """Returns a covariance (size, size) that the filter can use.
 
     Args:
-        covariance: as the sensor gave it. All zeros means unknown, as in the messages of ROS.
-        size: of what is measured.
-        least_std: nothing is trusted more than this.
+        covariance: as given by the sensor. All zeros means unknown, as in ROS messages.
+        size: number of measured components.
+        least_std: lower bound on the standard deviation in any direction.
 
     Returns:
-        None when it is unknown.
+        The covariance, or None if it is unknown.
 
     Raises:
-        ValueError: it is no covariance.
+        ValueError: it is not a covariance.
     """
     if covariance is None:
         return None
@@ -101,7 +106,42 @@ def checked_covariance(covariance: ArrayLike | None, size: int, least_std: float
 
 
 def pose_residual(measured: Array, expected: Array) -> Array:
-    """Difference of two poses (3,), its heading in [-pi, pi)."""
+    """Residual of two poses (3,), with the heading in [-pi, pi)."""
     difference = measured - expected
     difference[2] = wrap(difference[2])
     return difference
+
+
+@dataclass(frozen=True)
+class TopicHealth:
+    """Health of one topic.
+
+    Attributes:
+        received: number of accepted data.
+        rate_hz: rate of arrivals [1/s]; 0 before the second datum.
+        age_s: time since the latest arrival [s], on the clock of the receiver.
+        innovation: squared, normalised innovation of the newest measurement, close to its number
+            of components if the filter is consistent; NaN for topics that correct nothing.
+    """
+
+    received: int
+    rate_hz: float
+    age_s: float
+    innovation: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Health:
+    """Health of all topics of a robot.
+
+    Attributes:
+        topics: topic -> its health; topics without data are missing.
+        rejected: reason -> number of data; a reason begins with the topic.
+        noticed: surprising data that were used nevertheless (`odom: news`) -> number of times.
+        replayed: number of late data that were inserted at their time.
+    """
+
+    topics: dict[str, TopicHealth] = field(default_factory=dict)
+    rejected: dict[str, int] = field(default_factory=dict)
+    noticed: dict[str, int] = field(default_factory=dict)
+    replayed: int = 0

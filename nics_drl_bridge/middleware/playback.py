@@ -1,7 +1,7 @@
-"""Runs a recorded drive through the middleware: the same bag gives the same estimate, bit for bit.
+"""Runs a recorded drive through the middleware: the estimate of a bag is bit-identical.
 
-The order is that of receipt, and of equal times that of the topics' names; time is the bag's, so
-that nothing depends on the machine or on how busy it is.
+Messages are played in the order of receipt, at equal times in the order of the roles' names; time
+is the bag's, so that nothing depends on the machine or its load.
 """
 
 from __future__ import annotations
@@ -18,16 +18,15 @@ from numpy.typing import NDArray
 from nics_drl_bridge.errors import RecordingError, nearest
 from nics_drl_bridge.files import sha256, write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kinematics import topic_roles
-from nics_drl_bridge.kinematics.bag_file import BagFile, Message, opened
-from nics_drl_bridge.kinematics.bag_messages import command_row, pose_row, stamp, twist_row
-from nics_drl_bridge.lidar.canonical import Reader, reader_beside
-from nics_drl_bridge.lidar.rep117 import from_device
-from nics_drl_bridge.lidar.spec import ScanHeader
+from nics_drl_bridge.lidar.sectors import Reader, reader_beside
+from nics_drl_bridge.lidar.spec import ScanHeader, from_device
 from nics_drl_bridge.middleware.ekf import ANYWHERE
 from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.npz import npz_bytes
+from nics_drl_bridge.recording import topic_roles
+from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
+from nics_drl_bridge.recording.messages import command_row, pose_row, stamp, twist_row
 
 Array = NDArray[np.float64]
 
@@ -40,22 +39,22 @@ TYPES: Mapping[str, tuple[str, ...]] = {
     IMU: (topic_roles.IMU,),
 }
 ALWAYS = (SCAN, ODOM, CMD_VEL)
-"""Topics that are used when the bag has them; the others only when they are asked for."""
+"""Topics that are used if the bag has them; the others only on request."""
 APART_S = 1.0
-"""Stamps of one clock are no farther apart than this at any time [s]."""
+"""Greatest difference between stamps of one clock at the same time of receipt [s]."""
 COLUMNS = ("x", "y", "heading", "vx", "vy", "wz")
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """What the middleware made of a drive, after each odometry that was the newest.
+class EstimatedDrive:
+    """Estimates of the middleware over a drive, after each odometry that was the newest.
 
     Attributes:
         stamp_ns: (T,) of the estimates [ns].
         pose: (T, 3) x [m], y [m], heading [rad] in `map`.
         twist: (T, 3) vx [m/s], vy [m/s], wz [rad/s] in `base_link`.
         covariance: (T, 3, 3) of the pose.
-        rejected: reason -> how many data were not used.
+        rejected: reason -> number of data that were not used.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -71,7 +70,7 @@ class Estimate:
         return sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays))
 
 
-def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str]) -> Estimate:
+def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str]) -> EstimatedDrive:
     """Runs a bag through the middleware, in process.
 
     Args:
@@ -80,7 +79,7 @@ def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str])
         topics: role (`scan`, `odom`, `cmd_vel`, `pose`, `imu`) -> topic; see `chosen`.
 
     Returns:
-        The estimate, the same whenever and wherever it is computed with the same versions.
+        The estimate, identical in every run and on every machine with the same versions.
 
     Raises:
         RecordingError: the bag is damaged, a topic is missing or of a wrong type, or its data
@@ -96,7 +95,7 @@ def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str])
             "no odometry of the bag could be used; look at it with `nics bag info`."
         )
     stamps, poses, twists, covariances = zip(*rows, strict=True)
-    return Estimate(
+    return EstimatedDrive(
         np.array(stamps, dtype=np.int64), np.array(poses), np.array(twists),
         np.array(covariances), dict(playback.middleware.cache.rejected),
     )  # fmt: skip
@@ -110,7 +109,7 @@ def _row(middleware: Middleware, stamp_ns: int) -> tuple[int, Array, Array, Arra
 
 
 def played(path: str | Path, topics: Mapping[str, str]) -> dict[str, list[Message]]:
-    """The messages of each role that is played.
+    """Returns the messages of each role that is played.
 
     Args:
         path: of the bag.
@@ -127,15 +126,15 @@ def played(path: str | Path, topics: Mapping[str, str]) -> dict[str, list[Messag
 
 
 def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
-    """The topic of each role that is played.
+    """Returns the topic of each role that is played.
 
     Args:
-        bag: that has them.
-        topics: what the user said; `scan`, `odom` and `cmd_vel` are by default the topics of
-            these names, `pose` and `imu` are left out.
+        bag: the recording.
+        topics: role -> topic as given by the user; `scan`, `odom` and `cmd_vel` are by default the
+            topics of these names, `pose` and `imu` are left out.
 
     Raises:
-        RecordingError: there is no such topic, or it is of a wrong type; or no `odom`.
+        RecordingError: a topic does not exist or is of a wrong type, or there is no `odom`.
     """
     roles = {}
     for role, kinds in TYPES.items():
@@ -164,7 +163,7 @@ def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
 def _check_clocks(
     place: str, roles: Mapping[str, str], messages: Mapping[str, list[Message]]
 ) -> None:
-    """Raises RecordingError when the stamps are not of one clock."""
+    """Raises RecordingError if the stamps are not of one clock."""
     stamps = {
         role: np.array([(m.receive_ns, stamp(m.content)) for m in some], dtype=np.int64)
         for role, some in messages.items()
@@ -194,13 +193,13 @@ class Playback:
 
     Args:
         model: of the robot.
-        posed: whether a pose sensor says where the robot begins.
-        any_lidar: whether scans of another lidar than the model's are taken too, as `policy_node`
-            does; of the first one's from then on.
+        posed: whether a pose sensor gives the start of the robot.
+        any_lidar: whether scans of a lidar other than the model's are accepted, as by
+            `policy_node`; the first scan then fixes the lidar.
 
     Attributes:
-        middleware: that is fed.
-        lidar: whose scans it holds.
+        middleware: the middleware that is fed.
+        lidar: the lidar of its scans.
     """
 
     def __init__(self, model: SimulatorModel, posed: bool, any_lidar: bool = False) -> None:
@@ -210,7 +209,7 @@ class Playback:
         self._started = False
 
     def take(self, role: str, message: Message) -> bool:
-        """Takes a message; whether it is used, and the newest of its topic."""
+        """Feeds a message; True if it was used and is the newest of its topic."""
         takes = {
             SCAN: self._scan, ODOM: self._odometry, CMD_VEL: self._command,
             POSE: self._pose, IMU: self._imu,
@@ -231,7 +230,7 @@ class Playback:
         return self.middleware.scan(stamp(message), arrival_ns, ranges)
 
     def _followed(self, message: Any) -> Reader:
-        """How to read scans; of the first one's lidar from then on."""
+        """Returns the reader of the scans, which the lidar of the first scan determines."""
         if self._reader is None:
             header = ScanHeader(*(float(getattr(message, name)) for name in ScanHeader._fields))
             self._reader = reader_beside(header, len(message.ranges), self._model.lidar)
@@ -272,7 +271,7 @@ class Playback:
 
 
 def in_order(messages: Mapping[str, list[Message]]) -> Iterator[tuple[str, Message]]:
-    """All messages with their roles, in the order of receipt."""
+    """Yields all messages with their roles, in the order of receipt."""
     every = [
         (message.receive_ns, place, k, role, message)
         for place, (role, some) in enumerate(sorted(messages.items()))
@@ -282,8 +281,8 @@ def in_order(messages: Mapping[str, list[Message]]) -> Iterator[tuple[str, Messa
         yield role, message
 
 
-def write_estimate(made: Estimate, path: str | Path) -> None:
-    """Writes an estimate as `.npz`, or else as CSV whose numbers read back exactly."""
+def write_estimate(made: EstimatedDrive, path: str | Path) -> None:
+    """Writes an estimate as `.npz`, or otherwise as CSV with numbers in full precision."""
     if Path(path).suffix == ".npz":
         arrays = {
             "stamp_ns": made.stamp_ns, "pose": made.pose, "twist": made.twist,

@@ -1,4 +1,4 @@
-"""What the odometry itself says about its stamps, and about the way on which none could be used."""
+"""Consistency of odometry with its stamps, and the path driven while its stamps were rejected."""
 
 from __future__ import annotations
 
@@ -10,29 +10,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.middleware.replay import HISTORY_NS
-from nics_drl_bridge.middleware.stamps import CLOCK_JUMP, FUTURE_NS
-from nics_drl_bridge.middleware.unseen import JITTER_S
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.middleware.belief import JITTER_S
+from nics_drl_bridge.middleware.cache import CLOCK_JUMP, FUTURE_NS
+from nics_drl_bridge.middleware.timeline import HISTORY_NS
 
 Array = NDArray[np.float64]
-NANO = 1_000_000_000
 
 CONTRADICTED_NS = 200_000_000
-"""A stamp that is off by less [ns] can't be told from data that took longer."""
+"""A smaller error of a stamp [ns] cannot be distinguished from a longer transmission."""
 IN_STEP = 5
-"""So many odometries in a row came when their stamps said: arrivals then tell of time."""
+"""Number of consecutive odometries that arrived in step with their stamps, before arrivals count as
+a measure of time."""
 SIGMA = 6.0
-"""Odometry's pose and twist differ by at most so many standard deviations,"""
+"""Greatest difference between odometry's pose and twist, in standard deviations."""
 LEAST = 0.01
-"""and may always differ by this [m, rad]."""
+"""Difference between odometry's pose and twist that is always allowed [m, rad]."""
 STILL = 0.02
-"""What moves less than this [m/s, rad/s] says nothing about time."""
-NEAR_NS = HISTORY_NS + 2 * NANO
-"""A stamp farther back than this [ns] is refused so often that `Stamps` sees it."""
+"""Slower motion [m/s, rad/s] gives no information about time."""
+NEAR_NS = HISTORY_NS + 2 * NS_PER_S
+"""Stamps farther back than this [ns] are all rejected, which `Stamps` detects."""
 
 
-class Told(NamedTuple):
-    """An odometry as it came: stamp and arrival [ns], pose in `odom` (3,), body twist (3,)."""
+class ReportedPose(NamedTuple):
+    """An odometry as received: stamp and arrival [ns], pose in `odom` (3,), body twist (3,)."""
 
     stamp_ns: int
     arrival_ns: int
@@ -43,9 +44,9 @@ class Told(NamedTuple):
 class Trail:
     """Follows the odometries since the last one that was used.
 
-    Where a robot moves, the way between two odometries tells the time between them: its twist says
-    how fast it was. So a stamp that says another time, when the arrivals say that of the way, is
-    not late, nor was anything lost: the clock was set.
+    If the robot moves, the path between two odometries and their twists give the time between them.
+    If the arrivals agree with that time and the stamp does not, the odometry is neither late nor
+    did it follow a loss of data: the clock was set.
 
     Args:
         walk: (3,) variance per second by which pose and twist of odometry differ [m^2/s, rad^2/s].
@@ -56,24 +57,24 @@ class Trail:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets all."""
-        self._recent: deque[Told] = deque(maxlen=IN_STEP + 1)
-        self._refused: deque[Told] = deque(maxlen=CLOCK_JUMP)
+        """Forgets all odometries."""
+        self._recent: deque[ReportedPose] = deque(maxlen=IN_STEP + 1)
+        self._refused: deque[ReportedPose] = deque(maxlen=CLOCK_JUMP)
 
-    def use(self, told: Told) -> None:
-        """Notes an odometry that is used."""
+    def use(self, told: ReportedPose) -> None:
+        """Records an odometry that is used."""
         self._refused.clear()
         if not self._recent or told.stamp_ns > self._recent[-1].stamp_ns:
             self._recent.append(told)
 
-    def refuse(self, told: Told) -> None:
-        """Notes an odometry that is not used for its stamp."""
+    def refuse(self, told: ReportedPose) -> None:
+        """Records an odometry that is rejected for its stamp."""
         self._refused.append(told)
 
-    def contradicts(self, told: Told) -> bool:
-        """Whether an odometry's way and arrival both say that the clock was set, by a little.
+    def contradicts(self, told: ReportedPose) -> bool:
+        """True if an odometry's path and arrival both show that the clock was set by a little.
 
-        Such stamps look like late data, or like some that follow a gap.
+        Such stamps look like late data, or like data after a gap.
         """
         if len(self._recent) <= IN_STEP:
             return False
@@ -83,39 +84,43 @@ class Trail:
             return False
         if not all(self._in_step(*pair) for pair in pairwise(self._recent)):
             return False
-        seconds, stamped, arrived = self._time_of_way(last, told, 0.0), passed / NANO, waited / NANO
+        seconds, stamped, arrived = (
+            self._time_of_way(last, told, 0.0),
+            passed / NS_PER_S,
+            waited / NS_PER_S,
+        )
         return (
             seconds > 0.0
-            and abs(seconds - arrived) <= max(0.5 * arrived, 0.5 * CONTRADICTED_NS / NANO)
-            and abs(seconds - stamped) >= CONTRADICTED_NS / NANO
+            and abs(seconds - arrived) <= max(0.5 * arrived, 0.5 * CONTRADICTED_NS / NS_PER_S)
+            and abs(seconds - stamped) >= CONTRADICTED_NS / NS_PER_S
             and self._fits(last, told, seconds)
             and not self._fits(last, told, stamped)
         )
 
-    def _in_step(self, before: Told, after: Told) -> bool:
-        """Whether one came as long after the other as its stamp says, and so does its way."""
+    def _in_step(self, before: ReportedPose, after: ReportedPose) -> bool:
+        """True if both the arrivals and the path agree with the time between two stamps."""
         passed, waited = after.stamp_ns - before.stamp_ns, after.arrival_ns - before.arrival_ns
-        return 2 * abs(waited - passed) <= passed and self._fits(before, after, passed / NANO)
+        return 2 * abs(waited - passed) <= passed and self._fits(before, after, passed / NS_PER_S)
 
-    def seconds(self, now: Told) -> float:
-        """How long ago the last used odometry was, by its arrival and by the stamps since [s]."""
+    def seconds(self, now: ReportedPose) -> float:
+        """Time since the last used odometry, by its arrival and by the stamps since [s]."""
         if not self._recent:
             return 0.0
         last = self._recent[-1]
         waited = max(now.arrival_ns - last.arrival_ns, 0)
         stamped = now.stamp_ns - (*self._refused, now)[0].stamp_ns
-        # The first may have been a second late; then the arrivals show less time than has passed.
-        return max(waited, min(stamped, waited + HISTORY_NS)) / NANO
+        # The last used one may have been a second late; the arrivals then show too little time.
+        return max(waited, min(stamped, waited + HISTORY_NS)) / NS_PER_S
 
-    def continuous(self, now: Told) -> bool:
-        """Whether the poses since the last used odometry are those of one way, and tell of it."""
+    def continuous(self, now: ReportedPose) -> bool:
+        """True if the poses since the last used odometry form one path and follow the motion."""
         if not self._recent:
             return False
         way = [self._recent[-1], *self._refused, now]
         unmoved = all(np.array_equal(each.pose, way[0].pose) for each in way)
         if unmoved and any((np.abs(each.twist) > STILL).any() for each in way):
             return False
-        times = [(b.stamp_ns - a.stamp_ns) / NANO for a, b in pairwise(way[1:])]
+        times = [(b.stamp_ns - a.stamp_ns) / NS_PER_S for a, b in pairwise(way[1:])]
         first = max(self.seconds(now) - sum(times), 0.0)
         spans = [(max(first - JITTER_S, 0.0), first + JITTER_S)]
         spans += [(0.5 * each, 1.5 * each) for each in times]
@@ -125,16 +130,16 @@ class Trail:
         )
 
     @staticmethod
-    def _time_of_way(before: Told, after: Told, standing: float) -> float:
-        """The time [s] in which the mean twist leads from one pose to the other, if it moves."""
+    def _time_of_way(before: ReportedPose, after: ReportedPose, standing: float) -> float:
+        """Time [s] in which the mean twist leads between the poses; `standing` if it is at rest."""
         mean = (before.twist + after.twist) / 2.0
         if not (np.abs(mean) > STILL).any():
             return standing
         way = geometry.log(geometry.between(before.pose, after.pose))
         return float(way @ mean / (mean @ mean))
 
-    def _fits(self, before: Told, after: Told, seconds: float) -> bool:
-        """Whether the twists lead from one pose to the other in a time [s]."""
+    def _fits(self, before: ReportedPose, after: ReportedPose, seconds: float) -> bool:
+        """True if the twists lead from one pose to the other in a time [s]."""
         mean, change = (before.twist + after.twist) / 2.0, np.abs(after.twist - before.twist)
         way = geometry.between(before.pose, after.pose)
         off = np.abs(geometry.between(geometry.exp(mean * seconds), way))

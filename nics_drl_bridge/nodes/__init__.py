@@ -1,1 +1,1 @@
-"""ROS 2 nodes: thin coats around the simulator, the middleware and the policies."""
+"""ROS 2 nodes: thin wrappers around the simulator, the middleware and the policies."""

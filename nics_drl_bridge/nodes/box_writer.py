@@ -1,4 +1,4 @@
-"""Writing what this process remembers now, without ever waiting for a disk."""
+"""Snapshots of this process's memory, written without ever waiting for a disk."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 MOST_AT_WORK = 3
-"""Writers that a disk may hold up at a time; each keeps a copy of this process's memory."""
+"""Greatest number of writers at work; each keeps a copy of this process's memory."""
 PATIENCE_S = 20.0
-"""A writer that takes longer gives up."""
+"""A writer that takes longer gives up [s]."""
 OVERDUE_S = PATIENCE_S + 5.0
-"""One that has not even given up by then never will: another thread may have held a lock when it
-was copied, or the disk holds it."""
+"""A writer that still runs after this never gives up [s]: another thread may have held a lock
+during the fork, or the disk blocks it."""
 GRACE_S, POLL_S = 0.5, 0.005
 NICENESS = 5
 MOST_TOLD = 500
@@ -34,13 +34,13 @@ class _Writer:
 
 
 class BoxWriter:
-    """Writes files, each in a process of its own that begins as a copy of this one.
+    """Writes files, each in its own process, which starts as a copy of this one.
 
-    The copy (`fork`, which shares memory until somebody changes it) is the snapshot: it takes this
-    process some milliseconds, however much there is to write, and what happens here later is not in
-    it. A disk that hangs holds up the copy and nobody else, not even the end of this process, as a
-    thread that waits for it would. The copy has no other thread, lets go of all sockets, and runs
-    at ordinary priority.
+    The copy (`fork`, which shares memory until it is modified) is the snapshot: it takes this
+    process some milliseconds, however much there is to write, and later changes here are not in
+    it. A disk that hangs blocks the copy and nothing else, not even the end of this process, as a
+    waiting thread would. The copy has no other thread, closes all sockets, and runs at ordinary
+    priority.
     """
 
     def __init__(self) -> None:
@@ -48,10 +48,10 @@ class BoxWriter:
         self._failed: list[str] = []
 
     def begin(self, write: Callable[[], object]) -> bool:
-        """Lets a copy of this process write; False when too many are at work.
+        """Starts a copy of this process that writes; returns False if too many are at work.
 
         Args:
-            write: called in the copy. Where an exception ends it, it has to clean up after itself.
+            write: called in the copy. If an exception ends it, it has to clean up after itself.
 
         Raises:
             OSError: the system can't make another process.
@@ -75,13 +75,13 @@ class BoxWriter:
         return True
 
     def failures(self) -> list[str]:
-        """What went wrong with those that have ended since the last look."""
+        """Returns the failures of the writers that have ended since the last call."""
         self._look()
         failed, self._failed = self._failed, []
         return failed
 
     def _look(self) -> None:
-        """Parts with the writers that have ended, and ends those that are overdue."""
+        """Removes the writers that have ended, and kills those that are overdue."""
         for writer in tuple(self._writers):
             status = _ended(writer.pid)
             if status is None:
@@ -97,16 +97,16 @@ class BoxWriter:
         """Waits for the writers, and makes those give up that take longer.
 
         Args:
-            seconds: to wait at most, but for a moment to clean up.
+            seconds: longest wait, plus a moment for clean-up.
 
         Returns:
-            What went wrong.
+            The failures.
         """
         failed = self._wait(seconds)
         for writer in self._writers:
             os.kill(writer.pid, signal.SIGTERM)
         failed += self._wait(GRACE_S)
-        for writer in self._writers:  # held up by the disk; it ends when that lets it go
+        for writer in self._writers:  # blocked by the disk; it ends when that releases it
             os.kill(writer.pid, signal.SIGKILL)
             failed.append("the disk does not answer")
         return failed
@@ -121,7 +121,7 @@ class BoxWriter:
 
 @contextlib.contextmanager
 def _no_signals() -> Iterator[None]:
-    """Keeps signals waiting, lest the copy runs the handlers of the original."""
+    """Defers signals, so that the copy does not run the handlers of the original."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, *ENDING))
     try:
         yield
@@ -130,32 +130,32 @@ def _no_signals() -> Iterator[None]:
 
 
 def _copied() -> int:
-    """0 in a copy of this process, and its id in this one."""
+    """Forks; returns 0 in the copy of this process, and its id in this one."""
     with warnings.catch_warnings():
         # Of Python 3.12: locks that other threads hold stay locked in the copy. It needs none of
-        # theirs, and one that hangs all the same gives up.
+        # theirs, and a copy that hangs nevertheless gives up.
         warnings.simplefilter("ignore", DeprecationWarning)
         return os.fork()
 
 
 def _ended(pid: int) -> int | None:
-    """The status with which a writer has ended; None while it lives."""
+    """Returns the exit status of a writer; None while it runs."""
     try:
         ended, status = os.waitpid(pid, os.WNOHANG)
-    except ChildProcessError:  # where SIGCHLD is ignored nobody keeps it
+    except ChildProcessError:  # if SIGCHLD is ignored, no status is kept
         return 0
     return status if ended else None
 
 
 def _live(write: Callable[[], object], told: int) -> NoReturn:
-    """The life of a copy: it never returns to the code that it was copied from."""
+    """Runs in the copy; never returns to the code that it was copied from."""
     code = 1
     try:
         gc.disable()  # which would touch, and so copy, all memory
         _let_go(told)
         write()
         code = 0
-    finally:  # whatever comes, also out of a signal
+    finally:  # on any exception, also from a signal
         error = sys.exc_info()[1]
         if error is not None:
             os.write(told, (str(error) or type(error).__name__).encode()[:MOST_TOLD])
@@ -163,7 +163,7 @@ def _live(write: Callable[[], object], told: int) -> NoReturn:
 
 
 def _let_go(told: int) -> None:
-    """Gives up sockets, files, priority and signals that belong to the original."""
+    """Releases sockets, files, priority and signals that belong to the original."""
     for number in [int(name) for name in os.listdir("/proc/self/fd")]:
         if number != told:
             with contextlib.suppress(OSError):

@@ -1,7 +1,16 @@
-"""command_gate: passes the policy's commands on while there is reason to trust them."""
+"""command_gate: passes the policy's commands on while they can be trusted.
+
+Inputs of the gate, read from serialised messages (`wire`) into records of `safety`.
+
+rclpy would first make a Python object of each field, which at 50 Hz costs the gate more than
+deciding.
+
+Real-time priority of a process, if the system allows it.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import time
@@ -17,34 +26,46 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.nodes import gate_inputs, qos
-from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
+from nics_drl_bridge.gate import shield
+from nics_drl_bridge.gate.black_box import Entry
+from nics_drl_bridge.gate.gate import decide
+from nics_drl_bridge.gate.inputs import (
+    Arm,
+    Command,
+    Estimate,
+    EStop,
+    Input,
+    Odometry,
+    Press,
+    Reset,
+    Scan,
+    Tick,
+)
+from nics_drl_bridge.gate.limits import PERIOD_S
+from nics_drl_bridge.gate.state import Decision, begin
+from nics_drl_bridge.lidar.spec import LidarSpec, from_device
+from nics_drl_bridge.nodes import qos, wire
+from nics_drl_bridge.nodes.conversions import is_rotation
+from nics_drl_bridge.nodes.diagnostics import Condition, Diagnostics
 from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.gate_parameters import declare_gate
-from nics_drl_bridge.nodes.priority import HIGHEST, take_priority
-from nics_drl_bridge.nodes.qos_watch import QosWatch
+from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import declare, last_word, run_node
 from nics_drl_bridge.nodes.wire import UNREADABLE, TwistWriter
-from nics_drl_bridge.safety import shield
-from nics_drl_bridge.safety.black_box import Entry
-from nics_drl_bridge.safety.gate import decide
-from nics_drl_bridge.safety.inputs import Arm, Input, Press, Reset, Tick
-from nics_drl_bridge.safety.limits import PERIOD_S
-from nics_drl_bridge.safety.state import Decision, begin
 
 STALE_S = 0.05
-"""A motion that was decided on longer ago is decided on anew [s]."""
+"""A motion that was decided on longer ago than this is decided on again [s]."""
 
 
 class CommandGate(QosWatch):
-    """Stands between `cmd_vel_raw` and `cmd_vel`, in a process of its own.
+    """Stands between `cmd_vel_raw` and `cmd_vel`, in its own process.
 
-    It starts disarmed. `~/arm` lets commands pass if nothing speaks against it, `~/e_stop`
-    presses the emergency stop, `~/reset` clears a latched stop and leaves the gate disarmed. All
-    that it decides is in `safety`, on the steady clock.
+    It starts disarmed. `~/arm` lets commands pass if all checks succeed, `~/e_stop` presses the
+    emergency stop, `~/reset` clears a latched stop and leaves the gate disarmed. All decisions are
+    made in `safety`, on the steady clock.
 
     Args:
-        context: to live in.
+        context: of the node.
     """
 
     def __init__(self, context: Context) -> None:
@@ -72,17 +93,17 @@ class CommandGate(QosWatch):
         Diagnostics(self, "gate", self._look)
         about = "Real-time priority (SCHED_FIFO) of its process, 1 to 99; 0 for none."
         priority = declare(self, "priority", 0, about, low=0, high=HIGHEST, read_only=True)
-        refused = take_priority(priority)  # when all threads are there
+        refused = take_priority(priority)  # once all threads exist
         if refused:
             self.get_logger().warning(refused)
 
     def _listen(self) -> None:
         for kind, topic, read, profile in (
-            (LaserScan, "scan", partial(gate_inputs.scan, self._lidar), qos.SENSOR),
-            (OdometryMessage, "odom", gate_inputs.odometry, qos.SENSOR),
-            (OdometryMessage, "odometry/filtered", gate_inputs.estimate, qos.SENSOR),
-            (TwistStamped, "cmd_vel_raw", gate_inputs.command, qos.COMMAND),
-            (Bool, "e_stop", gate_inputs.e_stop, qos.EVERY_COMMAND),
+            (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),
+            (OdometryMessage, "odom", odometry, qos.SENSOR),
+            (OdometryMessage, "odometry/filtered", estimate, qos.SENSOR),
+            (TwistStamped, "cmd_vel_raw", command, qos.COMMAND),
+            (Bool, "e_stop", e_stop, qos.EVERY_COMMAND),
         ):
             taker = partial(self._take, topic, read)
             self.create_subscription(kind, topic, taker, profile, raw=True)
@@ -93,7 +114,7 @@ class CommandGate(QosWatch):
     def _take(self, topic: str, read: Callable[[bytes], Input], content: bytes) -> None:
         try:
             given = read(content)
-        except UNREADABLE as error:  # of a middleware that puts messages otherwise
+        except UNREADABLE as error:  # of a middleware with another encoding
             self._log.refuse(f"{topic}: {error}")
             return
         self._decide(given)
@@ -118,7 +139,7 @@ class CommandGate(QosWatch):
     def _decide(self, given: Input) -> Decision:
         now, before = time.monotonic(), self._state
         self._state, decision = decide(self._config, before, given, now)
-        # First of all: what follows may take its time.
+        # Publish first: the rest may take its time.
         instead = self._say(decision, now) if decision.publish else None
         self._log.note(Entry(now, given, before, decision))
         if instead is not None and not isinstance(given, Press):
@@ -126,12 +147,12 @@ class CommandGate(QosWatch):
         return decision
 
     def _say(self, decision: Decision, now: float) -> Input | None:
-        """Publishes a decision; the only way to the robot but for `stop`.
+        """Publishes a decision; the only path to the robot except `stop`.
 
         Returns:
-            What to decide on in its stead, if it must not be: whatever is not finite leaves as zero
-            and presses the e-stop. A motion that was decided on too long ago, in a process that was
-            frozen since, is not sent at all; so the last thing before that is a look at the clock.
+            An input to decide on instead, or None. What is not finite is sent as zero and presses
+            the e-stop. A motion that was decided on too long ago, in a process frozen since, is not
+            sent at all; so the clock is read immediately before.
         """
         finite, content = (
             bool(np.isfinite(decision.twist).all()),
@@ -146,8 +167,8 @@ class CommandGate(QosWatch):
         self._out.publish(content)
         return None
 
-    def _look(self) -> Finding:
-        """What `/diagnostics` tells; also who else moves the robot, which no gate can prevent."""
+    def _look(self) -> Condition:
+        """Returns the finding for `/diagnostics`; other publishers are reported, not prevented."""
         found = self._log.finding(self._state)
         others = self.count_publishers(self._out.topic_name) - 1
         if others < 1:
@@ -167,10 +188,81 @@ def main(args: list[str] | None = None) -> None:
     run_node(CommandGate, args, "command_gate")
     sys.stdout.flush()
     sys.stderr.flush()
-    # All is closed. To take the interpreter apart, too, costs half a second of a core, and several
-    # where others want it as well.
+    # Everything is closed. Tearing down the interpreter as well takes half a second of a core, and
+    # several where others need it too.
     os._exit(0)
 
 
 if __name__ == "__main__":
     main()
+
+
+ROTATION = slice(3, 7)
+"""Position of an odometry's quaternion among its numbers."""
+VARIANCES = wire.POSE_COVARIANCE, wire.POSE_COVARIANCE + 7, wire.POSE_COVARIANCE + 35
+"""Positions of the variances of x, y and heading."""
+
+
+def scan(lidar: LidarSpec, content: bytes) -> Scan:
+    """Reads a serialised LaserScan. Raises `wire.UNREADABLE`."""
+    ranges = from_device(wire.ranges_of(content), lidar)
+    return Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
+
+
+def odometry(content: bytes) -> Odometry:
+    """Reads a serialised Odometry; without a rotation its pose is NaN. Raises `wire.UNREADABLE`."""
+    pose, twist = wire.odometry_of(content)
+    if not is_rotation(*wire.numbers_of(content)[ROTATION].tolist()):
+        pose = np.full(3, np.nan)
+    return Odometry(wire.stamp_of(content), pose, twist)
+
+
+def estimate(content: bytes) -> Estimate:
+    """Reads a serialised Odometry of an estimator. Raises `wire.UNREADABLE`."""
+    x, y, heading = (wire.numbers_of(content)[place] for place in VARIANCES)
+    with np.errstate(invalid="ignore"):  # a negative variance gives NaN, too
+        std = np.sqrt([np.maximum(x, y), heading])
+    return Estimate(wire.odometry_of(content)[1], std)
+
+
+def command(content: bytes) -> Command:
+    """Reads a serialised TwistStamped. Raises `wire.UNREADABLE`."""
+    return Command(wire.stamp_of(content), np.array(wire.stamped_twist_of(content)))
+
+
+def e_stop(content: bytes) -> EStop:
+    """Reads a serialised Bool. Raises `wire.UNREADABLE`."""
+    return EStop(wire.truth_of(content))
+
+
+HIGHEST = 99
+REFUSED = (
+    "parameter 'priority': the system does not allow a real-time priority of {priority} ({error}); "
+    "allow it by `ulimit -r {priority}`, `LimitRTPRIO={priority}` in its systemd unit or the "
+    "capability CAP_SYS_NICE, or set 0. It goes on without."
+)
+
+
+def take_priority(priority: int) -> str:
+    """Gives all threads of this process priority over every ordinary one (SCHED_FIFO).
+
+    This includes the threads of the middleware: a gate that waits for them gains nothing by its own
+    priority alone. Threads created later have the priority of their creator.
+
+    Args:
+        priority: 1 to 99; 0 leaves everything as it is.
+
+    Returns:
+        A sentence with the reason and the fix if it fails; empty otherwise.
+    """
+    if priority == 0:
+        return ""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        for thread in os.listdir("/proc/self/task"):
+            with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
+                os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(priority))
+    except (OSError, AttributeError) as error:  # the latter on systems without it
+        reason = str(getattr(error, "strerror", None) or "it has none").lower()
+        return REFUSED.format(priority=priority, error=reason)
+    return ""

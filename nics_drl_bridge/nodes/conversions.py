@@ -1,4 +1,4 @@
-"""Messages to data and back, in pairs: `x_to_ros` and `x_from_ros`."""
+"""Conversion of messages to data and back, in pairs: `x_to_ros` and `x_from_ros`."""
 
 from __future__ import annotations
 
@@ -12,50 +12,49 @@ from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
 from sensor_msgs.msg import Imu, JointState, LaserScan
 
-from nics_drl_bridge.kinematics.joints import POSITION_UNITS
-from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.lidar.canonical import Reader, reader_beside
-from nics_drl_bridge.lidar.rep117 import from_device, to_device
-from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.lidar.sectors import Reader, reader_beside
+from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, from_device, to_device
+from nics_drl_bridge.recording.joints import POSITION_UNITS
+from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
-NANO = 1_000_000_000
 QUATERNION_TOLERANCE = 0.1
-"""By which the squared length of a rotation may differ from 1."""
+"""Tolerance of the squared length of a quaternion about 1."""
 
 
 def stamp_to_ros(time_ns: int) -> Time:
-    """Nanoseconds as a stamp."""
-    return Time(sec=time_ns // NANO, nanosec=time_ns % NANO)
+    """Returns nanoseconds as a stamp."""
+    return Time(sec=time_ns // NS_PER_S, nanosec=time_ns % NS_PER_S)
 
 
 def stamp_from_ros(stamp: Time) -> int:
-    """A stamp as nanoseconds."""
-    return int(stamp.sec) * NANO + int(stamp.nanosec)
+    """Returns a stamp as nanoseconds."""
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
 def heading_to_ros(heading: float) -> Quaternion:
-    """A heading [rad] as a quaternion."""
+    """Returns a heading [rad] as a quaternion."""
     return Quaternion(z=math.sin(heading / 2.0), w=math.cos(heading / 2.0))
 
 
 def heading_from_ros(q: Quaternion) -> float:
-    """The heading [rad] of a quaternion."""
+    """Returns the heading [rad] of a quaternion."""
     return heading_of(q.x, q.y, q.z, q.w)
 
 
 def heading_of(x: float, y: float, z: float, w: float) -> float:
-    """The heading [rad] of a quaternion by its components."""
+    """Returns the heading [rad] of a quaternion given by its components."""
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def is_rotation(x: float, y: float, z: float, w: float) -> bool:
-    """Whether a quaternion is of about unit length; one of zeros is what nobody filled in."""
+    """True if a quaternion has about unit length; one of zeros was never filled in."""
     return abs(w * w + x * x + y * y + z * z - 1.0) < QUATERNION_TOLERANCE
 
 
 def twist_to_ros(twist: ArrayLike) -> Twist:
-    """linear.x, linear.y, angular.z (3,) as a Twist."""
+    """Returns linear.x, linear.y, angular.z (3,) as a Twist."""
     x, y, w = (float(value) for value in np.asarray(twist))
     message = Twist()
     message.linear.x, message.linear.y, message.angular.z = x, y, w
@@ -63,7 +62,7 @@ def twist_to_ros(twist: ArrayLike) -> Twist:
 
 
 def twist_from_ros(message: Twist) -> Array:
-    """linear.x, linear.y, angular.z (3,) of a Twist."""
+    """Returns linear.x, linear.y, angular.z (3,) of a Twist."""
     return np.array([message.linear.x, message.linear.y, message.angular.z])
 
 
@@ -72,34 +71,31 @@ def scan_to_ros(
     ranges: NDArray[np.float32],
     time_ns: int,
     frame: str,
-    intensities: NDArray[np.float32] | None = None,
 ) -> LaserScan:
-    """Ranges (B,) as the LaserScan of the device; every header field follows from the spec.
+    """Returns ranges (B,) as the device's LaserScan; every header field follows from the spec.
 
-    Intensities (B,) are left out, as the message provides for, where there are none.
+    Its `intensities` stay empty, as the message provides for.
     """
     message = LaserScan()
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
     for field, value in spec.header._asdict().items():
         setattr(message, field, value)
     message.ranges = array.array("f", to_device(ranges, spec).tobytes())
-    if intensities is not None:
-        message.intensities = array.array("f", np.asarray(intensities, np.float32).tobytes())
     return message
 
 
 def scan_from_ros(spec: LidarSpec, message: LaserScan) -> NDArray[np.float32]:
-    """Ranges (B,) of a LaserScan of the device, REP-117."""
+    """Returns the ranges (B,) of the device's LaserScan, REP-117."""
     return from_device(message.ranges, spec)
 
 
 def reader_from_ros(message: LaserScan, like: LidarSpec, upside_down: bool = False) -> Reader:
-    """The lidar of a LaserScan and the order of its beams.
+    """Returns the lidar of a LaserScan and the order of its beams.
 
     Args:
         message: whose header describes it.
-        like: what is expected; it is the answer where the header says the same.
-        upside_down: whether the device hangs with its z axis down.
+        like: expected lidar; it is returned if the header agrees.
+        upside_down: whether the device is mounted with its z axis down.
 
     Raises:
         ConfigError: the header describes no lidar.
@@ -115,7 +111,7 @@ def odometry_to_ros(
     frames: tuple[str, str],
     variance: tuple[float, float, float, float],
 ) -> Odometry:
-    """Pose (3,) and body twist (3,) as an Odometry message.
+    """Returns pose (3,) and body twist (3,) as an Odometry message.
 
     Args:
         pose: x [m], y [m], heading [rad] in the first frame.
@@ -137,7 +133,7 @@ def odometry_to_ros(
 
 
 def odometry_from_ros(message: Odometry) -> tuple[Array, Array]:
-    """Pose (3,) and body twist (3,) of an Odometry message."""
+    """Returns pose (3,) and body twist (3,) of an Odometry message."""
     pose = message.pose.pose
     heading = heading_from_ros(pose.orientation)
     return np.array([pose.position.x, pose.position.y, heading]), twist_from_ros(
@@ -146,14 +142,14 @@ def odometry_from_ros(message: Odometry) -> tuple[Array, Array]:
 
 
 PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
-"""Where x, y and heading stand in the 6 x 6 covariance of a message."""
+"""Indices of x, y and heading in the 6 x 6 covariance of a message."""
 
 UNUSED_VARIANCE = 1e6
-"""Of z, roll and pitch, which a planar robot does not measure."""
+"""Variance of z, roll and pitch, which a planar robot does not measure."""
 
 
 def covariance_to_ros(planar: Array) -> Array:
-    """A covariance (3, 3) of x, y and heading, or of their rates, as the (36,) of a message."""
+    """Returns a covariance (3, 3) of x, y, heading, or of their rates, as a message's (36,)."""
     whole = np.diag(np.full(6, UNUSED_VARIANCE))
     whole[PLANAR] = planar
     return whole.ravel()
@@ -162,7 +158,7 @@ def covariance_to_ros(planar: Array) -> Array:
 def pose_from_ros(
     message: PoseStamped | PoseWithCovarianceStamped,
 ) -> tuple[Array, Array | None]:
-    """Pose (3,) of a message and its covariance (3, 3); None where it carries none."""
+    """Returns the pose (3,) of a message and its covariance (3, 3); None if it carries none."""
     pose, covariance = message.pose, None
     if isinstance(message, PoseWithCovarianceStamped):
         pose, covariance = pose.pose, np.reshape(pose.covariance, (6, 6))[PLANAR]
@@ -171,7 +167,7 @@ def pose_from_ros(
 
 
 def imu_from_ros(message: Imu) -> tuple[float, float] | None:
-    """Yaw rate [rad/s] and its variance [rad^2/s^2]; None where it measures no rates."""
+    """Returns yaw rate [rad/s] and its variance [rad^2/s^2]; None if no rates are measured."""
     covariance = message.angular_velocity_covariance
     if covariance[0] == -1.0:
         return None
@@ -179,7 +175,7 @@ def imu_from_ros(message: Imu) -> tuple[float, float] | None:
 
 
 def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState:
-    """A state (S,) as a JointState: angles and lengths as positions, all else as velocities."""
+    """Returns a state (S,) as a JointState: angles and lengths as positions, all else as rates."""
     message = JointState()
     message.header.stamp = stamp_to_ros(time_ns)
     for variable, value in zip(spec.state, np.asarray(state, dtype=np.float64), strict=True):

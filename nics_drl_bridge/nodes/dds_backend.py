@@ -1,8 +1,14 @@
-"""DdsBackend: the robot behind ROS 2 topics, as the same synchronous backend."""
+"""DdsBackend: the robot behind ROS 2 topics, as the same synchronous backend.
+
+Two threads that take turns on one core.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import math
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -15,14 +21,13 @@ from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.errors import BackendError, StaleDataError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import RobotView, Start
-from nics_drl_bridge.lidar.rep117 import from_device
-from nics_drl_bridge.middleware.view import Middleware
-from nics_drl_bridge.nodes import conversions, qos, wire
-from nics_drl_bridge.nodes.episodes import Episodes
+from nics_drl_bridge.interface import NS_PER_S, RobotView, Start
+from nics_drl_bridge.lidar.spec import from_device
+from nics_drl_bridge.middleware.middleware import Middleware
+from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.executor import HANDED_OVER
 from nics_drl_bridge.nodes.link import Link
-from nics_drl_bridge.nodes.one_core import OneCore
+from nics_drl_bridge.nodes.observer import EpisodeServices
 from nics_drl_bridge.nodes.robot_topics import data_facts
 from nics_drl_bridge.sim.world import World
 
@@ -30,20 +35,20 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 SCAN, ODOM, TRUTH = "scan", "odom", "ground_truth"
 AGAIN_S = 0.05
-"""What does not come for so long is asked for again."""
+"""Data that do not arrive within this time are requested again [s]."""
 ADVICE = "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and namespace."
 
 
 class _Mailbox:
     """The newest message of each topic, serialised, from the executor's thread to the caller's.
 
-    The caller is woken once, when all that it waits for is there: each waking costs as much as a
-    good part of a step. Odometry that it waits for is worked in by the executor's thread, while
-    the scan is still on its way.
+    The caller is woken once, when all that it waits for is there: each wake-up costs a good part
+    of a step. Odometry that it waits for is processed by the executor's thread, while the scan is
+    still in transit.
 
     Args:
         topics: that the caller waits for.
-        work: takes stamp [ns], arrival [ns] and message of an odometry.
+        work: called with stamp [ns], arrival [ns] and message of an odometry.
     """
 
     def __init__(self, topics: tuple[str, ...], work: Callable[[int, int, bytes], None]) -> None:
@@ -57,7 +62,7 @@ class _Mailbox:
         self._core = OneCore()
 
     def put(self, topic: str, message: bytes) -> object:
-        """Takes a message; returns `HANDED_OVER` when the caller now goes on."""
+        """Takes a message; returns `HANDED_OVER` if the caller now continues."""
         self._core.help()
         with self._lock:
             try:
@@ -72,33 +77,33 @@ class _Mailbox:
         return None
 
     def _work_in(self) -> None:
-        """Works in the odometry that is waited for, once."""
+        """Processes the awaited odometry, once."""
         awaited = self._awaited_ns
         if self._stamps[ODOM] == awaited != self._worked_ns:
             self._worked_ns = awaited
             self._work(awaited, self._arrivals[ODOM], self._messages[ODOM])
 
     def _late(self) -> str | None:
-        """The first topic whose newest message is older than what is waited for."""
+        """Returns the first topic whose newest message is older than awaited; None if none is."""
         for topic in self._topics:
             if self._stamps[topic] < self._awaited_ns:
                 return topic
         return None
 
     def stamp_ns(self, topic: str) -> int:
-        """Of the newest message; -1 when there is none."""
+        """Returns the stamp of the newest message [ns]; -1 if there is none."""
         return self._stamps[topic]
 
     def age_s(self, topic: str) -> float:
-        """Seconds since the newest message arrived; inf when there is none."""
+        """Returns the seconds since the newest message arrived; inf if there is none."""
         arrival_ns = self._arrivals.get(topic)
         return math.inf if arrival_ns is None else (time.monotonic_ns() - arrival_ns) * 1e-9
 
     def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, tuple[bytes, int]]:
-        """Message and arrival [ns] of each topic, once each is at least as new as a stamp.
+        """Returns message and arrival [ns] of each topic, once each is at least as new as a stamp.
 
         Raises:
-            StaleDataError: one does not come.
+            StaleDataError: a message does not arrive.
         """
         with self._lock:
             self._awaited_ns, self._failure = stamp_ns, None
@@ -118,7 +123,7 @@ class _Mailbox:
 
 
 def _worker(middleware: Middleware) -> Callable[[int, int, bytes], None]:
-    """What works in odometry; it knows nothing of the backend, which may be garbage."""
+    """Returns the callback for odometry, without a reference to the backend (it may be garbage)."""
 
     def work(stamp_ns: int, arrival_ns: int, message: bytes) -> None:
         middleware.odometry(stamp_ns, arrival_ns, *_read(ODOM, wire.odometry_of, message))
@@ -130,17 +135,17 @@ class DdsBackend:
     """One robot behind `cmd_vel`, `scan` and `odom`, in lock-step with a simulator node.
 
     Each step publishes one command and returns exactly the data that are stamped one control
-    period later. A node of its own in a context of its own listens in one executor thread;
-    nothing spins inside `step`. `close`, an error in `step` and garbage collection leave a zero
-    command behind, see `Link`. A vehicle, or a simulator in real time, is
-    `RealtimeBackend`'s, to which `mode="realtime"` leads in `backend_options`.
+    period later. Its own node in its own context listens in one executor thread; nothing spins
+    inside `step`. `close`, an error in `step` and garbage collection leave a zero command behind,
+    see `Link`. A vehicle, or a simulator in real time, needs `RealtimeBackend`, selected by
+    `mode="realtime"` in `backend_options`.
 
     Args:
         model: must be the one that the simulator node runs.
         world: likewise.
         namespace: of the robot.
         simulator: name of the simulator's node in that namespace.
-        timeout_s: how long to wait for a peer or an answer [s].
+        timeout_s: longest wait for a peer or an answer [s].
         truth: whether to wait for `ground_truth` too, and put the true pose into `info`.
         domain_id: DDS domain; the environment's by default.
 
@@ -160,7 +165,7 @@ class DdsBackend:
     ) -> None:
         self._robot, self._lidar = model.robot, model.lidar
         self._middleware = Middleware(model)
-        self._period_ns = round(model.control_period * conversions.NANO)
+        self._period_ns = round(model.control_period * NS_PER_S)
         self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *((TRUTH,) if truth else ()))
         self._now_ns, self._mail = 0, _Mailbox(self._topics, _worker(self._middleware))
         self._link = Link(namespace, domain_id)
@@ -169,7 +174,7 @@ class DdsBackend:
             self._link.node.create_subscription(
                 types[topic], topic, _putter(self._mail, topic), qos.SENSOR, raw=True
             )
-        self._episodes = Episodes(self._link, simulator, model, world)
+        self._episodes = EpisodeServices(self._link, simulator, model, world)
         self._link.begin()
         try:
             self._link.wait_for_peers(self._topics, self._episodes.clients, timeout_s, ADVICE)
@@ -190,13 +195,13 @@ class DdsBackend:
             return self.first(self.begin(), start.pose)
 
     def choose(self, start: Start) -> None:
-        """The first part of a reset: says which episode `begin` begins."""
+        """The first part of a reset: chooses the episode for `begin`."""
         self._link.check_open()
         self._link.check_alone()
         self._episodes.choose(start, self.timeout_s)
 
     def begin(self) -> int:
-        """The second part: begins it; the stamp of its first data [ns]."""
+        """The second part: begins it, and returns the stamp of its first data [ns]."""
         return self._episodes.begin(self.timeout_s)
 
     def first(self, stamp_ns: int, pose: Array) -> RobotView:
@@ -209,7 +214,7 @@ class DdsBackend:
         """Publishes a command and waits for the data after it; see `interface.Backend`.
 
         Raises:
-            BackendError: somebody else moved the simulator, or it is not in lock-step.
+            BackendError: another node moved the simulator, or it is not in lock-step.
             StaleDataError: the data do not arrive.
         """
         self.send(command)
@@ -219,18 +224,18 @@ class DdsBackend:
         """The first half of a step: checks and publishes a command (C,)."""
         self._link.check_open()
         with self._link.zero_after_an_error():
-            # Data that are there before the command would be taken for its answer.
+            # Data that arrived before the command would be taken for its answer.
             self._check_stamps()
             twist = self._robot.to_cmd_vel(command)
             self._link.send(twist)
-            # While the simulator is at work.
+            # Checked while the simulator is at work.
             self._link.check_alone()
             self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
             self._now_ns += self._period_ns
             self._middleware.foresee(self._now_ns)
 
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
-        """The second half: waits for the data after the command, and for `info` about them."""
+        """The second half: waits for the data after the command; returns the view and `info`."""
         with self._link.zero_after_an_error():
             return self._measure()
 
@@ -239,17 +244,17 @@ class DdsBackend:
             self._check_stamp(topic)
 
     def _check_stamp(self, topic: str) -> None:
-        """Raises BackendError when the newest datum is not stamped with the present step."""
+        """Raises BackendError if the newest datum is not stamped with the present step."""
         off_ns = self._mail.stamp_ns(topic) - self._now_ns
         if off_ns:
             self._link.check_alone()
             raise BackendError(
-                f"topic {topic!r}: stamped {off_ns / conversions.NANO:+.3f} s off the step; start "
+                f"topic {topic!r}: stamped {off_ns / NS_PER_S:+.3f} s off the step; start "
                 "the simulator with mode:=lockstep, and move it from here alone."
             )
 
     def _measure(self) -> tuple[RobotView, dict[str, Any]]:
-        """The view at the present stamp. Raises BackendError when the data are of another one."""
+        """Returns the view at the present stamp. Raises BackendError if the data have another."""
         now = self._now_ns
         messages = self._await(now)
         self._check_stamps()
@@ -265,9 +270,9 @@ class DdsBackend:
         return self._middleware.view(now), facts
 
     def _await(self, stamp_ns: int) -> dict[str, tuple[bytes, int]]:
-        """What the mailbox gives for a stamp; what does not come is asked for again.
+        """Returns the mailbox's data for a stamp; what does not arrive is requested again.
 
-        It may be lost, and what was sent before the simulator knew of a subscription is.
+        Data may be lost, and those sent before the simulator discovered a subscription always are.
         """
         deadline = time.monotonic() + self.timeout_s
         while True:
@@ -289,7 +294,7 @@ class DdsBackend:
 
 
 def _read(topic: str, read: Callable[[bytes], T], message: bytes) -> T:
-    """What a message says. Raises BackendError when it is no message of that type."""
+    """Returns the content of a message. Raises BackendError if it is not of that type."""
     try:
         return read(message)
     except wire.UNREADABLE as error:
@@ -300,3 +305,51 @@ def _read(topic: str, read: Callable[[bytes], T], message: bytes) -> T:
 
 def _putter(mail: _Mailbox, topic: str) -> Callable[[bytes], object]:
     return lambda message: mail.put(topic, message)
+
+
+try:
+    _core_now = ctypes.PyDLL(None).sched_getcpu
+    _allowed, _allow = os.sched_getaffinity, os.sched_setaffinity
+    CAN_CHOOSE = True
+except (AttributeError, TypeError):  # no Linux with glibc
+    CAN_CHOOSE = False
+
+
+class OneCore:
+    """Keeps a waiting thread, and the helper that it waits for, on one core during the wait.
+
+    So no thread has to be woken on another core that sleeps, which on a virtual machine takes about
+    a tenth of a lock-step step for each of the two. The helper follows the waiting thread wherever
+    the system moves it. After the wait, that thread may run anywhere again, so that threads that it
+    starts do not inherit anything.
+
+    If the system does not let threads choose, this only waits.
+    """
+
+    def __init__(self) -> None:
+        self._helper, self._place = 0, (0, -1)
+
+    def help(self) -> None:
+        """Registers the calling thread as the helper."""
+        self._helper = threading.get_native_id()
+
+    def wait(self, event: threading.Event, timeout_s: float) -> bool:
+        """Waits for an event; returns whether it came within a time [s]."""
+        cores = _allowed(0) if CAN_CHOOSE and self._helper else set()
+        if len(cores) < 2:
+            return event.wait(timeout_s)
+        try:
+            self._share()
+            return event.wait(timeout_s)
+        finally:  # also if interrupted in the middle of it
+            with contextlib.suppress(OSError):
+                _allow(0, cores)
+
+    def _share(self) -> None:
+        # The helper may have ended, and the system may restrict the cores.
+        with contextlib.suppress(OSError, ValueError):
+            core = _core_now()
+            if self._place != (self._helper, core):
+                _allow(self._helper, {core})
+                self._place = self._helper, core
+            _allow(0, {core})

@@ -19,30 +19,25 @@ from std_srvs.srv import SetBool, Trigger
 
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import Simulator
+from nics_drl_bridge.interface import NS_PER_S, Simulator
 from nics_drl_bridge.nodes import conversions, device_parameters, qos
-from nics_drl_bridge.nodes.command_inlet import CommandInlet
-from nics_drl_bridge.nodes.device_parameters import declare_device
-from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
-from nics_drl_bridge.nodes.graph import owner
-from nics_drl_bridge.nodes.outbox import Outbox
-from nics_drl_bridge.nodes.pace import Pace, RealTime
-from nics_drl_bridge.nodes.qos_watch import QosWatch
-from nics_drl_bridge.nodes.robot_port import RobotPort
+from nics_drl_bridge.nodes.device_parameters import RealTime, TopicPace, declare_device
+from nics_drl_bridge.nodes.device_robot import CommandInlet, Outbox, RobotPort, Transforms
+from nics_drl_bridge.nodes.diagnostics import Condition, Diagnostics
+from nics_drl_bridge.nodes.qos import QosWatch, owner
 from nics_drl_bridge.nodes.runner import declare_model
-from nics_drl_bridge.nodes.transforms import Transforms
-from nics_drl_bridge.sim.device_world import DeviceWorld
+from nics_drl_bridge.sim.device import DeviceWorld
 from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]
 CLOCK = "/clock"
 WATCH_S = 2.0
 LONGEST_TICK_S = 0.005
-"""How often it is looked whether something late is due."""
+"""Longest time between two checks for delayed data that are due [s]."""
 
 MakeSimulator = Callable[[Node, SimulatorModel, World, int], Simulator]
-"""Makes the simulator of so many robots; may declare parameters of its own at the node. The control
-period that it steps by is the given model's."""
+"""Makes the simulator of a number of robots; may declare its own parameters at the node. Its
+control period is that of the given model."""
 
 
 class DeviceNode(QosWatch):
@@ -50,15 +45,15 @@ class DeviceNode(QosWatch):
 
     With the parameter `robots` it is a fleet in one world, each robot in a namespace below the
     node's own. Stamps are simulated time, as on `/clock`: it begins at the system's time and never
-    runs backwards, also not at a reset. `~/reset` begins the episode of the parameters
+    runs backwards, not even at a reset. `~/reset` begins the episode of the parameters
     `episode_seed` and `episode_start`; its answer is JSON with the stamp of the first data. In
     lock-step the world moves when each robot has a command, and `~/repeat` publishes its present
-    data again. `~/touched` answers which robots have truly touched something in this episode.
+    data again. `~/touched` reports which robots have truly touched something in this episode.
 
     Args:
         name: of the node.
-        context: to live in.
-        make: makes what moves the robots.
+        context: of the node.
+        make: makes the simulator.
     """
 
     def __init__(self, name: str, context: Context, make: MakeSimulator) -> None:
@@ -76,7 +71,7 @@ class DeviceNode(QosWatch):
         self._command_ns = np.zeros(len(self._names), np.int64)
         self._heard = np.zeros(len(self._names), np.bool_)
         self._paused = False
-        self._world.advance()  # compiled before anybody waits for it
+        self._world.advance()  # compiles before anything waits for it
         self._lags, self._hardware = 0, model.robot.name
         self._open_topics(model)
         self._start_time()
@@ -110,19 +105,19 @@ class DeviceNode(QosWatch):
         Diagnostics(self, "simulator", self._look)
 
     def _start_time(self) -> None:
-        # Steady: not the node's clock, which with use_sim_time would wait for this very node.
+        # Steady: with use_sim_time the node's clock would wait for this very node.
         steady = SteadyClock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(WATCH_S, self._watch, clock=steady)
         step_ns = self._time.step_ns
         self._odom_pace, self._scan_pace = (
-            Pace(period_ns, step_ns) for period_ns in (self._time.odom_ns, self._time.scan_ns)
+            TopicPace(period_ns, step_ns) for period_ns in (self._time.odom_ns, self._time.scan_ns)
         )
         self._real_time = RealTime(step_ns, self._time.rate)
         self._timer = None
         self._soon = self.create_guard_condition(self._on_time)
         if self._time.mode == "realtime":
-            period = step_ns / conversions.NANO / self._time.rate
-            # A tick of which the step is a multiple.
+            period = step_ns / NS_PER_S / self._time.rate
+            # A tick that divides the step.
             ticks = max(1.0, np.ceil(period / LONGEST_TICK_S)) if self._time.late else 1.0
             self._timer = self.create_timer(period / ticks, self._on_time, clock=steady)
         elif not self._time.lockstep:
@@ -134,7 +129,7 @@ class DeviceNode(QosWatch):
         self._watch_clock()
 
     def _watch_clock(self) -> None:
-        """Warns once of each other node that tells the time: whoever listens would hear both."""
+        """Warns once of each other node that publishes the time: listeners would hear both."""
         ends = self.get_publishers_info_by_topic(CLOCK)
         names = {name for end in ends if (name := owner(end)) is not None}
         for name in names - self._clocks:
@@ -144,21 +139,21 @@ class DeviceNode(QosWatch):
             )
         self._clocks |= names
 
-    def _look(self) -> Finding:
-        """What `/diagnostics` tells."""
+    def _look(self) -> Condition:
+        """Returns the finding for `/diagnostics`."""
         facts = {
             "mode": self._time.mode,
             "rate": self._time.rate,
             "robots": len(self._names),
-            "simulated time [s]": f"{self._now_ns / conversions.NANO:.3f}",
+            "simulated time [s]": f"{self._now_ns / NS_PER_S:.3f}",
             "times it fell behind real time": self._lags,
             **self._identity,
         }
         message = "paused" if self._paused else "running"
-        return Finding(message, False, facts, self._hardware)
+        return Condition(message, False, facts, self._hardware)
 
     def _timeout_ns(self) -> int:
-        return int(float(self.get_parameter("command_timeout").value or 0.0) * conversions.NANO)
+        return int(float(self.get_parameter("command_timeout").value or 0.0) * NS_PER_S)
 
     def _too_old(self, stamp_ns: int) -> bool:
         return not self._time.lockstep and self._now_ns - stamp_ns > self._timeout_ns()
@@ -187,7 +182,7 @@ class DeviceNode(QosWatch):
             self._stop_the_silent()
             self._advance()
         if behind > 1:
-            self._soon.trigger()  # not here: commands that have come in are for the next step
+            self._soon.trigger()  # not here: commands that have arrived are for the next step
         self._outbox.flush(max(self._now_ns, self._real_time.time_at(steady_ns)))
 
     def _on_free_time(self) -> None:
@@ -206,7 +201,7 @@ class DeviceNode(QosWatch):
         self._publish()
 
     def _begin(self) -> None:
-        """Begins an episode. Raises BridgeError where the parameters do not fit the world."""
+        """Begins an episode. Raises BridgeError if the parameters do not fit the world."""
         given = bool(self.get_parameter("episode_start_given").value)
         start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
         seed = int(self.get_parameter("episode_seed").value or 0)
@@ -220,7 +215,7 @@ class DeviceNode(QosWatch):
         self._publish()
 
     def _go_on(self) -> None:
-        """Lets real time begin anew at the present."""
+        """Restarts real time at the present."""
         self._real_time.begin(time.monotonic_ns(), self._now_ns)
         if self._timer is not None:
             self._timer.reset()
@@ -244,7 +239,7 @@ class DeviceNode(QosWatch):
         return response
 
     def _on_repeat(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Tells the present again to who has lost a part of it; in real time the next one comes."""
+        """Publishes the present data again, if some were lost; in real time new ones follow."""
         response.success = self._time.lockstep
         if self._time.lockstep:
             self._tell(odom_due=True, scan_due=True)
@@ -252,12 +247,12 @@ class DeviceNode(QosWatch):
         return response
 
     def _on_touched(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Which robots have truly touched something in this episode, as JSON."""
+        """Reports which robots have truly touched something in this episode, as JSON."""
         response.success, response.message = True, json.dumps(self._world.touched)
         return response
 
     def _publish(self) -> None:
-        """Publishes what is due of the present."""
+        """Publishes what is due at present."""
         now_ns = self._now_ns
         if self._clock_topic.get_subscription_count():
             self._clock_message.clock = conversions.stamp_to_ros(now_ns)
@@ -267,7 +262,7 @@ class DeviceNode(QosWatch):
             self._tell(odom_due, scan_due)
 
     def _tell(self, odom_due: bool, scan_due: bool) -> None:
-        """Publishes what the robots' devices say of the present."""
+        """Publishes the present data of the robots' devices."""
         now_ns, outbox, moving = self._now_ns, self._outbox, []
         for k, port in enumerate(self._ports):
             sensed = self._world.sensed(k)

@@ -1,7 +1,11 @@
-"""Parameters of a device node: what it simulates, how its time runs, and how it tells of it."""
+"""Parameters of a device node: simulated devices, timing, frames and episodes.
+
+Pacing of a device's topics while its world moves in its own steps.
+"""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,9 +18,9 @@ from rclpy.parameter import Parameter
 
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kinematics.latency import Delay
-from nics_drl_bridge.nodes.pace import NANO, common_step
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes.runner import declare
+from nics_drl_bridge.robot.noise import Delay
 
 LOCKSTEP = "lockstep"
 MODES = ("realtime", LOCKSTEP, "as_fast_as_possible")
@@ -26,18 +30,18 @@ NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 
 
 @dataclass(frozen=True)
-class Timing:
-    """How the time of a device runs; lock-step is exact, without any of the delays.
+class DeviceTiming:
+    """Timing of a device; lock-step is exact, without any of the delays.
 
     Attributes:
         mode: one of `MODES`.
         rate: simulated seconds per second in realtime.
-        step_ns: by which the world moves.
+        step_ns: step of the world.
         odom_ns: between two odometries.
         scan_ns: between two scans.
-        scan_late_ns: least delay from a scan's measurement until it is told, and how much more the
-            greatest is.
-        odom_late_ns: the same of odometry.
+        scan_late_ns: least delay from a scan's measurement to its publication, and greatest
+            additional delay.
+        odom_late_ns: the same for odometry.
     """
 
     mode: str
@@ -50,12 +54,12 @@ class Timing:
 
     @property
     def lockstep(self) -> bool:
-        """Whether the world waits for commands."""
+        """True if the world waits for commands."""
         return self.mode == LOCKSTEP
 
     @property
     def late(self) -> bool:
-        """Whether anything is told later than it was measured."""
+        """True if anything is published later than it was measured."""
         return any((*self.scan_late_ns, *self.odom_late_ns))
 
 
@@ -70,8 +74,8 @@ class Frames:
 
 
 def declare_device(node: Node, laser_frame: str) -> None:
-    """Declares all but what belongs to the kind of simulator, and checks what can be set later."""
-    # First, so that it also judges the values that the node is started with.
+    """Declares all but the parameters of one kind of simulator, and checks later changes."""
+    # First, so that it also checks the values that the node is started with.
     node.add_on_set_parameters_callback(_check_episode)
     world = "World file, or the name of a shipped world."
     declare(node, "world", "arena", world, read_only=True)
@@ -116,27 +120,27 @@ def _declare_time(node: Node) -> None:
         declare(node, name, default, about, low=low, high=high, read_only=True)
 
 
-def timing(node: Node, model: SimulatorModel) -> Timing:
-    """How time runs, as the parameters say; in lock-step as the model alone says."""
+def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
+    """Returns the timing given by the parameters; in lock-step, by the model alone."""
     mode = choice(node, "mode", MODES)
     value = {
         name: float(node.get_parameter(name).value or 0.0)
         for name in ("rate", "odom_rate", "scan_rate")
     }
     if mode == LOCKSTEP:
-        period = round(model.control_period * NANO)
-        return Timing(mode, 1.0, period, period, period, (0, 0), (0, 0))
+        period = round(model.control_period * NS_PER_S)
+        return DeviceTiming(mode, 1.0, period, period, period, (0, 0), (0, 0))
     odom = 1.0 / value["odom_rate"] if value["odom_rate"] else model.control_period
     scan = 1.0 / (value["scan_rate"] or model.lidar.rate)
     dt = model.timing[0]
     step = common_step(dt, (odom, scan)) * dt
-    step_ns, odom_ns, scan_ns = (round(seconds * NANO) for seconds in (step, odom, scan))
+    step_ns, odom_ns, scan_ns = (round(seconds * NS_PER_S) for seconds in (step, odom, scan))
     late = [_late_ns(node, topic, model) for topic in ("scan", "odom")]
-    return Timing(mode, value["rate"], step_ns, odom_ns, scan_ns, *late)
+    return DeviceTiming(mode, value["rate"], step_ns, odom_ns, scan_ns, *late)
 
 
 def _late_ns(node: Node, topic: str, model: SimulatorModel) -> tuple[int, int]:
-    """The least delay of a topic and its jitter [ns]: as asked for, else as the model has them."""
+    """Returns least delay and jitter of a topic [ns]: as requested, otherwise as in the model."""
     own = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
     asked = (
         float(node.get_parameter(name).value or 0.0)
@@ -146,11 +150,11 @@ def _late_ns(node: Node, topic: str, model: SimulatorModel) -> tuple[int, int]:
         given if given >= 0.0 else measured
         for given, measured in zip(asked, (own.least, own.jitter), strict=True)
     )
-    return round(least * NANO), round(jitter * NANO)
+    return round(least * NS_PER_S), round(jitter * NS_PER_S)
 
 
-def timed_model(node: Node, model: SimulatorModel, time: Timing) -> SimulatorModel:
-    """The model with the step that the world moves by and the latency that was asked for."""
+def timed_model(node: Node, model: SimulatorModel, time: DeviceTiming) -> SimulatorModel:
+    """Returns the model with the step of the world and the requested latency."""
     latency = float(node.get_parameter("command_latency").value or 0.0)
     if time.lockstep:
         return model
@@ -158,12 +162,12 @@ def timed_model(node: Node, model: SimulatorModel, time: Timing) -> SimulatorMod
         calibration = replace(model.calibration, command_latency_s=latency)
         model = replace(model, calibration=calibration)
     dt = model.timing[0]
-    steps = round(time.step_ns / NANO / dt)
+    steps = round(time.step_ns / NS_PER_S / dt)
     return model if steps == model.timing[1] else replace(model, control_period=steps * dt)
 
 
 def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
-    """A parameter that must be one of some words. Raises ConfigError with the nearest."""
+    """Returns a parameter that must be one of some words. Raises ConfigError with the nearest."""
     value = str(node.get_parameter(name).value)
     if value not in valid:
         raise ConfigError(f"parameter {name!r}: unknown value {value!r}; {nearest(value, valid)}")
@@ -171,7 +175,7 @@ def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
 
 
 def namespaces(node: Node) -> tuple[str, ...]:
-    """The namespace of each robot below the node's own; one empty name for a robot alone.
+    """Returns the namespace of each robot below the node's own; one empty name for a single robot.
 
     Raises:
         ConfigError: `robots` is neither a count nor a list of different names.
@@ -190,12 +194,12 @@ def namespaces(node: Node) -> tuple[str, ...]:
 
 
 def default_namespaces(robots: int) -> tuple[str, ...]:
-    """Of so many robots: robot1, robot2, ..."""
+    """Returns the default namespaces of several robots: robot1, robot2, ..."""
     return tuple(f"robot{k + 1}" for k in range(robots))
 
 
 def frames(node: Node, namespace: str) -> Frames:
-    """The frames of a robot: those of a fleet begin with its namespace, but for the shared map."""
+    """Returns the frames of a robot; those of a fleet begin with its namespace, except the map."""
     prefix = str(node.get_parameter("frame_prefix").value) + (f"{namespace}/" if namespace else "")
     name = {
         each: str(node.get_parameter(f"{each}_frame").value)
@@ -216,3 +220,77 @@ def _check_episode(parameters: list[Parameter]) -> SetParametersResult:
         if reason:
             return SetParametersResult(successful=False, reason=reason)
     return SetParametersResult(successful=True)
+
+
+SLACK = 0.1
+"""A step may be early by this share of it, because timers are no more precise."""
+PATIENCE_NS = NS_PER_S // 2
+"""Steps missed for longer than this are not made up for [ns]."""
+
+
+class TopicPace:
+    """Decides when a topic is due, so that its mean rate is the requested one with any step.
+
+    Args:
+        period_ns: between two messages.
+        step_ns: between two calls of `due`; if it divides the period, the messages are regular.
+    """
+
+    def __init__(self, period_ns: int, step_ns: int) -> None:
+        self._period_ns, self._slack_ns = period_ns, step_ns // 2 if period_ns > step_ns else 0
+        self._next_ns = 0
+
+    def begin(self, now_ns: int) -> None:
+        """Starts anew: the next message is due now."""
+        self._next_ns = now_ns
+
+    def due(self, now_ns: int) -> bool:
+        """True if a message is due at a time; it then counts as sent."""
+        if now_ns + self._slack_ns < self._next_ns:
+            return False
+        self._next_ns += self._period_ns
+        return True
+
+
+def common_step(dt: float, periods: tuple[float, ...]) -> int:
+    """Returns the longest step, in steps of the model, that suits all periods as well as possible.
+
+    Args:
+        dt: step of the model [s].
+        periods: of the published topics [s].
+
+    Returns:
+        Steps of the model: a divisor of all periods if `dt` divides them.
+    """
+    return math.gcd(*(max(1, round(period / dt)) for period in periods))
+
+
+class RealTime:
+    """Tracks by how many steps the world is behind the steady clock.
+
+    Args:
+        step_ns: step of the world.
+        rate: simulated seconds per second.
+    """
+
+    def __init__(self, step_ns: int, rate: float) -> None:
+        self._step_ns, self._rate = step_ns, rate
+        self._began_ns = self._then_ns = 0
+
+    def begin(self, steady_ns: int, now_ns: int) -> None:
+        """Aligns a time of the steady clock with a simulated time."""
+        self._began_ns, self._then_ns = steady_ns, now_ns
+
+    def time_at(self, steady_ns: int) -> int:
+        """Returns the simulated time [ns] at a time of the steady clock."""
+        return self._then_ns + int((steady_ns - self._began_ns) * self._rate)
+
+    def behind(self, steady_ns: int, now_ns: int) -> int:
+        """Returns the steps due at a time of the steady clock, for a world at `now_ns`."""
+        missing_ns = self.time_at(steady_ns) - now_ns
+        return max(0, int((missing_ns + SLACK * self._step_ns) // self._step_ns))
+
+    def lost(self, steady_ns: int, now_ns: int) -> bool:
+        """True if the world is too far behind to catch up with real time."""
+        late_ns = self.time_at(steady_ns) - now_ns - self._step_ns
+        return late_ns > PATIENCE_NS * self._rate

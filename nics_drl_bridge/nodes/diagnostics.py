@@ -1,4 +1,4 @@
-"""What a node says about itself on `/diagnostics`."""
+"""Findings of a node about itself, published on `/diagnostics`."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from nics_drl_bridge.nodes import qos
 PERIOD_S = 1.0
 
 
-class Finding(NamedTuple):
-    """How a node is.
+class Condition(NamedTuple):
+    """Condition of a node.
 
     Attributes:
         message: one line.
-        warns: whether it is one that somebody should look at.
-        facts: what else is known, for people.
-        hardware: whose hardware it concerns, such as the robot's name.
+        warns: whether it needs attention.
+        facts: further facts, for people.
+        hardware: the hardware concerned, such as the robot's name.
     """
 
     message: str
@@ -31,15 +31,15 @@ class Finding(NamedTuple):
 
 
 class Diagnostics:
-    """Publishes what a node finds about itself once a second, in the format of the aggregator.
+    """Publishes a node's finding about itself once a second, in the format of the aggregator.
 
     Args:
-        node: that is told about.
-        part: of the node, for the status' name.
-        look: asked each time.
+        node: that is reported on.
+        part: of the node, for the name of the status.
+        look: returns the finding; called each time.
     """
 
-    def __init__(self, node: Node, part: str, look: Callable[[], Finding]) -> None:
+    def __init__(self, node: Node, part: str, look: Callable[[], Condition]) -> None:
         self._node, self._look = node, look
         self._name = f"{node.get_fully_qualified_name()}: {part}"
         self._topic = node.create_publisher(DiagnosticArray, "/diagnostics", qos.DIAGNOSTICS)

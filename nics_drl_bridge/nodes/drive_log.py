@@ -1,4 +1,4 @@
-"""DriveLog: what was sent to a robot and heard from it, until it becomes a Recording."""
+"""DriveLog: data sent to a robot and received from it, until they become a Recording."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 
 from nics_drl_bridge.errors import BackendError, RecordingError
-from nics_drl_bridge.kinematics.bag_messages import imu_row, pose_row, stamp, twist_row
-from nics_drl_bridge.kinematics.joints import JointMessage, Joints, gather, state_of, wheels_of
-from nics_drl_bridge.kinematics.recording import Recording
-from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.kinematics.stamping import TopicData, streams
-from nics_drl_bridge.kinematics.topic_roles import TopicRoles
-from nics_drl_bridge.nodes.conversions import NANO
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.recording.joints import JointMessage, Joints, gather, state_of, wheels_of
+from nics_drl_bridge.recording.messages import imu_row, pose_row, stamp, twist_row
+from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.recording.stamping import TopicData, streams
+from nics_drl_bridge.recording.topic_roles import TopicRoles
+from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 PLACE = "recording"
 FEWEST = 2
 SAME_PACE = (0.8, 1.25)
-"""Stamps that run at another pace than the time of receipt are of another kind of time."""
+"""Limits of the stamps' rate relative to receipt; beyond them it is another kind of time."""
 
 
 class _Rows:
@@ -39,7 +39,7 @@ class _Rows:
         return len(self._values)
 
     def add(self, receive_ns: int, header_ns: int, values: Array) -> bool:
-        """Whether the message is of use: finite, and newer than the last by its stamp."""
+        """Adds a message; returns False if it is not finite, or not newer than the last."""
         stale = header_ns != 0 and len(self._header) > 0 and header_ns <= self._header[-1]
         if stale or not np.isfinite(values).all():
             return False
@@ -50,16 +50,16 @@ class _Rows:
 
     @property
     def spans(self) -> tuple[int, int]:
-        """Between the first message and the last, by receipt and by stamp [ns]."""
+        """Time from the first message to the last, by receipt and by stamp [ns]."""
         if not self._values:
             return 0, 0
         return self._receive[-1] - self._receive[0], self._header[-1] - self._header[0]
 
     @property
     def pace(self) -> float:
-        """Seconds by stamp in a second of receipt; 1 where there is nothing to tell it by.
+        """Seconds by stamp per second of receipt; 1 if it can't be determined.
 
-        It is told by the promptest message of each half: others are late, by whatever time.
+        It is determined by the least delayed message of each half, because delays vary.
         """
         heard, stamped = self.spans
         if heard <= 0 or stamped <= 0:
@@ -80,7 +80,7 @@ class DriveLog:
     Args:
         spec: the robot.
         roles: may name the joints of state and wheels.
-        now: the time of receipt [ns], on the clock that the robot's stamps are compared with.
+        now: returns the time of receipt [ns], on the clock that stamps are compared with.
     """
 
     def __init__(self, spec: RobotSpec, roles: TopicRoles, now: Callable[[], int]) -> None:
@@ -91,15 +91,15 @@ class DriveLog:
 
     @property
     def seconds(self) -> float:
-        """How long commands were sent [s]."""
-        return self._commands.spans[0] / NANO
+        """Time over which commands were sent [s]."""
+        return self._commands.spans[0] / NS_PER_S
 
     def command(self, command: Array) -> None:
-        """Notes a command (C,) that is sent now."""
+        """Records a command (C,) that is sent now."""
         self._commands.add(self._now(), 0, command)
 
     def odometry(self, message: Odometry) -> Array | None:
-        """Notes an odometry; returns its pose (3,), or None if it is old, NaN or inf."""
+        """Records an odometry; returns its pose (3,), or None if it is old, NaN or inf."""
         now, header, pose = self._now(), stamp(message), np.array(pose_row(message))
         if not self._odom.add(now, header, pose):
             return None
@@ -107,15 +107,15 @@ class DriveLog:
         return pose
 
     def pose(self, message: Any) -> None:
-        """Notes a pose of motion capture or localisation."""
+        """Records a pose from motion capture or localisation."""
         self._pose.add(self._now(), stamp(message), np.array(pose_row(message)))
 
     def imu(self, message: Any) -> None:
-        """Notes accelerations and yaw rate."""
+        """Records accelerations and yaw rate."""
         self._imu.add(self._now(), stamp(message), np.array(imu_row(message)))
 
     def joints(self, message: JointState) -> None:
-        """Notes what the joints report."""
+        """Records the data of the joints."""
         self._joints.append(
             JointMessage(
                 self._now(),
@@ -127,11 +127,11 @@ class DriveLog:
         )
 
     def check(self) -> None:
-        """Makes sure, before the robot moves, that the recording will be of use.
+        """Checks, before the robot moves, that the recording will be usable.
 
         Raises:
-            BackendError, RecordingError: a state that has to be measured is not, or stamps run
-                at another pace than the time of receipt.
+            BackendError, RecordingError: a state that has to be measured is not, or stamps run at
+                another rate than the time of receipt.
         """
         measured = [v.name for v in self._spec.state if v.follows is None]
         if self._joints:
@@ -142,7 +142,7 @@ class DriveLog:
                 f"of robot {self._spec.name!r} has to be measured; start the joints' publisher, "
                 "or remap the topic."
             )
-        pace, heard = self._odom.pace, self._odom.spans[0] / NANO
+        pace, heard = self._odom.pace, self._odom.spans[0] / NS_PER_S
         if not SAME_PACE[0] <= pace <= SAME_PACE[1]:
             raise BackendError(
                 f"topic 'odom': its stamps went on by {pace * heard:.2f} s within "
@@ -154,9 +154,9 @@ class DriveLog:
         return gather("joint_states", self._joints)
 
     def recording(self) -> Recording:
-        """All streams on their clocks; the pose is that of `pose` where that topic spoke.
+        """Returns all streams on their clocks; the pose is that of `pose` if that topic was heard.
 
-        Beside such a pose, the twist of the odometry is kept to tell how noisy odometry is.
+        In addition to such a pose, the twist of the odometry is kept, to determine its noise.
 
         Raises:
             RecordingError: too little was received.
@@ -184,5 +184,5 @@ class DriveLog:
         try:
             return dict(streams(data, self._roles.stamps, PLACE))
         except RecordingError:
-            # Worse stamps are better than no recording of a drive that is over.
+            # Poorer stamps are better than no recording of a drive that is over.
             return dict(streams(data, "receive", PLACE))

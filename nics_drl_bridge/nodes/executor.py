@@ -1,4 +1,4 @@
-"""An executor whose wait set stands, instead of being made anew for each message."""
+"""An executor that keeps its wait set instead of building one for each message."""
 
 from __future__ import annotations
 
@@ -21,34 +21,35 @@ from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.waitable import NumberOfEntities
 
-NANO = 1_000_000_000
+from nics_drl_bridge.interface import NS_PER_S
+
 PARTS_MISSING = (AttributeError, TypeError)
-"""What Python raises where rclpy is another one than is known here."""
+"""Raised by Python if rclpy differs from what is known here."""
 Received = tuple[Callable[..., Any], tuple[Any, ...]]
 """A callback and its arguments."""
 HANDED_OVER = object()
-"""What a callback returns that has woken another thread of this process. The executor then rests,
-for less than an exchange of messages takes, rather than be in that thread's way."""
+"""Returned by a callback that has woken another thread of this process. The executor then rests,
+for less than an exchange of messages takes, to keep out of that thread's way."""
 REST_S = 1e-4
 MOST_AT_ONCE = 32
-"""A timer without a period is always ready, and who spins wants to look after other things too."""
+"""A timer without a period is always ready, and the spinning thread has other work, too."""
 
 
 class StandingExecutor(SingleThreadedExecutor):
-    """Waits for all ends of its nodes; calls back subscriptions itself and leaves the rest.
+    """Waits for all entities of its nodes; handles subscriptions and timers, and leaves the rest.
 
-    rclpy's executors gather the ends of all nodes, open their handles and make a new wait set
+    rclpy's executors gather the entities of all nodes, open their handles and build a new wait set
     each time they wait, and they wait three times for one message, woken by their own guard
-    condition. Here that is done when an end comes or goes. Whatever is no subscription and no timer
-    (services, clients, events, tasks) is left to rclpy's own executor.
+    condition. Here that is done only when an entity is added or removed. Everything except
+    subscriptions and timers (services, clients, events, tasks) is left to rclpy's own executor.
 
-    Callbacks of subscriptions are plain functions of the message, or of it and what is known about
-    it; those of timers are plain functions of nothing, others are left to rclpy, too. They are
-    called in the thread that spins, one after the other. See `HANDED_OVER` for what those of
+    Callbacks of subscriptions are plain functions of the message, or of the message and its info;
+    those of timers are plain functions without arguments, others are left to rclpy, too. They are
+    called in the spinning thread, one after the other. See `HANDED_OVER` for what those of
     subscriptions may return.
 
-    That needs parts of rclpy that no interface promises. With an rclpy that lacks one of them it
-    says so once in the log, and is rclpy's own executor from then on.
+    This needs parts of rclpy that are not public. If one of them is missing, it logs that once, and
+    is rclpy's own executor from then on.
 
     Args:
         context: of the nodes.
@@ -60,7 +61,7 @@ class StandingExecutor(SingleThreadedExecutor):
         self._changed, self.stands = True, True
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Waits for something and handles it; see rclpy.
+        """Waits for an event and handles it; see rclpy.
 
         Raises:
             ExternalShutdownException: the context is shut down.
@@ -74,7 +75,7 @@ class StandingExecutor(SingleThreadedExecutor):
         if not self.stands:
             super().spin_once(timeout_sec)
             return
-        # Before anything else is looked at: somebody may wait for the answer to a message.
+        # Before anything else: a peer may be waiting for the answer to a message.
         _call(received)
         due, others = self._others_ready()
         if received:
@@ -85,11 +86,11 @@ class StandingExecutor(SingleThreadedExecutor):
             self._handle_others()
 
     def _wait(self, timeout_sec: float | None) -> list[Received]:
-        """Waits; what subscriptions received."""
+        """Waits; returns what subscriptions received."""
         try:
             ends = self._gathered()
-            ends.wait(-1 if timeout_sec is None else int(timeout_sec * NANO))
-        except RuntimeError:  # of the library, whose context another thread may have shut down
+            ends.wait(-1 if timeout_sec is None else int(timeout_sec * NS_PER_S))
+        except RuntimeError:  # of the library: another thread may have shut down the context
             if self.context.ok():
                 raise
         if not self.context.ok():
@@ -97,17 +98,17 @@ class StandingExecutor(SingleThreadedExecutor):
         return ends.taken()
 
     def _come_since(self) -> list[Received]:
-        """What has come while callbacks ran; to take it costs less than to wait for it."""
+        """Returns what arrived while callbacks ran; to take it costs less than to wait for it."""
         return [] if self._ends is None or not self.context.ok() else self._ends.come()
 
     def _others_ready(self) -> tuple[list[Any], bool]:
-        """Timers that are due, and whether anything else but subscriptions was ready."""
-        if self._ends is None or not self.context.ok():  # a callback may have shut all down
+        """Returns the timers that are due, and whether anything that is left to rclpy was ready."""
+        if self._ends is None or not self.context.ok():  # a callback may have shut it down
             return [], False
         try:
             due = self._ends.due()
             woken, others = self._ends.others_ready(self._guard)
-            self._changed |= woken or others  # whoever adds an end to a node wakes the executor
+            self._changed |= woken or others  # adding an entity to a node wakes the executor
             # So does rclpy itself, after each callback; then there is nothing to handle.
             return due, others or (woken and bool(self._tasks))
         except PARTS_MISSING as error:
@@ -115,7 +116,7 @@ class StandingExecutor(SingleThreadedExecutor):
             return [], False
 
     def _tick(self, timer: Any) -> None:
-        """Calls a timer back, unless a callback before it has ended all, or that timer."""
+        """Calls a timer back, unless an earlier callback has ended the context or the timer."""
         if not self.context.ok() or not any(timer in node.timers for node in self.get_nodes()):
             return
         try:
@@ -128,23 +129,23 @@ class StandingExecutor(SingleThreadedExecutor):
         timer.callback()
 
     def _fall_back(self, error: Exception) -> None:
-        """Goes on as rclpy's own executor."""
+        """Continues as rclpy's own executor."""
         self.stands = False
         self._release()
         get_logger("executor").warning(f"this rclpy needs its own, slower executor ({error})")
 
     def _handle_others(self) -> None:
-        """Lets rclpy handle all that is ready now."""
+        """Lets rclpy handle everything that is ready now."""
         with contextlib.suppress(TimeoutException):
             for _ in range(MOST_AT_ONCE):
-                if not self.context.ok():  # a callback may have ended it
+                if not self.context.ok():  # a callback may have shut it down
                     raise ExternalShutdownException
                 task, _, _ = self.wait_for_ready_callbacks(timeout_sec=0.0)
                 task()
-                task.result()  # raises what the callback did
+                task.result()  # re-raises the callback's exception
 
     def _gathered(self) -> _Ends:
-        """The ends that there are, in a new wait set if they are others than before."""
+        """Returns the entities, in a new wait set if they have changed."""
         if self._ends is None or self._changed:
             self._changed = False
             nodes = self.get_nodes()
@@ -160,13 +161,13 @@ class StandingExecutor(SingleThreadedExecutor):
             self._ends = None
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
-        """Lets go of all ends; see rclpy."""
+        """Releases all entities; see rclpy."""
         self._release()
         return bool(super().shutdown(timeout_sec))
 
 
 class _Ends:
-    """The ends of nodes, their handles held open, and a wait set with room for all of them."""
+    """The entities of nodes, their handles kept open, and a wait set for all of them."""
 
     def __init__(self, nodes: Sequence[Node], guards: Sequence[Any], context: Context) -> None:
         self.all = _all_ends(nodes)
@@ -196,8 +197,8 @@ class _Ends:
         ]
 
     def wait(self, timeout_ns: int) -> None:
-        """Waits until something is ready; for ever if the timeout is negative."""
-        self._wait_set.clear_entities()  # each wait forgets those that were not ready
+        """Waits until something is ready; without limit if the timeout is negative."""
+        self._wait_set.clear_entities()  # each wait drops those that were not ready
         for add, handle in self._adding:
             add(handle)
         for waitable in self._waitables:
@@ -205,27 +206,27 @@ class _Ends:
         self._wait_set.wait(timeout_ns)
 
     def taken(self) -> list[Received]:
-        """What the subscriptions received that waiting found ready."""
+        """Returns what was received by the subscriptions that are ready."""
         is_ready = self._wait_set.is_ready
         found = enumerate(self._subscriptions)
         return _take(entry for i, entry in found if is_ready("subscription", i))
 
     def come(self) -> list[Received]:
-        """What any subscription has received by now."""
+        """Returns what any subscription has received by now."""
         return _take(self._subscriptions)
 
     def due(self) -> list[Any]:
-        """The timers with plain callbacks that waiting found ready."""
+        """Returns the timers with plain callbacks that are ready."""
         is_ready = self._wait_set.is_ready
         return [timer for i, timer in self._timers if is_ready("timer", i)]
 
     def others_ready(self, own: Any) -> tuple[bool, bool]:
-        """Whether the executor's own guard condition is ready, and what is left to rclpy."""
+        """Returns whether the executor's guard condition is ready, and whether rclpy has work."""
         ready = self._wait_set.get_ready_entities
         triggered = list(ready("guard_condition"))
         for guard in self.all[1]:
             if guard.handle.pointer in triggered:
-                guard._executor_triggered = True  # waiting has reset it; rclpy sets it anew
+                guard._executor_triggered = True  # waiting has reset it; set again for rclpy
         woken = own is not None and own.handle.pointer in triggered
         if woken:
             triggered.remove(own.handle.pointer)
@@ -236,12 +237,12 @@ class _Ends:
         )
 
     def close(self) -> None:
-        """Lets go of the handles."""
+        """Releases the handles."""
         self._open.close()
 
 
 def _take(subscriptions: Iterable[tuple[Any, int]]) -> list[Received]:
-    """One message of each subscription that has one, for its callback of so many arguments."""
+    """Takes one message of each subscription that has one, with its callback's arguments."""
     received = []
     for subscription, arguments in subscriptions:
         taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
@@ -251,7 +252,7 @@ def _take(subscriptions: Iterable[tuple[Any, int]]) -> list[Received]:
 
 
 def _call(received: Iterable[Received]) -> None:
-    """Calls back, and rests if another thread now goes on."""
+    """Calls back, and rests if another thread continues."""
     handed_over = False
     for callback, arguments in received:
         handed_over |= callback(*arguments) is HANDED_OVER
@@ -260,7 +261,7 @@ def _call(received: Iterable[Received]) -> None:
 
 
 def _arguments(callback: Callable[..., Any]) -> int:
-    """How many a subscription's callback takes: the message, or with it what is known about it."""
+    """Returns the arguments that a subscription's callback takes: the message, or also its info."""
     try:
         inspect.signature(callback).bind(None)
     except TypeError:
@@ -269,7 +270,7 @@ def _arguments(callback: Callable[..., Any]) -> int:
 
 
 def _plain(callback: Callable[..., Any] | None) -> bool:
-    """Whether a timer's callback is a function of nothing that does not have to be awaited."""
+    """True if a timer's callback takes no arguments and is no coroutine."""
     try:
         inspect.signature(callback).bind()  # type: ignore[arg-type]
     except TypeError:
@@ -278,6 +279,6 @@ def _plain(callback: Callable[..., Any] | None) -> bool:
 
 
 def _all_ends(nodes: Sequence[Node]) -> tuple[tuple[Any, ...], ...]:
-    """Subscriptions, guard conditions, timers, clients, services and waitables of nodes."""
+    """Returns subscriptions, guard conditions, timers, clients, services and waitables of nodes."""
     kinds = ("subscriptions", "guards", "timers", "clients", "services", "waitables")
     return tuple(tuple(end for node in nodes for end in getattr(node, kind)) for kind in kinds)

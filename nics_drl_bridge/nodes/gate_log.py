@@ -1,4 +1,4 @@
-"""What `command_gate` tells about itself: lines, counters, and the black box."""
+"""Reports of `command_gate`: log lines, counters, and the black box."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ from pathlib import Path
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
+from nics_drl_bridge.gate.black_box import BlackBox, Entry, write
+from nics_drl_bridge.gate.state import Cause, GateState
 from nics_drl_bridge.nodes.box_writer import BoxWriter
-from nics_drl_bridge.nodes.diagnostics import Finding
+from nics_drl_bridge.nodes.diagnostics import Condition
 from nics_drl_bridge.nodes.gate_parameters import GateParameters
-from nics_drl_bridge.safety.black_box import BlackBox, Entry, write
-from nics_drl_bridge.safety.state import Cause, GateState
 
 FILES_KEPT = 20
 BURST_S = 3.0
-"""Commands pass for so long before a stop counts as a new one, and not as one more of a burst."""
+"""Time for which commands must pass before a stop counts as new, not as part of a burst [s]."""
 LINE_S = 2.0
-"""Between two lines of a kind; what comes in between is counted."""
+"""Time between two log lines of a kind [s]; those in between are counted."""
 CLOSING_S = 0.7
-"""The end waits so long for files that are being written."""
+"""Longest wait at the end for files that are being written [s]."""
 
 
 class _Lines:
-    """Lines of the log, at most one of a kind within `LINE_S`."""
+    """Log lines, at most one of a kind within `LINE_S`."""
 
     def __init__(self) -> None:
         self._said: dict[str, float] = {}
         self._kept: Counter[str] = Counter()
 
     def count(self, kind: str) -> None:
-        """There is one more to say."""
+        """Counts one more line of a kind."""
         self._kept[kind] += 1
 
     def due(self, kind: str, now: float) -> str | None:
-        """None if one has just been said; else what to add about those that were not said."""
+        """Returns a suffix about lines that were not logged; None if one has just been logged."""
         if now - self._said.get(kind, float("-inf")) < LINE_S:
             return None
         kept, self._said[kind] = self._kept.pop(kind, 1) - 1, now
@@ -44,14 +44,14 @@ class _Lines:
 
 
 class GateLog:
-    """Counters of everything, lines that do not flood, and one file for each stop that is new.
+    """Counts everything, logs without flooding, and writes one file for each new stop.
 
-    Stops that follow each other closely are a burst. Of each rule, the first stop of a burst is
-    written, as it was at that moment; the others are counted.
+    Stops in quick succession are a burst. The first stop of each rule in a burst is written, as it
+    was at that moment; the others are counted.
 
     Args:
         parameters: of the gate.
-        logger: takes the lines.
+        logger: for the lines.
     """
 
     def __init__(self, parameters: GateParameters, logger: RcutilsLogger) -> None:
@@ -61,15 +61,15 @@ class GateLog:
         self._cause: Cause | None = None
         self._now = self._since = float("-inf")
         self._rule: str | None = None
-        """That stops the robot; empty while commands pass, None at first."""
+        """Rule that stops the robot; empty while commands pass, None at first."""
         self._burst: set[str] = set()
-        """Rules of which a stop was written since commands last passed for long."""
+        """Rules with a written stop since commands last passed for long."""
         self._lines, self._owed = _Lines(), False
         self._names: list[str] = []
         self._writer = BoxWriter()
 
     def note(self, entry: Entry) -> None:
-        """Takes a decision into account."""
+        """Accounts for a decision."""
         self._box.note(entry)
         decision, cause = entry.decision, entry.decision.cause
         self._now = entry.now
@@ -87,7 +87,7 @@ class GateLog:
             self._burst.clear()
 
     def refuse(self, reason: str) -> None:
-        """Counts an input that is not used, by what stands before the colon, and tells of it."""
+        """Counts an unused input, by the part of the reason before the colon, and logs it."""
         kind = f"refused, {reason.partition(':')[0]}"
         self.counters[kind] += 1
         self._lines.count(kind)
@@ -96,7 +96,7 @@ class GateLog:
             self._logger.warning(f"refused: {reason}{more}")
 
     def no_number(self, twist: Sequence[float]) -> None:
-        """Counts a decision that must never have been, and tells of it."""
+        """Counts and logs a decision that is not finite, which must never happen."""
         kind = "not finite, sent as zero"
         self.counters[kind] += 1
         self._lines.count(kind)
@@ -108,7 +108,7 @@ class GateLog:
             )
 
     def _changed(self, rule: str) -> None:
-        """Another rule stops the robot than before, or none."""
+        """Handles a change of the rule that stops the robot."""
         was_passing = self._rule == ""
         self._rule, self._since, self._owed = rule, self._now, True
         self._lines.count(rule)
@@ -124,7 +124,7 @@ class GateLog:
         self._write(rule)
 
     def _tell(self, rule: str) -> None:
-        """Says what is the case now; later, if it was said a moment ago."""
+        """Logs the present state; later, if it was logged a moment ago."""
         more = self._lines.due(rule, self._now)
         self._owed = more is None
         if more is None:
@@ -154,8 +154,8 @@ class GateLog:
         self.counters["not written"] += 1
         self._logger.error(f"the black box could not be written: {reason}")
 
-    def finding(self, state: GateState) -> Finding:
-        """For `/diagnostics`."""
+    def finding(self, state: GateState) -> Condition:
+        """Returns the finding for `/diagnostics`."""
         for failure in self._writer.failures():
             self._failed(failure)
         facts = {
@@ -164,21 +164,21 @@ class GateLog:
             **dict(sorted(self.counters.items())),
         }
         message = self._cause.line if self._cause else "commands pass"
-        return Finding(message, self._cause is not None, facts, self._hardware)
+        return Condition(message, self._cause is not None, facts, self._hardware)
 
     def close(self) -> None:
-        """Waits a moment for the files that are being written; none is left in part."""
+        """Waits briefly for files that are being written; none is left incomplete."""
         for failure in self._writer.close(CLOSING_S):
             self._failed(failure)
 
 
 def prune(folder: Path, own: Sequence[str]) -> None:
-    """Removes files of stops beyond `FILES_KEPT`, the oldest first.
+    """Removes the files of stops beyond `FILES_KEPT`, oldest first.
 
     Args:
         folder: of the black box.
-        own: names of those that this gate wrote, oldest first. They are the youngest of all: the
-            names of the others may come from a clock that was set back since.
+        own: names of this gate's files, oldest first. They count as the newest: the names of the
+            others may come from a clock that has been set back since.
     """
     place = {name: i for i, name in enumerate(own, 1)}
     files = sorted(folder.glob("*.jsonl"), key=lambda file: (place.get(file.name, 0), file.name))

@@ -1,4 +1,4 @@
-"""The parameters of `command_gate`."""
+"""Parameters of `command_gate`."""
 
 from __future__ import annotations
 
@@ -11,27 +11,26 @@ from pathlib import Path
 import numpy as np
 from rclpy.node import Node
 
+from nics_drl_bridge.gate.limits import Limits, load_limits
+from nics_drl_bridge.gate.state import GateConfig, ShieldConfig
+from nics_drl_bridge.gate.stopping import doubtful, require_possible, shield_config
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes.runner import declare, declare_model
-from nics_drl_bridge.safety.limits import Limits, load_limits
-from nics_drl_bridge.safety.settings import doubtful, require_possible
-from nics_drl_bridge.safety.state import GateConfig, ShieldConfig
-from nics_drl_bridge.safety.stopping import shield_config
 
 SCAN_PERIODS = 1.75
-"""A command's scan is no older by default than so many of the lidar's periods, if it is slow."""
+"""For a slow lidar, the default age limit of a command's scan, in periods of the lidar."""
 DEFAULTS = GateConfig((), None, np.zeros(0), (0.0, 0.0, 0.0), 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class GateParameters:
-    """What `command_gate` is to do.
+    """Values of the parameters of `command_gate`.
 
     Attributes:
         config: of the rules.
         robot: name of the robot behind it.
-        lidar: whose scans it gets.
+        lidar: of the robot.
         black_box: folder of the recordings of stops.
         shield_said: a sentence about the shield.
     """
@@ -97,7 +96,7 @@ def declare_gate(node: Node) -> GateParameters:
     if doubt:
         node.get_logger().warning(doubt)
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
-    # Gates of other namespaces have folders of their own, so that none removes another's files.
+    # Gates of other namespaces have their own folders, so that none removes another's files.
     black_box = Path(get("black_box", "", folder) or home / "black_box")
     black_box /= node.get_namespace().strip("/")
     return GateParameters(config, robot.name, lidar, black_box, said)
@@ -106,7 +105,7 @@ def declare_gate(node: Node) -> GateParameters:
 def _declare_shield(
     node: Node, model: SimulatorModel, limits: Limits | None, file: str
 ) -> tuple[ShieldConfig | None, str]:
-    """The shield, None if it is off; and a sentence about it for the log."""
+    """Returns the shield, None if it is off, and a sentence about it for the log."""
 
     def get(name: str, description: str) -> float:
         about = f"{description}; .nan: by the limits' file, or derived from the model."

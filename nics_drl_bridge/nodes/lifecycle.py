@@ -1,4 +1,4 @@
-"""What the managed nodes share: configure, activate, deactivate, cleanup, shutdown."""
+"""Base of the managed nodes: configure, activate, deactivate, cleanup, shutdown."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 
 from nics_drl_bridge.errors import BridgeError
-from nics_drl_bridge.nodes.qos_watch import QosWatch
+from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import declare
 
 UNCONFIGURED, INACTIVE, ACTIVE = "unconfigured", "inactive", "active"
@@ -21,17 +21,17 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 
 
 class ManagedNode(QosWatch, LifecycleNode):
-    """A node that `ros2 lifecycle` and Nav2's lifecycle manager can lead through its states.
+    """A node that `ros2 lifecycle` and Nav2's lifecycle manager can manage.
 
     With the parameter `autostart`, which is the default, it configures and activates itself. A
-    subclass declares its parameters when it is made, so that they can be set while it is
-    unconfigured, and says what the transitions do: `configure` reads the parameters, makes what
-    they ask for, listens, and puts on the stack `undo` how to get rid of each; `activate` begins
-    to act; `deactivate` leaves the robot standing still.
+    subclass declares its parameters in its constructor, so that they can be set while it is
+    unconfigured, and implements the transitions: `configure` reads the parameters, makes what they
+    request, subscribes, and puts the clean-up of each on the stack `undo`; `activate` starts to
+    act; `deactivate` leaves the robot at rest.
 
     Args:
         name: of the node.
-        context: to live in.
+        context: of the node.
     """
 
     def __init__(self, name: str, context: Context) -> None:
@@ -45,30 +45,30 @@ class ManagedNode(QosWatch, LifecycleNode):
         self.add_on_set_parameters_callback(self._check_fixed)
 
     def create_lifecycle_publisher(self, kind: Any, topic: str, qos: Any) -> Publisher:
-        """A publisher that is silent unless the node is active."""
+        """Creates a publisher that is silent unless the node is active."""
         events = self.publisher_events(topic, qos)
         return super().create_lifecycle_publisher(kind, topic, qos, event_callbacks=events)
 
     def configure(self) -> None:
-        """Makes what the parameters ask for.
+        """Makes what the parameters request.
 
         Raises:
             BridgeError: a parameter can't be used.
         """
 
     def activate(self) -> None:
-        """Begins to act."""
+        """Starts to act."""
 
     def deactivate(self) -> None:
-        """Leaves the robot standing still; says nothing after."""
+        """Leaves the robot at rest; publishes nothing afterwards."""
 
     @property
     def state(self) -> str:
-        """The primary state that it was last in: `unconfigured`, `inactive` or `active`."""
+        """Last primary state: `unconfigured`, `inactive` or `active`."""
         return self._state
 
     def start(self) -> None:
-        """Configures and activates the node, if `autostart` says so.
+        """Configures and activates the node, if `autostart` is set.
 
         Raises:
             BridgeError: a parameter can't be used.
@@ -83,12 +83,12 @@ class ManagedNode(QosWatch, LifecycleNode):
         self._starting = False
 
     def stop(self) -> None:
-        """Leaves the robot standing still, from whatever state."""
+        """Leaves the robot at rest, from any state."""
         if self._state == ACTIVE:
             self.deactivate()
 
     def _check_fixed(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Refuses what would not be read any more."""
+        """Refuses changes that would no longer be read."""
         late = sorted(self.fixed & {parameter.name for parameter in parameters})
         if not late or self._state == UNCONFIGURED:
             return SetParametersResult(successful=True)
@@ -122,17 +122,17 @@ class ManagedNode(QosWatch, LifecycleNode):
         return self._attempt(self.undo.close, UNCONFIGURED)
 
     def on_shutdown(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Transition of the state machine, from any state; the process goes on."""
+        """Transition of the state machine, from any state; the process continues."""
         self.stop()
         return self._attempt(self.undo.close, UNCONFIGURED)
 
     def on_error(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """What follows a transition that raised; afterwards it can be configured anew."""
+        """Handles a transition that raised; afterwards the node can be configured again."""
         self.stop()
         return self._attempt(self.undo.close, UNCONFIGURED)
 
     def _attempt(self, do: Callable[[], None], reached: str) -> TransitionCallbackReturn:
-        """Does the work of a transition; rclpy itself would not tell why one failed."""
+        """Does the work of a transition; rclpy itself would not report why one failed."""
         self._failure = None
         try:
             do()

@@ -1,4 +1,7 @@
-"""Link: a process's own end of a robot's topics, which never leaves the robot moving."""
+"""Link: a process's own rclpy entities for a robot, which never leave the robot moving.
+
+CommandTimeout: publishes a zero when commands stop coming.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +26,8 @@ from rclpy.publisher import Publisher
 from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.command_timeout import CommandTimeout
 from nics_drl_bridge.nodes.executor import StandingExecutor
-from nics_drl_bridge.nodes.graph import owner
-from nics_drl_bridge.nodes.qos_watch import QosWatch
+from nics_drl_bridge.nodes.qos import QosWatch, owner
 from nics_drl_bridge.nodes.runner import last_word, open_context
 from nics_drl_bridge.nodes.wire import TwistWriter
 
@@ -35,20 +36,20 @@ POLL_S = 0.002
 
 
 class Link:
-    """A node of its own in a context of its own, one executor thread, and the command topic.
+    """A node in its own context, one executor thread, and the command topic.
 
-    `close`, an error inside `zero_after_an_error`, garbage collection and the end of the process
-    leave a zero command behind, also when that end is SIGTERM. SIGKILL can't be answered:
-    `command_gate` and the base's own timeout are for that.
+    `close`, an error inside `zero_after_an_error`, garbage collection and the end of the process,
+    SIGTERM included, leave a zero command behind. SIGKILL can't be handled: `command_gate` and the
+    base's own timeout are for that.
 
     Args:
         namespace: of the robot.
         domain_id: DDS domain; the environment's by default.
-        command_topic: where commands go.
+        command_topic: of the commands.
         stamped: whether they are TwistStamped.
         parameters: of the node.
-        command_timeout_s: a command that no other one follows for so long is followed by a zero
-            [s]; inf never.
+        command_timeout_s: a command without a successor within this time is followed by a zero
+            [s]; inf for never.
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class Link:
         self._closing: weakref.finalize[Any, Any] | None = None
 
     def begin(self) -> None:
-        """Starts the executor's thread; to be called when all subscriptions are there."""
+        """Starts the executor's thread; call it once all subscriptions exist."""
         thread = threading.Thread(
             target=_spin, args=(self._context, self.node, self._timeout), daemon=True,
             name="dds_backend",
@@ -88,7 +89,7 @@ class Link:
         """Publishes linear.x, linear.y, angular.z (3,), stamped if the topic is.
 
         Raises:
-            BackendError: they are not finite; a zero is published instead.
+            BackendError: it is not finite; a zero is published instead.
         """
         if not all(map(math.isfinite, twist)):
             self.halt()
@@ -113,7 +114,7 @@ class Link:
 
     @contextlib.contextmanager
     def zero_after_an_error(self) -> Iterator[None]:
-        """Publishes a zero command when what is inside ends by any exception."""
+        """Publishes a zero command if the body ends by any exception."""
         try:
             yield
         except BaseException:
@@ -121,14 +122,14 @@ class Link:
             raise
 
     def check_open(self) -> None:
-        """Raises BackendError when it is closed."""
+        """Raises BackendError if the link is closed."""
         if self._closing is None or not self._closing.alive or not self._context.ok():
             raise BackendError("this backend is closed; make another one.")
 
     def call(self, client: Any, request: Any, timeout_s: float) -> Any:
         """Calls a service; the executor's thread completes the future. Raises BackendError."""
         done, deadline = threading.Event(), time.monotonic() + timeout_s
-        # A server that hung for long was given up, and has to be found anew.
+        # A server that hung for long was dropped, and has to be discovered again.
         while not client.service_is_ready() and time.monotonic() < deadline:
             time.sleep(POLL_S)
         future = client.call_async(request)
@@ -142,11 +143,11 @@ class Link:
         return future.result()
 
     def others_command(self) -> bool:
-        """Whether somebody else publishes commands too."""
+        """True if another node publishes commands too."""
         return bool(self.node.count_publishers(self.commands.topic_name) > 1)
 
     def check_alone(self) -> None:
-        """Raises BackendError with the name of whoever else publishes commands."""
+        """Raises BackendError with the names of any other publishers of commands."""
         if not self.others_command():
             return
         topic = self.commands.topic_name
@@ -158,7 +159,7 @@ class Link:
 
     def wait_for_peers(self, topics: Sequence[str], clients: Sequence[Any], patience_s: float,
                        advice: str) -> None:  # fmt: skip
-        """Waits until every end is matched. Raises BackendError with what is missing."""
+        """Waits until all peers are matched. Raises BackendError with what is missing."""
         resolve, service = self.node.resolve_topic_name, self.node.resolve_service_name
         needed: dict[str, Callable[[], bool]] = {
             f"subscriber of {self.commands.topic_name}": lambda: (
@@ -179,7 +180,7 @@ class Link:
                     f"after {patience_s:g} s there is still no {', no '.join(missing)}; {advice}"
                 )
             time.sleep(POLL_S)
-        # Somebody who was killed stays in the graph for a while.
+        # A publisher that was killed stays in the graph for a while.
         while self.others_command() and time.monotonic() < deadline:
             time.sleep(POLL_S)
         self.check_alone()
@@ -200,7 +201,7 @@ def _spin(context: Context, node: Node, timeout: CommandTimeout) -> None:
     except ExternalShutdownException:
         pass
     finally:
-        if context.ok():  # an error ends it, and with it whoever would notice that data are old
+        if context.ok():  # after an error: nothing would notice old data any more
             timeout.end()
             context.try_shutdown()
         executor.shutdown(timeout_sec=1.0)
@@ -208,18 +209,18 @@ def _spin(context: Context, node: Node, timeout: CommandTimeout) -> None:
 
 
 def _shut_down(context: Context, commands: Publisher, kind: Any, thread: threading.Thread) -> None:
-    """Leaves a zero command behind and ends the thread; knows nothing of the link."""
-    with uninterrupted():  # the interpreter would end beside a thread in the middleware's library
+    """Leaves a zero command behind and ends the thread; holds no reference to the link."""
+    with uninterrupted():  # else Python may exit with a thread inside the middleware's library
         if context.ok():
             last_word(commands, kind())
             context.try_shutdown()
-        # Garbage may be collected in any thread, also in that one.
+        # Garbage may be collected in any thread, including that one.
         if thread is not threading.current_thread():
             thread.join(timeout=2.0)
 
 
 def _end_orderly_on_sigterm() -> None:
-    """Makes SIGTERM end Python as an exception does, unless the program handles it itself."""
+    """Makes SIGTERM end Python like an exception, unless the program handles it itself."""
     in_main = threading.current_thread() is threading.main_thread()
     if in_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _end)
@@ -227,3 +228,35 @@ def _end_orderly_on_sigterm() -> None:
 
 def _end(number: int, _: Any) -> None:
     raise SystemExit(128 + number)
+
+
+class CommandTimeout:
+    """Ends a command whose sender has been silent for a while.
+
+    The caller of `step` may have failed where the env does not see it: a policy that raised, a
+    wrapper, a loop that hangs. No reference to the link is kept, because it may be garbage.
+
+    Args:
+        publisher: of the commands.
+        kind: type of the messages.
+        limit_s: time for which a command is valid [s]; inf for no limit.
+    """
+
+    def __init__(self, publisher: Publisher, kind: Any, limit_s: float) -> None:
+        self._publisher, self._kind, self._limit_s = publisher, kind, limit_s
+        self._due_s = self._answered_s = math.inf
+
+    def begin(self, moving: bool) -> None:
+        """Restarts the timeout; call it before a command is published, zero or not."""
+        self._due_s = time.monotonic() + self._limit_s if moving else math.inf
+
+    def look(self) -> None:
+        """Publishes one zero when the time is over; call it often, from another thread."""
+        due_s = self._due_s
+        if due_s != self._answered_s and time.monotonic() >= due_s:
+            self._answered_s = due_s
+            self._publisher.publish(self._kind())
+
+    def end(self) -> None:
+        """Publishes the last zero, and waits for its delivery."""
+        last_word(self._publisher, self._kind())

@@ -1,4 +1,4 @@
-"""Message types by their names, of whatever packages are installed."""
+"""Message types by name, from any installed package."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")
 
 
 def message_type(kind: str) -> Any | None:
-    """The class of a type, as `nav_msgs/msg/Odometry`; None where its package is not installed."""
+    """Returns the class of a type like `nav_msgs/msg/Odometry`; None if it is not installed."""
     parts = kind.split("/")
     if len(parts) != PARTS:
         return None
@@ -25,7 +25,7 @@ def message_type(kind: str) -> Any | None:
 
 
 def message_texts(kind: str) -> dict[str, str]:
-    """The `.msg` texts of a type and of all that it is made of, as far as they are installed."""
+    """Returns the `.msg` texts of a type and of all types in it, as far as they are installed."""
     texts: dict[str, str] = {}
     waiting = [kind]
     while waiting:
@@ -57,5 +57,5 @@ def _prefixes() -> list[Path]:
 
     try:
         return [Path(path) for path in get_search_paths()]
-    except OSError:  # where ROS 2 comes from wheels the variable is not set
+    except OSError:  # if ROS 2 comes from wheels, the variable is not set
         return []

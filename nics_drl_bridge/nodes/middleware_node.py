@@ -10,27 +10,27 @@ from rclpy.context import Context
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.middleware.health import Health
-from nics_drl_bridge.middleware.view import rehearse
+from nics_drl_bridge.middleware.measurement import Health
+from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.diagnostics import Diagnostics, Finding
+from nics_drl_bridge.nodes.diagnostics import Condition, Diagnostics
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
 from nics_drl_bridge.nodes.runner import declare, declare_model_name, run_node
 
 SILENCE_S = 5.0
-"""Diagnostics warn of a topic that has been silent for so long."""
+"""Diagnostics warn of a topic that has been silent for this long [s]."""
 
 
 class MiddlewareNode(ManagedNode):
     """Listens to a robot's topics; publishes `odometry/filtered` and `/diagnostics`.
 
-    Which topics, `RobotTopics` says; what becomes of them, `docs/middleware.md`.
-    `~/reset` forgets everything, so that the next odometry fixes `map` anew. It listens when it is
-    configured and publishes the estimate when it is active; diagnostics come in every state.
+    `RobotTopics` describes these topics, `docs/middleware.md` their use. `~/reset` clears all
+    state, so that the next odometry fixes `map` anew. It listens when configured and publishes the
+    estimate when active; diagnostics are published in every state.
 
     Args:
-        context: to live in.
+        context: of the node.
     """
 
     def __init__(self, context: Context) -> None:
@@ -43,7 +43,7 @@ class MiddlewareNode(ManagedNode):
         Diagnostics(self, "topics", self._look)
 
     def configure(self) -> None:
-        """Opens the model and listens."""
+        """Opens the model and subscribes."""
         model = open_model(str(self.get_parameter("model").value))
         self._hardware = model.robot.name
         rehearse(model)
@@ -78,17 +78,17 @@ class MiddlewareNode(ManagedNode):
         response.success, response.message = True, "the next odometry fixes the map frame"
         return response
 
-    def _look(self) -> Finding:
+    def _look(self) -> Condition:
         if self.state == UNCONFIGURED:
-            return Finding(self.state, warns=False, facts={})
+            return Condition(self.state, warns=False, facts={})
         health = self._topics.middleware.health(self._topics.now_ns())
         trouble = silence(health, self._topics.expected)
         message = trouble or ("receiving" if self.state == ACTIVE else self.state)
-        return Finding(message, bool(trouble), facts(health), self._hardware)
+        return Condition(message, bool(trouble), facts(health), self._hardware)
 
 
 def silence(health: Health, expected: Sequence[str]) -> str:
-    """Which of the expected topics say nothing, as a sentence; empty when all speak."""
+    """Returns a sentence about expected topics that are silent; empty if none is."""
     missing = [topic for topic in expected if topic not in health.topics]
     if missing:
         return f"nothing on {', '.join(missing)} yet"
@@ -97,7 +97,7 @@ def silence(health: Health, expected: Sequence[str]) -> str:
 
 
 def facts(health: Health) -> dict[str, str]:
-    """Health as keys and values for people."""
+    """Returns the health as keys and values for people."""
     told = {}
     for topic, each in health.topics.items():
         told[f"{topic} received"] = str(each.received)

@@ -18,32 +18,32 @@ from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
-from nics_drl_bridge.middleware.view import rehearse
+from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
 from nics_drl_bridge.nodes.runner import declare, declare_model_name, last_word, run_node
-from nics_drl_bridge.policy.pacing import Answer, Deadline, Pace
+from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
 
 POLLS = 0.1
-"""How often it looks whether it is time to act, in shares of the control period."""
+"""Time between two checks whether to act, as a share of the control period."""
 DIAGNOSTICS_PERIOD_S = 1.0
 LONGEST_REASON = 300
-"""Characters of what a policy raised."""
+"""Greatest length of a policy's error text, in characters."""
 
 
 class PolicyNode(ManagedNode):
-    """Answers scans with `cmd_vel_raw`, stamped with its scan, until the goal is reached.
+    """Answers scans with `cmd_vel_raw`, with the stamp of the scan, until the goal is reached.
 
     It observes through the same task as the Gymnasium env, at a fixed rate of the steady clock: it
-    acts at most once in a control period and on each scan. An inference that takes longer than the
-    deadline is dropped; after several in a row it commands zero. The goal, in `map`, is a parameter
-    at the start and the topic `goal_pose` afterwards. It listens when it is configured and commands
-    when it is active; the last that it says before it is no longer is zero.
+    acts at most once per control period and per scan. An inference that exceeds the deadline is
+    dropped; after several in a row it commands zero. The goal, in `map`, is a parameter at the
+    start and the topic `goal_pose` afterwards. It listens when configured and commands when active;
+    its last command before deactivation is zero.
 
     Args:
-        context: to live in.
+        context: of the node.
     """
 
     def __init__(self, context: Context) -> None:
@@ -68,7 +68,7 @@ class PolicyNode(ManagedNode):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
     def configure(self) -> None:
-        """Opens model and policy, and listens."""
+        """Opens model and policy, and subscribes."""
         model = self._model = open_model(str(self.get_parameter("model").value))
         self._open_policy(model)
         self._goal: NDArray[np.float64] = self._declared_goal()
@@ -93,7 +93,7 @@ class PolicyNode(ManagedNode):
         """Leaves a zero command behind."""
         last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
 
-    def _declared_pace(self, control_period: float) -> tuple[Pace, Deadline]:
+    def _declared_pace(self, control_period: float) -> tuple[ActionPace, Deadline]:
         rate, limit, patience = (
             self.get_parameter(name).value for name in ("rate", "deadline", "late_limit")
         )
@@ -103,10 +103,12 @@ class PolicyNode(ManagedNode):
                 "least 0, more than 0, and at least 1."
             )
         period = control_period if np.isnan(rate) else 1.0 / rate if rate > 0.0 else 0.0
-        return Pace(period), Deadline(0.5 * control_period if np.isnan(limit) else limit, patience)
+        return ActionPace(period), Deadline(
+            0.5 * control_period if np.isnan(limit) else limit, patience
+        )
 
     def _open_policy(self, model: SimulatorModel) -> None:
-        """Opens the policy for a model, and uses it once: what it compiles is compiled now."""
+        """Opens the policy for a model, and runs it once, so that it compiles now."""
         name = str(self.get_parameter("policy").value)
         self._policy, self._task = open_policy(name, model)
         view = rehearse(model)
@@ -114,7 +116,7 @@ class PolicyNode(ManagedNode):
         self._asked(view, np.zeros(2))
 
     def _on_lidar(self, lidar: LidarSpec) -> None:
-        """Looks through another lidar from now on. Raises ConfigError where that can't be done."""
+        """Switches to another lidar. Raises ConfigError if that is not possible."""
         self._open_policy(replace(self._model, lidar=lidar))
         begin, end = np.degrees([lidar.angles[0], lidar.angles[-1]])
         self.get_logger().info(
@@ -134,7 +136,7 @@ class PolicyNode(ManagedNode):
         self.get_logger().info(f"new goal ({self._goal[0]:.2f}, {self._goal[1]:.2f}) m")
 
     def _act(self, _: int = 0) -> None:
-        """Acts when it is time, once per scan, with an odometry at least as new."""
+        """Acts when due, once per scan, with an odometry at least as new."""
         if self.state != ACTIVE:
             return
         newest = self._topics.middleware.cache.newest
@@ -174,9 +176,9 @@ class PolicyNode(ManagedNode):
         self._diagnostics.publish(message)
 
     def _twist(self) -> NDArray[np.float64]:
-        """The command (3,) for the present view; zero without a goal, at it, or at a touch.
+        """Returns the command (3,) for the present view; zero without a goal, at it, or on contact.
 
-        Where a pose sensor tells where the robot is, zero before its first pose too.
+        With a pose sensor, it is also zero before the first pose.
         """
         if not (self._topics.located and np.isfinite(self._goal).all()):
             return np.zeros(3)
@@ -190,7 +192,7 @@ class PolicyNode(ManagedNode):
         return self._asked(view, self._goal)
 
     def _asked(self, view: RobotView, goal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What the policy wants (3,). Raises BridgeError, which ends the node, where it raises."""
+        """Returns the policy's command (3,). Its errors become BridgeError, which ends the node."""
         try:
             return self._command(view, goal)
         except BridgeError:
@@ -205,7 +207,7 @@ class PolicyNode(ManagedNode):
             ) from error
 
     def _command(self, view: RobotView, goal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What the policy wants (3,)."""
+        """Returns the policy's command (3,)."""
         action = self._policy.act(self._task.observation(view, {"goal": goal}))
         return self._task.robot.to_cmd_vel(self._task.command(action))
 

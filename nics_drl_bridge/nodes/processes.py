@@ -1,4 +1,4 @@
-"""Starting the package's nodes as operating-system processes, and ending them for certain."""
+"""Operating-system processes for the package's nodes, with a reliable end."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from typing import Any
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.nodes.udp import domains_in_use
+from nics_drl_bridge.nodes.transport import domains_in_use
 
 LAST_DOMAIN_ID, GREATEST_DOMAIN_ID = 101, 232
-"""Above the first, DDS ports may collide with those that Linux hands out; above the other there
+"""Above the first, DDS ports may collide with Linux's ephemeral ports; above the other there
 are none."""
 PR_SET_PDEATHSIG = 1
 PATIENCE_S = 5.0
@@ -26,12 +26,12 @@ LOG_LINES = 5
 
 
 def free_domain_id() -> int:
-    """The domain id of the environment, or one drawn at random so that runs keep apart.
+    """Returns the domain id of the environment, or a random one, so that runs keep apart.
 
-    Drawn is among those that nobody on this machine uses.
+    A random one is drawn from those that are not in use on this machine.
 
     Raises:
-        ConfigError: the environment's is no domain id.
+        ConfigError: the environment's value is not a domain id.
     """
     given = os.environ.get("ROS_DOMAIN_ID")
     if not given:
@@ -47,7 +47,7 @@ def free_domain_id() -> int:
 
 
 def _dies_with_parent() -> Callable[[], None] | None:
-    """What a child does first, on Linux: ask for SIGTERM when its parent dies, however it dies.
+    """Returns what a child does first, on Linux: request SIGTERM for any death of its parent.
 
     The library is loaded before the fork, because little is safe after it.
     """
@@ -64,18 +64,18 @@ def _dies_with_parent() -> Callable[[], None] | None:
 
 
 class NodeProcess(AbstractContextManager["NodeProcess", None]):
-    """One node in a process of its own; a context manager that ends it.
+    """One node in its own process; a context manager that ends it.
 
     On Linux the node also ends when the thread that started it does.
 
     Args:
-        node: module below `nics_drl_bridge.nodes`, which is also the executable's name.
+        node: name of its executable.
         folder: for its log and its parameter file.
         parameters: of the node.
         domain_id: DDS domain.
         namespace: of the node.
         remap: names, from -> to.
-        discovery: how far it looks for others: LOCALHOST or SUBNET.
+        discovery: range of its discovery: LOCALHOST or SUBNET.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
         self.log = folder / f"{node}.log"
         file = folder / f"{node}.yaml"
         file.write_text(dump_yaml({"/**": {"ros__parameters": dict(parameters)}}), encoding="utf-8")
-        command = [sys.executable, "-m", f"nics_drl_bridge.nodes.{node}", "--ros-args"]
+        command = [sys.executable, "-m", "nics_drl_bridge.nodes.start", node, "--ros-args"]
         command += ["--params-file", str(file)]
         if namespace:
             command += ["-r", f"__ns:=/{namespace.strip('/')}"]
@@ -104,8 +104,8 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
             "ROS_AUTOMATIC_DISCOVERY_RANGE": discovery,
         }
         with self.log.open("wb") as log:
-            # A session of its own: Ctrl-C in the terminal reaches the parent alone, which then
-            # ends its children in order.
+            # Its own session: Ctrl-C in the terminal reaches the parent alone, which then ends its
+            # children in order.
             self._process = subprocess.Popen(
                 command,
                 env=environment,
@@ -122,7 +122,7 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
         return self._process.pid
 
     def check(self) -> None:
-        """Raises BackendError with the end of its log when the node has ended by itself."""
+        """Raises BackendError with the end of its log if the node has ended by itself."""
         code = self._process.poll()
         if code is not None:
             lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
@@ -132,7 +132,7 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
             )
 
     def close(self) -> int:
-        """Ends the node: SIGINT, and SIGKILL if it does not listen. Returns its exit code."""
+        """Ends the node: SIGINT, then SIGKILL if it does not react. Returns its exit code."""
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGINT)
             try:

@@ -1,37 +1,40 @@
-"""RealtimeBackend: a vehicle, or a simulator on the wall clock, as the same synchronous backend."""
+"""RealtimeBackend: a vehicle, or a simulator on the wall clock, as the same synchronous backend.
+
+Options of a backend in real time.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.config import validate
+from nics_drl_bridge.config import Schema, validate
 from nics_drl_bridge.errors import BackendError, StaleDataError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import RobotView, Start
+from nics_drl_bridge.interface import NS_PER_S, RobotView, Start
 from nics_drl_bridge.middleware.measurement import SCAN
-from nics_drl_bridge.middleware.view import rehearse
-from nics_drl_bridge.nodes.episodes import Episodes
+from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes.link import Link
-from nics_drl_bridge.nodes.realtime_options import RealtimeOptions
+from nics_drl_bridge.nodes.observer import EpisodeServices
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_sensors
 from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
-NANO = 1_000_000_000
 POLL_S = 0.01
 SAY_EVERY_S = 2.0
 SERVICES_S = 0.5
-"""What has shown no services so long after its topics is a vehicle."""
+"""A peer that shows no services this long after its topics is a vehicle [s]."""
 COMMAND_S, PERIODS = 0.5, 2
-"""A command holds so long, and for so many periods at least; then a zero follows by itself."""
+"""A command lasts this long, and at least this many periods; then a zero follows by itself."""
 STILL = (0.02, 0.05)
-"""A robot that is slower stands [m/s, rad/s]."""
+"""A slower robot is at rest [m/s, rad/s]."""
 ADVICE = (
     "start the robot, or `simulator_node` with mode:=realtime, in the same ROS_DOMAIN_ID and "
     "namespace."
@@ -41,10 +44,10 @@ ADVICE = (
 class RealtimeBackend:
     """One robot behind its topics, stepped at a fixed period of the steady clock.
 
-    A step publishes its command at once, waits until the period is over, and returns the newest
-    view. Whoever comes late misses deadlines, which are counted and not made up for: the next
-    step again ends on the grid of periods. Data feed the middleware as they come, in one executor
-    thread; late and disordered ones are put in their place there.
+    A step publishes its command at once, waits for the end of the period, and returns the newest
+    view. A late caller misses deadlines, which are counted and not made up for: the next step again
+    ends on the grid of periods. Data feed the middleware as they arrive, in one executor thread;
+    late and unordered ones are put in their place there.
 
     Args:
         model: of the robot; a simulator must run the same.
@@ -53,13 +56,13 @@ class RealtimeBackend:
 
     Raises:
         ConfigError: an option can't be used.
-        BackendError: nobody is there.
+        BackendError: no peer is there.
     """
 
     def __init__(self, model: SimulatorModel, world: World, **options: Any) -> None:
         chosen = validate(options, RealtimeOptions, "backend_options")
         self._options, self._robot = chosen, model.robot
-        self._period_ns = round((chosen.period_s or model.control_period) * NANO)
+        self._period_ns = round((chosen.period_s or model.control_period) * NS_PER_S)
         self._deadline_ns = self._misses = 0
         rehearse(model)
         self._simulated = False
@@ -71,13 +74,13 @@ class RealtimeBackend:
                 "use_imu": chosen.use_imu,
                 "enable_stamped_cmd_vel": chosen.stamped,
             },
-            # A gate looks after it by itself.
+            # A gate has its own timeout.
             command_timeout_s=math.inf if chosen.gated else self._command_timeout_s(),
         )  # fmt: skip
         try:
             declare_sensors(self._link.node)
             self._topics = RobotTopics(self._link.node, model, now_ns=time.monotonic_ns)
-            self._episodes = Episodes(self._link, chosen.simulator, model, world)
+            self._episodes = EpisodeServices(self._link, chosen.simulator, model, world)
             self._link.begin()
             clients = self._episodes.clients if chosen.vehicle is False else []
             self._link.wait_for_peers(self._topics.expected, clients, chosen.timeout_s, ADVICE)
@@ -90,13 +93,13 @@ class RealtimeBackend:
             raise
 
     def _command_timeout_s(self) -> float:
-        return max(COMMAND_S, PERIODS * self._period_ns / NANO)
+        return max(COMMAND_S, PERIODS * self._period_ns / NS_PER_S)
 
     def reset(self, start: Start) -> RobotView:
-        """Begins an episode: a simulator's service does, or a vehicle has to stand there.
+        """Begins an episode: by a simulator's service, or when a vehicle stands at the start.
 
         Raises:
-            BackendError: the simulator refuses, or the vehicle does not come to stand there.
+            BackendError: the simulator refuses, or the vehicle does not come to rest there.
             StaleDataError: its data do not arrive.
         """
         self._link.check_open()
@@ -110,9 +113,9 @@ class RealtimeBackend:
             return self._fresh_view()[0]
 
     def _is_vehicle(self) -> bool:
-        """What the options say; else a robot without a simulator's services is one.
+        """True for a vehicle: by the options, otherwise if it shows no services of a simulator.
 
-        What was a simulator once stays one: it may be out of sight for a while.
+        What was a simulator once stays one, because it may be out of sight for a while.
         """
         if self._options.vehicle is not None:
             return self._options.vehicle
@@ -132,9 +135,9 @@ class RealtimeBackend:
             time.sleep(POLL_S)
 
     def _await_start(self, start: Start) -> None:
-        """Waits until a vehicle stands at its start, and says what is missing.
+        """Waits until a vehicle stands at its start, and reports what is missing.
 
-        Ends as well when services show that it is a simulator.
+        Also ends if services show that it is a simulator.
         """
         say = self._options.say or self._link.node.get_logger().info
         began, said = time.monotonic(), -math.inf
@@ -151,7 +154,7 @@ class RealtimeBackend:
             time.sleep(POLL_S)
 
     def _missing(self, start: Start) -> str:
-        """What is missing until an episode may begin, as a clause; empty when nothing is."""
+        """Returns what is missing before an episode may begin, as a clause; empty if nothing is."""
         topic, silence_s = self._oldest()
         if math.isinf(silence_s):
             return f"no {topic} yet"
@@ -174,15 +177,15 @@ class RealtimeBackend:
         )
 
     def _oldest(self) -> tuple[str, float]:
-        """The topic with the oldest datum, and how old that is [s]; inf when there is none.
+        """Returns the topic with the oldest datum, and its age [s]; inf if there is none.
 
-        A datum is as old as it is silent, or as its stamp is behind the newest of all topics.
+        The age is the time since arrival, or the lag of its stamp behind the newest of all topics.
         """
         with self._topics.lock:
             newest, now = dict(self._topics.middleware.cache.newest), time.monotonic_ns()
         latest = max((datum.stamp_ns for datum in newest.values()), default=0)
         ages = {
-            topic: max(now - newest[topic].arrival_ns, latest - newest[topic].stamp_ns) / NANO
+            topic: max(now - newest[topic].arrival_ns, latest - newest[topic].stamp_ns) / NS_PER_S
             if topic in newest
             else math.inf
             for topic in self._topics.expected
@@ -191,7 +194,7 @@ class RealtimeBackend:
         return oldest, ages[oldest]
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
-        """Publishes a command, waits until the period is over; see `interface.Backend`.
+        """Publishes a command, waits for the end of the period; see `interface.Backend`.
 
         Raises:
             StaleDataError: the newest datum of a topic is older than `stale_after_s`.
@@ -210,7 +213,7 @@ class RealtimeBackend:
             self._link.send(self._robot.to_cmd_vel(command), stamp_ns)
 
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
-        """The second half: waits until the period is over, and returns what is known then."""
+        """The second half: waits for the end of the period, and returns the newest view."""
         with self._link.zero_after_an_error():
             late_ns = time.monotonic_ns() - self._deadline_ns
             if late_ns > 0:
@@ -218,12 +221,12 @@ class RealtimeBackend:
                 self._misses += missed
                 self._deadline_ns += missed * self._period_ns
             while (left_ns := self._deadline_ns - time.monotonic_ns()) > 0:
-                time.sleep(left_ns / NANO)
+                time.sleep(left_ns / NS_PER_S)
             self._deadline_ns += self._period_ns
             return self._fresh_view()
 
     def _fresh_view(self) -> tuple[RobotView, dict[str, Any]]:
-        """The newest view, with facts. Raises StaleDataError when it is too old."""
+        """Returns the newest view, with facts. Raises StaleDataError if it is too old."""
         topic, age_s = self._oldest()
         if age_s > self._options.stale_after_s:
             raise StaleDataError(topic, age_s, self._options.stale_after_s)
@@ -239,3 +242,57 @@ class RealtimeBackend:
     def close(self) -> None:
         """Publishes a zero command and ends the node."""
         self._link.close()
+
+
+RAW = "cmd_vel_raw"
+
+
+class RealtimeOptions(Schema):
+    """Options of `RealtimeBackend`.
+
+    Attributes:
+        namespace: of the robot.
+        simulator: name of the simulator's node in that namespace.
+        domain_id: DDS domain; the environment's by default.
+        timeout_s: longest wait for a peer or an answer [s].
+        vehicle: whether the robot is a vehicle, which has no services. None: detected.
+        period_s: duration of a step on the steady clock [s]; the model's control period by default.
+        stale_after_s: age from which data are too old for a view [s].
+        start: of an episode on a vehicle: `wait` until it stands at the requested pose, or take the
+            `present` one.
+        tolerance: of the pose at the start [m, rad].
+        start_timeout_s: longest wait for that [s].
+        say: called with what is still missing; the node's logger by default.
+        command_topic: of the commands. `cmd_vel_raw` leads through `command_gate`: then each
+            command is a TwistStamped with the stamp of the scan that it answers.
+        stamped: whether `cmd_vel` is a TwistStamped.
+        pose_type: type of `pose`, a pose sensor in `map`, or `none`.
+        use_imu: whether to use the yaw rate of `imu`.
+    """
+
+    namespace: str = ""
+    simulator: str = "simulator_node"
+    domain_id: int | None = Field(None, ge=0, le=232)
+    timeout_s: float = Field(30.0, gt=0.0)
+    vehicle: bool | None = None
+    period_s: float | None = Field(None, gt=0.0)
+    stale_after_s: float = Field(0.5, gt=0.0)
+    start: Literal["wait", "present"] = "wait"
+    tolerance: tuple[float, float] = (0.1, 0.1)
+    start_timeout_s: float = Field(300.0, gt=0.0)
+    say: Callable[[str], None] | None = None
+    command_topic: str = Field("cmd_vel", min_length=1)
+    stamped: bool = False
+    pose_type: str = "none"
+    use_imu: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> RealtimeOptions:
+        if not all(value > 0.0 for value in self.tolerance):
+            raise ValueError("tolerance must be above 0: metres and radians.")
+        return self
+
+    @property
+    def gated(self) -> bool:
+        """True if commands pass a `command_gate`."""
+        return self.command_topic.rsplit("/", 1)[-1] == RAW

@@ -1,6 +1,6 @@
-"""What `nics record` does around `record_node`: preview, drive, and what to do next.
+"""The part of `nics record` around `record_node`: preview, drive, and next steps.
 
-It imports ROS 2 only when asked to drive, so that a drive can be previewed without.
+It imports ROS 2 only to drive, so that a drive can be previewed without it.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ import numpy as np
 
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError
 from nics_drl_bridge.files import write_bytes
-from nics_drl_bridge.kinematics.coverage import coverage
-from nics_drl_bridge.kinematics.drive_file import check_out
-from nics_drl_bridge.kinematics.drive_plan import DrivePlan
-from nics_drl_bridge.kinematics.recording import Recording
-from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
-from nics_drl_bridge.kinematics.topic_roles import topic_roles
-from nics_drl_bridge.report.drive_picture import drive_picture
+from nics_drl_bridge.identify.excitation import coverage
+from nics_drl_bridge.recording.drive_plan import DrivePlan
+from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.recording.topic_roles import topic_roles
+from nics_drl_bridge.recording.write import check_out
+from nics_drl_bridge.report.pictures import drive_picture
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 NODE = "nics_drl_bridge.nodes.record_node"
 
 
 @dataclass(frozen=True)
-class Order:
-    """What to record, as `nics record` takes it.
+class RecordOrder:
+    """Options of `nics record`.
 
     Attributes:
         robot: name or YAML file of the robot.
@@ -57,7 +57,7 @@ class Order:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Of `record_node`."""
+        """Parameters for `record_node`."""
         return {
             "robot": self.robot,
             "out": str(self.out),
@@ -72,10 +72,10 @@ class Order:
 
     @property
     def arguments(self) -> list[str]:
-        """The command line of `record_node`.
+        """Command line for `record_node`.
 
         Raises:
-            ConfigError: a remapping is none.
+            ConfigError: a remapping rule is malformed.
         """
         rules = [f"__ns:=/{self.namespace.strip('/')}"] if self.namespace.strip("/") else []
         for rule in self.remap:
@@ -92,7 +92,7 @@ def require_ros() -> None:
     """Imports ROS 2.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: it is not installed.
     """
     try:
         import_module(NODE)
@@ -102,8 +102,8 @@ def require_ros() -> None:
         raise ConfigError(f"nics record {MISSING_ROS.format(module=error.name)}") from None
 
 
-def preview(order: Order) -> tuple[str, ...]:
-    """Draws the expected drive beside the recording.
+def preview(order: RecordOrder) -> tuple[str, ...]:
+    """Draws the expected drive next to the recording.
 
     Returns:
         Lines for people.
@@ -112,7 +112,7 @@ def preview(order: Order) -> tuple[str, ...]:
         ConfigError: the order can't be carried out.
     """
     robot, out = load_robot(order.robot), check_out(order.out)
-    topic_roles(order.topics)  # a wrong file is told of before anybody drives
+    topic_roles(order.topics)  # reports a wrong file before the robot moves
     plan = DrivePlan(robot, order.bound, order.duration, order.speed, order.seed)
     pattern = plan.preview()
     picture = out.parent / f"{out.stem}_preview.png"
@@ -120,14 +120,14 @@ def preview(order: Order) -> tuple[str, ...]:
     return (*pattern.lines(), f"its path is drawn in {picture}")
 
 
-def drive(order: Order) -> tuple[tuple[str, ...], bool]:
+def drive(order: RecordOrder) -> tuple[tuple[str, ...], bool]:
     """Drives the robot and records it.
 
     Returns:
-        Lines for people, and whether the drive went to its end; otherwise it was interrupted.
+        Lines for people, and whether the drive was completed; otherwise it was interrupted.
 
     Raises:
-        BridgeError: why it ended before, and what was saved.
+        BridgeError: the drive failed; with the reason, and what was saved.
     """
     outcome = import_module(NODE).record(order.parameters, order.arguments)
     if outcome.failure is not None:
@@ -138,8 +138,8 @@ def drive(order: Order) -> tuple[tuple[str, ...], bool]:
     return lines, outcome.complete
 
 
-def summary(recording: Recording, robot: RobotSpec, order: Order) -> tuple[str, ...]:
-    """How far the robot went, how well each command was moved, and what to do next."""
+def summary(recording: Recording, robot: RobotSpec, order: RecordOrder) -> tuple[str, ...]:
+    """Returns lines about the robot's path, the coverage of each command, and the next step."""
     place = recording.pose.values[:, :2] - recording.pose.values[0, :2]
     path = float(np.hypot(*np.diff(place, axis=0).T).sum())
     reach = float(np.hypot(*place.T).max())

@@ -1,4 +1,4 @@
-"""What every listening node shares: a robot's topics, fed into the middleware."""
+"""A robot's topics, fed into the middleware; shared by all listening nodes."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ from sensor_msgs.msg import Imu, LaserScan
 from nics_drl_bridge.errors import BridgeError, ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.lidar.canonical import Reader
-from nics_drl_bridge.lidar.rep117 import from_device
-from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.lidar.sectors import Reader
+from nics_drl_bridge.lidar.spec import LidarSpec, from_device
 from nics_drl_bridge.middleware.ekf import ANYWHERE
 from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.runner import declare
 
@@ -32,7 +31,7 @@ POSE_TYPES = {
 
 
 def declare_sensors(node: Node) -> None:
-    """Declares which sensors a robot has beside scan and odometry."""
+    """Declares the sensors that a robot has in addition to scan and odometry."""
     about = f"Type of `{POSE}`, in the map frame: {NO_POSE}, {', '.join(POSE_TYPES)}."
     declare(node, "pose_type", NO_POSE, about, read_only=True)
     about = "Whether the lidar hangs with its z axis down, so that its beams come clockwise."
@@ -45,25 +44,25 @@ def declare_sensors(node: Node) -> None:
 class RobotTopics:
     """Subscribes to a robot's topics and keeps the middleware up to date.
 
-    These are `scan`, `odom` and `cmd_vel`, and if the node's parameters `pose_type` and `use_imu`
-    say so, `pose` and `imu`. `declare_sensors` declares these two, and whether `cmd_vel` is
-    stamped, before. Whoever reads from another thread than the one that spins holds `lock`.
+    These are `scan`, `odom` and `cmd_vel`, and, as the node's parameters `pose_type` and `use_imu`
+    request, `pose` and `imu`. `declare_sensors` has to be called before, for these parameters and
+    whether `cmd_vel` is stamped. A reader in another thread than the spinning one holds `lock`.
     Data are used at their own stamps; a command, which has none, at the stamp of the newest datum
-    before it. The first odometry fixes where `map` is, unless there is a pose sensor: then the
-    first pose does.
+    before it. The first odometry fixes `map`, unless there is a pose sensor: then the first pose
+    does.
 
     Args:
-        node: whose topics they are.
+        node: that subscribes.
         model: of the robot.
         on_odometry: called with the stamp [ns] after each odometry that is the newest.
         on_scan: called with the stamp [ns] after each scan that was used.
-        on_lidar: called when scans come whose header is not that of the model's lidar, with what
-            they come from; it raises ConfigError where that can't be used. Without it, and then,
-            such scans are rejected.
-        now_ns: the clock of arrivals [ns]; the node's by default.
+        on_lidar: called with the lidar of scans whose header is not that of the model's; raises
+            ConfigError if it can't be used, and its scans are then rejected. Without it the header
+            is not compared, and only scans with another number of beams are rejected.
+        now_ns: clock of arrivals [ns]; the node's by default.
 
     Raises:
-        ConfigError: no such `pose_type`.
+        ConfigError: `pose_type` is unknown.
     """
 
     def __init__(
@@ -96,7 +95,7 @@ class RobotTopics:
         self.expected = (SCAN, ODOM, *self._subscribe_optional())
 
     def _subscribe_optional(self) -> list[str]:
-        """The topics that the parameters ask for."""
+        """Subscribes to the topics that the parameters request; returns their names."""
         node, asked = self._node, {}
         pose_type = str(node.get_parameter("pose_type").value)
         self._posed = pose_type != NO_POSE
@@ -123,36 +122,36 @@ class RobotTopics:
         return locked
 
     def close(self) -> None:
-        """Listens no more."""
+        """Ends the subscriptions."""
         while self._subscriptions:
             self._node.destroy_subscription(self._subscriptions.pop())
 
     def restart(self) -> None:
-        """Forgets everything; the next odometry begins anew."""
+        """Clears all state; the next odometry starts anew."""
         self._started, self._since_ns = False, 0
         self.middleware.reset(0, np.zeros(3))
 
     def begin(self, stamp_ns: int, pose: conversions.Array) -> None:
-        """Forgets everything before a stamp [ns], at which the robot stands at a pose (3,)."""
+        """Clears all state before a stamp [ns], at which the robot stands at a pose (3,)."""
         self._started, self._since_ns = True, stamp_ns
         self.middleware.reset(stamp_ns, pose)
 
     @property
     def newest_ns(self) -> int:
-        """Stamp of the newest datum [ns], 0 when there is none."""
+        """Stamp of the newest datum [ns]; 0 if there is none."""
         return self.middleware.newest_ns or 0
 
     @property
     def located(self) -> bool:
-        """Whether it is known where in the map the robot is."""
+        """True if the robot's position in the map is known."""
         return not self._posed or POSE in self.middleware.cache.newest
 
     def view(self) -> RobotView:
-        """What is known at the stamp of the newest datum."""
+        """Returns the view at the stamp of the newest datum."""
         return self.middleware.view(self.newest_ns)
 
     def now_ns(self) -> int:
-        """The time on the clock of arrivals [ns]."""
+        """Returns the time on the clock of arrivals [ns]."""
         if self._clock_ns is not None:
             return self._clock_ns()
         return int(self._node.get_clock().now().nanoseconds)
@@ -172,7 +171,7 @@ class RobotTopics:
             self._on_scan(stamp)
 
     def _reader_for(self, message: LaserScan) -> Reader | None:
-        """How to read a scan; None when it can't be used, which is told once for each header."""
+        """Returns the reader of a scan; None if it can't be used, logged once for each header."""
         fields = [message.angle_min, message.angle_increment, message.range_min, message.range_max]
         header = np.array([*fields, len(message.ranges)], np.float32).tobytes()
         if header != self._header and self._on_lidar is not None:
@@ -235,9 +234,9 @@ class RobotTopics:
 
 
 def data_facts(middleware: Middleware, now_ns: int) -> dict[str, Any]:
-    """For `info`: number, stamp [ns] and silence [s] of the newest datum of each topic.
+    """Returns facts for `info`: number, stamp [ns] and silence [s] of each topic's newest datum.
 
-    The silence is the time since it came, on the receiver's clock, on which `now_ns` is.
+    The silence is the time since its arrival, on the receiver's clock, which also gives `now_ns`.
     """
     facts: dict[str, Any] = {}
     for topic, datum in middleware.cache.newest.items():

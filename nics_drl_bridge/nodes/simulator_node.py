@@ -18,7 +18,7 @@ from nics_drl_bridge.sim.world import World
 
 
 def fast_simulator(node: Node, model: SimulatorModel, world: World, robots: int) -> Simulator:
-    """The fast simulator, with the lidar that the parameter `renderer` names."""
+    """Makes the fast simulator, with the lidar that the parameter `renderer` names."""
     declare(node, "renderer", "baked", "Lidar: baked or exact.", read_only=True)
     renderer = cast(Renderer, choice(node, "renderer", RENDERERS))
     tell = node.get_logger().warning
@@ -26,7 +26,7 @@ def fast_simulator(node: Node, model: SimulatorModel, world: World, robots: int)
 
 
 def simulator_node(context: Context) -> DeviceNode:
-    """The node `simulator_node`; see `DeviceNode`."""
+    """Makes the node `simulator_node`; see `DeviceNode`."""
     return DeviceNode("simulator_node", context, fast_simulator)
 
 

@@ -1,17 +1,19 @@
-"""What messages travel by: UDP, so that nobody who stands still holds up who publishes.
+"""Transport of messages: UDP, so that a stalled listener can't block a publisher.
 
-Fast DDS's shared memory has a lock for each process that listens. One that is frozen, or killed,
-while it holds the lock holds up everybody who sends to it, for as long as it stands still: a gate
-that tells the base to stop, a base that sends its odometry to a policy. UDP has no such lock, and
-a step in lock-step takes a twentieth longer. These nodes have no shared memory, neither to send
-through nor to be sent to, so that drivers that have it aren't held up by them either.
+Fast DDS's shared memory has a lock for each listening process. A process that is frozen or killed
+while it has the lock blocks everyone who sends to it, for as long as it is stalled: a gate that
+stops the base, a base that sends its odometry to a policy. UDP has no such lock, and makes a step
+in lock-step a twentieth longer. These nodes have no shared memory, neither for sending nor for
+receiving, so that they can't block drivers that have it either.
 
-Where discovery stays on this machine, rmw_fastrtps chooses the transports itself. A profile does
-what it does then, but for the shared memory. Fast DDS reads it once in a process, with its first
-node, so it is looked at what came of it; the environment is left as it was found. A node that
-somebody makes in the process afterwards does not listen to multicast, and may have shared memory.
+If discovery stays on this machine, rmw_fastrtps chooses the transports itself. A profile does the
+same without the shared memory. Fast DDS reads it once in a process, with its first node, so the
+result is checked; the environment is restored. A node that other code creates in the process
+afterwards does not listen to multicast, and may have shared memory.
 
-Where discovery goes further, a variable is enough. It is read with each node, and stays.
+If discovery goes further, an environment variable is enough. It is read with each node and stays.
+
+Bound ports of UDP over IPv4, as reported by Linux; empty on other systems.
 """
 
 from __future__ import annotations
@@ -30,28 +32,27 @@ from rclpy.parameter import Parameter
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.nodes.udp import multicast_port, ports_of
 
 RANGE, LOCAL, ONLY_LOCAL = "ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST", "ROS_LOCALHOST_ONLY"
 SELF_MADE = "SYSTEM_DEFAULT"
 OTHER_RANGES = ("SUBNET", "OFF", SELF_MADE, "")
-"""rcl takes every other word for LOCALHOST."""
+"""rcl treats any other value as LOCALHOST."""
 OLDEST_DISTRIBUTION = "humble"
-"""Knows no ranges."""
+"""It has no discovery ranges."""
 TRANSPORTS, UDP = "FASTDDS_BUILTIN_TRANSPORTS", "UDPv4"
 PROFILE = Path(__file__).with_name("this_machine.xml")
 PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
-"""Names of the same variable, of Fast DDS 3 and of Fast DDS 2, which the library's name tells."""
+"""The same variable in Fast DDS 3 and in Fast DDS 2; the library's name shows which one applies."""
 PROFILES_HERE = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 """Fast DDS reads them in the working directory."""
 FAST_DDS_2, FAST_DDS_2_DISTRIBUTIONS = b"libfastrtps.so", (OLDEST_DISTRIBUTION, "iron", "jazzy")
 PEERS = ("ROS_DISCOVERY_SERVER", "ROS_STATIC_PEERS")
-"""Who sets one of these looks for others elsewhere, too, which the profile does not."""
+"""With one of these set, discovery also looks elsewhere, which the profile does not."""
 SEGMENTS = (b"shm/fastdds_", b"shm/fastrtps_")
 
 
 def stays_here(environment: Mapping[str, str]) -> bool:
-    """Whether discovery stays on this machine, in an environment that says how far it goes."""
+    """True if discovery stays on this machine, in an environment that sets its range."""
     if environment.get(ONLY_LOCAL) == "1":
         return True
     ranges = environment.get("ROS_DISTRO") != OLDEST_DISTRIBUTION
@@ -59,33 +60,33 @@ def stays_here(environment: Mapping[str, str]) -> bool:
 
 
 def chosen(environment: Mapping[str, str]) -> bool:
-    """Whether somebody has chosen the transports: any but UDP, or by profiles of Fast DDS."""
+    """True if the user has chosen the transports: any but UDP, or by profiles of Fast DDS."""
     named = environment.get(TRANSPORTS, "") not in ("", UDP)
     return named or any(map(environment.get, PROFILES)) or any(map(os.path.exists, PROFILES_HERE))
 
 
 def stay_on_this_machine(environment: MutableMapping[str, str]) -> None:
-    """Limits discovery to this machine in an environment that does not say how far it goes."""
+    """Limits discovery to this machine in an environment that does not set its range."""
     environment.setdefault(RANGE, LOCAL)
     if environment.get("ROS_DISTRO") == OLDEST_DISTRIBUTION:
         environment.setdefault(ONLY_LOCAL, "1")
 
 
 class Transport:
-    """How the nodes of this process send."""
+    """Transport of the nodes of this process."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._in_force: bool | None = None  # the profile; None: not tried yet
 
     def open(self, make: Callable[[], Context]) -> Context:
-        """A context over UDP; as ROS 2 makes it where somebody has chosen or UDP can't be had.
+        """Returns a context over UDP, or ROS 2's default if the user chose or UDP is unavailable.
 
         Args:
             make: makes a context in the environment of this process.
 
         Raises:
-            BackendError: discovery should go further than that of an earlier context.
+            BackendError: discovery should reach further than that of an earlier context.
         """
         with self._lock:
             stay_on_this_machine(os.environ)
@@ -128,7 +129,7 @@ class Transport:
 
 @contextlib.contextmanager
 def _changed(environment: MutableMapping[str, str], words: Mapping[str, str]) -> Iterator[None]:
-    """With these words, and without the older one on discovery, which overrules them."""
+    """Sets variables for a while, without the older discovery variable, which overrides them."""
     kept = {key: environment.get(key) for key in (ONLY_LOCAL, *words)}
     environment.pop(ONLY_LOCAL, None)
     environment.update(words)
@@ -143,13 +144,13 @@ def _changed(environment: MutableMapping[str, str], words: Mapping[str, str]) ->
 
 
 def _is_fast_dds() -> bool:
-    """Whether it is known what to do here: Fast DDS on Linux."""
+    """True for Fast DDS on Linux, the only case that is handled here."""
     name = str(get_rmw_implementation_identifier())
     return sys.platform == "linux" and name.startswith("rmw_fast")
 
 
 def _profiles_variable(distribution: str | None) -> str:
-    """Name of the variable of the profiles' file in this process."""
+    """Returns the name of the variable of the profiles' file in this process."""
     return PROFILES[distribution in FAST_DDS_2_DISTRIBUTIONS or FAST_DDS_2 in _maps()]
 
 
@@ -158,7 +159,7 @@ def _maps() -> bytes:
 
 
 def _is_in_force(context: Context) -> bool:
-    """Whether a node in a context has neither shared memory nor the multicast of its domain."""
+    """True if a node in a context has neither shared memory nor the multicast of its domain."""
     try:
         node = Node(
             "transport_probe",
@@ -179,3 +180,38 @@ def _is_in_force(context: Context) -> bool:
 
 
 OF_THIS_PROCESS = Transport()
+
+
+TABLE = Path("/proc/net/udp")
+FIRST_PORT, PORTS_OF_A_DOMAIN = 7400, 250
+"""RTPS: the first port of a domain is that of its multicast."""
+
+
+def multicast_port(domain_id: int) -> int:
+    """Returns the port that participants bind to discover others beyond this machine."""
+    return FIRST_PORT + PORTS_OF_A_DOMAIN * domain_id
+
+
+def ports_of(process: int | str = "self") -> set[int]:
+    """Returns the ports that a process has bound."""
+    names = set()
+    for file in Path(f"/proc/{process}/fd").iterdir():
+        with contextlib.suppress(OSError):  # another thread has closed it
+            names.add(os.readlink(file))
+    return {port for inode, port in _sockets() if f"socket:[{inode}]" in names}
+
+
+def domains_in_use() -> set[int]:
+    """Returns the DDS domains with a participant on this machine."""
+    first = (port - FIRST_PORT for _, port in _sockets())
+    return {offset // PORTS_OF_A_DOMAIN for offset in first if offset >= 0}
+
+
+def _sockets() -> list[tuple[str, int]]:
+    """Returns inode and port of each socket."""
+    try:
+        lines = TABLE.read_text(encoding="ascii").splitlines()[1:]
+    except OSError:
+        return []
+    rows = [line.split() for line in lines]
+    return [(row[9], int(row[1].split(":")[1], 16)) for row in rows]

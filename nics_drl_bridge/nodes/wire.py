@@ -1,11 +1,10 @@
-"""Scans, odometry and twists as the bytes that travel, without a Python object for each number.
+"""Scans, odometry and twists in serialised form, without a Python object for each number.
 
 rclpy makes a Python object of each field of a message, and back, and checks it: for an odometry
-that takes longer than to simulate its step. What is sent and received in each step is
-therefore written into, and read from, its serialised form. That is the Common Data Representation
-of DDS, with its numbers aligned to their size, counted from behind four bytes that name the order
-of the bytes (OMG DDS-XTypes 7.4.3, "plain CDR"). `test/nodes/test_wire.py` holds it against
-rclpy's own serialisation.
+that takes longer than to simulate its step. So the data of each step are written into, and read
+from, their serialised form. That is the Common Data Representation of DDS, with numbers aligned to
+their size, counted from behind a header of four bytes that gives the byte order (OMG DDS-XTypes
+7.4.3, "plain CDR"). `test/nodes/test_wire.py` compares it with rclpy's own serialisation.
 """
 
 from __future__ import annotations
@@ -20,65 +19,66 @@ from numpy.typing import ArrayLike, NDArray
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import LaserScan
 
-from nics_drl_bridge.nodes.conversions import NANO, PLANAR, heading_of
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.nodes.conversions import PLANAR, heading_of
 
 Array = NDArray[np.float64]
 Bytes = bytes | bytearray
 HEAD = 4
-"""The bytes before the first that counts for alignment; the second of them tells the order."""
+"""Bytes of the header, which do not count for alignment; the second one gives the byte order."""
 STAMP = 4
-"""Where the stamp of a header begins."""
+"""Offset of the stamp of a header."""
 FRAME = 12
-"""Where its frame begins."""
+"""Offset of its frame."""
 UNREADABLE = (ValueError, struct.error)
-"""What is raised for bytes that are no message of the type."""
+"""Raised for bytes that are not a message of the type."""
 PLAIN = (0, 1)
 """Big-endian and little-endian plain CDR."""
 DOUBLES = 7 + 36 + 6 + 36
-"""Of an odometry: pose, its covariance, twist, its covariance."""
+"""Numbers of an odometry: pose, its covariance, twist, its covariance."""
 POSE_COVARIANCE, TWIST = 7, 7 + 36
 SCAN_FIELDS = 7
 """Floats of a scan between its header and its ranges."""
 
 
 def _order(content: Bytes) -> str:
-    """The order of bytes, for `struct`. Raises ValueError when it is no plain CDR."""
+    """Returns the byte order, for `struct`. Raises ValueError if it is not plain CDR."""
     if len(content) < HEAD or content[0] != 0 or content[1] not in PLAIN:
         raise ValueError(f"the bytes {bytes(content[:HEAD]).hex()} begin no plain CDR")
     return "<" if content[1] else ">"
 
 
 def _after_text(content: Bytes, place: int, order: str) -> int:
-    """Where the text ends that begins, with its length, at the next multiple of 4."""
+    """Returns the end of the text that begins, with its length, at the next multiple of 4."""
     place = _aligned(place, 4)
     (length,) = struct.unpack_from(f"{order}I", content, place)
     return place + 4 + int(length)
 
 
 def _aligned(place: int, size: int) -> int:
-    """The next place at which a number of a size may stand."""
+    """Returns the next offset at which a number of a size may stand."""
     return place + (HEAD - place) % size
 
 
 def _doubles(content: Bytes, order: str) -> int:
-    """Where the numbers of an odometry begin."""
+    """Returns the offset of the numbers of an odometry."""
     return _aligned(_after_text(content, _after_text(content, FRAME, order), order), 8)
 
 
 def stamp_of(content: Bytes) -> int:
-    """The stamp of a message that begins with a header [ns]. Raises `UNREADABLE`."""
+    """Returns the stamp of a message that begins with a header [ns]. Raises `UNREADABLE`."""
     seconds, nanoseconds = struct.unpack_from(f"{_order(content)}iI", content, STAMP)
-    return int(seconds) * NANO + int(nanoseconds)
+    return int(seconds) * NS_PER_S + int(nanoseconds)
 
 
 def numbers_of(content: Bytes) -> Array:
-    """All numbers (85,) of a serialised Odometry, in order. Raises `UNREADABLE`."""
+    """Returns all numbers (85,) of a serialised Odometry, in order. Raises `UNREADABLE`."""
     order = _order(content)
     return np.frombuffer(content, f"{order}f8", DOUBLES, _doubles(content, order))
 
 
 def odometry_of(content: Bytes) -> tuple[Array, Array]:
-    """Pose (3,) and body twist (3,) of a serialised Odometry. Raises `UNREADABLE`."""
+    """Returns pose (3,) and body twist (3,) of a serialised Odometry. Raises `UNREADABLE`."""
     values = numbers_of(content)
     x, y, _, qx, qy, qz, qw = values[:7].tolist()
     vx, vy, wz = values[TWIST], values[TWIST + 1], values[TWIST + 5]
@@ -86,12 +86,12 @@ def odometry_of(content: Bytes) -> tuple[Array, Array]:
 
 
 def _scan(content: Bytes, order: str) -> int:
-    """Where the floats of a scan begin."""
+    """Returns the offset of the floats of a scan."""
     return _aligned(_after_text(content, FRAME, order), 4)
 
 
 def ranges_of(content: Bytes) -> NDArray[np.float32]:
-    """The ranges (B,) of a serialised LaserScan, as the device says. Raises `UNREADABLE`."""
+    """Returns the device's ranges (B,) of a serialised LaserScan. Raises `UNREADABLE`."""
     order = _order(content)
     place = _scan(content, order) + 4 * SCAN_FIELDS
     (beams,) = struct.unpack_from(f"{order}I", content, place)
@@ -99,20 +99,20 @@ def ranges_of(content: Bytes) -> NDArray[np.float32]:
 
 
 def angles_of(content: Bytes) -> tuple[float, float]:
-    """angle_min and angle_increment [rad] of a serialised LaserScan. Raises `UNREADABLE`."""
+    """Returns angle_min, angle_increment [rad] of a serialised LaserScan. Raises `UNREADABLE`."""
     order = _order(content)
     first, _, step = struct.unpack_from(f"{order}3f", content, _scan(content, order))
     return first, step
 
 
 def twist_of(content: Bytes) -> tuple[float, float, float]:
-    """linear.x, linear.y, angular.z of a serialised Twist. Raises `UNREADABLE`."""
+    """Returns linear.x, linear.y, angular.z of a serialised Twist. Raises `UNREADABLE`."""
     x, y, _, _, _, w = struct.unpack_from(f"{_order(content)}6d", content, HEAD)
     return x, y, w
 
 
 def stamped_twist_of(content: Bytes) -> tuple[float, float, float]:
-    """linear.x, linear.y, angular.z of a serialised TwistStamped. Raises `UNREADABLE`."""
+    """Returns linear.x, linear.y, angular.z of a serialised TwistStamped. Raises `UNREADABLE`."""
     order = _order(content)
     place = _aligned(_after_text(content, FRAME, order), 8)
     x, y, _, _, _, w = struct.unpack_from(f"{order}6d", content, place)
@@ -120,16 +120,16 @@ def stamped_twist_of(content: Bytes) -> tuple[float, float, float]:
 
 
 def truth_of(content: Bytes) -> bool:
-    """The word of a serialised Bool. Raises `UNREADABLE`."""
+    """Returns the value of a serialised Bool. Raises `UNREADABLE`."""
     _order(content)
     return bool(struct.unpack_from("B", content, HEAD)[0])
 
 
 class OdometryWriter:
-    """Odometries of one robot.
+    """Serialises the odometries of one robot.
 
     Args:
-        message: with its frames and whatever else stays as it is.
+        message: with its frames and everything else that stays the same.
     """
 
     def __init__(self, message: Odometry) -> None:
@@ -146,11 +146,11 @@ class OdometryWriter:
     def write(
         self, stamp_ns: int, pose: Array, twist: Array, covariance: Array | None = None
     ) -> bytes:
-        """One of pose (3,), body twist (3,), and covariance (3, 3) of the pose."""
+        """Returns a message with pose (3,), body twist (3,), and covariance (3, 3) of the pose."""
         content, place = self._content, self._place
         x, y, heading = pose.tolist()
         vx, vy, wz = twist.tolist()
-        self._stamp.pack_into(content, STAMP, *divmod(stamp_ns, NANO))
+        self._stamp.pack_into(content, STAMP, *divmod(stamp_ns, NS_PER_S))
         self._two.pack_into(content, place, x, y)
         self._two.pack_into(
             content, place + 8 * 5, math.sin(heading / 2.0), math.cos(heading / 2.0)
@@ -163,32 +163,32 @@ class OdometryWriter:
 
 
 class ScanWriter:
-    """Scans of one lidar.
+    """Serialises the scans of one lidar.
 
     Args:
-        message: with its header and its ranges (B,), and whatever else stays as it is.
+        message: with its header, its ranges (B,), and everything else that stays the same.
     """
 
     def __init__(self, message: LaserScan) -> None:
         self._content = bytearray(serialize_message(message))
         self._stamp = struct.Struct(f"{_order(self._content)}iI")
-        self._ranges = ranges_of(self._content)  # which, of a bytearray, can be written to
+        self._ranges = ranges_of(self._content)  # writable, because it is a view of a bytearray
 
     def write(self, stamp_ns: int, ranges: NDArray[np.float32]) -> bytes:
-        """One of ranges (B,), as the device reports them."""
-        self._stamp.pack_into(self._content, STAMP, *divmod(stamp_ns, NANO))
+        """Returns a message with ranges (B,), as the device reports them."""
+        self._stamp.pack_into(self._content, STAMP, *divmod(stamp_ns, NS_PER_S))
         self._ranges[:] = ranges
         return bytes(self._content)
 
 
 class TwistWriter:
-    """Twists in the plane."""
+    """Serialises twists in the plane."""
 
     def __init__(self) -> None:
         self._content: bytes = serialize_message(Twist())
         self._six = struct.Struct(f"{_order(self._content)}6d")
 
     def write(self, twist: ArrayLike) -> bytes:
-        """One of linear.x, linear.y, angular.z (3,)."""
+        """Returns a message with linear.x, linear.y, angular.z (3,)."""
         x, y, w = np.asarray(twist, np.float64).tolist()
         return self._content[:HEAD] + self._six.pack(x, y, 0.0, 0.0, 0.0, w)

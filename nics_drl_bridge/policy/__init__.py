@@ -1,1 +1,1 @@
-"""Policies: from observation to action, and how good they are."""
+"""Policies: from observation to action, their training and their evaluation."""

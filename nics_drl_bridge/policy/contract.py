@@ -1,4 +1,4 @@
-"""The contract of a policy file: what it was trained on, and what it must run on."""
+"""The contract of a policy file: its training, and the robot that it needs."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from nics_drl_bridge.config import Schema, validate
+from nics_drl_bridge.env.registry import TASKS
 from nics_drl_bridge.env.task import Task
-from nics_drl_bridge.env.tasks import TASKS
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.lidar.canonical import ScanLayout
+from nics_drl_bridge.lidar.sectors import ScanLayout
 from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.robot.spec import RobotSpec
 
 FORMAT = "nics_drl_bridge/policy/1"
 GOLDEN = 16
 MOST_ENTRIES = 20_000
 CHECKSUM = 8
-"""Hexadecimal digits of a field's checksum; it finds mistakes, it is no signature."""
+"""Hexadecimal digits of a field's checksum, which detects mistakes but is no signature."""
 Rows = NDArray[np.float32]
 
 
@@ -35,8 +35,8 @@ class TaskEntry(Schema):
     """The task of a policy.
 
     Attributes:
-        name: as in `env.tasks.TASKS`, or the name of a class of one's own.
-        options: all of its options but `scan`.
+        name: as in `env.registry.TASKS`, or the name of a user's class.
+        options: all of its options except `scan`.
         sha256: over name, options and observation.
     """
 
@@ -46,12 +46,12 @@ class TaskEntry(Schema):
 
 
 class ObservationEntry(Schema):
-    """What the network takes.
+    """Input of the network.
 
     Attributes:
-        size: O, parts.
-        scan_parts: P, the first ones, which are a scan.
-        rest_low, rest_high: (O - P) limits of the others.
+        size: O, number of parts.
+        scan_parts: P, number of leading parts that are a scan.
+        rest_low, rest_high: (O - P) limits of the other parts.
     """
 
     size: int = Field(ge=1, le=200_000)
@@ -61,7 +61,7 @@ class ObservationEntry(Schema):
 
 
 class GoldenEntry(Schema):
-    """Sixteen pairs that must reproduce; float32, little endian, in base 64.
+    """Sixteen pairs that must be reproduced; float32, little endian, in base 64.
 
     Attributes:
         observations: (16, O).
@@ -74,27 +74,27 @@ class GoldenEntry(Schema):
     commands: str
 
     def rows(self, name: str) -> Rows:
-        """One of them as (16, ...). Raises ValueError when it is damaged."""
+        """One of the arrays as (16, ...). Raises ValueError if it is damaged."""
         data = base64.b64decode(getattr(self, name), validate=True)
         return np.frombuffer(data, "<f4").reshape(GOLDEN, -1)
 
 
 class Contract(Schema):
-    """All that a policy file says about itself.
+    """All that a policy file states about itself.
 
     Attributes:
         format: of the file.
-        robot: whose commands it gives.
-        lidar: that it was trained with.
-        scan: the sectors that it sees; None: the beams of exactly this lidar.
-        task: what it was trained to do.
-        observation: what the network takes.
+        robot: the robot that it commands.
+        lidar: the lidar that it was trained with.
+        scan: sectors of its observations; None: the beams of exactly this lidar.
+        task: the task that it was trained for.
+        observation: input of the network.
         actions: `continuous` or `discrete`.
         control_period: time between commands [s].
         model_fingerprint: of the SimulatorModel that it was trained in.
-        provenance: command, seed, versions: how it came about.
-        graph_sha256: over the graph, weights included.
-        golden: pairs that must reproduce.
+        provenance: command, seed and versions of its making.
+        graph_sha256: of the graph, including the weights.
+        golden: pairs that must be reproduced.
         checksums: of each entry above, by its path.
     """
 
@@ -127,17 +127,17 @@ def contract_of(
     graph_sha256: str,
     provenance: Mapping[str, Any],
 ) -> str:
-    """The contract of a policy for a task of a robot, as JSON.
+    """Writes the contract of a policy for a task of a robot, as JSON.
 
     Args:
         task: gives observation, action, scan and options.
-        model: that it was trained in.
+        model: the model that it was trained in.
         golden: the arrays of `GoldenEntry` by name.
         graph_sha256: see `Contract`.
-        provenance: words and numbers.
+        provenance: strings and numbers.
 
     Raises:
-        ConfigError: an entry is not of its kind.
+        ConfigError: an entry has a wrong type.
     """
     data = {
         "format": FORMAT,
@@ -175,7 +175,7 @@ def task_entry(task: Task) -> dict[str, Any]:
 
 
 def observation_entry(task: Task) -> dict[str, Any]:
-    """What a task observes."""
+    """Observation of a task, as an entry."""
     space, parts = task.observation_space, task.scan_parts
     return {
         "size": int(space.shape[0]),
@@ -186,7 +186,7 @@ def observation_entry(task: Task) -> dict[str, Any]:
 
 
 def task_hash(task: Task) -> str:
-    """Tells two tasks apart: SHA-256 over name, options and observation."""
+    """Identifies a task: SHA-256 over name, options and observation."""
     return hash_of(task_entry(task), observation_entry(task))
 
 
@@ -197,7 +197,7 @@ def hash_of(entry: Mapping[str, Any], observation: Mapping[str, Any]) -> str:
 
 
 def leaves(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every entry of nested mappings and lists, with its path, as `robot.command.0.max`."""
+    """Yields every entry of nested mappings and lists with its path, as `robot.command.0.max`."""
     if isinstance(data, dict | list) and data:
         items = data.items() if isinstance(data, dict) else enumerate(data)
         for key, value in items:
@@ -207,7 +207,7 @@ def leaves(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def checksums(data: Mapping[str, Any]) -> dict[str, str]:
-    """A checksum of each entry but `checksums`, by its path."""
+    """Checksum of each entry except `checksums`, by path."""
     known = {name: value for name, value in data.items() if name != "checksums"}
     return {path: sha256(json.dumps(v).encode())[:CHECKSUM] for path, v in leaves(known)}
 
@@ -216,8 +216,8 @@ def read_contract(text: str, source: str) -> Contract:
     """Reads and checks the contract of a policy file.
 
     Raises:
-        PolicyError: an entry is missing, unknown, of a wrong kind, changed after the export, or
-            does not agree with another; the field is named.
+        PolicyError: an entry is missing, unknown, of a wrong type, changed after the export, or
+            contradicts another; names the field.
     """
     entries = sum(map(text.count, ",[{"))
     if entries > MOST_ENTRIES:

@@ -1,4 +1,4 @@
-"""A dynamic-window planner: the twist of the next moments that serves best."""
+"""A dynamic-window planner: the best twist for the next moments."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ LAGS = ("speed_lag", "steering_lag", "wheel_lag")
 class DynamicWindow:
     """The dynamic-window approach (Fox, Burgard, Thrun 1997) on scan, goal and twist.
 
-    Tries the twists that the commands allow, within what the robot can reach from its present one
-    in a period; each is held for the look-ahead. One that would touch something before the robot
-    could stop is not admissible; of the others the best in distance, aim, clearance and room is
-    chosen. It plans no way: behind a long wall it stays.
+    Tries the twists that the commands allow and that the robot can reach from its present one in a
+    period; each is held for the look-ahead. A twist with a contact before the robot could stop is
+    inadmissible; the best of the others in distance, aim, clearance and time to contact is chosen.
+    It plans no path: behind a long wall it stays.
 
     Attributes:
-        task: whose observations and actions it speaks.
-        margin: free space to keep beside the footprint [m].
+        task: defines observations and actions.
+        margin: clearance to keep around the footprint [m].
         period: between commands [s].
         steps: of the look-ahead, each a period and a half long.
         weights: of gap to the goal [1/m], aim, clearance, and time until a contact.
@@ -42,7 +42,7 @@ class DynamicWindow:
     weights: tuple[float, float, float, float] = (1.0, 0.6, 0.3, 1.5)
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The action (C,) for an observation (O,); or (N, C) for (N, O)."""
+        """Returns the action (C,) for an observation (O,); or (N, C) for (N, O)."""
         parts = self.task.scan_parts
         seen = np.atleast_2d(observation).astype(np.float64)
         goals = seen[:, parts : parts + 1] * seen[:, parts + 1 : parts + 3]
@@ -62,7 +62,7 @@ class DynamicWindow:
 
     @cached_property
     def _body(self) -> tuple[Array, float, float, int, float]:
-        """What the kernel takes as `body`."""
+        """The kernel's argument `body`."""
         robot = self.task.robot
         lag = max((robot.parameters.get(name, 0.0) for name in LAGS), default=0.0)
         share = 1.0 - math.exp(-self.period / lag) if lag > 0.0 else 1.0
@@ -72,7 +72,7 @@ class DynamicWindow:
 
     @cached_property
     def _commands(self) -> Array:
-        """(K, C) a grid of commands between their limits, zero among them."""
+        """(K, C) grid of commands between their limits, including zero."""
         robot = self.task.robot
         counts = {1: (15,), 2: (7, 15), 3: (7, 7, 5)}.get(len(robot.command))
         axes = [
@@ -83,13 +83,13 @@ class DynamicWindow:
 
     @cached_property
     def _actions(self) -> NDArray[np.float32]:
-        """(K, C) the same, scaled to [-1, 1]."""
+        """(K, C) the same commands, scaled to [-1, 1]."""
         low, high = self.task.robot.command_low, self.task.robot.command_high
         return (2.0 * (self._commands - low) / (high - low) - 1.0).astype(np.float32)
 
     @cached_property
     def _twists(self) -> Array:
-        """(K, 3) the body twist that each command comes to."""
+        """(K, 3) body twist of each command."""
         robot = self.task.robot
         twists = robot.to_cmd_vel(self._commands)
         if any(one.cmd_vel == "angular.z" and one.unit == "rad" for one in robot.command):

@@ -5,25 +5,26 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from nics_drl_bridge.kernels import kernel
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def choose_all(out, scans, goals, twists, candidates, sight, body, weights):  # type: ignore[no-untyped-def]
-    """`choose` for N robots, into out (N,): which of the candidates each takes."""
+    """Writes for N robots the index of the candidate that `choose` returns into out (N,)."""
     hits = np.empty((scans.shape[1], 2))
     for n in range(out.shape[0]):
         count = hits_of(hits, scans[n], sight)
         out[n] = choose(hits[:count], goals[n], twists[n], candidates, body, weights)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def hits_of(hits, shares, sight):  # type: ignore[no-untyped-def]
-    """Writes where a scan ended into hits (P, 2) [m] in `base_link`; how many there are.
+    """Writes the end points of a scan into hits (P, 2) [m] in `base_link`; returns their number.
 
     Args:
         hits: result.
-        shares: (P,) of the greatest range; 1 is free.
+        shares: (P,) of the maximum range; 1 is free.
         sight: directions (P, 2), origin (2,) [m] and range_max [m].
     """
     directions, origin, range_max = sight
@@ -36,17 +37,17 @@ def hits_of(hits, shares, sight):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def choose(hits, goal, twist, candidates, body, weights):  # type: ignore[no-untyped-def]
-    """The candidate that costs least; of those within the window, if any is.
+    """Returns the index of the cheapest candidate, preferring those within the window.
 
     Args:
-        hits: (H, 2) where the scan ended [m].
+        hits: (H, 2) end points of the scan [m].
         goal: (2,) in `base_link` [m].
-        twist: (3,) of the robot now.
-        candidates: (K, 3) twists that it may aim at.
-        body: reach (3,) of a twist in one period, radius with margin [m], period [s], steps of
-            the look ahead, time to come to rest [s].
+        twist: (3,) present twist of the robot.
+        candidates: (K, 3) twists to choose from.
+        body: reach (3,) of a twist in one period, radius with margin [m], time step [s] and number
+            of steps of the look-ahead, time to come to rest [s].
         weights: (4,) of gap, aim, clearance and time until a contact.
     """
     reach = body[0]
@@ -62,14 +63,14 @@ def choose(hits, goal, twist, candidates, body, weights):  # type: ignore[no-unt
     return best
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def cost_of(hits, goal, aimed, body, weights):  # type: ignore[no-untyped-def]
-    """What it costs to hold a twist (3,): it may not lead to a contact before it can be stopped."""
+    """Cost of holding a twist (3,), which is inadmissible if it hits before it can be stopped."""
     _, radius, period, steps, rest = body
     x, y, heading = 0.0, 0.0, 0.0
     gap, clearance, free = math.hypot(goal[0], goal[1]), math.inf, steps
     now = nearest_hit(hits, 0.0, 0.0)
-    limit = min(radius, 0.98 * now)  # already nearer than that: then away only
+    limit = min(radius, 0.98 * now)  # already nearer than that: only away
     for step in range(steps):
         middle = heading + 0.5 * aimed[2] * period
         x += (aimed[0] * math.cos(middle) - aimed[1] * math.sin(middle)) * period
@@ -82,7 +83,7 @@ def cost_of(hits, goal, aimed, body, weights):  # type: ignore[no-untyped-def]
         clearance = min(clearance, room - radius)
         gap = min(gap, math.hypot(goal[0] - x, goal[1] - y))
         if gap < 0.15:
-            break  # what lies behind the goal does not matter
+            break  # anything behind the goal does not matter
     turn = math.atan2(goal[1] - y, goal[0] - x) - heading
     turn = abs((turn + math.pi) % (2.0 * math.pi) - math.pi) / math.pi
     cost = weights[0] * gap + weights[1] * turn * min(gap, 1.0)
@@ -92,7 +93,7 @@ def cost_of(hits, goal, aimed, body, weights):  # type: ignore[no-untyped-def]
     return cost + (1e3 if moves and free * period < rest else 0.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def nearest_hit(hits, x, y):  # type: ignore[no-untyped-def]
     """Distance [m] from a point to the nearest of hits (H, 2)."""
     least = math.inf

@@ -1,4 +1,4 @@
-"""Driving episodes with a policy, keeping what happened, and judging it by the truth."""
+"""Drives episodes with a policy, records them, and judges them by the truth."""
 
 from __future__ import annotations
 
@@ -18,24 +18,25 @@ from nics_drl_bridge.policy.policies import Policy
 Array = NDArray[np.float64]
 
 DRIFT_M = 0.1
-"""A robot stops where it believes to be at its goal; odometry may have drifted by this much."""
+"""A robot stops where it believes its goal is; odometry may have drifted by this much."""
 ELSEWHERE = "elsewhere"
 
 
 @dataclass(frozen=True)
 class Episode:
-    """What happened in one episode.
+    """Record of one episode.
 
     Attributes:
         seed: of the episode.
-        result: `success`, `collision`, `time-out`, or `elsewhere`, where the robot believed to be
-            at its goal and was not. It is judged by the truth where the backend knows it.
-        path: (T, 3) true pose where the backend knows it, else the estimate, after each step.
-        estimate: (T, 3) what the robot believed.
+        result: `success`, `collision`, `time-out`, or `elsewhere` if the robot wrongly believed to
+            be at its goal. Judged by the truth if the backend knows it.
+        path: (T, 3) poses at the start and after each step: true ones if the backend knows them,
+            else estimates.
+        estimate: (T, 3) estimated poses.
         goal: (2,) [m].
-        bodies: (K, 7) obstacles as they stood at the start, see `sim.scenes.Scene`.
+        bodies: (K, 7) obstacles at the start, see `sim.scenes.Scene`.
         reward: sum over the episode.
-        believed: the result by what the robot itself knows; None where that is all that is known.
+        believed: the result by the robot's own knowledge; None if nothing else is known.
     """
 
     seed: int
@@ -49,12 +50,12 @@ class Episode:
 
     @property
     def believed_success(self) -> bool:
-        """Whether the robot believed to have arrived, and to have touched nothing."""
+        """True if the robot believed to have arrived without touching anything."""
         return (self.believed or self.result) == "success"
 
     @property
     def miss(self) -> float:
-        """How far from the goal the path ends [m]."""
+        """Distance from the end of the path to the goal [m]."""
         return float(np.linalg.norm(self.path[-1, :2] - self.goal))
 
     @property
@@ -76,20 +77,20 @@ def drive(
     on_start: Callable[[], None] = lambda: None,
     touched: Callable[[], bool] | None = None,
 ) -> Episode:
-    """Drives one episode to its end; the robot is halted where the policy or a callback raises.
+    """Drives one episode to its end; halts the robot if the policy or a callback raises.
 
     Args:
         env: to drive in.
-        policy: that drives.
+        policy: chooses the actions.
         seed: of the episode.
         options: of `env.reset`.
-        on_start: is called when the robot stands at its start.
-        touched: says at the end whether the robot truly touched something, where `info` does not.
+        on_start: called when the robot stands at its start.
+        touched: returns at the end whether the robot truly touched something, if `info` does not.
     """
     try:
         return _drive(env, policy, seed, options, on_start, touched)
     except BaseException:
-        if isinstance(env.unwrapped, BridgeEnv):  # which never sees what a policy raises
+        if isinstance(env.unwrapped, BridgeEnv):  # it does not see errors of a policy
             with uninterrupted():
                 env.unwrapped.halt()
         raise
@@ -137,9 +138,9 @@ def _true(believed: str, there: bool, hit: bool) -> str:
 
 
 def truly_near(task: Any, poses: Array, goals: Array) -> NDArray[np.bool_]:
-    """Whether robots at true poses (..., 3) are at their goals (..., 2), as far as they can know.
+    """True where robots at true poses (..., 3) are at their goals (..., 2), up to `DRIFT_M`.
 
-    True for tasks whose robots have no goal each of their own.
+    Always True for tasks other than `Navigation`, whose robots have no individual goals.
     """
     if not isinstance(task, Navigation):
         return np.ones(np.shape(poses)[:-1], np.bool_)
@@ -154,7 +155,7 @@ def drive_all(
     on_episode: Callable[[Episode], None] = lambda _: None,
     touched: Callable[[], bool] | None = None,
 ) -> list[Episode]:
-    """Drives one episode per seed and tells of each as it ends."""
+    """Drives one episode per seed and calls `on_episode` as each ends."""
     episodes = []
     for seed in seeds:
         episodes.append(drive(env, policy, seed, touched=touched))
@@ -163,11 +164,11 @@ def drive_all(
 
 
 def successes(episodes: Iterable[Episode]) -> int:
-    """How many reached their goal."""
+    """Number of episodes that reached their goal."""
     return sum(episode.result == "success" for episode in episodes)
 
 
 def deviation(one: Episode, other: Episode) -> float:
-    """Greatest distance between two paths, step by step, over their common length [m]."""
+    """Maximum distance between two paths at the same step, over their common length [m]."""
     steps = min(len(one.path), len(other.path))
     return float(np.linalg.norm(one.path[:steps, :2] - other.path[:steps, :2], axis=1).max())

@@ -1,4 +1,4 @@
-"""The evaluation protocol: episodes of fixed seeds, hundreds side by side in a vector env."""
+"""The evaluation protocol: episodes of fixed seeds, hundreds at once in a vector env."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.policy.evaluation import truly_near
-from nics_drl_bridge.policy.evaluation_intervals import Estimate, mean, rate
+from nics_drl_bridge.policy.statistics import ConfidenceInterval, mean, rate
 from nics_drl_bridge.seeds import checked_seeds
 
 Array = NDArray[np.float64]
@@ -19,19 +19,19 @@ Flags = NDArray[np.bool_]
 Act = Callable[[NDArray[np.float32]], NDArray[Any]]
 """Actions (N, C) for observations (N, O)."""
 FIRST_SEED = 1_000_000
-"""Of an evaluation: far from the seeds of any training."""
+"""First seed of an evaluation, far from the seeds of any training."""
 
 
 @dataclass(frozen=True)
 class Outcomes:
-    """How episodes ended. All arrays are (E,).
+    """Outcomes of episodes. All arrays are (E,).
 
     Attributes:
         seeds: of the episodes, as `BridgeEnv.reset` takes them.
-        success: the goal was truly reached and nothing touched.
-        collision: the task says so, or the robot truly touched something.
+        success: the goal was truly reached, and nothing touched.
+        collision: the task reports one, or the robot truly touched something.
         steps: control periods.
-        length: of the true path [m]; of a team, the mean of its robots.
+        length: of the true path [m]; for a team, the mean over its robots.
         reward: sum over the episode.
     """
 
@@ -50,7 +50,7 @@ class Outcomes:
 
 @dataclass(frozen=True)
 class Summary:
-    """What an evaluation came to, each figure with its 95 % interval.
+    """Summary of an evaluation, each figure with its 95 % interval.
 
     Attributes:
         episodes: E.
@@ -60,15 +60,15 @@ class Summary:
     """
 
     episodes: int
-    success: Estimate
-    collision: Estimate
-    time_out: Estimate
-    length: Estimate
-    time: Estimate
+    success: ConfidenceInterval
+    collision: ConfidenceInterval
+    time_out: ConfidenceInterval
+    length: ConfidenceInterval
+    time: ConfidenceInterval
 
 
 def summarise(outcomes: Outcomes, control_period: float) -> Summary:
-    """The figures of episodes; `control_period` [s]."""
+    """Summarises episodes; `control_period` [s]."""
     count = len(outcomes.seeds)
     success, collision, time_out = (
         rate(int(flags.sum()), count)
@@ -82,17 +82,17 @@ def summarise(outcomes: Outcomes, control_period: float) -> Summary:
 def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcomes:
     """Drives one episode per seed, as many at once as the env has worlds.
 
-    The episodes are those of `BridgeEnv.reset(seed=...)` without estimator, to the bit.
+    The episodes are bit-identical to those of `BridgeEnv.reset(seed=...)` without estimator.
 
     Args:
-        env: whose `autoreset_mode` is `NextStep`, the default.
+        env: its `autoreset_mode` is `NextStep`, the default.
         act: the policy, for many robots at once.
         seeds: of the episodes.
     """
     width, given = env.num_envs, checked_seeds(seeds)
     done = []
     for first in range(0, len(given), width):
-        # The last ones are filled up with seeds that are driven but not counted.
+        # The last batch is padded with seeds that are driven but not counted.
         chunk = np.resize(given[first : first + width], width)
         rows = _drive_once(env, act, chunk)
         done.append(tuple(row[: len(given) - first] for row in rows))
@@ -100,7 +100,7 @@ def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcom
 
 
 def _drive_once(env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]) -> tuple[Any, ...]:
-    """One episode in each world: success, collision, steps, length, reward, each (N,)."""
+    """Drives one episode in each world: success, collision, steps, length, reward, each (N,)."""
     count = env.num_envs
     observation, info = env.reset(seed=list(seeds))
     where = np.reshape(info["start"], (count, -1, 3))[..., :2]

@@ -1,4 +1,4 @@
-"""A hand-written policy: go to the goal, turn away from obstacles."""
+"""A hand-written policy: drives to the goal and turns away from obstacles."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ SHORT_COST = 0.4
 
 @dataclass(frozen=True)
 class GoToGoal:
-    """Tries pairs of arcs against the scan and begins the best free one.
+    """Checks pairs of arcs against the scan and starts on the best free one.
 
     A small dynamic-window planner (Fox, Burgard, Thrun 1997) over curvature alone; the second
-    arc keeps a car out of places that it can't leave again. It reads nothing but the
-    observation of the navigation task.
+    arc keeps a car out of places that it can't leave again. It uses only the observation of the
+    navigation task.
 
     Attributes:
-        task: whose observations and actions it speaks.
+        task: defines observations and actions.
         turn_radius: of the tightest arc [m].
-        margin: free space to keep beside the footprint [m].
+        margin: clearance to keep around the footprint [m].
         first, second: lengths of the two arcs [m].
-        curvatures: how many first arcs, and how many second ones for each.
-        beams: at most so many beams of the scan are looked at.
-        cruise: speed in shares of the greatest.
+        curvatures: number of first arcs, and of second arcs for each.
+        beams: maximum number of beams of the scan that are used.
+        cruise: speed as a share of the maximum.
     """
 
     task: Navigation
@@ -60,14 +60,14 @@ class GoToGoal:
 
     @cached_property
     def _chosen(self) -> tuple[NDArray[np.intp], Array]:
-        """The parts of the scan to look at, and their directions (H, 2) in `base_link`."""
+        """Indices of the scan parts that are used, and their directions (H, 2) in `base_link`."""
         count = self.task.scan_parts
         index = np.unique(np.linspace(0, count - 1, min(count, self.beams)).astype(np.intp))
         angles = self.task.sight.angles[index]
         return index, np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The action (C,) for an observation (O,); or (N, C) for (N, O)."""
+        """Returns the action (C,) for an observation (O,); or (N, C) for (N, O)."""
         if observation.ndim == 2:
             return np.stack([self.act(one) for one in observation])
         distance, cosine, sine = observation[self.task.scan_parts :][:3].astype(float)
@@ -78,7 +78,7 @@ class GoToGoal:
         return self._action(curvature[best], free[best] / points.shape[1])
 
     def _free_steps(self, observation: NDArray[np.float32], points: Array) -> NDArray[np.int64]:
-        """How many points (P,) of each path the footprint reaches without coming too close."""
+        """Number of points (P,) of each path that the footprint reaches with enough clearance."""
         index, directions = self._chosen
         share = observation[index].astype(float)
         sight = self.task.sight
@@ -89,7 +89,7 @@ class GoToGoal:
             points[:, :, None, 1] - hits[:, 1]
         ) ** 2
         room = self.task.robot.footprint_radius + self.margin
-        # Already nearer than that? Then a path has to lead away; none would start free.
+        # If something is already nearer, a path only has to lead away; none would start free.
         limit = min(room * room, 0.98 * float((hits**2).sum(axis=-1).min()))
         close = squared.min(axis=-1) < limit
         return np.asarray(np.where(close.any(axis=1), close.argmax(axis=1), points.shape[1]))
@@ -112,7 +112,7 @@ class GoToGoal:
 
 
 def _cost(goal: Array, points: Array, heading: Array, free: NDArray[np.int64]) -> Array:
-    """What each path (P,) costs: the gap left at its best reachable point, and its dangers."""
+    """Cost of each path (P,): the gap left at its best reachable point, and its dangers."""
     offset = goal - points
     gap = np.hypot(offset[..., 0], offset[..., 1])
     turn = np.arctan2(offset[..., 1], offset[..., 0]) - heading

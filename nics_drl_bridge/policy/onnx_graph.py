@@ -1,4 +1,10 @@
-"""What the graph of a policy file may hold, checked before anything of it runs."""
+"""Checks of the graph of a policy file, before anything of it runs.
+
+Size checks of a policy file's bytes before they are parsed.
+
+Two bytes of a file can become a message of some hundred bytes in memory, and one byte a number of
+eight. So the parts are counted in the raw bytes, and only a file with few of them is parsed.
+"""
 
 from __future__ import annotations
 
@@ -13,24 +19,23 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 
 from nics_drl_bridge.errors import PolicyError
 from nics_drl_bridge.files import sha256
-from nics_drl_bridge.policy.onnx_wire import WireError, check_wire
 
 KEY = "nics_drl_bridge"
-"""Of the metadata that holds the contract."""
+"""Key of the metadata entry with the contract."""
 SEAL = "sha256"
-"""Of the metadata at the file's end: the checksum of all that stands before it."""
+"""Key of the metadata entry at the file's end: the checksum of everything before it."""
 SIZE_LIMIT = 32 * 2**20
 MOST_NODES = 1000
-"""An exported network has some dozens."""
+"""Maximum number of nodes; an exported network has some dozens."""
 MOST_DIMENSIONS = 8
-"""Of one array of weights."""
+"""Maximum number of dimensions of an array of weights."""
 NUMBERS = frozenset(
     getattr(onnx.TensorProto, kind)
     for kind in ("FLOAT", "DOUBLE", "FLOAT16", "INT64", "INT32", "BOOL")
 )
-"""Kinds of arrays that are as large in memory as in the file."""
+"""Types of arrays that are as large in memory as in the file."""
 CONTRACT_LIMIT = 4 * 2**20
-"""Bytes of the contract, whose golden observations are the most of it."""
+"""Maximum size of the contract [bytes], most of which are golden observations."""
 INPUT, ACTION, COMMAND = "observation", "action", "command"
 OPERATORS = frozenset({
     "Abs", "Add", "ArgMax", "AveragePool", "Cast", "Clip", "Concat", "Constant", "Conv", "Div",
@@ -40,7 +45,7 @@ OPERATORS = frozenset({
     "Relu", "Reshape", "Selu", "Shape", "Sigmoid", "Slice", "Softmax", "Softplus", "Softsign",
     "Split", "Sqrt", "Squeeze", "Sub", "Tanh", "Transpose", "Unsqueeze",
 })  # fmt: skip
-"""Feed-forward networks; nothing that loops, branches, draws, or grows with its input's values."""
+"""Operators of feed-forward networks: no loops, branches, random draws or data-dependent sizes."""
 OTHER_FORMATS = (
     (b"PK", "a zip archive, as Stable-Baselines3 and torch write them"),
     (b"\x80", "a pickle"),
@@ -48,14 +53,14 @@ OTHER_FORMATS = (
     (b"\x89HDF", "an HDF5 file"),
     (b"\x1f\x8b", "a gzip file"),
 )
-"""How files begin that trainers write and that are never opened here."""
+"""First bytes of files that trainers write and that are never opened here."""
 
 
 def parse(data: bytes, source: str) -> Any:
-    """The ModelProto of a policy file's content, checked.
+    """Parses and checks the ModelProto of a policy file's content.
 
     Raises:
-        PolicyError: it is no ONNX model, or one that this package would not run.
+        PolicyError: it is not an ONNX model, or one that this package does not run.
     """
     for start, kind in OTHER_FORMATS:
         if data.startswith(start):
@@ -78,9 +83,9 @@ def parse(data: bytes, source: str) -> Any:
 
 
 def sealed(data: bytes) -> bytes:
-    """A model's bytes with their checksum as one more entry of the metadata.
+    """Appends to a model's bytes their checksum, as another metadata entry.
 
-    Parts of a protobuf message may follow one another, so other programs read it as any other.
+    Parts of a protobuf message may be concatenated, so other programs read the file as usual.
     """
     end = onnx.ModelProto()
     entry = end.metadata_props.add()
@@ -89,7 +94,7 @@ def sealed(data: bytes) -> bytes:
 
 
 def check_seal(data: bytes, source: str) -> None:
-    """Raises PolicyError unless every bit of a file is as it was written."""
+    """Raises PolicyError unless a file is bit-identical to what was written."""
     size = len(sealed(b""))
     if data != sealed(data[:-size]):
         reason = "does not fit the file, which was changed or damaged; copy or export it again."
@@ -97,7 +102,7 @@ def check_seal(data: bytes, source: str) -> None:
 
 
 def check_graph(model: Any, source: str) -> None:
-    """Raises PolicyError for a graph that is not self-contained, or holds other operators."""
+    """Raises PolicyError for a graph that is not self-contained, or has other operators."""
     graph = model.graph
     if len(graph.node) > MOST_NODES:
         reason = f"has {len(graph.node)} operators, a policy at most {MOST_NODES}; not run."
@@ -134,7 +139,7 @@ def check_graph(model: Any, source: str) -> None:
 
 
 def tensors(graph: Any) -> Iterator[Any]:
-    """Every tensor of a graph: its weights, and constants in its nodes."""
+    """Yields every tensor of a graph: its weights, and constants in its nodes."""
     yield from graph.initializer
     for attribute in itertools.chain.from_iterable(node.attribute for node in graph.node):
         if attribute.HasField("t"):
@@ -163,7 +168,7 @@ def check_ends(model: Any, widths: dict[str, int | None], source: str) -> None:
 
     Args:
         model: the ModelProto.
-        widths: of `observation`, `action` and `command`; None: whole numbers (n,).
+        widths: of `observation`, `action` and `command`; None: integers (n,).
         source: the file's name.
     """
     weights = {tensor.name for tensor in model.graph.initializer}
@@ -187,7 +192,7 @@ def check_ends(model: Any, widths: dict[str, int | None], source: str) -> None:
 
 
 def metadata(model: Any, source: str) -> str:
-    """The text of the contract. Raises PolicyError when there is none, or more."""
+    """The text of the contract. Raises PolicyError unless there is exactly one."""
     found = [entry.value for entry in model.metadata_props if entry.key == KEY]
     if len(found) != 1:
         reason = f"{len(found)} contracts in it; only files of `export_policy` are policies."
@@ -199,8 +204,83 @@ def metadata(model: Any, source: str) -> str:
 
 
 def graph_hash(model: Any) -> str:
-    """SHA-256 over a model without its metadata."""
+    """SHA-256 of a model without its metadata."""
     bare = onnx.ModelProto()
     bare.CopyFrom(model)
     del bare.metadata_props[:]
     return sha256(bare.SerializeToString(deterministic=True))
+
+
+MOST_PARTS = 50_000
+"""Maximum number of fields of all messages; each array of weights is one part."""
+MOST_NESTED = 16
+"""Maximum nesting of messages; an exported graph needs six levels."""
+MOST_PACKED = 2**20
+"""Maximum size of packed integers in one part, such as an array's shape [bytes]; not weights."""
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
+_LONGEST_VARINT = 10
+
+
+class WireError(ValueError):
+    """The bytes are no message, or one that is too large once parsed."""
+
+
+def check_wire(data: bytes) -> None:
+    """Checks that the bytes of a ModelProto have few parts.
+
+    Raises:
+        WireError: they are no message, or have more parts or deeper nesting than allowed.
+    """
+    view, parts = memoryview(data), 0
+    ahead: list[tuple[int, int, Any, int]] = [(0, len(data), onnx.ModelProto.DESCRIPTOR, 1)]
+    while ahead:
+        start, end, kind, depth = ahead.pop()
+        if depth > MOST_NESTED:
+            raise WireError(f"is nested more than {MOST_NESTED} levels deep")
+        while start < end:
+            parts += 1
+            if parts > MOST_PARTS:
+                raise WireError(f"has more than {MOST_PARTS} parts")
+            key, start = _varint(view, start, end)
+            begin, start = _extent(view, start, end, key & 7)
+            field = kind.fields_by_number.get(key >> 3)
+            if field is None or key & 7 != _BYTES:
+                continue
+            if field.message_type is not None:
+                ahead.append((begin, start, field.message_type, depth + 1))
+            elif _is_packed_number(field) and start - begin > MOST_PACKED:
+                raise WireError(f"has {start - begin} bytes of {field.name!r}, not weights")
+
+
+def _is_packed_number(field: Any) -> bool:
+    """True for a field of variable-length numbers, which grow when they are parsed."""
+    growing = (
+        field.TYPE_INT64, field.TYPE_UINT64, field.TYPE_INT32, field.TYPE_UINT32, field.TYPE_ENUM,
+    )  # fmt: skip
+    return field.type in growing
+
+
+def _extent(view: memoryview, start: int, end: int, wire: int) -> tuple[int, int]:
+    """Start and end of the content of a field."""
+    if wire == _VARINT:
+        return start, _varint(view, start, end)[1]
+    if wire == _BYTES:
+        size, start = _varint(view, start, end)
+    elif wire in (_FIXED64, _FIXED32):
+        size = 8 if wire == _FIXED64 else 4
+    else:
+        raise WireError("is no ONNX model")
+    if start + size > end:
+        raise WireError("is cut off")
+    return start, start + size
+
+
+def _varint(view: memoryview, start: int, end: int) -> tuple[int, int]:
+    value = 0
+    for k in range(_LONGEST_VARINT):
+        if start + k >= end:
+            break
+        value |= (view[start + k] & 0x7F) << (7 * k)
+        if view[start + k] < 0x80:
+            return value, start + k + 1
+    raise WireError("is no ONNX model, or is cut off")

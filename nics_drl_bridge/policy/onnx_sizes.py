@@ -1,6 +1,6 @@
-"""How much memory and work a policy's graph takes, before anything of it runs.
+"""Memory and work that a policy's graph takes, determined before it runs.
 
-Shapes are those of onnx's strict inference, on a copy without weights; the counting is done here.
+Shapes come from onnx's strict inference on a copy without weights; the counting is done here.
 """
 
 from __future__ import annotations
@@ -14,35 +14,35 @@ import onnx
 from nics_drl_bridge.errors import PolicyError
 
 MOST_NUMBERS = 1_000_000
-"""That all nodes together may give for one observation."""
+"""Maximum output of all nodes together for one observation."""
 MOST_WORK = 20_000_000
-"""Multiplications, or numbers read and written, for one observation."""
+"""Maximum number of multiplications, or of numbers read and written, for one observation."""
 MOST_AT_ONCE = 64 * MOST_NUMBERS
-"""Numbers that all nodes together may give in one run, so at most 256 MB of float32."""
+"""Maximum output of all nodes together in one run, so at most 256 MB of float32."""
 ROWS = 16
-"""Observations for which the sizes are told, as many as there are golden ones."""
+"""Observations for which the sizes are computed, as many as there are golden ones."""
 SMALL = 1024
-"""Whole numbers of an array that may be a shape, an axis or an index; larger ones are no such."""
+"""Maximum length of an integer array that may be a shape, an axis or an index."""
 GREATEST_SETTING = 65_536
-"""Of a kernel's size, stride, padding or dilation."""
+"""Maximum size, stride, padding or dilation of a kernel."""
 MOST_AXES = 256
-"""That all nodes together may add to their arrays, each of which makes inference longer."""
+"""Axes that all nodes together may add to their arrays; each makes inference longer."""
 FLOATS = frozenset({onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE, onnx.TensorProto.FLOAT16})
 DIVIDING = frozenset({"Div", "ReduceMean"})
-"""Of whole numbers, division by zero, or of the least by -1, ends the process."""
+"""On integers, division by zero, or of the minimum by -1, ends the process."""
 Shape = tuple[int, ...]
 Cost = tuple[int, int]
 
 
 def rows_at_once(model: Any, source: str) -> int:
-    """Observations that a graph may be given in one run.
+    """Number of observations that a graph may be given in one run.
 
     Args:
-        model: the ModelProto, whose operators are known ones.
+        model: the ModelProto, with known operators only.
         source: the file's name.
 
     Raises:
-        PolicyError: a size can't be told, or is more than any policy needs.
+        PolicyError: a size is unknown, or is more than any policy needs.
     """
     _check_settings(model.graph, source)
     _check_axes(model.graph, source)
@@ -88,7 +88,7 @@ def _check_axes(graph: Any, source: str) -> None:
 
 
 def _check_whole_numbers(model: Any, source: str) -> None:
-    """Refuses what whole numbers can do: to divide, and to grow while they are only looked at."""
+    """Refuses integers that are divided, or that grow while shapes are inferred."""
     told = _inferred(_without_weights(model, ROWS), source, values=False)
     kinds = {tensor.name: tensor.data_type for tensor in told.initializer}
     sizes = {}
@@ -108,7 +108,7 @@ def _check_whole_numbers(model: Any, source: str) -> None:
 
 
 def _costs(model: Any, rows: int, source: str) -> Cost:
-    """Numbers that all nodes give, and work, for so many observations."""
+    """Output and work of all nodes for `rows` observations."""
     shapes = _shapes(model, rows, source)
     numbers = work = 0
     for node in model.graph.node:
@@ -123,13 +123,13 @@ def _costs(model: Any, rows: int, source: str) -> Cost:
 
 
 def _known(names: Any, shapes: Mapping[str, Shape]) -> list[Shape] | None:
-    """Shapes of the tensors of a node, but those left out; None when one is not known."""
+    """Shapes of a node's tensors, except omitted ones; None if one is unknown."""
     found = [shapes.get(name) for name in names if name]
     return None if None in found else [shape for shape in found if shape is not None]
 
 
 def _work(node: Any, given: list[Shape], made: list[Shape]) -> int:
-    """Multiplications of a node, or numbers that it reads and writes."""
+    """Multiplications of a node, and numbers that it reads and writes."""
     moved = sum(map(math.prod, (*given, *made)))
     settings = {attribute.name: attribute for attribute in node.attribute}
     if node.op_type in ("MatMul", "Gemm"):
@@ -143,7 +143,7 @@ def _work(node: Any, given: list[Shape], made: list[Shape]) -> int:
 
 
 def _buffer(node: Any, given: list[Shape], made: list[Shape]) -> int:
-    """Numbers that the runtime lays out for a convolution besides what it gives."""
+    """Numbers that the runtime allocates for a convolution in addition to its output."""
     if node.op_type != "Conv":
         return 0
     groups = int(next((a.i for a in node.attribute if a.name == "group"), 1))
@@ -151,7 +151,7 @@ def _buffer(node: Any, given: list[Shape], made: list[Shape]) -> int:
 
 
 def _shapes(model: Any, rows: int, source: str) -> dict[str, Shape]:
-    """The shape of every tensor, for so many observations; one that is not known is missing."""
+    """Shape of every tensor for `rows` observations; unknown ones are missing."""
     told = _inferred(_without_weights(model, rows), source, values=True)
     shapes = {tensor.name: tuple(tensor.dims) for tensor in told.initializer}
     for value in (*told.input, *told.value_info, *told.output):
@@ -162,16 +162,16 @@ def _shapes(model: Any, rows: int, source: str) -> dict[str, Shape]:
 
 
 def _inferred(bare: Any, source: str, values: bool) -> Any:
-    """A graph with the types and shapes that follow; `values`: from those of whole numbers too."""
+    """A graph with inferred types and shapes; `values`: infers from integer values too."""
     try:
         return onnx.shape_inference.infer_shapes(bare, strict_mode=True, data_prop=values).graph
-    except Exception as error:  # noqa: BLE001 - it raises what it likes at a damaged graph
+    except Exception as error:  # noqa: BLE001 - a damaged graph raises anything
         words = " ".join(str(error).split())[:120]
         raise PolicyError(source, "graph", f"its shapes do not fit ({words}).") from None
 
 
 def _without_weights(model: Any, rows: int) -> Any:
-    """The graph for so many observations, with weights and constants as inputs of their shape."""
+    """The graph for `rows` observations, with weights and constants as inputs of their shape."""
     bare = onnx.ModelProto(ir_version=model.ir_version, opset_import=model.opset_import)
     graph = bare.graph
     graph.name = "sizes"
@@ -187,14 +187,14 @@ def _without_weights(model: Any, rows: int) -> Any:
     for value in (one for one in model.graph.input if one.name not in held):
         graph.input.append(value)
         graph.input[-1].type.tensor_type.shape.dim[0].dim_value = rows
-    for value in model.graph.output:  # whose shapes are to come out, not to be believed
+    for value in model.graph.output:  # their shapes are to be inferred, not trusted
         kind = value.type.tensor_type.elem_type
         graph.output.append(onnx.helper.make_tensor_value_info(value.name, kind, None))
     return bare
 
 
 def _add_tensor(graph: Any, tensor: Any, name: str) -> None:
-    """Adds a small array of whole numbers, which may be a shape; of another the shape alone."""
+    """Adds a small integer array, which may be a shape, as it is; of others only the shape."""
     small = math.prod(tensor.dims) <= SMALL
     if small and tensor.data_type in (onnx.TensorProto.INT64, onnx.TensorProto.INT32):
         graph.initializer.append(tensor)

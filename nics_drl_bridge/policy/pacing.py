@@ -1,6 +1,6 @@
-"""When a policy acts, and what becomes of an inference that takes too long.
+"""Pacing of a policy's actions, and handling of inferences that take too long.
 
-Times are seconds on a steady clock, given by the caller.
+Times are in seconds on a steady clock, given by the caller.
 """
 
 from __future__ import annotations
@@ -8,11 +8,11 @@ from __future__ import annotations
 from enum import Enum
 
 
-class Pace:
-    """At most one action in each period, as soon as there is something to act on.
+class ActionPace:
+    """Allows at most one action per period, as soon as there are data to act on.
 
-    Due times follow each other by the period, so that jitter of the data makes it neither faster
-    nor slower; when data come late, the next due time is a period after them.
+    Due times are a period apart, so that jitter of the data makes it neither faster nor slower;
+    if data come late, the next due time is a period after them.
 
     Args:
         period_s: between actions; 0 acts on everything.
@@ -22,17 +22,17 @@ class Pace:
         self._period_s, self._due_s = period_s, -float("inf")
 
     def due(self, now_s: float) -> bool:
-        """Whether it is time to act."""
+        """True if it is time to act."""
         return now_s >= self._due_s
 
     def acted(self, now_s: float) -> None:
-        """Notes an action at its begin."""
+        """Records the start of an action."""
         late = now_s - self._due_s > 0.5 * self._period_s
         self._due_s = (now_s if late else self._due_s) + self._period_s
 
 
 class Answer(Enum):
-    """What becomes of a command."""
+    """Fate of a command."""
 
     SEND = "send"
     DROP = "drop"
@@ -40,18 +40,18 @@ class Answer(Enum):
 
 
 class Deadline:
-    """Judges how long each inference took.
+    """Judges the duration of each inference.
 
-    A late command is dropped: it answers a world that has moved on. After several in a row the
-    robot is told to stop, until one is in time again.
+    A late command is dropped, because the world has moved on. After several in a row the robot is
+    stopped until one is in time again.
 
     Args:
-        limit_s: longest time of an inference.
-        patience: with so many late ones in a row, zero is sent.
+        limit_s: maximum duration of an inference.
+        patience: number of late ones in a row from which zero is sent.
 
     Attributes:
-        answered, late: how many were in time, and how many not.
-        longest_s: that one took.
+        answered, late: number of inferences in time, and of late ones.
+        longest_s: maximum duration so far.
     """
 
     def __init__(self, limit_s: float, patience: int) -> None:
@@ -60,7 +60,7 @@ class Deadline:
         self.longest_s = 0.0
 
     def judge(self, taken_s: float) -> Answer:
-        """What becomes of a command that took so long."""
+        """Decides on a command whose inference took `taken_s`."""
         self.longest_s = max(self.longest_s, taken_s)
         if taken_s <= self._limit_s:
             self.answered += 1

@@ -1,8 +1,12 @@
-"""Policies by name."""
+"""Baselines that any policy must beat: straight to the goal, and random actions.
+
+Policies by name.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Protocol
 
@@ -15,14 +19,65 @@ from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy.dynamic_window import DynamicWindow
 from nics_drl_bridge.policy.go_to_goal import GoToGoal
-from nics_drl_bridge.policy.simple_policies import RandomActions, StraightToGoal
+
+FULL_TURN_RAD = 0.8
+"""Bearing of the goal from which a robot turns as fast as it can."""
+CREEP = 0.3
+"""Share of the maximum speed for a robot that can't turn on the spot and has its goal behind."""
+
+
+@dataclass(frozen=True)
+class StraightToGoal:
+    """Turns to the goal and drives there, ignoring obstacles.
+
+    Attributes:
+        task: defines observations and actions.
+    """
+
+    task: Navigation
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Returns the action (C,) for an observation (O,); or (N, C) for (N, O)."""
+        robot, first = self.task.robot, self.task.scan_parts + 1
+        cosine, sine = np.moveaxis(observation[..., first : first + 2].astype(float), -1, 0)
+        turn = np.clip(np.arctan2(sine, cosine) / FULL_TURN_RAD, -1.0, 1.0)
+        steers = any(one.cmd_vel == "angular.z" and one.unit == "rad" for one in robot.command)
+        ahead = np.maximum(cosine, CREEP if steers else 0.0)
+        shares = {"linear.x": ahead, "angular.z": turn}
+        wanted = np.zeros((*cosine.shape, len(robot.command)))
+        for i, one in enumerate(robot.command):
+            if one.cmd_vel in shares:
+                wanted[..., i] = shares[one.cmd_vel] * one.max
+        low, high = robot.command_low, robot.command_high
+        return np.clip(2.0 * (wanted - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class RandomActions:
+    """Draws each action at random, ignoring the observation.
+
+    Attributes:
+        task: defines the actions.
+        seed: of the draws.
+    """
+
+    task: Navigation
+    seed: int = 0
+    _rng: list[np.random.Generator] = field(default_factory=list, repr=False)
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Returns an action (C,); or (N, C) for (N, O)."""
+        if not self._rng:
+            self._rng.append(np.random.default_rng(self.seed))
+        shape = (*observation.shape[:-1], len(self.task.robot.command))
+        return self._rng[0].uniform(-1.0, 1.0, shape).astype(np.float32)
 
 
 class Policy(Protocol):
-    """From an observation to an action; the same in every world."""
+    """Maps observations to actions; the same in every world."""
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The action (C,) in [-1, 1] for an observation (O,); or (N, C) for (N, O)."""
+        """Returns the action (C,) in [-1, 1] for an observation (O,); or (N, C) for (N, O)."""
         ...
 
 
@@ -43,23 +98,23 @@ def shipped_policies() -> list[str]:
 
 
 def check_name(name: str) -> None:
-    """Raises ConfigError for what is neither a policy's name nor that of a policy file."""
+    """Raises ConfigError for a name that is neither a policy's nor a policy file's."""
     files = shipped_policies()
     if name not in POLICIES and not name.endswith(SUFFIX) and name not in files:
         raise ConfigError(f"unknown policy {name!r}; {nearest(name, (*POLICIES, *files))}")
 
 
 def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None) -> Policy:
-    """A policy by name.
+    """Makes a policy by name.
 
     Args:
-        name: of one in `POLICIES`, of a shipped policy file, or the path of a policy file.
-        task: whose observations and actions it speaks.
-        model: of the robot; a policy file is then checked against it, and against the task.
+        name: a key of `POLICIES`, a shipped policy file, or the path of a policy file.
+        task: defines observations and actions.
+        model: of the robot; a policy file is checked against it and the task.
 
     Raises:
-        ConfigError: an unknown name, with the nearest.
-        PolicyError: the file can't be used, or does not fit; the field is named.
+        ConfigError: an unknown name; suggests the nearest.
+        PolicyError: the file can't be used, or does not fit; names the field.
     """
     check_name(name)
     if name in POLICIES:
@@ -71,14 +126,14 @@ def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None
 
 
 def open_policy(name: str, model: SimulatorModel) -> tuple[Policy, Navigation]:
-    """A policy by name and the navigation task that it is for.
+    """Opens a policy by name, with the navigation task that it is for.
 
     Args:
         name: see `make_policy`.
         model: of the robot.
 
     Raises:
-        ConfigError, PolicyError: see `make_policy`; or it was trained for another task.
+        ConfigError, PolicyError: see `make_policy`; or the policy was trained for another task.
     """
     if name in POLICIES or not (name.endswith(SUFFIX) or name in shipped_policies()):
         task = Navigation(model.robot, model.lidar)

@@ -1,6 +1,6 @@
 """Policy files: one `.onnx` with network, normaliser, commands and contract.
 
-Loading needs onnxruntime and onnx, and nothing of training. Everything is checked before the
+Loading needs onnxruntime and onnx, but no training library. Everything is checked before the
 first inference; nothing is ever unpickled.
 """
 
@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.config import share_folder
+from nics_drl_bridge.env.registry import TASKS, make_task
 from nics_drl_bridge.env.task import Task
-from nics_drl_bridge.env.tasks import TASKS, make_task
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.lidar.canonical import plan_of
+from nics_drl_bridge.lidar.sectors import plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.policy import onnx_graph, onnx_sizes
 from nics_drl_bridge.policy.contract import (
@@ -30,6 +29,7 @@ from nics_drl_bridge.policy.contract import (
     read_contract,
     task_entry,
 )
+from nics_drl_bridge.robot.spec import RobotSpec
 
 SUFFIX = ".onnx"
 GOLDEN_TOLERANCE = 1e-5
@@ -38,11 +38,11 @@ Rows = NDArray[np.float32]
 
 
 class PolicyFile:
-    """A policy that was loaded and checked.
+    """A loaded and checked policy.
 
     Attributes:
         path: of the file.
-        contract: what it says about itself.
+        contract: its contract.
     """
 
     def __init__(self, path: Path, contract: Contract, session: Any, rows_at_once: int) -> None:
@@ -50,11 +50,11 @@ class PolicyFile:
         self._rows_at_once = rows_at_once
 
     def act(self, observation: Rows) -> NDArray[Any]:
-        """The action (C,) in [-1, 1], or () discrete, for an observation (O,); or of n at once."""
+        """Returns the action (C,) in [-1, 1], or () discrete, for (O,); or n of them for (n, O)."""
         return self._run(observation)[0]
 
     def command(self, observation: Rows) -> Rows:
-        """The command (C,) in SI, in the order of the robot, for (O,); or (n, C) for (n, O)."""
+        """Returns the command (C,) in SI, in the robot's order, for (O,); or (n, C) for (n, O)."""
         return self._run(observation)[1]
 
     def _run(self, observation: Rows) -> list[NDArray[Any]]:
@@ -75,7 +75,7 @@ class PolicyFile:
         names = [onnx_graph.ACTION, onnx_graph.COMMAND]
         try:
             out: list[NDArray[Any]] = self._session.run(names, {onnx_graph.INPUT: rows})
-        except Exception as error:  # noqa: BLE001 - the runtime's errors have no base of their own
+        except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
             raise _cannot_run(str(self.path), error) from None
         if any(len(part) != len(rows) for part in out):
             reason = f"gives {[part.shape for part in out]} for {len(rows)} observations."
@@ -84,19 +84,19 @@ class PolicyFile:
 
     @cached_property
     def task_options(self) -> dict[str, Any]:
-        """What makes the policy's task: its options, and its scan."""
+        """Arguments of the policy's task: its options and its scan."""
         scan = self.contract.scan
         return {**self.contract.task.options, **({} if scan is None else {"scan": scan})}
 
     def make_task(self, model: SimulatorModel, kind: str | type[Task] | None = None) -> Task:
-        """The task of the policy, for a robot that it fits.
+        """Makes the policy's task for a robot that it fits.
 
         Args:
             model: the robot.
-            kind: where the task is no shipped one, its class or `path/to/file.py:ClassName`.
+            kind: for a task that is not shipped, its class or `path/to/file.py:ClassName`.
 
         Raises:
-            PolicyError: it does not fit; the field is named.
+            PolicyError: the policy does not fit; names the field.
         """
         name = self.contract.task.name
         if kind is None and name not in TASKS:
@@ -171,7 +171,7 @@ LIDAR = {"beams", "angle_min", "angle_max", "range_max", "mount"}
 
 
 def find_policy(name: str) -> Path:
-    """The file of a policy by its path, or by the name of a shipped one."""
+    """Path of a policy file, by its path or by the name of a shipped one."""
     path = Path(name)
     return path if name.endswith(SUFFIX) or path.is_file() else shipped() / f"{name}{SUFFIX}"
 
@@ -182,13 +182,13 @@ def shipped() -> Path:
 
 
 def load_policy(path: str | Path) -> PolicyFile:
-    """Loads a policy file, after it has passed every check.
+    """Loads a policy file and runs every check.
 
     Args:
-        path: of the file, or the name of a shipped one.
+        path: path of the file, or the name of a shipped one.
 
     Raises:
-        PolicyError: anything is wrong with it; the field is named.
+        PolicyError: a check fails; names the field.
     """
     file = find_policy(str(path))
     return policy_of(_read(file), file)
@@ -210,7 +210,7 @@ def _read(path: Path) -> bytes:
 
 
 def policy_of(data: bytes, path: Path) -> PolicyFile:
-    """The policy that a file's content holds; see `load_policy`."""
+    """Makes a policy from a file's content; see `load_policy`."""
     source = str(path)
     model = onnx_graph.parse(data, source)
     contract = read_contract(onnx_graph.metadata(model, source), source)
@@ -222,10 +222,10 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
         reason = "does not belong to the graph, which was changed after the export."
         raise PolicyError(source, "graph_sha256", reason)
     rows = onnx_sizes.rows_at_once(model, source)
-    del model  # the runtime makes its own of the bytes
+    del model  # the runtime parses the bytes itself
     policy = PolicyFile(path, contract, open_session(data, source), rows)
     _check_golden(policy, source)
-    onnx_graph.check_seal(data, source)  # at last: what can be named was named before
+    onnx_graph.check_seal(data, source)  # last, so that faults with a known field are named first
     return policy
 
 
@@ -233,7 +233,8 @@ def open_session(data: bytes, source: str) -> Any:
     """An onnxruntime session on one thread.
 
     Raises:
-        PolicyError: onnxruntime is missing, or can't run the graph.
+        ConfigError: onnxruntime is missing.
+        PolicyError: onnxruntime can't run the graph.
     """
     try:
         import onnxruntime
@@ -247,7 +248,7 @@ def open_session(data: bytes, source: str) -> Any:
     options.log_severity_level = 4
     try:
         return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # noqa: BLE001 - the runtime's errors have no base of their own
+    except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
         raise _cannot_run(source, error) from None
 
 
@@ -273,7 +274,7 @@ def _check_golden(policy: PolicyFile, source: str) -> None:
 
 
 def summary(policy: PolicyFile) -> dict[str, Any]:
-    """The contract in plain data, without arrays and checksums."""
+    """The contract as plain data, without arrays and checksums."""
     data = policy.contract.model_dump(mode="json")
     del data["golden"], data["checksums"]
     return {"file": str(policy.path), "bytes": policy.path.stat().st_size, **data}

@@ -1,4 +1,4 @@
-"""Shadow mode: what a policy would have commanded in a recorded drive, beside what was driven."""
+"""Shadow mode: compares the commands of a policy with those of a recorded drive."""
 
 from __future__ import annotations
 
@@ -12,38 +12,37 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.kinematics.bag_file import Message
-from nics_drl_bridge.kinematics.bag_messages import command_row
+from nics_drl_bridge.interface import S_PER_NS, RobotView
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.playback import Playback, in_order, played
-from nics_drl_bridge.policy.pacing import Pace
+from nics_drl_bridge.policy.pacing import ActionPace
 from nics_drl_bridge.policy.policies import open_policy
+from nics_drl_bridge.recording.bag_file import Message
+from nics_drl_bridge.recording.messages import command_row
 
 Array = NDArray[np.float64]
-NANO = 1e-9
 JITTER = 0.25
-"""So many periods may a scan be early."""
+"""Permitted earliness of a scan, in control periods."""
 HELD_S = 1.0
-"""A command that is older is no longer what the robot does."""
+"""Age from which a command no longer applies to the robot."""
 DEAD_BAND = 0.05
-"""Smaller commands, in shares of their greatest, have no sign."""
+"""Commands below this share of their maximum have no sign."""
 PERCENTILES = (50, 90, 99)
 
 
 @dataclass(frozen=True)
 class Shadow:
-    """A policy beside a drive, at T times at which it would have acted.
+    """A policy compared with a drive, at the T times at which it would have acted.
 
     Attributes:
         names, units: (C) of the commands.
         time: (T,) since the first [s].
         pose: (T, 3) estimated, in `map`.
-        goal: (T, 2) that the policy was given [m].
-        policy: (T, C) its commands.
-        driven: (T, C) the recorded ones.
-        scale: (C,) the greatest that each command can be.
-        skipped: reason -> at how many times nothing was compared.
+        goal: (T, 2) goal given to the policy [m].
+        policy: (T, C) commands of the policy.
+        driven: (T, C) recorded commands.
+        scale: (C,) maximum magnitude of each command.
+        skipped: reason -> number of times that were not compared.
     """
 
     names: tuple[str, ...]
@@ -57,10 +56,10 @@ class Shadow:
     skipped: Mapping[str, int]
 
     def differences(self) -> dict[str, dict[str, float]]:
-        """How far the policy is from the drive, for each command.
+        """Differences between policy and drive, for each command.
 
-        Mean (policy less drive), mean, percentiles and greatest of its size, in the command's unit;
-        and of the times at which both tell a direction, the share at which they differ.
+        Mean of policy minus drive; mean, percentiles and maximum of its magnitude, in the command's
+        unit; and the share of opposite signs among the times at which both have a sign.
         """
         told = {}
         for c, name in enumerate(self.names):
@@ -77,14 +76,14 @@ class Shadow:
 
 
 def _opposite(one: Array, other: Array, band: float) -> float:
-    """Share of the times at which both are beyond a band, and on different sides."""
+    """Share of opposite signs among the times at which both are outside a band."""
     told = (np.abs(one) > band) & (np.abs(other) > band)
     return float((one[told] * other[told] < 0.0).mean()) if told.any() else 0.0
 
 
 @dataclass
 class _Moment:
-    """A time at which the policy would act."""
+    """A time at which the policy would act, with its view and the driven command."""
 
     receive_ns: int
     stamp_ns: int
@@ -100,20 +99,20 @@ def shadow(
     goal: ArrayLike | None = None,
     ahead_s: float = 4.0,
 ) -> Shadow:
-    """Gives a policy what a robot saw, in process and always alike.
+    """Runs a policy on a recorded drive, in process and deterministically.
 
-    The policy acts when `policy_node` would: once per scan, with an odometry at least as new, at
-    most once in a control period of the stamps. A command is compared with the first one that was
-    recorded after that, or else with the one that still held.
+    The policy acts when `policy_node` would: once per scan, with odometry at least as new, at most
+    once per control period of the stamps. Its command is compared with the first one recorded after
+    that, or else with the one that still applied.
 
     Args:
         path: of the bag.
         model: of the robot.
-        policy: a file, or the name of a shipped one or of a baseline.
+        policy: a file, or the name of a shipped policy or of a baseline.
         topics: role -> topic, see `playback.chosen`.
-        goal: (2,) in `map` [m], where the first odometry is what it says. None takes in its place
-            where the robot was `ahead_s` later: the driver's intention, in hindsight.
-        ahead_s: see there [s].
+        goal: (2,) in `map` [m], in which the first odometry is taken at face value. None uses the
+            robot's position `ahead_s` later instead: the driver's intention, in hindsight.
+        ahead_s: see `goal` [s].
 
     Raises:
         RecordingError: the bag can't be used, or lacks scans or commands.
@@ -139,7 +138,7 @@ def shadow(
 def _moments(
     playback: Playback, messages: Mapping[str, list[Message]], model: SimulatorModel
 ) -> list[_Moment]:
-    pace, moments = Pace(model.control_period), list[_Moment]()
+    pace, moments = ActionPace(model.control_period), list[_Moment]()
     held: tuple[int, Array] | None = None
     acted_ns = 0
     for role, message in in_order(messages):
@@ -157,9 +156,9 @@ def _moments(
         scan_ns = newest[SCAN].stamp_ns
         if newest[ODOM].stamp_ns < scan_ns or scan_ns <= acted_ns:
             continue
-        if not pace.due(scan_ns * NANO + JITTER * model.control_period):
+        if not pace.due(scan_ns * S_PER_NS + JITTER * model.control_period):
             continue
-        pace.acted(scan_ns * NANO)
+        pace.acted(scan_ns * S_PER_NS)
         acted_ns = scan_ns
         _hold(moments, held)
         view = playback.middleware.view(playback.middleware.newest_ns or scan_ns)
@@ -169,17 +168,17 @@ def _moments(
 
 
 def _hold(moments: list[_Moment], held: tuple[int, Array] | None) -> None:
-    """The newest moment's command is the one that held, if none came after it."""
+    """Gives the newest moment the command that still applied, if none came after it."""
     if moments and moments[-1].driven is None and held is not None:
-        age_s = (moments[-1].receive_ns - held[0]) * NANO
+        age_s = (moments[-1].receive_ns - held[0]) * S_PER_NS
         moments[-1].driven = held[1] if age_s <= HELD_S else None
 
 
 def _goals(moments: list[_Moment], goal: ArrayLike | None, ahead_s: float) -> Array:
-    """(T, 2) the goal of each moment."""
+    """(T, 2) goal of each moment."""
     if goal is not None:
         return np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
-    times = np.array([moment.stamp_ns for moment in moments]) * NANO
+    times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
     places = np.array([moment.view.pose[:2] for moment in moments])
     return np.stack([np.interp(times + ahead_s, times, place) for place in places.T], axis=-1)
 
@@ -208,7 +207,7 @@ def _answered(moments: list[_Moment], goals: Array, name: str, model: SimulatorM
     return Shadow(
         tuple(one.name for one in robot.command),
         tuple(one.unit for one in robot.command),
-        (stamps - stamps[0]) * NANO,
+        (stamps - stamps[0]) * S_PER_NS,
         poses, aims, wanted, driven,
         np.maximum(np.abs(robot.command_low), np.abs(robot.command_high)),
         skipped,

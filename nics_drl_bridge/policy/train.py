@@ -1,9 +1,14 @@
-"""Training a policy with Stable-Baselines3 on the vector env: begun, kept, taken up again."""
+"""Trains a policy with Stable-Baselines3 on the vector env, with checkpoints and resumption.
+
+A training run: several seeds, each trained, evaluated, and saved in its own folder.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,35 +17,50 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import configure
 
+from nics_drl_bridge.config import dump_yaml, load_yaml
+from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, shortened
+from nics_drl_bridge.files import write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.policy.evaluation_batch import FIRST_SEED, Outcomes, drive_worlds
-from nics_drl_bridge.policy.train_actor import Actor
-from nics_drl_bridge.policy.train_algorithms import act_of, make_algorithm
-from nics_drl_bridge.policy.train_checkpoint import read_checkpoint, resume, save_checkpoint
-from nics_drl_bridge.policy.train_normaliser import observed
-from nics_drl_bridge.policy.train_progress import Companion, Progress
+from nics_drl_bridge.policy.evaluation_batch import (
+    FIRST_SEED,
+    Outcomes,
+    Summary,
+    drive_worlds,
+    summarise,
+)
+from nics_drl_bridge.policy.statistics import ConfidenceInterval
+from nics_drl_bridge.policy.train_algorithms import Actor, act_of, make_algorithm, observed
+from nics_drl_bridge.policy.train_checkpoint import (
+    Companion,
+    Progress,
+    read_checkpoint,
+    resume,
+    save_checkpoint,
+)
+from nics_drl_bridge.policy.train_export import export_policy
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
+from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.world import World
 
 CHECKPOINT = "checkpoint.pt"
 SEEDS = 2**40
 Tell = Callable[[Progress], None]
 LOG_EVERY = {"ppo": 1, "sac": 1000}
-"""Rollouts, or episodes, between two entries of TensorBoard."""
+"""Roll-outs (PPO) or episodes (SAC) between two entries of TensorBoard."""
 
 
 @dataclass(frozen=True)
 class Trained:
-    """A training that has ended.
+    """A finished training.
 
     Attributes:
-        algorithm: with its policy; on Ray only the part that acts.
-        steps: environment steps of all.
+        algorithm: with its policy; on Ray only the acting part.
+        steps: environment steps of all worlds together.
         wall_s: time that this process spent on it [s].
-        stepping_s: of which in the simulator [s].
+        stepping_s: part of it in the simulator [s].
     """
 
     algorithm: BaseAlgorithm | Actor
@@ -58,18 +78,18 @@ def train(
 ) -> Trained:
     """Trains one policy.
 
-    Interrupted and taken up again, it comes to the same weights, to the bit, as without a break:
-    a checkpoint holds the network, the optimiser, all random generators and all worlds.
+    An interrupted and resumed training gives bit-identical weights to an uninterrupted one: a
+    checkpoint contains the network, the optimiser, all random generators and all worlds.
 
     Args:
         settings: what to learn.
-        seed: of all that is drawn.
-        folder: for checkpoint and TensorBoard's logs; made when missing.
-        tell: is told of the progress, some times a second.
-        resumed: whether to go on from the checkpoint in `folder`.
+        seed: of all random numbers.
+        folder: for checkpoint and TensorBoard logs; created if missing.
+        tell: called with the progress, a few times per second.
+        resumed: True continues from the checkpoint in `folder`.
 
     Raises:
-        ConfigError: settings that do not fit together, or no checkpoint that fits them.
+        ConfigError: the settings are inconsistent, or no checkpoint fits them.
     """
     begin, path = time.perf_counter(), folder / CHECKPOINT
     content = read_checkpoint(path) if resumed else None
@@ -100,12 +120,12 @@ def make_train_env(
     model: SimulatorModel | None = None,
     scenes: Mapping[str, World] | None = None,
 ) -> TrainVecEnv:
-    """The worlds that settings name, side by side.
+    """Makes the worlds of the settings in one env.
 
     Args:
         settings: of the training.
-        model: of the robot, where it is open already.
-        scenes: name -> world, where they are loaded already.
+        model: of the robot, if it is already open.
+        scenes: name -> world, if they are already loaded.
     """
     model = model or open_model(settings.robot)
     return TrainVecEnv(
@@ -124,7 +144,7 @@ def _begin(settings: TrainingSettings, env: TrainVecEnv, seed: int) -> BaseAlgor
     rng = np.random.default_rng(seed)
     env.seed(int(rng.integers(SEEDS)))
     algorithm = make_algorithm(settings, env, seed, observed(env, rng))
-    env.seed(int(rng.integers(SEEDS)))  # the algorithm gave its own seed, whose next are near
+    env.seed(int(rng.integers(SEEDS)))  # replaces the algorithm's seed, near those of other runs
     return algorithm
 
 
@@ -135,7 +155,7 @@ def _again(
     env: TrainVecEnv,
     path: Path,
 ) -> BaseAlgorithm:
-    """The algorithm of a checkpoint. Raises ConfigError when it is of another training."""
+    """Restores the algorithm of a checkpoint. Raises ConfigError if it is of another training."""
     check_same(content["about"], about, path)
     size = int(np.prod(env.observation_space.shape))
     algorithm = make_algorithm(settings, env, about["seed"], (np.zeros(size), np.ones(size)))
@@ -150,10 +170,10 @@ def _again(
 
 
 def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
-    """Raises ConfigError unless a checkpoint is of the settings and seed of a training.
+    """Raises ConfigError unless a checkpoint has the settings and seed of a training.
 
     Args:
-        old: seed and settings that the checkpoint is of.
+        old: seed and settings of the checkpoint.
         new: those of the training.
         path: of the checkpoint.
     """
@@ -176,9 +196,149 @@ def evaluate(
     episodes: int,
     model: SimulatorModel | None = None,
 ) -> Outcomes:
-    """Episodes of the evaluation protocol in a world, with the policy of an algorithm."""
+    """Drives the episodes of the evaluation protocol in a world with an algorithm's policy."""
     env = BridgeVectorEnv(
         episodes, model or open_model(settings.robot), world, settings.task,
         settings.task_options, settings.max_episode_steps, randomisation=settings.randomisation,
     )  # fmt: skip
     return drive_worlds(env, act_of(algorithm), range(FIRST_SEED, FIRST_SEED + episodes))
+
+
+SETTINGS, EVALUATION, POLICY = "settings.yaml", "evaluation.json", "policy.onnx"
+GREATEST_SEED = 2**32 - 1
+"""Largest seed of numpy's global generator, from which Stable-Baselines3 draws."""
+Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]
+"""A function like `train`: of settings, seed, folder, progress callback and `resumed`."""
+
+
+@dataclass(frozen=True)
+class SeedResult:
+    """Result of one seed.
+
+    Attributes:
+        seed: of the training.
+        trained: the training that ended, with its policy.
+        summaries: world -> evaluation of the policy there.
+    """
+
+    seed: int
+    trained: Trained
+    summaries: dict[str, Summary]
+
+
+@dataclass(frozen=True)
+class TrainOrder:
+    """An order for a training run.
+
+    Attributes:
+        settings: what to learn; for a resumed run its own, see `settings_of`.
+        seeds: of the trainings.
+        out: folder of the run; each seed gets one below it.
+        episodes: number of episodes of the evaluation in each world.
+        resumed: True continues from the existing checkpoints.
+        command: the user's command line, for the policy files.
+    """
+
+    settings: TrainingSettings
+    seeds: Sequence[int]
+    out: Path
+    episodes: int
+    resumed: bool = False
+    command: str = ""
+
+
+def run(
+    order: TrainOrder,
+    tell: Tell = lambda _: None,
+    done: Callable[[SeedResult], None] = lambda _: None,
+    learn: Learn = train,
+) -> list[SeedResult]:
+    """Trains seed after seed and evaluates each in its training worlds.
+
+    Args:
+        order: the order.
+        tell: called with the progress.
+        done: called with the result of each seed.
+        learn: trains one policy.
+
+    Raises:
+        ConfigError: the folder already contains a run, or none to resume.
+    """
+    _check(order.seeds, order.out, order.resumed)
+    settings = order.settings
+    write_text(order.out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
+    results = []
+    for seed in order.seeds:
+        folder = order.out / f"seed_{seed}"
+        begun = (folder / CHECKPOINT).is_file()
+        trained = learn(settings, seed, folder, tell, order.resumed and begun)
+        result = SeedResult(seed, trained, _evaluated(settings, trained, order.episodes))
+        plain = {world: dataclasses.asdict(one) for world, one in result.summaries.items()}
+        write_text(folder / EVALUATION, json.dumps(plain, indent=2) + "\n")
+        export(settings, result, order.command, folder / POLICY)
+        done(result)
+        results.append(result)
+    return results
+
+
+def export(settings: TrainingSettings, result: SeedResult, command: str, path: Path) -> None:
+    """Writes the policy file, which records the policy's origin and its success rates.
+
+    Args:
+        settings: of the training.
+        result: of one seed.
+        command: the user's command line.
+        path: of the file, `*.onnx`.
+    """
+    model = open_model(settings.robot)
+    task = make_task(settings.task, model, settings.task_options)
+    rates = {f"success in {world}": one.success.value for world, one in result.summaries.items()}
+    provenance = {"command": command, "seed": result.seed, "steps": result.trained.steps, **rates}
+    export_policy(result.trained.algorithm, task, model, path, provenance=provenance)
+
+
+def _check(seeds: Sequence[int], out: Path, resumed: bool) -> None:
+    checked_seeds(seeds, GREATEST_SEED)
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise ConfigError(f"seeds {list(seeds)}: give one or more, none twice.")
+    begun = any((out / f"seed_{seed}" / CHECKPOINT).is_file() for seed in seeds)
+    if begun and not resumed:
+        raise ConfigError(
+            f"{out}: holds checkpoints of these seeds; add --resume, or choose another --out."
+        )
+    if resumed and not begun:
+        raise ConfigError(f"{out}: holds no checkpoint of these seeds; leave out --resume.")
+
+
+def settings_of(out: Path) -> TrainingSettings:
+    """Reads the settings of an existing run. Raises ConfigError if there is none."""
+    if not (out / SETTINGS).is_file():
+        raise ConfigError(f"{out}: holds no {SETTINGS}; name the folder of a run with --out.")
+    return load_yaml(out / SETTINGS, TrainingSettings)
+
+
+def _evaluated(settings: TrainingSettings, trained: Trained, episodes: int) -> dict[str, Summary]:
+    model = open_model(settings.robot)
+    return {
+        world: summarise(
+            evaluate(trained.algorithm, settings, world, episodes, model), model.control_period
+        )
+        for world in settings.worlds
+    }
+
+
+def line_of(summary: Summary) -> str:
+    """Formats a summary as text, every figure with its 95 % interval."""
+    shares = (summary.success, summary.collision, summary.time_out)
+    named = zip(("success", "collision", "time-out"), shares, strict=True)
+    rates = ", ".join(f"{name} {_percent(share)}" for name, share in named)
+    length, time = _amount(summary.length, "m"), _amount(summary.time, "s")
+    return f"{rates}, path {length}, time {time} of {summary.episodes} episodes"
+
+
+def _percent(share: ConfidenceInterval) -> str:
+    return f"{100 * share.value:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})"
+
+
+def _amount(value: ConfidenceInterval, unit: str) -> str:
+    return f"{value.value:.2f} {unit} ({value.low:.2f} to {value.high:.2f})"

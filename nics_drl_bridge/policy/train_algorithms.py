@@ -1,7 +1,14 @@
-"""PPO and SAC of Stable-Baselines3, made from settings."""
+"""PPO and SAC of Stable-Baselines3, built from settings.
+
+Normaliser of observations, a part of the network so that it can't get lost.
+
+The acting part of a network as a separate module: normaliser and layers.
+"""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -10,34 +17,34 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecEnv
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.policy.evaluation_batch import Act
-from nics_drl_bridge.policy.train_actor import Actor
-from nics_drl_bridge.policy.train_normaliser import Normaliser
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import PpoSettings, SacSettings, TrainingSettings
 
 Array = NDArray[np.float64]
 RECENT = 1000
-"""Episodes that the success rate of the progress is of."""
+"""Number of episodes over which the progress reports its rates."""
 LEAST_RATE = 0.02
-"""Share of the learning rate of PPO at the end."""
+"""Share of PPO's learning rate that is left at the end."""
 
 
 def make_algorithm(
     settings: TrainingSettings, env: TrainVecEnv, seed: int, normaliser: tuple[Array, Array]
 ) -> BaseAlgorithm:
-    """An algorithm that has learned nothing yet.
+    """Makes an untrained algorithm.
 
     Args:
         settings: of the training.
-        env: to learn on.
-        seed: of the network's weights and all that the algorithm draws.
+        env: the training env.
+        seed: of the network's weights and all random numbers of the algorithm.
         normaliser: mean and standard deviation (O,) of the observations.
 
     Raises:
-        ConfigError: the algorithm does not serve the task.
+        ConfigError: the algorithm does not suit the task.
     """
     check_serves(settings, env)
     torch.set_num_threads(settings.threads)
@@ -53,7 +60,7 @@ def make_algorithm(
 
 
 def check_serves(settings: TrainingSettings, env: TrainVecEnv) -> None:
-    """Raises ConfigError when the algorithm does not serve the task."""
+    """Raises ConfigError if the algorithm does not suit the task."""
     if len(env.observation_space.shape) != 1:
         raise ConfigError(
             f"task {settings.task!r}: shows {env.observation_space.shape}, and training "
@@ -112,7 +119,7 @@ def _sac(
 
 
 def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
-    """What the policy of an algorithm does at its best: without the noise of exploration."""
+    """Returns the deterministic policy of an algorithm, without exploration noise."""
 
     def act(observations: NDArray[np.float32]) -> NDArray[Any]:
         seen = torch.as_tensor(observations)
@@ -123,3 +130,110 @@ def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
             return np.asarray(policy._predict(seen, deterministic=True).numpy())
 
     return act
+
+
+LEAST_STD = 0.05
+LIMIT = 5.0
+LOOKS = 64
+
+
+class Normaliser(BaseFeaturesExtractor):
+    """First layer of actor and critic: (observation - mean) / std, cut at +-5; not trained.
+
+    Args:
+        space: observation space, Box (O,).
+        mean, std: (O,), see `observed`.
+    """
+
+    mean: torch.Tensor
+    std: torch.Tensor
+
+    def __init__(self, space: gymnasium.spaces.Box, mean: Array, std: Array) -> None:
+        super().__init__(space, features_dim=int(np.prod(space.shape)))
+        self.register_buffer("mean", torch.as_tensor(mean, dtype=torch.float32))
+        self.register_buffer("std", torch.as_tensor(std, dtype=torch.float32))
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Normalises observations (N, O)."""
+        return torch.clamp((observations - self.mean) / self.std, -LIMIT, LIMIT)
+
+
+def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Mean and standard deviation (O,) of the observations under random actions.
+
+    Each world holds its action for several steps, because otherwise a robot with inertia would stay
+    in place. A part that hardly varies gets a deviation of 0.05. The state of the env is arbitrary
+    afterwards.
+    """
+    seen = [np.array(env.reset())]
+    for k in range(LOOKS):
+        if k % 8 == 0:
+            actions = _random_actions(env, rng)
+        seen.append(np.array(env.step(actions)[0]))
+    rows = np.concatenate(seen).reshape(-1, seen[0].shape[-1]).astype(np.float64)
+    return rows.mean(axis=0), np.maximum(rows.std(axis=0), LEAST_STD)
+
+
+def _random_actions(env: VecEnv, rng: np.random.Generator) -> NDArray[Any]:
+    space = env.action_space
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return np.asarray(rng.integers(space.n, size=env.num_envs))
+    return rng.uniform(-1.0, 1.0, (env.num_envs, *space.shape)).astype(np.float32)
+
+
+GAIN = 2.0**0.5
+ACTION_GAIN = 0.01
+"""Initial gain of an actor's last layer: all its actions are near zero."""
+
+
+class Actor(torch.nn.Module):
+    """Maps observations (n, O) to raw actions (n, C), or to logits (n, A) of discrete ones.
+
+    Args:
+        observations: space of one observation, Box (O,).
+        actions: space of one action.
+        hidden: widths of the hidden layers.
+        normaliser: mean and standard deviation (O,) of the observations.
+    """
+
+    def __init__(
+        self,
+        observations: gymnasium.spaces.Box,
+        actions: gymnasium.spaces.Box | gymnasium.spaces.Discrete,
+        hidden: Sequence[int],
+        normaliser: tuple[Array, Array],
+    ) -> None:
+        super().__init__()
+        if isinstance(actions, gymnasium.spaces.Discrete):
+            self.discrete, count = True, int(actions.n)
+        else:
+            self.discrete, count = False, int(np.prod(actions.shape))
+        self.normaliser = Normaliser(observations, *normaliser)
+        self.layers = layers_of([self.normaliser.features_dim, *hidden, count], ACTION_GAIN)
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        """Parameters of the distribution of actions: its mode if continuous, else logits."""
+        raw: torch.Tensor = self.layers(self.normaliser(observations))
+        return raw
+
+    def best(self, observations: torch.Tensor) -> torch.Tensor:
+        """The most likely actions (n, C), or (n,) discrete."""
+        raw = self(observations)
+        return raw.argmax(dim=1) if self.discrete else raw
+
+
+def layers_of(widths: Sequence[int], gain: float) -> torch.nn.Sequential:
+    """Linear layers with tanh in between, initialised orthogonally as in Stable-Baselines3.
+
+    Args:
+        widths: of input, hidden layers and output.
+        gain: of the last layer.
+    """
+    layers: list[torch.nn.Module] = []
+    for ins, outs in itertools.pairwise(widths):
+        layers += [torch.nn.Linear(ins, outs), torch.nn.Tanh()]
+    del layers[-1]
+    for layer in layers[::2]:
+        torch.nn.init.orthogonal_(layer.weight, gain if layer is layers[-1] else GAIN)
+        torch.nn.init.zeros_(layer.bias)
+    return torch.nn.Sequential(*layers)

@@ -1,8 +1,11 @@
-"""Checkpoints of a training: all that it needs to go on with the same bits.
+"""Checkpoints of a training: all that it needs to continue bit-identically.
 
-A checkpoint is the trainer's own and is never deployed. It holds tensors, numbers and text only
-and is read by PyTorch's `weights_only` reader, which makes no other objects: nothing in it can
-run code.
+A checkpoint is for training only and is never deployed. It contains only tensors, numbers and text
+and is read by PyTorch's `weights_only` reader, which builds no other objects: it can't run code.
+
+Progress of a training: reported to the user and to TensorBoard; checkpoints.
+
+Snapshots of a vector env: saves and restores all that changes while it runs.
 """
 
 from __future__ import annotations
@@ -10,8 +13,11 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import time
 import zipfile
 from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +25,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 
-from nics_drl_bridge.env.vector_state import restore, snapshot
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_sealed, sealed, write_bytes
+from nics_drl_bridge.policy.train_algorithms import RECENT
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 
 FORMAT = "nics_drl_bridge/checkpoint/2"
 MOST_BYTES = 4 * 2**30
-"""Of a file, which holds all of SAC's buffer."""
+"""Maximum size of a file, which contains all of SAC's buffer."""
 COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
 REPLAYED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
@@ -37,13 +45,13 @@ REPLAYED = ("observations", "next_observations", "actions", "rewards", "dones", 
 def save_checkpoint(
     path: Path, algorithm: BaseAlgorithm, env: TrainVecEnv, about: dict[str, Any]
 ) -> None:
-    """Writes a checkpoint, whole or not at all, between two rollouts.
+    """Writes a checkpoint, completely or not at all, between two roll-outs.
 
     Args:
         path: the file.
-        algorithm: that learns on `env`.
-        env: where it stands.
-        about: plain data that tell which training it is of.
+        algorithm: the algorithm that learns on `env`.
+        env: the training env.
+        about: plain data that identify the training.
     """
     content = {
         "format": FORMAT,
@@ -64,21 +72,21 @@ _LAST = ("_last_obs", "_last_episode_starts")
 
 
 def write_content(path: Path, content: dict[str, Any]) -> None:
-    """Writes a checkpoint of tensors, numbers and text, whole or not at all."""
+    """Writes a checkpoint of tensors, numbers and text, completely or not at all."""
     buffer = io.BytesIO()
     torch.save(content, buffer)
     write_bytes(path, sealed(buffer.getvalue()))
 
 
 def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
-    """The content of a checkpoint; `about` is that of `save_checkpoint`.
+    """Reads the content of a checkpoint; `about` is that of `save_checkpoint`.
 
     Args:
         path: the file.
-        kind: which format it is to have.
+        kind: the expected format.
 
     Raises:
-        ConfigError: there is none, or it is damaged or of another kind.
+        ConfigError: there is none, or it is damaged or of another format.
     """
     if not path.is_file():
         raise ConfigError(f"{path}: no such checkpoint; leave out --resume to begin anew.")
@@ -92,7 +100,7 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
                 if any(member.compress_type for member in archive.infolist()):
                     raise ValueError("torch packs nothing")
             file.seek(0)
-            # What else a pickle could do, it does not do here; with torch before 2.6 it could.
+            # weights_only blocks whatever else a pickle could do; before torch 2.6 it had gaps.
             content: Any = torch.load(file, map_location="cpu", weights_only=True)
         _check_tensors(content, size)
         found = str(content["format"])
@@ -111,7 +119,7 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
 
 
 def _check_tensors(content: Any, size: int) -> None:
-    """Raises ValueError for a tensor that is larger than the file, as one repeated number is."""
+    """Raises ValueError for a tensor larger than the file, such as one repeated number."""
     parts = content.values() if isinstance(content, dict) else content
     for part in parts if isinstance(content, dict | list | tuple) else ():
         _check_tensors(part, size)
@@ -120,7 +128,7 @@ def _check_tensors(content: Any, size: int) -> None:
 
 
 def resume(content: dict[str, Any], algorithm: BaseAlgorithm, env: TrainVecEnv) -> None:
-    """Puts a checkpoint into an algorithm and an env that are made as those were."""
+    """Puts a checkpoint into an algorithm and an env made with the same arguments."""
     algorithm.set_parameters(content["parameters"], exact_match=True)
     for name, value in content["variables"].items():
         getattr(algorithm, name).data.copy_(value)
@@ -143,7 +151,7 @@ def _tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
 
 
 def _variables(algorithm: BaseAlgorithm) -> dict[str, torch.Tensor]:
-    """What an algorithm learns beside its networks: the temperature of SAC."""
+    """Learned variables other than the networks: the temperature of SAC."""
     names = algorithm._get_torch_save_params()[1]
     return {name: getattr(algorithm, name).detach().clone() for name in names}
 
@@ -164,7 +172,7 @@ def _fill_replay(algorithm: OffPolicyAlgorithm, content: dict[str, Any]) -> None
 
 
 def _random_state(algorithm: BaseAlgorithm) -> dict[str, Any]:
-    """Of all generators that draw: PyTorch's, numpy's global one, that of the action space."""
+    """State of all random generators: PyTorch's, numpy's global one, the action space's."""
     shared = np.random.get_state(legacy=False)  # noqa: NPY002 - Stable-Baselines3 draws from it
     spaces = algorithm.action_space.np_random.bit_generator.state
     return {
@@ -181,3 +189,148 @@ def _set_random_state(algorithm: BaseAlgorithm, content: dict[str, Any]) -> None
     shared["state"]["key"] = np.array(shared["state"]["key"], np.uint32)
     np.random.set_state(shared)  # noqa: NPY002 - as above
     algorithm.action_space.np_random.bit_generator.state = json.loads(content["actions"])
+
+
+TOLD_S = 0.2
+"""Minimum time between two reports of the progress [s]."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Progress of a training.
+
+    Attributes:
+        seed: of the training.
+        steps: environment steps done.
+        total: environment steps of the whole training.
+        success, collision: shares of the last 1000 episodes; NaN before the first has ended.
+        steps_per_s: since this process began or resumed it.
+        env_share: share of the wall time that went to the simulator.
+    """
+
+    seed: int
+    steps: int
+    total: int
+    success: float
+    collision: float
+    steps_per_s: float
+    env_share: float
+
+
+class Companion(BaseCallback):
+    """Callback that monitors each step and roll-out of a training.
+
+    Args:
+        env: the training env.
+        seed: of the training.
+        total: environment steps of the whole training.
+        checkpoint_every: environment steps between two calls of `save`.
+        save: saves everything; called between two roll-outs only.
+        tell: called with the progress.
+    """
+
+    def __init__(
+        self,
+        env: TrainVecEnv,
+        seed: int,
+        total: int,
+        checkpoint_every: int,
+        save: Callable[[], None],
+        tell: Callable[[Progress], None],
+    ) -> None:
+        super().__init__()
+        self._env, self._seed, self._total = env, seed, total
+        self._every, self._save, self._tell = checkpoint_every, save, tell
+        self._collisions: deque[bool] = deque(maxlen=RECENT)
+        self._begin = self._told = time.perf_counter()
+        self._first = self._saved = 0
+        self._busy = env.stepping_s
+
+    def _on_training_start(self) -> None:
+        self._begin, self._busy = time.perf_counter(), self._env.stepping_s
+        self._first = self._saved = self.num_timesteps
+
+    def _on_rollout_start(self) -> None:
+        """Saves a checkpoint if due: between two roll-outs nothing is half done."""
+        if self.model.num_timesteps // self._every > self._saved // self._every:
+            self._save()
+            self._saved = self.model.num_timesteps
+
+    def _on_step(self) -> bool:
+        for n in np.flatnonzero(self.locals["dones"]):
+            self._collisions.append(bool(self.locals["infos"][n].get("collision", False)))
+        return True
+
+    def _on_rollout_end(self) -> None:
+        now = time.perf_counter()
+        if now - self._told < TOLD_S and self.num_timesteps < self._total:
+            return
+        self._told = now
+        progress = self.progress()
+        self.logger.record("rollout/collision_rate", progress.collision)
+        self.logger.record("time/env_share", progress.env_share)
+        self._tell(progress)
+
+    def progress(self) -> Progress:
+        """The current progress."""
+        taken = max(time.perf_counter() - self._begin, 1e-9)
+        successes = self.model.ep_success_buffer
+        return Progress(
+            self._seed,
+            self.num_timesteps,
+            self._total,
+            float(np.mean(successes)) if successes else np.nan,
+            float(np.mean(self._collisions)) if self._collisions else np.nan,
+            (self.num_timesteps - self._first) / taken,
+            (self._env.stepping_s - self._busy) / taken,
+        )
+
+
+Arrays = dict[str, NDArray[Any]]
+MEMORY, DRAWN = "memory.", "drawn."
+"""Prefixes of the arrays whose names depend on the running episodes."""
+
+
+def snapshot(env: BridgeVectorEnv) -> Arrays:
+    """Copies all that changes in a vector env, by name.
+
+    An env with the same arguments continues bit-identically from it after `restore`.
+    """
+    found = dict(env.changing)
+    found |= {MEMORY + name: rows for name, rows in env.memory.items()}
+    found |= {DRAWN + name: rows for name, rows in env.simulator.drawn.items()}
+    return {name: rows.copy() for name, rows in found.items()}
+
+
+def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
+    """Puts a snapshot into a vector env with the same arguments.
+
+    Raises:
+        ConfigError: the snapshot is of an env with other worlds, robots, lidar or task.
+    """
+    targets = env.changing
+    known = {name for name in state if not name.startswith((MEMORY, DRAWN))}
+    for name in sorted(known ^ set(targets)):
+        raise ConfigError(f"state of a vector env: {name!r} is in one of both only; {_SAME}")
+    for name, target in targets.items():
+        if state[name].shape != target.shape or state[name].dtype != target.dtype:
+            raise ConfigError(
+                f"state of a vector env: {name!r} is of shape {state[name].shape}, this env's of "
+                f"{target.shape}; {_SAME}"
+            )
+    for name, target in targets.items():
+        target[...] = state[name]  # in place: the compiled steps refer to these arrays
+    env.memory = _below(MEMORY, state)
+    env.simulator.drawn = _below(DRAWN, state)
+    env.ready = bool((targets["episode"] >= 0).all())
+
+
+_SAME = "make the env with the arguments that it had."
+
+
+def _below(prefix: str, state: Mapping[str, NDArray[Any]]) -> Arrays:
+    return {
+        name.removeprefix(prefix): np.array(rows)
+        for name, rows in state.items()
+        if name.startswith(prefix)
+    }

@@ -1,6 +1,6 @@
 """From a trained network to a policy file: normaliser, network and commands in one graph.
 
-Stable-Baselines3's own recipe for ONNX leaves out clipping, unscaling and the normaliser.
+Stable-Baselines3's own recipe for ONNX omits clipping, unscaling and the normaliser.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ Normaliser = tuple[ArrayLike, ArrayLike, float]
 OPSET = 17
 GOLDEN_SEED = 0
 GOLDEN_SPREAD = 3.0
-"""Golden observations lie within this of zero where their limits are wider."""
+"""Golden observations lie within this distance of zero if their limits are wider."""
 
 
 class Deployed(torch.nn.Module):  # type: ignore[misc]
-    """What the graph of a policy file computes.
+    """Computation of the graph of a policy file.
 
     Args:
-        actor: from observations (n, O) to raw actions (n, C), or logits (n, A) of discrete ones.
+        actor: maps observations (n, O) to raw actions (n, C), or logits (n, A) of discrete ones.
         task: gives the commands and their limits.
-        normaliser: mean (O,), standard deviation (O,), limit; None where the actor has its own.
+        normaliser: mean (O,), standard deviation (O,), limit; None if the actor has its own.
     """
 
     def __init__(self, actor: torch.nn.Module, task: Task, normaliser: Normaliser | None) -> None:
@@ -62,7 +62,7 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
             self.register_buffer("high", _vector(task.robot.command_high))
 
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Actions (n, C) in [-1, 1] or (n,), and commands (n, C) in SI, of observations (n, O)."""
+        """Actions (n, C) in [-1, 1] or (n,), and commands (n, C) in SI, for observations (n, O)."""
         seen = observation
         if self.limit is not None:
             seen = torch.clamp((seen - self.mean) / self.std, -self.limit, self.limit)
@@ -100,14 +100,14 @@ class _Squashed(torch.nn.Module):  # type: ignore[misc]
 
 
 def actor_of(model: Any) -> torch.nn.Module:
-    """The part of a trained model that acts, without exploration.
+    """Returns the acting part of a trained model, without exploration.
 
     Args:
-        model: an algorithm or policy of Stable-Baselines3 (PPO, A2C, SAC), or any module from
+        model: an algorithm or policy of Stable-Baselines3 (PPO, A2C, SAC), or any module that maps
             observations (n, O) to raw actions (n, C) or logits (n, A).
 
     Raises:
-        ConfigError: none of these.
+        ConfigError: it is none of these.
     """
     policy = getattr(model, "policy", model)
     if hasattr(policy, "action_net") and hasattr(policy, "mlp_extractor"):
@@ -133,15 +133,15 @@ def export_policy(
 
     Args:
         model: see `actor_of`.
-        task: that it was trained on.
-        simulator_model: that it was trained in.
+        task: the task that it was trained on.
+        simulator_model: the model that it was trained in.
         path: of the file, `*.onnx`.
         normaliser: mean (O,), standard deviation (O,) and limit of the normalised observations.
-        provenance: command, seed and so on: words and numbers.
+        provenance: command, seed and so on, as strings and numbers.
 
     Raises:
         ConfigError: the model can't be exported.
-        PolicyError: the file does not give what the model gives.
+        PolicyError: the file does not reproduce the model's outputs.
     """
     file = Path(path)
     if file.suffix != SUFFIX:
@@ -169,7 +169,7 @@ def export_policy(
 
 
 def golden_observations(task: Task) -> Rows:
-    """(16, O) observations within their limits, always the same."""
+    """(16, O) fixed observations within their limits."""
     space = task.observation_space
     low = np.maximum(space.low, -GOLDEN_SPREAD)
     high = np.minimum(space.high, GOLDEN_SPREAD)
@@ -178,11 +178,11 @@ def golden_observations(task: Task) -> Rows:
 
 
 def _graph(deployed: Deployed, task: Task) -> Any:
-    """The ModelProto of a module."""
+    """Exports a module as a ModelProto."""
     example = torch.zeros(1, task.observation_space.shape[0])
     names, buffer = [onnx_graph.ACTION, onnx_graph.COMMAND], io.BytesIO()
     with warnings.catch_warnings():
-        # This exporter is being replaced; the new one takes several times longer.
+        # This exporter is deprecated; the new one takes several times longer.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             deployed, (example,), buffer,
@@ -194,7 +194,7 @@ def _graph(deployed: Deployed, task: Task) -> Any:
 
 
 def _compare(deployed: Deployed, seen: Rows, action: Rows, command: Rows, source: str) -> None:
-    """Raises PolicyError unless the graph gives what the module gives."""
+    """Raises PolicyError unless the graph reproduces the module's outputs."""
     with torch.no_grad():
         wanted = [part.numpy() for part in deployed(torch.as_tensor(seen))]
     for name, ours, theirs in zip(("actions", "commands"), (action, command), wanted, strict=True):

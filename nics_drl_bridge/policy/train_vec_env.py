@@ -22,19 +22,20 @@ Observation = NDArray[np.float32]
 class TrainVecEnv(VecEnv):
     """Feeds Stable-Baselines3 from a `BridgeVectorEnv`, or from several side by side.
 
-    The observations are the vector env's own array of the step; what is done for one world at a
-    time concerns only those that ended: their `terminal_observation`, `TimeLimit.truncated`,
-    `is_success` and `collision` in `infos`.
+    The observations are the vector env's own array of the step; only worlds that ended are handled
+    one by one: their `terminal_observation`, `TimeLimit.truncated`, `is_success` and `collision`
+    in `infos`.
 
     Args:
-        envs: of the same spaces, as those of several worlds; their `autoreset_mode` is `SameStep`
-            and their `copy` is True, as the algorithms keep the last observation over a step.
+        envs: with equal spaces, for instance of several worlds; their `autoreset_mode` is
+            `SameStep` and their `copy` is True, as the algorithms keep the last observation over a
+            step.
 
     Attributes:
-        stepping_s: wall time that was spent in the vector envs [s].
+        stepping_s: wall time spent in the vector envs [s].
 
     Raises:
-        ConfigError: an env that is made otherwise, or envs that do not fit together.
+        ConfigError: an env with other arguments, or envs that do not fit together.
     """
 
     def __init__(self, *envs: BridgeVectorEnv) -> None:
@@ -61,7 +62,7 @@ class TrainVecEnv(VecEnv):
         self.stepping_s = 0.0
 
     def reset(self) -> Observation:
-        """Begins an episode in every world, of the seeds given to `seed`."""
+        """Begins an episode in every world, with the seeds given to `seed`."""
         shown = []
         for env, rows in zip(self.envs, self._rows, strict=True):
             given = self._seeds[rows]
@@ -72,13 +73,13 @@ class TrainVecEnv(VecEnv):
         return _together(shown)
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Takes the actions of the next step."""
+        """Stores the actions of the next step."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Observation, NDArray[np.float32], NDArray[np.bool_], list[Any]]:
-        """One control period in every world; see Stable-Baselines3."""
+        """Advances every world by one control period; see Stable-Baselines3."""
         begin = time.perf_counter()
-        for n in self._told:  # fresh ones: an algorithm may still hold those it was given
+        for n in self._told:  # new dicts: an algorithm may still refer to the old ones
             self._infos[n] = {}
         self._told = []
         parts = [self._step_env(env, rows) for env, rows in zip(self.envs, self._rows, strict=True)]
@@ -89,7 +90,7 @@ class TrainVecEnv(VecEnv):
     def _step_env(
         self, env: BridgeVectorEnv, rows: slice
     ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_]]:
-        """Steps one of the envs and tells of those of its worlds that ended."""
+        """Steps one of the envs and fills the infos of its worlds that ended."""
         observation, reward, terminated, truncated, info = env.step(self._actions[rows])
         done = terminated | truncated
         for n in np.flatnonzero(done):
@@ -102,7 +103,7 @@ class TrainVecEnv(VecEnv):
         return observation, reward, done
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of the vector env of each of the worlds."""
+        """An attribute of the vector env of each world."""
         return [getattr(self._env_of(n), attr_name) for n in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
@@ -113,21 +114,21 @@ class TrainVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Calls a method of each vector env once; the result for each of its worlds."""
+        """Calls a method of each vector env once; returns its result for each of its worlds."""
         results = {
             id(env): getattr(env, method_name)(*method_args, **method_kwargs) for env in self.envs
         }
         return [results[id(self._env_of(n))] for n in self._get_indices(indices)]
 
     def _env_of(self, n: int) -> BridgeVectorEnv:
-        """The vector env that world n is in."""
+        """The vector env that contains world n."""
         which = next(k for k, rows in enumerate(self._rows) if n < rows.stop)
         return self.envs[which]
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None
     ) -> list[bool]:
-        """No world is."""
+        """False for every world."""
         return [False] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
@@ -141,11 +142,11 @@ class TrainVecEnv(VecEnv):
 
 
 def _together(parts: list[NDArray[Any]]) -> NDArray[Any]:
-    """Rows of several envs below each other; those of one as they are."""
+    """Concatenates the rows of several envs; those of one are returned unchanged."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _results(final: dict[str, Any], n: np.intp) -> dict[str, Any]:
-    """How the episode of world n ended, as far as its task says."""
+    """Result of the episode of world n, as far as its task reports it."""
     known = {name: final[name][n] for name in ("is_success", "collision") if name in final}
     return {name: bool(np.all(value)) for name, value in known.items()}

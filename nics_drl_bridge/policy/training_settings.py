@@ -1,4 +1,4 @@
-"""Settings of a training: what is learned, where, by which algorithm, for how long."""
+"""Settings of a training: task, worlds, algorithm and duration."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from nics_drl_bridge.config import Schema, find_config, load_yaml, share_folder,
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1, le=10**12)]
 MOST_WORLDS = 65_536
-"""Copies of all worlds together."""
+"""Maximum number of copies of all worlds together."""
 MOST_LAYERS, MOST_WIDE = 16, 8_192
 MOST_KEPT = 2**26
-"""Transitions that are kept at once: of a rollout in all worlds, or of SAC's buffer."""
+"""Maximum number of stored transitions: of a roll-out in all worlds, or of SAC's buffer."""
 Algorithm = Literal["ppo", "sac"]
 
 
@@ -23,17 +23,17 @@ Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
 
 
 class PpoSettings(Schema):
-    """Proximal policy optimisation (Schulman and others 2017), as Stable-Baselines3 has it.
+    """Proximal policy optimisation (Schulman and others 2017), as in Stable-Baselines3.
 
     Attributes:
         learning_rate: at the start; it falls linearly to a fiftieth at the end.
         rollout: steps in each world between two updates.
         batch: transitions of one gradient step.
-        epochs: how often an update goes through the rollouts.
+        epochs: passes of an update through the roll-outs.
         discount, gae_lambda: of the advantages.
         clip: of the ratio of the new policy to the old one.
         entropy: weight of the entropy of the policy.
-        log_std: logarithm of the spread of actions at the start.
+        log_std: logarithm of the standard deviation of actions at the start.
     """
 
     learning_rate: float = Field(default=1e-3, gt=0.0)
@@ -48,16 +48,16 @@ class PpoSettings(Schema):
 
 
 class SacSettings(Schema):
-    """Soft actor-critic (Haarnoja and others 2018), as Stable-Baselines3 has it.
+    """Soft actor-critic (Haarnoja and others 2018), as in Stable-Baselines3.
 
     Attributes:
         learning_rate: of actor, critics and entropy; constant.
-        buffer: transitions that are kept, of all worlds together.
+        buffer: transitions that are stored, of all worlds together.
         batch: transitions of one gradient step.
         updates: gradient steps after each step of the worlds.
         begin_after: transitions of random actions before the first update.
         discount: of later rewards.
-        soft_update: share of the critics that their targets take over in each gradient step.
+        soft_update: share by which the target critics move to the critics in each gradient step.
     """
 
     learning_rate: float = Field(default=1e-3, gt=0.0)
@@ -70,21 +70,21 @@ class SacSettings(Schema):
 
 
 class TrainingSettings(Schema):
-    """A training, as `config/training/*.yaml` has it.
+    """A training, as in `config/training/*.yaml`.
 
     Attributes:
         task: a name, or `path/to/file.py:ClassName`.
         task_options: further arguments of the task's class.
         robot: name of a shipped robot, or the folder of a model.
-        worlds: how many copies of which worlds; names of shipped ones or YAML files.
-        randomisation: what each episode draws anew, a shipped one or a YAML file.
+        worlds: world -> number of copies; names of shipped ones or YAML files.
+        randomisation: quantities drawn in each episode: a shipped one or a YAML file.
         steps: environment steps of all worlds together.
-        max_episode_steps: after so many an episode ends as a time-out.
-        algorithm: which of the two sections below learns.
-        hidden: widths of the hidden layers of actor and critic, each for itself.
-        threads: of PyTorch; sums of several round otherwise than those of one.
+        max_episode_steps: an episode ends as a time-out after this many steps.
+        algorithm: one of the two sections below.
+        hidden: widths of the hidden layers of actor and critic, which share none.
+        threads: of PyTorch; sums over several round differently from those of one.
         checkpoint_every: environment steps between two checkpoints.
-        ppo, sac: of the algorithm.
+        ppo, sac: settings of the algorithms.
     """
 
     task: str = "navigation"
@@ -122,18 +122,18 @@ class TrainingSettings(Schema):
 
     @property
     def title(self) -> str:
-        """What a folder of its runs may be called."""
+        """Suitable name for the folder of its runs."""
         task = self.task.rpartition(":")[2]
         return f"{task}_{Path(self.robot).stem}_{self.algorithm}"
 
     @property
     def num_envs(self) -> int:
-        """N, worlds of all kinds together."""
+        """N, number of worlds of all kinds together."""
         return sum(self.worlds.values())
 
 
 def load_training(name: str | Path) -> TrainingSettings:
-    """Settings by the name of a shipped file (`navigation_differential`), or by path.
+    """Loads settings by the name of a shipped file (`navigation_differential`), or by path.
 
     Raises:
         ConfigError: no such file, or something in it is wrong.
@@ -142,14 +142,14 @@ def load_training(name: str | Path) -> TrainingSettings:
 
 
 def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> TrainingSettings:
-    """Settings as a user chose them.
+    """Settings chosen by the user.
 
     Args:
         task: to learn.
-        name: of shipped settings, or a YAML file; by default those of task and robot, and where
-            none are shipped, the defaults.
-        changes: further keys of `TrainingSettings`; and `world`, names that share the worlds
-            among them.
+        name: of shipped settings, or a YAML file; by default those of task and robot if they are
+            shipped, else the defaults.
+        changes: further keys of `TrainingSettings`; and `world`, names that share the number of
+            worlds.
 
     Raises:
         ConfigError: an unknown name or a wrong value.

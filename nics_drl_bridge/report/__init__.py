@@ -1,1 +1,1 @@
-"""Pictures and pages for people."""
+"""Pictures, HTML pages and diagnostic reports."""

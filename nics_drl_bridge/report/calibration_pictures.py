@@ -1,24 +1,42 @@
-"""Pictures of a calibration: one per estimate that the recording allowed, titled with it."""
+"""Pictures of a calibration: one per estimate that the recording allowed, which is its title.
+
+Picture of the noise of each sensor, and of the robot's drift from its model.
+
+Curves behind the timing estimates: the residual against a shift in time.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.calibration import stamps
-from nics_drl_bridge.calibration.calibrate import tracked_twists
-from nics_drl_bridge.calibration.curves import timing_curves
-from nics_drl_bridge.calibration.estimates import Estimate, estimates
-from nics_drl_bridge.calibration.identify import Identified
-from nics_drl_bridge.calibration.signals import interval_means
-from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.report.drawing import DARK, MEASURED, MODEL, OTHER, png
-from nics_drl_bridge.report.noise_picture import noise
+from nics_drl_bridge.identify import repair
+from nics_drl_bridge.identify.calibrate import tracked_twists
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drift import drift_growth, odometry_residual
+from nics_drl_bridge.identify.identify import Identified
+from nics_drl_bridge.identify.noise import pose_residual
+from nics_drl_bridge.identify.report import CalibratedValue, estimates
+from nics_drl_bridge.identify.signals import interval_means
+from nics_drl_bridge.identify.timing import (
+    moved_commands,
+    nominal_lags,
+    residual_by_shift,
+    response_residual,
+    state_residual,
+)
+from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.report.page import DARK, MEASURED, MODEL, OTHER, png
+from nics_drl_bridge.robot.noise import Level
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.threads import one_blas_thread
 
 Array = NDArray[np.float64]
 
@@ -52,8 +70,10 @@ def calibration_pictures(spec: RobotSpec, identified: Identified) -> dict[str, b
     return {name: picture for name, picture in drawn.items() if picture is not None}
 
 
-def timing(spec: RobotSpec, identified: Identified, found: dict[str, Estimate]) -> bytes | None:
-    """What each shift in time leaves unexplained, with the estimate and its uncertainty."""
+def timing(
+    spec: RobotSpec, identified: Identified, found: dict[str, CalibratedValue]
+) -> bytes | None:
+    """Draws the unexplained part over each shift in time, with the estimate and its uncertainty."""
     curves = timing_curves(identified.recording, spec, identified.calibration)
     if not curves:
         return None
@@ -76,14 +96,14 @@ def timing(spec: RobotSpec, identified: Identified, found: dict[str, Estimate]) 
     return png(figure)
 
 
-def bursts(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
-    """Stamps of the poses as they arrived, and as they were spread."""
+def bursts(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
+    """Draws stamps of the poses as they arrived, and as they were spread."""
     t = identified.recording.pose.t
-    groups = stamps.find_bursts(t)
+    groups = repair.find_bursts(t)
     if groups is None:
         return None
     shown = slice(0, int(BURSTS_SHOWN * groups.size))
-    spread = stamps.spread(t, groups)
+    spread = repair.spread(t, groups)
     figure = Figure(figsize=(9.0, 3.8), layout="constrained")
     axes, intervals = figure.subplots(1, 2)
     number = np.arange(len(t))[shown]
@@ -101,8 +121,8 @@ def bursts(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
     return png(figure)
 
 
-def mounting(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
-    """Velocities of the tracked body and of `base_link`: rotation and lever arm as slopes."""
+def mounting(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
+    """Draws velocities of the tracked body and of `base_link`: rotation and lever arm as slopes."""
     rotation, lever_x, lever_y = (
         found[name] for name in ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
     )
@@ -135,8 +155,8 @@ def _points(axes: Axes, tracked: Sequence[Array], base: Sequence[Array]) -> None
     axes.plot(*base, ".", markersize=3, color=MODEL, label="base_link")
 
 
-def wheels(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
-    """Wheel speeds against the motion: their scale, and which one is the left one."""
+def wheels(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
+    """Draws wheel speeds against the motion: their scale, and which wheel is the left one."""
     stream, calibration = identified.recording.wheels, identified.calibration
     if stream is None or calibration.wheel_scale is None:
         return None
@@ -165,7 +185,7 @@ def wheels(identified: Identified, found: dict[str, Estimate]) -> bytes | None:
     return png(figure)
 
 
-def _plus_minus(estimate: Estimate) -> str:
+def _plus_minus(estimate: CalibratedValue) -> str:
     return estimate.text.replace("+-", "±")
 
 
@@ -173,3 +193,139 @@ def _finish(axes: Axes, title: str) -> None:
     axes.set_title(title, fontsize=10, color=DARK)
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, fontsize=9)
+
+
+BINS = 60
+REACH = 5.0
+"""Histograms end at this many standard deviations."""
+
+
+def noise(spec: RobotSpec, identified: Identified) -> bytes | None:
+    """Draws histograms of the residuals with the normal curve, and the growth of the drift.
+
+    Returns None if the recording is free of noise.
+    """
+    levels, panels = identified.noise, []
+    pose = pose_residual(identified.recording.pose)
+    if pose is not None:
+        panels += [("pose position", levels.pose_position, pose[:, :2].ravel())]
+        panels += [("pose heading", levels.pose_heading, pose[:, 2])]
+    odometry = odometry_residual(
+        identified.recording, identified.calibration, identified.model, identified.samples
+    )
+    if odometry is not None:
+        panels += [("odometry, linear", levels.odom_linear, odometry[:, 0])]
+        panels += [("odometry, angular", levels.odom_angular, odometry[:, 2])]
+    panels = [p for p in panels if p[1].measured and p[1].std > 0.0]
+    grown = drift_growth(identified.recording, identified.calibration, identified.model, spec)
+    drifts = grown is not None and levels.position_drift.measured and bool(grown[1].max() > 1e-9)
+    if not panels and not drifts:
+        return None
+    count = len(panels) + 2 * drifts
+    columns = 2 if count == 4 else min(count, 3)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(4.3 * columns, 3.4 * rows), layout="constrained")
+    grid = list(figure.subplots(rows, columns, squeeze=False).ravel())
+    for axes, (name, level, rest) in zip(grid, panels, strict=False):
+        _histogram(axes, name, level, rest)
+    if drifts and grown is not None:
+        horizon, position, heading = grown
+        rows_ = (
+            ("position", levels.position_drift, position, "m"),
+            ("heading", levels.heading_drift, heading, "rad"),
+        )
+        for axes, row in zip(grid[len(panels) :], rows_, strict=False):
+            _growth(axes, horizon, *row)
+    for axes in grid[count:]:
+        axes.set_axis_off()
+    return png(figure)
+
+
+def _histogram(axes: Axes, name: str, level: Level, rest: Array) -> None:
+    edges = np.linspace(-REACH * level.std, REACH * level.std, BINS + 1)
+    axes.hist(rest - np.median(rest), list(edges), density=True, color=MEASURED, alpha=0.55)
+    normal = np.exp(-0.5 * (edges / level.std) ** 2) / (level.std * np.sqrt(2.0 * np.pi))
+    axes.plot(edges, normal, "--", color=MODEL)
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.set_xlabel(f"residual [{level.unit}]")
+    axes.set_ylabel("density")
+    axes.set_title(f"noise of the {name}\n{_value(level)}", fontsize=10, color=DARK)
+
+
+def _growth(axes: Axes, horizon: Array, name: str, level: Level, error: Array, unit: str) -> None:
+    axes.plot(horizon, error, "o-", color=MEASURED, markersize=4, label="error of the prediction")
+    axes.plot(horizon, level.std * np.sqrt(horizon), "--", color=MODEL, label="the drift alone")
+    axes.set_xlabel("horizon [s]")
+    axes.set_ylabel(f"root mean square [{unit}]")
+    axes.set_title(f"drift of the {name}\n{_value(level)}", fontsize=10, color=DARK)
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False, fontsize=9)
+
+
+def _value(level: Level) -> str:
+    spread = "" if level.uncertainty is None else f" ± {level.uncertainty:.1g}"
+    return f"{level.std:.3g}{spread} {level.unit}"
+
+
+REACH_S = 0.5
+POINTS = 81
+
+
+@dataclass(frozen=True)
+class ShiftCurve:
+    """Residual against an estimated time.
+
+    Attributes:
+        name: of the estimate, as in `Calibration`.
+        value: (n,) trial values of the time [s].
+        unexplained: (n,) root mean square residual, as a share of the signal's spread.
+    """
+
+    name: str
+    value: Array
+    unexplained: Array
+
+
+@one_blas_thread
+def timing_curves(
+    recording: Recording, spec: RobotSpec, calibration: Calibration
+) -> tuple[ShiftCurve, ...]:
+    """Returns a curve for the clock offset and one for the latency, if they were estimated."""
+    if not moved_commands(recording.command).any():
+        return ()
+    curves = []
+    for name in ("clock_offset_s", "command_latency_s"):
+        if name in calibration.uncertainty:
+            found = _curve(recording, spec, calibration, name)
+            curves += [found] if found is not None else []
+    return tuple(curves)
+
+
+def _curve(
+    recording: Recording, spec: RobotSpec, calibration: Calibration, name: str
+) -> ShiftCurve | None:
+    value = float(getattr(calibration, name)) + np.linspace(-REACH_S, REACH_S, POINTS)
+    twists = tracked_twists(recording)
+    pose = twists.start, twists.end, twists.twist
+    lags = np.array([r.lag_s for r in calibration.responses])
+    lags = lags if len(lags) == len(spec.state) else nominal_lags(spec)
+    state, wheels, command = recording.state, recording.wheels, recording.command
+    if name == "clock_offset_s" and state is not None:
+        by_state = residual_by_shift(state, pose)
+        rest = [by_state(np.array([-v])) for v in value]
+    elif name == "clock_offset_s":
+        by_command = response_residual(command, spec, pose)
+        rest = [by_command(lags, calibration.command_latency_s - v) for v in value]
+    elif state is not None:
+        by_delay = state_residual(command, state, spec)
+        rest = [by_delay(np.array([v])) for v in value]
+    elif recording.pose.clock == command.clock:
+        by_command = response_residual(command, spec, pose)
+        rest = [by_command(lags, v) for v in value]
+    elif wheels is not None:
+        tick = float(np.median(np.diff(wheels.t)))
+        by_command = response_residual(command, spec, (wheels.t - tick, wheels.t, wheels.values))
+        rest = [by_command(lags, v) for v in value]
+    else:
+        return None
+    return ShiftCurve(name, value, np.array([np.sqrt(np.mean(r**2)) for r in rest]))

@@ -1,18 +1,28 @@
-"""What was heard of a robot, live or out of a bag: the facts that the doctor judges."""
+"""Facts about a robot, live or from a bag, for the doctor to judge.
+
+Expectations of the doctor, and its findings.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.kinematics.bag_file import opened
-from nics_drl_bridge.kinematics.bag_qos import Offer
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.lidar.sectors import ScanLayout, plan_of, reader_of
+from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader
+from nics_drl_bridge.policy.contract import Contract
+from nics_drl_bridge.recording.bag_file import opened
+from nics_drl_bridge.recording.messages import Offer
+from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 Nanoseconds = NDArray[np.int64]
@@ -22,19 +32,18 @@ SCAN_TYPE, ODOM_TYPE = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 TWIST_TYPE, TWIST_STAMPED_TYPE = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 MOST_SCANS = 200
-"""Ranges are kept of so many scans; of the others only the time."""
-NANO = 1_000_000_000
+"""Maximum number of scans whose ranges are kept; of the others only the times are."""
 MOST_RAD = 7.0
 
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Who speaks and who listens on a topic.
+    """Publishers and subscribers of a topic.
 
     Attributes:
-        types: of the messages, by what the publishers say.
+        types: of the messages, as declared by the publishers.
         offers: quality of service of each publisher.
-        asks: that each subscriber asks for; the doctor's own is left out.
+        asks: quality of service requested by each subscriber, without the doctor's own.
     """
 
     types: tuple[str, ...]
@@ -47,7 +56,7 @@ class TopicFacts:
     """The messages of a topic.
 
     Attributes:
-        arrivals_ns: when each came [ns].
+        arrivals_ns: times of arrival [ns].
         stamps_ns: of the headers [ns].
         frames: ids of the headers.
         children: ids of the child frames.
@@ -60,14 +69,14 @@ class TopicFacts:
 
     @property
     def rate_hz(self) -> float | None:
-        """Messages per second between the first and the last; None below three."""
-        span = (self.arrivals_ns[-1] - self.arrivals_ns[0]) / NANO if self.arrivals_ns else 0.0
+        """Messages per second between the first and the last; None for fewer than three."""
+        span = (self.arrivals_ns[-1] - self.arrivals_ns[0]) / NS_PER_S if self.arrivals_ns else 0.0
         return (len(self.arrivals_ns) - 1) / span if len(self.arrivals_ns) > 2 and span else None
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The beams of a scan, as its header tells them, see `ScanHeader`."""
+    """The beams of a scan according to its header, see `ScanHeader`."""
 
     beams: int
     angle_min: float
@@ -83,27 +92,27 @@ class Layout:
 
     @property
     def in_degrees(self) -> bool:
-        """Whether the angles are too great for radians."""
+        """True if the angles are too large for radians."""
         return max(abs(self.angle_min), abs(self.angle_max)) > MOST_RAD
 
 
 @dataclass
 class Facts:
-    """All that was heard.
+    """All facts that were collected.
 
     Attributes:
-        source: where, for people.
-        live: over DDS, or out of a bag.
-        topics: of the robot and what became of each: name -> who is there.
+        source: name of the source, for messages.
+        live: True over DDS, False from a bag.
+        topics: topic -> its publishers and subscribers.
         heard: role (`scan`, `odom`, `cmd_vel`, `/clock`) -> messages.
         names: role -> topic.
-        end_ns: when listening ended, on the clock of arrivals [ns].
-        layouts: of the scans, each different one once.
+        end_ns: end of listening, on the clock of arrivals [ns].
+        layouts: distinct layouts of the scans.
         ranges: of up to 200 scans [m].
         poses: of odometry, rows x, y [m], heading [rad].
         twists: of odometry, rows vx, vy [m/s], wz [rad/s].
         lengths: of odometry's quaternions.
-        uncovered: odometries whose covariance of pose and twist is all zeros.
+        uncovered: number of odometry messages whose covariance of pose or twist is all zeros.
         commands: rows vx, vy [m/s], wz [rad/s].
         clock_ns: content of `/clock` [ns].
     """
@@ -124,12 +133,12 @@ class Facts:
     clock_ns: list[int] = field(default_factory=list)
 
     def take(self, role: str, arrival_ns: int, message: Any) -> None:
-        """Notes a message, of ROS or of a bag: both have the same fields."""
+        """Records a message from ROS or from a bag, which have the same fields."""
         heard = self.heard.setdefault(role, TopicFacts())
         heard.arrivals_ns.append(arrival_ns)
         if hasattr(message, "header"):
             time = message.header.stamp
-            heard.stamps_ns.append(int(time.sec) * NANO + int(time.nanosec))
+            heard.stamps_ns.append(int(time.sec) * NS_PER_S + int(time.nanosec))
             heard.frames.add(str(message.header.frame_id))
         if role == SCAN:
             self._scan(message)
@@ -139,7 +148,7 @@ class Facts:
         elif role == CMD_VEL:
             self.commands.append(_twist(getattr(message, "twist", message)))
         else:
-            self.clock_ns.append(int(message.clock.sec) * NANO + int(message.clock.nanosec))
+            self.clock_ns.append(int(message.clock.sec) * NS_PER_S + int(message.clock.nanosec))
 
     def _scan(self, message: Any) -> None:
         layout = Layout(
@@ -178,11 +187,11 @@ KINDS: dict[str, Sequence[str]] = {
     CMD_VEL: (TWIST_TYPE, TWIST_STAMPED_TYPE),
     CLOCK: (CLOCK_TYPE,),
 }
-"""The message types of each role; what is of another is not looked into."""
+"""Message types of each role; messages of other types are not read."""
 
 
 def facts_of_bag(path: str | Path, namespace: str = "") -> Facts:
-    """What a bag tells of a robot.
+    """Collects the facts of a robot from a bag.
 
     Raises:
         RecordingError: the bag is damaged.
@@ -197,3 +206,75 @@ def facts_of_bag(path: str | Path, namespace: str = "") -> Facts:
                 for message in bag.messages(topic):
                     facts.take(role, message.receive_ns, message.content)
     return facts
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """A mismatch between robot and expectation.
+
+    Attributes:
+        severity: an `error` makes a policy misbehave; a `warning` may.
+        check: name of the check.
+        where: the topic.
+        what: the mismatch, with numbers.
+        fix: the remedy.
+    """
+
+    severity: Literal["error", "warning"]
+    check: str
+    where: str
+    what: str
+    fix: str
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Expectations of a robot, by a model or a policy.
+
+    Attributes:
+        robot: units and limits of state and command.
+        lidar: beams, limits, rate, frame and range convention.
+        period_s: between commands [s].
+        scan: sectors that any lidar may fill; None: the beams of exactly this one.
+    """
+
+    robot: RobotSpec
+    lidar: LidarSpec
+    period_s: float
+    scan: ScanLayout | None = None
+
+
+def expected_of_model(model: SimulatorModel) -> Expected:
+    """Expectations of a SimulatorModel."""
+    return Expected(model.robot, model.lidar, model.control_period)
+
+
+def expected_of_policy(contract: Contract) -> Expected:
+    """Expectations of a policy file: its robot, and its lidar or one that fills its sectors."""
+    return Expected(contract.robot, contract.lidar, contract.control_period, contract.scan)
+
+
+def seen(facts: Facts, expected: Expected) -> Expected:
+    """Replaces the expected lidar by the present one if that fills the required sectors."""
+    if expected.scan is None or not facts.layouts:
+        return expected
+    try:
+        lidar = filling(facts.layouts[0], expected.lidar, expected.scan)
+    except ConfigError:
+        return expected
+    return replace(expected, lidar=lidar)
+
+
+def filling(have: Layout, like: LidarSpec, scan: ScanLayout) -> LidarSpec:
+    """The lidar of a scan header, mounted like another one.
+
+    Raises:
+        ConfigError: it does not fill the sectors.
+    """
+    header = ScanHeader(
+        have.angle_min, have.angle_max, have.angle_increment, 0.0, 0.0, have.range_min,
+        have.range_max,
+    )  # fmt: skip
+    lidar = reader_of(header, have.beams, like).lidar
+    plan_of(lidar, scan)
+    return lidar

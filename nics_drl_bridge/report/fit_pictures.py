@@ -1,4 +1,4 @@
-"""Pictures of a fit: what it learnt from, how well it predicts, what each term is worth."""
+"""Pictures of a fit: its data, its predictions, and the value of each term."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from nics_drl_bridge.calibration.identify import Identified
-from nics_drl_bridge.calibration.open_loop import HORIZON_S, Windows, predict, windows
-from nics_drl_bridge.calibration.signals import held
 from nics_drl_bridge.files import write_bytes
-from nics_drl_bridge.kinematics.recording import Samples
-from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.identify.identify import Identified
+from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, predict, windows
+from nics_drl_bridge.identify.signals import held
+from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.report.calibration_pictures import calibration_pictures
-from nics_drl_bridge.report.drawing import MEASURED, MODEL, OTHER, png
+from nics_drl_bridge.report.page import MEASURED, MODEL, OTHER, png
+from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 
@@ -35,8 +35,8 @@ def write_pictures(spec: RobotSpec, identified: Identified, folder: str | Path) 
 
     Args:
         spec: the robot.
-        identified: all that was learnt.
-        folder: to write them into; it is made if it is not there.
+        identified: all results of the identification.
+        folder: output folder; created if missing.
 
     Returns:
         The files.
@@ -54,7 +54,7 @@ def write_pictures(spec: RobotSpec, identified: Identified, folder: str | Path) 
 def fit_pictures(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
     """The pictures of a fit by name, each a PNG.
 
-    `accuracy` is there always; `paths` and `residuals` if data was held out from the fit,
+    `accuracy` is always included; `paths` and `residuals` if data was held out from the fit,
     `alignment` if a command changed.
     """
     pictures = {"accuracy": accuracy(identified)}
@@ -68,7 +68,7 @@ def fit_pictures(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
 
 
 def accuracy(identified: Identified) -> bytes:
-    """Cross-validated error against the number of terms, a line per degree of freedom."""
+    """Draws the cross-validated error over the number of terms, a line per degree of freedom."""
     figure = Figure(figsize=(7.5, 4.5), layout="constrained")
     axes = figure.subplots()
     for n, curve in enumerate(identified.fit.curves):
@@ -95,7 +95,7 @@ def accuracy(identified: Identified) -> bytes:
 
 
 def held_out_paths(spec: RobotSpec, identified: Identified) -> bytes:
-    """Open-loop predictions on unseen data beside the measured paths, from the same start."""
+    """Draws open-loop predictions on unseen data and the measured paths, from the same start."""
     recording, calibration = identified.recording, identified.calibration
     duration = float(recording.pose.t[-1] - recording.pose.t[0])
     free = max(duration - identified.train_until_s - HORIZON_S, 0.0)
@@ -125,7 +125,7 @@ def held_out_paths(spec: RobotSpec, identified: Identified) -> bytes:
 
 
 def residuals(identified: Identified, unseen: Samples) -> bytes:
-    """Rates on unseen data against those of the model, and what is left over, in time."""
+    """Draws rates on unseen data, those of the model, and the residuals, over time."""
     model = identified.model
     predicted, t = model.rates(unseen.x), unseen.t - unseen.t[0]
     shown = t < SHOWN_S
@@ -148,7 +148,7 @@ def residuals(identified: Identified, unseen: Samples) -> bytes:
 
 
 def alignment(spec: RobotSpec, identified: Identified) -> bytes:
-    """Each command that changed, as stamped and as it takes effect, and the rate it moves most."""
+    """Draws each changing command, as stamped and as it takes effect, with its main response."""
     samples, calibration = identified.samples, identified.calibration
     command = identified.recording.command
     moved = np.flatnonzero(np.ptp(command.values, axis=0) > 0.0)
@@ -180,7 +180,7 @@ def alignment(spec: RobotSpec, identified: Identified) -> bytes:
 def _response(
     axes: Axes, samples: Samples, shown: NDArray[np.bool_], variable: int, identified: Identified
 ) -> None:
-    """Draws the part of the body twist that goes most with a variable of X."""
+    """Draws the component of the body twist that correlates most with a variable of X."""
     twist, wanted = samples.dq[:, :3], samples.x[:, variable]
     with np.errstate(all="ignore"):
         alike = np.abs([np.corrcoef(twist[:, d], wanted)[0, 1] for d in range(3)])

@@ -1,11 +1,17 @@
-"""The report: one HTML file that holds everything, pictures included."""
+"""The report: one self-contained HTML file, including pictures.
+
+Colours and PNG export shared by the pictures of a fit.
+"""
 
 from __future__ import annotations
 
 import base64
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+
+from matplotlib.figure import Figure
 
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 64rem;
@@ -38,7 +44,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Code:
-    """Text to show as it stands."""
+    """Preformatted text."""
 
     text: str
 
@@ -47,12 +53,12 @@ Block = Table | Picture | Code | str
 
 
 def page(title: str, lead: str, sections: Sequence[tuple[str, Sequence[Block]]]) -> str:
-    """An HTML page.
+    """Builds an HTML page.
 
     Args:
         title: of the page.
-        lead: one sentence below it.
-        sections: heading and blocks of each; plain text is a paragraph.
+        lead: one sentence below the title.
+        sections: heading and blocks of each section; plain text is a paragraph.
     """
     body = "".join(
         f"<h2>{escape(heading)}</h2>{''.join(_block(block) for block in blocks)}"
@@ -82,3 +88,13 @@ def _block(block: Block) -> str:
         "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in block.rows
     )
     return f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+
+
+MEASURED, MODEL, OTHER, DARK = "#1f6fb2", "#d1495b", "#8d99ae", "#333333"
+
+
+def png(figure: Figure) -> bytes:
+    """Renders a figure as a PNG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()

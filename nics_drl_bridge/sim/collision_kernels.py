@@ -1,14 +1,14 @@
 """Compiled collision: the signed clearance between bodies, straight walls and a static map.
 
-A clearance is the distance between two outlines where they are apart, and less than 0 where they
-overlap: then it is how deep the deepest point of one lies within the other, of their corners and
-of the middles of the pieces of their edges that lie within. Circles are compared by their
-centres, and an outline is only looked at where the circles around both come near.
+A clearance is the distance between two outlines that are apart. Where they overlap it is negative:
+the depth at which the deepest point of one lies within the other, taken over their corners and
+the midpoints of the pieces of their edges that lie within. Circles are compared by their centres,
+and outlines only where the circles around both are near.
 
 Shared arguments: a body (7,) is as in `lidar.shapes.BODY`; `corners` (sum V, 2) and `corner`
 (H + 1,) are the outlines of all shapes, see `lidar.shapes.Outlines`: none for a circle, two
-corners for a segment. What is farther than `limit` [m] is not measured: the answer is `limit`.
-`grid` is the map: distances (rows, columns) of `lidar.maps_grid.GridMap.distance_field`, 0 in
+corners for a segment. Clearances beyond `limit` [m] are not measured: the result is `limit`.
+`grid` is the map: distances (rows, columns) of `lidar.maps.GridMap.distance_field`, 0 in
 solid cells, and frame (5,): x, y [m], cosine, sine of its origin, resolution [m]. `spare` (F, 2) is
 scratch for the corners of the first body, at least 4.
 """
@@ -18,17 +18,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from nics_drl_bridge.kernels import kernel
 
 TOUCHING = 1e-12
-"""Outlines this near to each other touch: whether they overlap is seen by their depth [m]."""
+"""Outlines within this distance touch; their depth then decides whether they overlap [m]."""
 ON_EDGE = 1e-9
-"""An edge may be cut this far beyond its ends, in parts of its length."""
+"""Tolerance beyond the ends of an edge for intersections, as a share of its length."""
 FLOAT32 = 1e-6
-"""Distances of a map are rounded to so many parts of themselves."""
+"""Relative rounding error of the distances of a map."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def segment_distance2(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
     """Square of the distance from (x, y) to the segment from (ax, ay) to (bx, by) [m^2]."""
     ex, ey, dx, dy = bx - ax, by - ay, x - ax, y - ay
@@ -40,14 +41,14 @@ def segment_distance2(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
     return dx * dx + dy * dy
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _side(ax, ay, bx, by, x, y):  # type: ignore[no-untyped-def]
     return (bx - ax) * (y - ay) - (by - ay) * (x - ax)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _edges_distance2(ax, ay, bx, by, px, py, qx, qy):  # type: ignore[no-untyped-def]
-    """Square of the distance between two segments; -1 where one crosses the other."""
+    """Square of the distance between two segments [m^2]; -1 if they cross."""
     if (_side(ax, ay, bx, by, px, py) > 0.0) != (_side(ax, ay, bx, by, qx, qy) > 0.0) and (
         _side(px, py, qx, qy, ax, ay) > 0.0
     ) != (_side(px, py, qx, qy, bx, by) > 0.0):
@@ -60,7 +61,7 @@ def _edges_distance2(ax, ay, bx, by, px, py, qx, qy):  # type: ignore[no-untyped
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def outline_point(x, y, corners, begin, end):  # type: ignore[no-untyped-def]
     """Signed distance from (x, y) to the outline of `corners[begin:end]`; negative inside."""
     if end - begin == 2:
@@ -81,9 +82,9 @@ def outline_point(x, y, corners, begin, end):  # type: ignore[no-untyped-def]
     return -math.sqrt(least) if inside else math.sqrt(least)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _next_cut(ax, ay, ex, ey, after, q, q_begin, q_end):  # type: ignore[no-untyped-def]
-    """Where outline q next cuts the edge from (ax, ay) along (ex, ey), in parts of its length."""
+    """Next cut of the edge from (ax, ay) along (ex, ey) by outline q, as a share of its length."""
     least = 1.0
     cx, cy = q[q_end - 1, 0], q[q_end - 1, 1]
     for w in range(q_begin, q_end):
@@ -100,9 +101,9 @@ def _next_cut(ax, ay, ex, ey, after, q, q_begin, q_end):  # type: ignore[no-unty
     return least
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _deepest(p, p_begin, p_end, q, q_begin, q_end):  # type: ignore[no-untyped-def]
-    """How deep the edges of outline p lie within outline q; 0 where they don't."""
+    """Depth of the edges of outline p within outline q [m]; 0 if they do not overlap."""
     depth = 0.0
     if q_end - q_begin == 2:
         return depth
@@ -123,13 +124,13 @@ def _deepest(p, p_begin, p_end, q, q_begin, q_end):  # type: ignore[no-untyped-d
     return depth
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def outline_gap(p, p_begin, p_end, x, y, reach, q, q_begin, q_end, limit):  # type: ignore[no-untyped-def]
     """Signed clearance of two outlines in one frame.
 
     Args:
-        p, p_begin, p_end: the corners of one, best that of fewer corners.
-        x, y, reach: a circle that holds it.
+        p, p_begin, p_end: the corners of one, preferably the one with fewer corners.
+        x, y, reach: a circle that encloses it.
         q, q_begin, q_end: the corners of the other.
         limit: see the module.
     """
@@ -164,7 +165,7 @@ def outline_gap(p, p_begin, p_end, x, y, reach, q, q_begin, q_end, limit):  # ty
     return -TOUCHING if crossing and (q_end - q_begin > 2 or p_end - p_begin > 2) else 0.0
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def body_gap(body, other, corners, corner, limit, spare):  # type: ignore[no-untyped-def]
     """Signed clearance of two bodies; see the module."""
     dx, dy = body[0] - other[0], body[1] - other[1]
@@ -195,7 +196,7 @@ def body_gap(body, other, corners, corner, limit, spare):  # type: ignore[no-unt
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def wall_gap(body, wall, corners, corner, limit, spare):  # type: ignore[no-untyped-def]
     """Signed clearance of a body and a straight wall (4,)."""
     distance2 = segment_distance2(body[0], body[1], wall[0], wall[1], wall[2], wall[3])
@@ -214,22 +215,22 @@ def wall_gap(body, wall, corners, corner, limit, spare):  # type: ignore[no-unty
     return min(gap, limit)
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _in_grid(body, frame):  # type: ignore[no-untyped-def]
-    """Place [m], cosine and sine of a body in the frame of the map."""
+    """Returns x, y [m], cosine and sine of a body in the frame of the map."""
     dx, dy = body[0] - frame[0], body[1] - frame[1]
     x, y = frame[2] * dx + frame[3] * dy, frame[2] * dy - frame[3] * dx
     c, s = body[3] * frame[2] + body[4] * frame[3], body[4] * frame[2] - body[3] * frame[3]
     return x, y, c, s
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def _bounds(x, y, distances, size):  # type: ignore[no-untyped-def]
-    """Least and greatest distance that (x, y) can have to a solid cell, by the nearest cell [m]."""
+    """Bounds on the distance from (x, y) to a solid cell, from that of the nearest cell [m]."""
     rows, columns = distances.shape
     i = min(max(math.floor(y / size), 0), rows - 1)
     j = min(max(math.floor(x / size), 0), columns - 1)
-    # Seen from outside, the nearest place of the map is nearer to each of its cells.
+    # From outside, the nearest point of the map is nearer to each of its cells than (x, y) is.
     px, py = min(max(x, 0.0), columns * size), min(max(y, 0.0), rows * size)
     within = math.hypot(px - (j + 0.5) * size, py - (i + 0.5) * size)
     outside = math.hypot(x - px, y - py)
@@ -237,9 +238,9 @@ def _bounds(x, y, distances, size):  # type: ignore[no-untyped-def]
     return middle * (1.0 - FLOAT32) - within, middle * (1.0 + FLOAT32) + within + outside
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def map_bound(body, grid):  # type: ignore[no-untyped-def]
-    """A distance [m] that the circle around a body keeps from the map at least."""
+    """Lower bound on the distance from the circle around a body to the map [m]."""
     distances, frame = grid
     if distances.size == 0:
         return np.inf
@@ -247,7 +248,7 @@ def map_bound(body, grid):  # type: ignore[no-untyped-def]
     return _bounds(x, y, distances, frame[4])[0] - body[5]
 
 
-@njit(cache=True, error_model="numpy", nogil=True, _nrt=False)
+@kernel
 def map_gap(body, grid, corners, corner, limit, spare):  # type: ignore[no-untyped-def]
     """Signed clearance of a body and the solid cells of a map."""
     distances, frame = grid

@@ -1,4 +1,8 @@
-"""DrivenSimulator: worlds of the fast simulator whose robots are moved from outside."""
+"""DrivenSimulator: worlds of the fast simulator whose robots are moved from outside.
+
+Obstacles move and robots sense by the functions of the fast simulator's own step, so that both are
+the same in a world whose robots are moved by another physics engine.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.scanner import Renderer
-from nics_drl_bridge.sim import contact_kernels, driven_kernels
+from nics_drl_bridge.sim import contact_kernels, step_kernels
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
@@ -19,14 +23,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Driven:
-    """What robots have done in one control period.
+    """Motion of the robots in one control period.
 
     Attributes:
         pose: (M, 3) true pose of `base_link` in `map` at the end.
         twist: (M, 3) true body twist at the end [m/s, m/s, rad/s].
         state: (M, S) at the end.
-        wheels: (M, 3) pose at the end by counting the turns of the wheels, without noise.
-        counted: (M, 3) body twist at the end by the wheels.
+        wheels: (M, 3) pose at the end by wheel odometry, without noise.
+        counted: (M, 3) body twist at the end by wheel odometry.
         touched: (M,) whether each robot touched anything.
     """
 
@@ -42,7 +46,7 @@ class DrivenSimulator:
     """One world: its scenes, moving obstacles, odometry noise and lidar, without its physics.
 
     Scenes, motion of the obstacles, noise, faults and scans are those of the FastSimulator for the
-    same seed. Odometry is what the wheels count, with the model's noise.
+    same seed. Odometry is the wheel odometry with the model's noise.
 
     Args:
         model: the robot.
@@ -51,8 +55,8 @@ class DrivenSimulator:
         renderer: see `FastSimulator`.
 
     Attributes:
-        fast: holds all data; its own `step` is not for use.
-        wheels: (M, 3) pose by counting the turns of the wheels, since the start pose.
+        fast: holds all data; do not call its `step`.
+        wheels: (M, 3) pose by wheel odometry, beginning at the start pose.
     """
 
     def __init__(
@@ -72,10 +76,10 @@ class DrivenSimulator:
         """Sets the obstacles' velocities for the period that begins."""
         data = self.fast.data
         self._start = data.bodies[0, :, :3].copy()
-        driven_kernels.begin_period(self.fast.packed[0])
+        step_kernels.begin_period(self.fast.packed[0])
 
     def move_obstacles(self, time: float) -> Array:
-        """Puts the obstacles to where they are `time` [s] after the beginning of the period.
+        """Moves the obstacles to their poses `time` [s] after the beginning of the period.
 
         Returns:
             (K, 7) see `lidar.shapes.BODY`.
@@ -85,11 +89,11 @@ class DrivenSimulator:
         return data.bodies[0, : data.velocity.shape[1]]
 
     def end_period(self, driven: Driven) -> None:
-        """Takes over what the robots have done and measures what they sense."""
+        """Takes over the motion of the robots and measures what they sense."""
         data = self.fast.data
         data.pose[0], data.state[0] = driven.pose, driven.state
         data.collided[0] |= driven.touched.astype(np.uint8)
-        driven_kernels.end_period(
+        step_kernels.end_period(
             self.fast.packed[0], driven.twist[None], self.wheels[None], driven.wheels[None],
             driven.counted[None],
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Domain randomisation: which robot, sensors and scene an episode gets, within YAML's ranges."""
+"""Domain randomisation: robot, sensors and scene of an episode, drawn from ranges in YAML."""
 
 from __future__ import annotations
 
@@ -13,8 +13,17 @@ from nics_drl_bridge.config import find_config, load_yaml
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import fault_kernels
 from nics_drl_bridge.seeds import checked_seeds
-from nics_drl_bridge.sim import randomisation_bounds as bounds
-from nics_drl_bridge.sim import randomisation_kernels as kernels
+from nics_drl_bridge.sim import randomisation_ranges as bounds
+from nics_drl_bridge.sim.randomisation_kernels import (
+    KINEMATICS,
+    LATENCY,
+    LIDAR,
+    OBSTACLES,
+    ODOMETRY,
+    draw_between,
+    draw_choice,
+    draw_whole,
+)
 from nics_drl_bridge.sim.randomisation_ranges import Randomisation
 
 __all__ = ["Draws", "Label", "Randomisation", "Sampler", "load_randomisation"]
@@ -28,19 +37,19 @@ FAULT_COLUMNS = (
 
 
 def load_randomisation(name: str | Path) -> Randomisation:
-    """Loads a shipped randomisation by name (`mild`), or any by the path of its YAML file."""
+    """Loads a shipped randomisation by name (`mild`), or any other by the path of its YAML file."""
     return load_yaml(find_config(name, "randomisation"), Randomisation)
 
 
 @dataclass(frozen=True)
 class Label:
-    """A drawn number's name, and where it stands in `Draws`.
+    """Name of a drawn number and its place in `Draws`.
 
     Attributes:
-        name: for people: `kinematics.wz.speed*steering`, `action_latency_s`.
+        name: human-readable: `kinematics.wz.speed*steering`, `action_latency_s`.
         field: of `Draws`.
-        column: along the last axis; None where there is none.
-        unit: what to multiply by, such as seconds per substep.
+        column: index along the last axis; None where there is none.
+        unit: factor to multiply by, such as seconds per substep.
     """
 
     name: str
@@ -51,19 +60,19 @@ class Label:
 
 @dataclass(frozen=True)
 class Draws:
-    """What n episodes of M robots got: every number the simulator needs, drawn or the model's.
+    """Draws for n episodes of M robots: every number the simulator needs, drawn or the model's.
 
     Attributes:
-        coefficient: (n, M, T) of the kept terms, in the order of `kinematics.kernels.term_arrays`.
-        delay: (n, M) from a command to its effect, the model's included [substeps].
-        age: (n, M) of scan and odometry when they are seen [substeps].
+        coefficient: (n, M, T) of the kept terms, in the order of `robot.kernels.term_arrays`.
+        delay: (n, M) from a command to its effect, including the model's [substeps].
+        age: (n, M) of scan and odometry when they are observed [substeps].
         noise: (n, M, 2 + 3 + S) standard deviations: odometry, linear [m/s] and angular [rad/s],
             and the drift of x, y, heading and state after a second.
         faults: (n, M, P) of each lidar, columns as in `lidar.fault_kernels`.
         count: (n,) obstacles in the scene; None leaves it to the world.
         size: (n,) index into `Randomisation.sizes`; None where there is only one.
-        sizes: (R,) those of `Randomisation.sizes`.
-        labels: of what was drawn and may differ from episode to episode.
+        sizes: (R,) the sizes of `Randomisation.sizes`.
+        labels: of the drawn numbers that may differ from episode to episode.
     """
 
     coefficient: Array
@@ -77,7 +86,7 @@ class Draws:
     labels: tuple[Label, ...]
 
     def named(self) -> dict[str, NDArray[np.generic]]:
-        """What was drawn, by name: (n, M) of each robot, (n,) of the scene."""
+        """Returns the drawn numbers by name: (n, M) per robot, (n,) per scene."""
         named: dict[str, NDArray[np.generic]] = {}
         for label in self.labels:
             value = getattr(self, label.field)
@@ -90,17 +99,17 @@ class Draws:
 
 
 class Sampler:
-    """Draws what episodes get; a seed gives the same bits in a batch of any size.
+    """Draws the randomised numbers of episodes; a seed is bit-identical in any batch.
 
     Args:
         randomisation: the ranges.
-        model: what they are ranges around.
+        model: provides the nominal values.
         robots: M.
 
     Attributes:
         longest_delay: greatest latency of a command that may occur [substeps].
         longest_age: greatest age of an observation that may occur [substeps].
-        skews: whether a lidar may measure its beams one after the other.
+        skews: True if a lidar may measure its beams one after the other.
     """
 
     def __init__(
@@ -123,7 +132,7 @@ class Sampler:
         self._labels = tuple(self._name(model))
 
     def draw(self, seeds: ArrayLike) -> Draws:
-        """What the episodes of some seeds (n,) get."""
+        """Draws the numbers of the episodes of some seeds (n,)."""
         chosen = checked_seeds(seeds)
         shape = (len(chosen), self._robots)
         coefficient = np.empty((*shape, len(self._coefficient[0])))
@@ -131,14 +140,14 @@ class Sampler:
         faults = np.empty((*shape, len(self._faults[0])))
         timing = np.empty((2, *shape), np.int64)
         scene = np.empty((2, len(chosen), 1), np.int64)
-        kernels.draw_between(coefficient, *self._coefficient, chosen, kernels.KINEMATICS)
-        kernels.draw_between(noise, *self._noise, chosen, kernels.ODOMETRY)
-        kernels.draw_between(faults, *self._faults, chosen, kernels.LIDAR)
-        kernels.draw_whole(timing.transpose(1, 2, 0), *self._timing, chosen, kernels.LATENCY)
-        kernels.draw_whole(scene.transpose(1, 2, 0), *self._scene, chosen, kernels.OBSTACLES)
+        draw_between(coefficient, *self._coefficient, chosen, KINEMATICS)
+        draw_between(noise, *self._noise, chosen, ODOMETRY)
+        draw_between(faults, *self._faults, chosen, LIDAR)
+        draw_whole(timing.transpose(1, 2, 0), *self._timing, chosen, LATENCY)
+        draw_whole(scene.transpose(1, 2, 0), *self._scene, chosen, OBSTACLES)
         noise[..., 3] = noise[..., 2]
         for column, values in self._choices:
-            kernels.draw_choice(faults, column, values, chosen)
+            draw_choice(faults, column, values, chosen)
         counts = self.randomisation.obstacles.count is not None
         return Draws(
             coefficient, timing[0], timing[1], noise, faults,

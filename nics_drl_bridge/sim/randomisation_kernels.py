@@ -1,8 +1,8 @@
-"""Compiled draws of domain randomisation, each fixed by seed, robot and place alone.
+"""Compiled draws of domain randomisation, each fixed by seed, robot, group and column alone.
 
-Shared arguments: `seeds` (n,) of the episodes; `group` is what the numbers are for, one of the
-constants below. A place whose bounds are equal takes that value and draws nothing, and a group
-never shifts the draws of another.
+Shared arguments: `seeds` (n,) of the episodes; `group` is the purpose of the numbers, one of the
+constants below; `place` is a column. A column whose bounds are equal takes that value and draws
+nothing, and a group never shifts the draws of another.
 """
 
 from __future__ import annotations
@@ -10,41 +10,41 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from nics_drl_bridge import random_kernels as random
+from nics_drl_bridge.kernels import kernel
 
 KINEMATICS, LATENCY, ODOMETRY, LIDAR, CHOICES, OBSTACLES = range(6)
 PLACES = 1 << 20
-"""More than a group has places; the counters of two groups never meet."""
+"""More than a group has columns; the counters of two groups never collide."""
 GROUPS = 8
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _share(seed, robot, group, place):  # type: ignore[no-untyped-def]
-    """The draw in [0, 1) of one place."""
+    """Returns the draw in [0, 1) of one column."""
     counter = (robot * GROUPS + group) * PLACES + place
     return random.uniform(seed, random.RANDOMISATION_STREAM, counter)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _between(low, high, seed, robot, group, place):  # type: ignore[no-untyped-def]
-    """A number between `low` and `high`; the very number where they are the same."""
+    """Draws a number between `low` and `high`; exactly `low` if they are equal."""
     return low if high == low else low + _share(seed, robot, group, place) * (high - low)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def draw_between(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
-    """Fills out (n, M, Q) evenly between low (Q,) and high (Q,)."""
+    """Fills out (n, M, Q) uniformly between low (Q,) and high (Q,)."""
     for n in range(out.shape[0]):
         for m in range(out.shape[1]):
             for q in range(out.shape[2]):
                 out[n, m, q] = _between(low[q], high[q], seeds[n], m, group, q)
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def draw_whole(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
-    """Fills out (n, M, Q) with whole numbers: evenly between low and high, cut down."""
+    """Fills out (n, M, Q) with integers: uniform between low (Q,) and high (Q,), floored."""
     for n in range(out.shape[0]):
         for m in range(out.shape[1]):
             for q in range(out.shape[2]):
@@ -52,9 +52,9 @@ def draw_whole(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
                 out[n, m, q] = np.int64(math.floor(value))
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def draw_choice(out, column, values, seeds):  # type: ignore[no-untyped-def]
-    """Fills one column of out (n, M, P) with one of the values (V,), each as likely."""
+    """Fills one column of out (n, M, P) with one of the values (V,), all equally likely."""
     for n in range(out.shape[0]):
         for m in range(out.shape[1]):
             share = _share(seeds[n], m, CHOICES, column)

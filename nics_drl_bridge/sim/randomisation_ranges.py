@@ -1,20 +1,32 @@
-"""The ranges of domain randomisation: the schema of its YAML files."""
+"""The ranges of domain randomisation: the schema of its YAML files.
+
+Bounds of every drawn number: the ranges of domain randomisation applied to one model.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
-from nics_drl_bridge.config import Schema
-from nics_drl_bridge.lidar.faults import LidarFaults, Skew, TooClose
+from nics_drl_bridge.config import Schema, validate
+from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar import fault_kernels
+from nics_drl_bridge.lidar.faults import SKEW, TOO_CLOSE, LidarFaults, Skew, TooClose
+from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.kernels import term_arrays
+from nics_drl_bridge.robot.taylor import TaylorModel
 
 MOST_PERIODS = 50.0
-"""Greatest latency that may be drawn: the simulator keeps so many periods."""
+"""Greatest latency that may be drawn [control periods]; the simulator stores as many."""
 MOST_OBSTACLES = 10_000
 LIDAR_CHOICES = ("skew", "too_close")
-"""Faults of which one of some words is drawn; of the others, a number."""
+"""Faults that are drawn from several words; the others are numbers."""
 
 
 GREATEST_FACTOR = 1e3
@@ -56,12 +68,12 @@ AS_IT_IS: Factor = (1.0, 1.0)
 
 
 class KinematicRanges(Schema):
-    """Factors on the coefficients of the Taylor model, drawn for each coefficient on its own.
+    """Factors on the coefficients of the Taylor model, drawn independently for each coefficient.
 
     Attributes:
         scale: for every coefficient.
-        dofs: instead of it, for the coefficients of a rate, by its name in `model.yaml` (`wz`).
-        terms: instead of both, by rate and term: `{wz: {speed*steering: [0.8, 1.2]}}`.
+        dofs: overrides `scale` for the coefficients of a rate, by its name in `model.yaml` (`wz`).
+        terms: overrides both, by rate and term: `{wz: {speed*steering: [0.8, 1.2]}}`.
     """
 
     scale: Factor = AS_IT_IS
@@ -70,12 +82,12 @@ class KinematicRanges(Schema):
 
 
 class OdometryRanges(Schema):
-    """What odometry and motion get wrong; factors on the model's levels, or levels instead.
+    """Errors of odometry and motion: factors on the model's levels, or levels instead.
 
     Attributes:
         noise: factor on the noise of the measured twist.
-        drift: factor on what the model does not explain of the motion; only a drift that the
-            recording showed can be scaled.
+        drift: factor on the part of the motion that the model does not explain; only a drift that
+            was found in the recording can be scaled.
         odom_linear: noise of the velocity [m/s], instead of the model's.
         odom_angular: noise of the yaw rate [rad/s].
         position_drift: of x and y [m/sqrt(s)].
@@ -106,7 +118,7 @@ class LidarRanges(Schema):
     Attributes:
         noise_std: see `LidarSpec` [m].
         noise_proportional, quantisation, dropout, dropout_far: [least, greatest].
-        skew, too_close: the words that may be drawn, each as likely.
+        skew, too_close: the words that may be drawn, all equally likely.
     """
 
     noise_std: Level | None = None
@@ -125,7 +137,7 @@ class LidarRanges(Schema):
         return self
 
     def numbers(self, end: int) -> dict[str, float]:
-        """The least (end 0) or the greatest (end 1) of each number that `LidarFaults` holds."""
+        """Returns the least (end 0) or greatest (end 1) of each number in `LidarFaults`."""
         spans = {name: getattr(self, name) for name in LidarFaults.model_fields}
         return {
             name: span[end]
@@ -135,12 +147,12 @@ class LidarRanges(Schema):
 
 
 class ObstacleRanges(Schema):
-    """How many obstacles a scene has, and how large they are.
+    """Number and size of the obstacles of a scene.
 
     Attributes:
         count: [least, greatest], instead of the world's.
-        size: factor on the size of every obstacle, one for a whole episode.
-        rungs: so many sizes are drawn from, evenly spaced: each is baked beforehand.
+        size: factor on the size of every obstacle, one per episode.
+        rungs: number of sizes to draw from, evenly spaced: each is baked beforehand.
     """
 
     count: tuple[int, int] | None = None
@@ -162,12 +174,12 @@ class ObstacleRanges(Schema):
 
 
 class Randomisation(Schema):
-    """What is drawn anew for every episode; what is not named stays as in model and world.
+    """Ranges that are drawn from in every episode; all else stays as in model and world.
 
     Attributes:
-        name: what users call it.
+        name: the name users refer to it by.
         kinematics: see `KinematicRanges`.
-        action_latency: on top of the model's [control periods].
+        action_latency: in addition to the model's [control periods].
         observation_latency: age of scan and odometry [control periods].
         odometry: see `OdometryRanges`.
         lidar: see `LidarRanges`.
@@ -186,3 +198,138 @@ class Randomisation(Schema):
     def sizes(self) -> tuple[float, ...]:
         """The factors on the obstacles' size that may be drawn, ascending."""
         return self.obstacles.sizes
+
+
+Array = NDArray[np.float64]
+Bounds = tuple[Array, Array]
+NOISE_NAMES = ("odom_linear", "odom_angular", "position_drift", None, "heading_drift")
+"""Columns of the noise, before those of the state; the drift of y equals that of x."""
+CORNERS = 256
+"""Number of mixtures of least and greatest factors that are checked for stability."""
+
+
+def coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bounds:
+    """Bounds (T,) of the coefficients. Raises ConfigError for an invalid name or range."""
+    spans = np.tile(ranges.scale, (*model.coefficients.shape, 1))
+    for dof, span in ranges.dofs.items():
+        spans[_rate(dof, model, f"{where}: key 'kinematics.dofs'")] = span
+    for dof, terms in ranges.terms.items():
+        place = f"{where}: key 'kinematics.terms'"
+        d = _rate(dof, model, place)
+        for term, span in terms.items():
+            spans[d, _term(d, term, model, f"{place}, rate {dof!r}")] = span
+    _check_stable(model, spans, where)
+    kept = np.nonzero(model.coefficients)
+    base = term_arrays(model).coefficient
+    return base * spans[kept][:, 0], base * spans[kept][:, 1]
+
+
+def _rate(name: str, model: TaylorModel, where: str) -> int:
+    if name not in model.dofs:
+        raise ConfigError(f"{where}: unknown rate {name!r}; {nearest(name, model.dofs)}")
+    return model.dofs.index(name)
+
+
+def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
+    kept = np.flatnonzero(model.coefficients[d])
+    try:
+        row = taylor.parse_term(name, model.variables)
+    except ValueError:
+        row = None
+    for k in kept:
+        if row is not None and np.array_equal(model.powers[k], row):
+            return int(k)
+    known = [model.term_names[k] for k in kept]
+    raise ConfigError(
+        f"{where}: the model has no term {name!r} there; "
+        + (nearest(name, known) if known else "it has none at all: remove it.")
+    )
+
+
+def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
+    """Raises ConfigError if a decaying state would grow for some factors.
+
+    Checks the linear part of the state's step: no eigenvalue may exceed 1 in magnitude.
+    """
+    size = model.state_size
+    if not size:
+        return
+    linear = np.zeros((size, size))
+    low, high = np.ones_like(linear), np.ones_like(linear)
+    for k in np.flatnonzero(model.powers.sum(axis=1) == 1):
+        v = int(np.argmax(model.powers[k]))
+        if v < size:
+            linear[:, v] = model.coefficients[3:, k]
+            low[:, v], high[:, v] = spans[3:, k].T
+    mixed = np.random.default_rng(0).integers(0, 2, (CORNERS, size, size)).astype(bool)
+    steps = np.eye(size) + model.dt * linear * np.where(mixed, low, high)
+    nominal = np.abs(np.linalg.eigvals(np.eye(size) + model.dt * linear)).max()
+    worst = np.abs(np.linalg.eigvals(steps)).max()
+    if worst > max(1.0, nominal) + 1e-9:
+        raise ConfigError(
+            f"{where}: key 'kinematics': with some of these factors the state of the robot grows "
+            f"by itself (eigenvalue {worst:.4g} of a step of {model.dt:g} s); narrow the ranges."
+        )
+
+
+def latencies(ranges: Randomisation, model: SimulatorModel) -> Bounds:
+    """Bounds (2,) of delay and age, such that flooring the draws rounds them [substeps]."""
+    _, substeps, delay = model.timing
+    spans = np.array([ranges.action_latency, ranges.observation_latency]) * substeps + 0.5
+    spans[0] += delay
+    same = np.floor(spans[:, 0]) == np.floor(spans[:, 1])
+    spans[same] = np.floor(spans[same])  # equal bounds: nothing is drawn
+    return np.ascontiguousarray(spans[:, 0]), np.ascontiguousarray(spans[:, 1])
+
+
+def levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
+    """Bounds (2 + 3 + S,) of the noise."""
+    odometry = ranges.odometry
+    base = np.array([*model.noise.odometry, *model.noise.simulated_drift(model.robot)])
+    factors: tuple[tuple[str, Factor | None, slice, str], ...] = (
+        ("noise", odometry.noise, slice(0, 2), "'odom_linear' and 'odom_angular'"),
+        ("drift", odometry.drift, slice(2, None), "'position_drift' and 'heading_drift'"),
+    )
+    low, high = base.copy(), base.copy()
+    for key, factor, part, instead in factors:
+        if factor is None:
+            continue
+        if not base[part].any():
+            raise ConfigError(
+                f"{where}: key 'odometry.{key}': the model of {model.robot.name!r} has no "
+                f"measured {key} to scale; give {instead} instead."
+            )
+        low[part], high[part] = base[part] * factor[0], base[part] * factor[1]
+    for column, name in enumerate(NOISE_NAMES):
+        level = getattr(odometry, name) if name else None
+        if level is not None:
+            low[column], high[column] = level
+    return low, high
+
+
+def faults(ranges: Randomisation, lidar: LidarSpec, where: str) -> Bounds:
+    """Bounds (P,) of the lidar's noise and faults."""
+    bounds = []
+    for end in range(2):
+        std = lidar.noise_std if ranges.lidar.noise_std is None else ranges.lidar.noise_std[end]
+        numbers = ranges.lidar.numbers(end)
+        faults = lidar.faults.model_dump() | numbers
+        spec = lidar.model_dump() | {"noise_std": std, "faults": faults}
+        bounds.append(validate(spec, LidarSpec, f"{where} of the lidar {lidar.name!r}"))
+    return bounds[0].fault_parameters, bounds[1].fault_parameters
+
+
+def choices(ranges: Randomisation) -> Iterator[tuple[int, Array]]:
+    """Yields the columns of the faults that take one of several values, and these values."""
+    if ranges.lidar.skew is not None:
+        values = [SKEW[word] for word in ranges.lidar.skew]
+        yield fault_kernels.SKEW, np.array(values, dtype=np.float64)
+    if ranges.lidar.too_close is not None:
+        values = [TOO_CLOSE[word] for word in ranges.lidar.too_close]
+        yield fault_kernels.TOO_CLOSE, np.array(values, dtype=np.float64)
+
+
+def scene(ranges: Randomisation) -> Bounds:
+    """Bounds (2,) of number and size index, such that flooring makes all equally likely."""
+    least, most = ranges.obstacles.count or (0, 0)
+    return np.array([least, 0.0]), np.array([most + 1.0, len(ranges.sizes)])

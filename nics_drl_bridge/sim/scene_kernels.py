@@ -1,12 +1,12 @@
 """Compiled drawing of scenes: obstacles, starts and goals of one seed after the other.
 
-What a seed gives does not depend on the batch: every number is drawn from its own counter.
+The scene of a seed does not depend on the batch: every number is drawn from its own counter.
 Obstacles are placed one after the other where they overlap nothing, then starts and goals in pairs;
-what gets stuck begins anew with fresh numbers. Points are drawn in the cells of a grid that are
-known to have room.
+if placement fails, the scene is restarted with fresh numbers. Points are drawn in the cells of a
+grid that are known to be free.
 
 Shared arguments: `static`, `outlines` and `spare` are those of `space_kernels`; `seed` and
-`counter` are of the next draw.
+`counter` are those of the next draw.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from nics_drl_bridge import random_kernels as random
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.sim.space_kernels import (
     area_of,
     clear_of_bodies,
@@ -28,38 +28,38 @@ from nics_drl_bridge.sim.space_kernels import (
 TRIES = 2000
 RESTARTS = 50
 DETOURS = 4
-"""So many pairs of start and goal without a way between them, and the obstacles stand anew."""
+"""Number of pairs of start and goal without a path after which the obstacles are redrawn."""
 MARGIN = 1e-9
-"""Obstacles keep this from walls and from each other at least [m]."""
+"""Least distance of obstacles from walls and from each other [m]."""
 DRAWN, NO_OBSTACLES, NO_ROBOTS = 0, 1, 2
 LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING = range(7)
 """Columns of a group."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _uniform(seed, counter):  # type: ignore[no-untyped-def]
     return random.uniform(seed, random.SCENE_STREAM, counter)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _point(seed, counter, cells, static):  # type: ignore[no-untyped-def]
-    """A point in one of the cells, which are numbered along the rows; takes 3 counters."""
+    """Draws a point in one of the cells, given by row-major indices; takes 3 counters."""
     distance, frame = static[0], static[2]
     cell = cells[int(_uniform(seed, counter) * cells.shape[0])]
     i, j = cell // distance.shape[1], cell % distance.shape[1]
     return place_in(i + _uniform(seed, counter + 1), j + _uniform(seed, counter + 2), frame)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _put(body, x, y, heading, shape, outlines):  # type: ignore[no-untyped-def]
     body[0], body[1], body[2] = x, y, heading
     body[3], body[4] = math.cos(heading), math.sin(heading)
     body[5], body[6] = outlines[2][shape], shape
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _choose(seed, counter, wanted, size, plan, bodies, active):  # type: ignore[no-untyped-def]
-    """Which obstacles there are, marked in `active` (K,), and the shape of each."""
+    """Draws which obstacles exist, marked in `active` (K,), and the shape of each."""
     groups, _, base, index, _ = plan
     total, before, k = 0, 0, 0
     for g in range(groups.shape[0]):
@@ -70,7 +70,7 @@ def _choose(seed, counter, wanted, size, plan, bodies, active):  # type: ignore[
         count = least + int(_uniform(seed, counter) * (greatest - least + 1))
         counter += 1
         if groups[g, FIXED] == 0.0:
-            if wanted >= 0:  # each group its share
+            if wanted >= 0:  # each group gets its share
                 asked, after = min(wanted, total), before + greatest
                 count = (asked * after + total // 2) // total - (
                     (asked * before + total // 2) // total
@@ -88,11 +88,11 @@ def _choose(seed, counter, wanted, size, plan, bodies, active):  # type: ignore[
     return counter
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _place_obstacles(  # type: ignore[no-untyped-def]
     seed, counter, plan, static, cells, outlines, bodies, active, gaps, trial, spare
 ):
-    """Places the obstacles: first those that always stand somewhere, then the others."""
+    """Places the obstacles: first those at fixed poses, then the others."""
     groups, slot, _, _, poses = plan
     corner = outlines[1]
     for k in range(bodies.shape[0]):
@@ -122,15 +122,15 @@ def _place_obstacles(  # type: ignore[no-untyped-def]
     return counter, True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _spot(seed, counter, places, cells, static):  # type: ignore[no-untyped-def]
-    """x, y, heading of a start or goal; takes 4 counters.
+    """Draws x, y, heading of a start or goal; takes 4 counters.
 
     Args:
         seed, counter: of the draw.
-        places: (P, 7) x1, y1, x2, y2 of a region, least and greatest heading, share of all places
-            up to this one; none for anywhere.
-        cells: where else.
+        places: (P, 7) x1, y1, x2, y2 of a region, least and greatest heading, cumulative share of
+            the places up to this one; no rows for anywhere.
+        cells: used if there are no places.
         static: see the module.
     """
     turn = _uniform(seed, counter + 3)
@@ -145,18 +145,18 @@ def _spot(seed, counter, places, cells, static):  # type: ignore[no-untyped-def]
     return x, y, places[p, 4] + turn * (places[p, 5] - places[p, 4])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _free(disc, x, y, rules, static, bodies, none, outlines, spare):  # type: ignore[no-untyped-def]
-    """Whether a robot and the clearance around it have room at a point."""
+    """True if a robot with the clearance around it fits at a point."""
     disc[0], disc[1] = x, y
     return clear_of_bodies(disc, rules[1], bodies, none, outlines, spare) and clear_of_walls(
         disc, rules[1], static, outlines, spare
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _apart(x, y, others, m, least):  # type: ignore[no-untyped-def]
-    """Whether a point is farther than `least` [m] from the first m of others (M, 2 or more)."""
+    """True if a point is farther than `least` [m] from the first m of others (M, 2 or more)."""
     for other in range(m):
         dx, dy = x - others[other, 0], y - others[other, 1]
         if dx * dx + dy * dy <= least * least:
@@ -164,21 +164,21 @@ def _apart(x, y, others, m, least):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _in_ring(seed, counter, x, y, least, greatest):  # type: ignore[no-untyped-def]
-    """A point evenly in the ring of these distances [m] around another."""
+    """Draws a point uniformly in the ring of these distances [m] around another."""
     turn = 2.0 * math.pi * _uniform(seed, counter)
     share = _uniform(seed, counter + 1)
     far = math.sqrt(least * least + share * (greatest * greatest - least * least))
     return x + far * math.cos(turn), y + far * math.sin(turn)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _place_robots(  # type: ignore[no-untyped-def]
     seed, counter, rules, where, still, static, outlines, bodies, none, starts, goals, disc,
     search, spare,
 ):  # fmt: skip
-    """Places starts and goals in pairs, each with a way between."""
+    """Places starts and goals in pairs, each pair with a path between them."""
     start_places, goal_places, cells, _ = where
     footprint, clearance, least, greatest, room, around = rules
     for m in range(starts.shape[0]):
@@ -221,7 +221,7 @@ def _place_robots(  # type: ignore[no-untyped-def]
     return counter, True
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def draw_scenes(  # type: ignore[no-untyped-def]
     seeds, wanted, sizes, plan, static, outlines, rules, where, bodies, starts, goals, search
 ):
@@ -229,23 +229,23 @@ def draw_scenes(  # type: ignore[no-untyped-def]
 
     Args:
         seeds: (n,).
-        wanted: (n,) how many random obstacles, -1 for what the world says.
+        wanted: (n,) number of random obstacles, -1 for the world's own.
         sizes: (n,) rows of the shapes' index.
-        plan: groups (G, 7), group of each obstacle (K,), which shapes each group may take, one
+        plan: groups (G, 7), group of each obstacle (K,), shapes that each group may take, one
             group after the other, index (S, H) of each shape in each size, poses (K, 3) of the
-            obstacles that always stand somewhere.
+            obstacles at fixed poses.
         static, outlines: see the module.
-        rules: footprint and clearance [m], least and greatest distance of the goal [m], their
-            sum in the centre of a cell [m], 1 to draw goals around their starts.
-        where: places of starts and of goals, see `_spot`; cells with room for robots, and those
-            with room for anything.
+        rules: footprint and clearance [m], least and greatest distance of the goal [m], free space
+            required at the centre of a cell [m], 1 to draw goals around their starts.
+        where: places of starts and of goals, see `_spot`; cells free for robots, and cells with
+            any free space.
         bodies: (n, K, 7) result, see `lidar.shapes.BODY`.
         starts: (n, M, 3) result.
         goals: (n, M, 2) result.
         search: scratch, see `joined`.
 
     Returns:
-        The first row that could not be drawn, or n, and what was in the way.
+        The first row that could not be drawn, or n, and the reason.
     """
     count = bodies.shape[1]
     gaps, none = np.zeros(count), np.zeros(count)

@@ -1,4 +1,4 @@
-"""The scenes that are drawn from worlds: obstacles, starts and goals of each seed."""
+"""Scenes drawn from worlds: obstacles, starts and goals of each seed."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from nics_drl_bridge.lidar.shapes import (
 )
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim import scene_kernels as kernels
-from nics_drl_bridge.sim.areas import Areas, areas_of
-from nics_drl_bridge.sim.motion import Motion
+from nics_drl_bridge.sim.free_space import Areas, areas_of
+from nics_drl_bridge.sim.obstacles import Motion
 from nics_drl_bridge.sim.world import Goals, Starts, World
 
 __all__ = ["Scene", "SceneSampler", "Scenes", "sample_scene", "scaled"]
@@ -39,11 +39,11 @@ Search = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class Scene:
-    """What one seed gives in a world.
+    """Scene of one seed in a world.
 
     Attributes:
         bodies: (K, 7) obstacles as in `lidar.shapes.BODY`; the index of the shape is that in
-            `SceneSampler.shapes`, the radius is 0 where there is none.
+            `SceneSampler.shapes`, the radius is 0 for an absent obstacle.
         starts: (M, 3) pose of each robot.
         goals: (M, 2) position of each goal [m].
     """
@@ -55,7 +55,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Scenes:
-    """What n seeds give in a world; `scenes[i]` is the Scene of one.
+    """Scenes of n seeds in a world; `scenes[i]` is the Scene of one.
 
     Attributes:
         bodies: (n, K, 7) see `Scene`.
@@ -72,11 +72,11 @@ class Scenes:
         return len(self.bodies)
 
     def __getitem__(self, row: int) -> Scene:
-        """One of them."""
+        """Returns one scene."""
         return Scene(self.bodies[row], self.starts[row], self.goals[row])
 
     def __iter__(self) -> Iterator[Scene]:
-        """One after the other."""
+        """Iterates over the scenes."""
         return (self[row] for row in range(len(self)))
 
 
@@ -84,22 +84,22 @@ class SceneSampler:
     """Draws scenes of a world.
 
     A start and its goal are free, with the clearance of the world around the robot, and a robot
-    that keeps this clearance can move from one to the other, among walls, map and all obstacles
-    that do not move. Obstacles overlap neither each other nor walls nor map, and keep their gaps.
+    that keeps this clearance can move from one to the other among walls, map and all static
+    obstacles. Obstacles overlap neither each other nor walls nor map, and keep their gaps.
 
     Args:
-        world: where.
+        world: the field, its map and its obstacles.
         footprint_radius: of a robot [m].
         robots: M.
-        sizes: factors that obstacles may be larger by.
-        most: the greatest number of random obstacles that `draw` may be asked for, if it is more
-            than the world has.
+        sizes: factors by which obstacles may be scaled.
+        most: greatest number of random obstacles that may be requested from `draw`, if more than
+            the world has.
 
     Attributes:
         shapes: every shape that can occur: those of the world in the first size, then in the next.
-        count: K, the most obstacles.
-        motions: (K) how each obstacle moves, None for not at all; obstacle k belongs to the same
-            group in every scene.
+        count: K, the greatest number of obstacles.
+        motions: (K) motion of each obstacle, None if it stands still; obstacle k belongs to the
+            same group in every scene.
 
     Raises:
         ConfigError: the world has no free space for such a robot.
@@ -138,13 +138,13 @@ class SceneSampler:
         count: ArrayLike | None = None,
         size: ArrayLike | None = None,
     ) -> Scenes:
-        """Draws the scenes that belong to seeds; the same in every process and batch.
+        """Draws the scenes of seeds; identical in every process and batch.
 
         Args:
             seeds: (n,).
-            count: (n,) how many random obstacles each has, at most what the world allows; by
-                default as the world says.
-            size: (n,) which of the sizes all obstacles of a scene have; the first by default.
+            count: (n,) number of random obstacles of each scene, at most as many as the world
+                allows; by default that of the world.
+            size: (n,) index of the size of all obstacles of a scene; the first by default.
 
         Raises:
             ConfigError: a seed is out of range, or the world has no room for a scene.
@@ -173,7 +173,7 @@ class SceneSampler:
         return scenes
 
     def _search(self) -> Search:
-        """Scratch for one call; threads may draw at the same time."""
+        """Returns scratch memory for one call; threads may draw at the same time."""
         try:
             return self._searches.pop()
         except IndexError:
@@ -199,10 +199,10 @@ class SceneSampler:
 
 
 def sample_scene(world: World, footprint: float, seed: int, robots: int = 1) -> Scene:
-    """Draws the scene that belongs to a seed; the same in every process.
+    """Draws the scene of a seed; identical in every process.
 
     Args:
-        world: where.
+        world: the field, its map and its obstacles.
         footprint: radius of a robot [m].
         seed: of the episode.
         robots: M.
@@ -219,7 +219,7 @@ def _sampler(world: World, footprint: float, robots: int) -> SceneSampler:
 
 
 def scaled(shape: Shape, factor: float) -> Shape:
-    """A shape, larger by a factor."""
+    """Returns a shape scaled by a factor."""
     if factor == 1.0:
         return shape
     try:
@@ -243,7 +243,7 @@ def _scaled(shape: Shape, factor: float) -> Shape:
 
 
 def _with_room(world: World, most: int) -> World:
-    """The world with so many places for random obstacles, shared out as the groups' are."""
+    """Returns the world with `most` random obstacles, distributed over groups as in the world."""
     at_random = [group for group in world.obstacles if not group.at]
     if most and not at_random:
         raise ConfigError(
@@ -263,7 +263,7 @@ def _with_room(world: World, most: int) -> World:
 
 
 def _rules(world: World, footprint: float, areas: Areas) -> tuple[float, ...]:
-    """What `scene_kernels.draw_scenes` takes as `rules`."""
+    """Returns the argument `rules` of `scene_kernels.draw_scenes`."""
     least, greatest = world.goal_distance
     cell = areas.static[2][4]
     ring = math.pi * (greatest * greatest - least * least)
@@ -272,7 +272,7 @@ def _rules(world: World, footprint: float, areas: Areas) -> tuple[float, ...]:
 
 
 def _places(places: Starts | Goals | None) -> Array:
-    """(P, 7) see `scene_kernels.draw_scenes`."""
+    """Returns the places (P, 7), see `scene_kernels.draw_scenes`."""
     if places is None:
         return np.zeros((0, 7))
     rows = np.zeros((len(places.at) + len(places.regions), 7))
@@ -287,7 +287,7 @@ def _places(places: Starts | Goals | None) -> Array:
 
 
 def _plan(world: World, slots: Sequence[int], sizes: int) -> tuple[Any, ...]:
-    """What `scene_kernels.draw_scenes` takes as `plan`."""
+    """Returns the argument `plan` of `scene_kernels.draw_scenes`."""
     groups = np.zeros((len(world.obstacles), 7))
     base: list[int] = []
     poses = np.zeros((len(slots), 3))

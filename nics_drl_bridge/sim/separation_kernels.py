@@ -1,14 +1,13 @@
-"""Compiled separation: a round obstacle moves no further than the room that it has.
+"""Compiled separation: a round obstacle moves no further than its free space.
 
-Around every obstacle each wall, body and side of the field leaves a half plane: along the unit
-vector to its nearest point there is so much `room`. Two that both move may take half of the gap
-each, so that they need not know of each other's step (buffered Voronoi cells; Zhou, Wang,
-Bandyopadhyay, Schwager 2017). A displacement within all half planes touches nothing, at no time
-of the period.
+Each wall, body and side of the field limits an obstacle to a half plane: along the unit vector to
+the nearest point it may move by `room`. Of two that both move, each may use half of the gap, so
+that neither needs to know the other's step (buffered Voronoi cells; Zhou, Wang, Bandyopadhyay,
+Schwager 2017). A displacement within all half planes is free of contacts throughout the period.
 
 Shared arguments, all of one world: `bodies` (K + M, 7), see `lidar.shapes.BODY`, robots from index
 `first`; `walls` (W, 4); `half` (2,) half the size of the field [m]; `distances` see
-`motion.distance_arrays`; `scene` is (bodies, walls, half, distances).
+`obstacles.distance_arrays`; `scene` is (bodies, walls, half, distances).
 """
 
 from __future__ import annotations
@@ -16,23 +15,37 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from nics_drl_bridge.sim import motion_layout as at
+from nics_drl_bridge.kernels import kernel
+
+# A row of a plan (K, P): the motion of an obstacle.
+(
+    KIND, SPEED_LOW, SPEED_HIGH, FIRST, COUNT, LOOP, PAUSE,
+    RELAXATION, REPULSION, RANGE, WALL_REPULSION, WALL_RANGE, FORESIGHT, VIEW, BEHIND,
+    FLUCTUATION,
+) = range(16)  # fmt: skip
+PLAN = 16
+
+# Values of the column KIND.
+STILL, WANDER, PATROL, PEDESTRIAN = range(4)
+
+# Memory of an obstacle, a row of marks (N, K, F).
+SPEED, VX, VY, DIRECTION, AIM, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST = range(11)
+MARK = 11
 
 SLACK = 1e-6
-"""Room that is never used, in metres: rounding must not make two bodies touch."""
+"""Margin that is never used [m]: rounding must not make two bodies touch."""
 PASSES = 3
-"""A displacement is bent so often before what remains too much is shortened."""
+"""Number of times a displacement is bent before the remaining excess is shortened."""
 FINEST = 0.25
-"""Least step along a way through a static map, in cells."""
+"""Least step along a path through a static map, in cells."""
 HALVINGS = 8
-"""The last step of it is halved so often to find where the way ends."""
+"""Number of bisections of its last step to find the end of the free path."""
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def on_wall(x, y, wall):  # type: ignore[no-untyped-def]
-    """The point of a straight wall (4,) that is nearest to a point."""
+    """Returns the point of a straight wall (4,) nearest to a point."""
     ex, ey = wall[2] - wall[0], wall[3] - wall[1]
     length2 = ex * ex + ey * ey
     share = 0.0
@@ -41,9 +54,9 @@ def on_wall(x, y, wall):  # type: ignore[no-untyped-def]
     return wall[0] + share * ex, wall[1] + share * ey
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def map_distance(x, y, distances):  # type: ignore[no-untyped-def]
-    """Distance from a point to the static map [m], between the centres of cells bilinearly."""
+    """Distance from a point to the static map [m], bilinear between the centres of cells."""
     grid, frame = distances
     rows, columns = grid.shape
     if rows < 2 or columns < 2:
@@ -61,7 +74,7 @@ def map_distance(x, y, distances):  # type: ignore[no-untyped-def]
     return low * (1.0 - v) + high * v
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def map_direction(x, y, distances):  # type: ignore[no-untyped-def]
     """Unit vector to the nearest point of the static map; zero where there is none."""
     step = 0.5 * distances[1][4]
@@ -73,9 +86,9 @@ def map_direction(x, y, distances):  # type: ignore[no-untyped-def]
     return gx / length, gy / length
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def clearance(x, y, k, scene):  # type: ignore[no-untyped-def]
-    """Distance from a point to the nearest thing but body k, and the unit vector to it."""
+    """Distance from a point to the nearest object except body k [m], and the unit vector to it."""
     bodies, walls, half, distances = scene
     least, nx, ny = half[0] - abs(x), math.copysign(1.0, x), 0.0
     if half[1] - abs(y) < least:
@@ -101,11 +114,11 @@ def clearance(x, y, k, scene):  # type: ignore[no-untyped-def]
     return least, nx, ny
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
-    """A displacement that leads no further than `room` along n.
+    """Limits a displacement to `room` along n.
 
-    What is too much is cut off (`bend`), or the whole is shortened.
+    Either the excess along n is removed (`bend`), or the whole displacement is shortened.
     """
     ahead = dx * nx + dy * ny
     room = max(room - SLACK, 0.0)
@@ -116,9 +129,9 @@ def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
     return dx * (room / ahead), dy * (room / ahead)
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _hold_bodies(dx, dy, k, bodies, first, speeds, rows, period, bend):  # type: ignore[no-untyped-def]
-    """Holds the displacement of body k within the room that the other bodies leave it."""
+    """Limits the displacement of body k to the room that the other bodies leave."""
     x, y, radius = bodies[k, 0], bodies[k, 1], bodies[k, 5]
     length = math.sqrt(dx * dx + dy * dy)
     for j in range(bodies.shape[0]):
@@ -138,15 +151,15 @@ def _hold_bodies(dx, dy, k, bodies, first, speeds, rows, period, bend):  # type:
         if j >= first:
             towards = speeds[j - first, 0] * nx + speeds[j - first, 1] * ny
             room += min(towards, 0.0) * period
-        elif rows[j, at.KIND] != at.STILL:
+        elif rows[j, KIND] != STILL:
             room *= 0.5
         dx, dy = _hold(dx, dy, nx, ny, room, bend)
     return dx, dy
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _hold_walls(dx, dy, x, y, radius, walls, half, bend):  # type: ignore[no-untyped-def]
-    """Holds a displacement within the field and on this side of its walls."""
+    """Limits a displacement to the field and to this side of the walls."""
     reach = radius + math.sqrt(dx * dx + dy * dy) + 2.0 * SLACK
     for side in (-1.0, 1.0):
         dx, dy = _hold(dx, dy, side, 0.0, half[0] - radius - side * x, bend)
@@ -161,9 +174,9 @@ def _hold_walls(dx, dy, x, y, radius, walls, half, bend):  # type: ignore[no-unt
     return dx, dy
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def _hold_map(dx, dy, x, y, radius, distances, bend):  # type: ignore[no-untyped-def]
-    """Holds a displacement clear of the static map; it walks ahead by the room that it finds."""
+    """Limits a displacement to keep clear of the static map, by marching along the path."""
     length = math.sqrt(dx * dx + dy * dy)
     here = map_distance(x, y, distances) - radius
     if here - SLACK > length or length == 0.0:
@@ -172,7 +185,7 @@ def _hold_map(dx, dy, x, y, radius, distances, bend):  # type: ignore[no-untyped
     if bend:
         return _hold(dx, dy, nx, ny, here, True)
     if here <= SLACK and dx * nx + dy * ny <= 0.0 and nx * nx + ny * ny > 0.0:
-        # It touches the map; it may go where there is more room.
+        # In contact with the map it may only move to where there is no less room.
         return (dx, dy) if map_distance(x + dx, y + dy, distances) - radius >= here else (0.0, 0.0)
     free, way, finest = 0.0, 0.0, FINEST * distances[1][4] / length
     room = here
@@ -191,16 +204,16 @@ def _hold_map(dx, dy, x, y, radius, distances, bend):  # type: ignore[no-untyped
     return dx * free, dy * free
 
 
-@njit(cache=True)
+@kernel(allocates=True)
 def restrain(dx, dy, k, scene, first, speeds, rows, period, bends):  # type: ignore[no-untyped-def]
-    """The part of a displacement [m] that body k can make within a period.
+    """Returns the part of a displacement [m] that body k can make within a period.
 
     Args:
-        k: of the body, below `first`.
+        k: index of the body, below `first`.
         speeds: (M, 2) velocity of the robots in `map` [m/s].
-        rows: (K, P) plans, which tell what moves.
+        rows: (K, P) plans, which define the moving obstacles.
         period: [s].
-        bends: whether it slides along what is in the way, or keeps its direction.
+        bends: whether it slides along obstructions or keeps its direction.
     """
     bodies, walls, half, distances = scene
     x, y, radius = bodies[k, 0], bodies[k, 1], bodies[k, 5]
@@ -211,7 +224,7 @@ def restrain(dx, dy, k, scene, first, speeds, rows, period, bends):  # type: ign
         dx, dy = _hold_map(dx, dy, x, y, radius, distances, True)
         if dx == wished_x and dy == wished_y:
             break
-    # Shortening keeps what was held before, so after it everything holds.
+    # Shortening preserves limits already met, so all are met afterwards.
     dx, dy = _hold_bodies(dx, dy, k, bodies, first, speeds, rows, period, False)
     dx, dy = _hold_walls(dx, dy, x, y, radius, walls, half, False)
     return _hold_map(dx, dy, x, y, radius, distances, False)

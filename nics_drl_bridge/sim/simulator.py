@@ -11,13 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
-from nics_drl_bridge.lidar.baking import with_shapes
+from nics_drl_bridge.lidar.bake import with_shapes
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
 from nics_drl_bridge.lidar.shapes import SHAPE, place
-from nics_drl_bridge.sim import kernels
-from nics_drl_bridge.sim.motion import distance_arrays, plan_arrays
+from nics_drl_bridge.sim import step_kernels
+from nics_drl_bridge.sim.allocation import SLICES, Sizes, allocate, part_of, split
+from nics_drl_bridge.sim.obstacles import distance_arrays, plan_arrays
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
+from nics_drl_bridge.sim.state import Movers, State
 from nics_drl_bridge.sim.validity import (
     CommandBox,
     OutsideValidityWarning,
@@ -25,23 +27,22 @@ from nics_drl_bridge.sim.validity import (
     warn,
 )
 from nics_drl_bridge.sim.world import World
-from nics_drl_bridge.sim.worlds import SLICES, Sizes, Worlds, allocate, arguments, split
 from nics_drl_bridge.threads import Crew
 
-__all__ = ["SLICES", "FastSimulator", "OutsideValidityWarning", "Worlds"]
+__all__ = ["SLICES", "FastSimulator", "OutsideValidityWarning", "State"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 R = TypeVar("R")
 MOST_ROBOTS = 1_000
-"""Of one world; every one is held against every other."""
+"""Greatest number of robots in one world; each is tested against every other."""
 MOST_NUMBERS = 2**30
-"""That all worlds together may hold, some GB: beams of robots, states of obstacles."""
+"""Greatest number of values in all worlds, some GB: beams of robots, states of obstacles."""
 PER_BODY = 64
 
 
 def _check_memory(model: SimulatorModel, world: World, worlds: int, robots: int) -> None:
-    """Raises ConfigError for more copies of a world than fit, before any of them is made."""
+    """Raises ConfigError for more copies of a world than fit in memory, before any allocation."""
     obstacles = sum(group.counts[1] for group in world.obstacles)
     each = robots * (model.lidar.beams + PER_BODY) + obstacles * PER_BODY
     if robots > MOST_ROBOTS or worlds * each > MOST_NUMBERS:
@@ -54,29 +55,30 @@ def _check_memory(model: SimulatorModel, world: World, worlds: int, robots: int)
 class FastSimulator:
     """The simulator that a SimulatorModel describes, in a world.
 
-    A world comes to the same bits in a batch of any size and with any number of threads.
+    A world is bit-identical in a batch of any size and with any number of threads.
 
     Args:
         model: the robot: motion, lidar, noise.
         world: the field and its obstacles.
         worlds: N.
-        robots: M in each world. They see and touch each other.
+        robots: M in each world. They scan and collide with each other.
         renderer: `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`.
-        threads: so many parts of the worlds are moved at the same time.
-        randomisation: what each episode draws anew, the name of a shipped one, or a YAML file.
-        longest_delay: greatest latency of commands that `data.delay` may be given [substeps]; the
-            model's by default, or what the randomisation may draw.
-        longest_age: greatest age of scan and odometry that `data.age` may be given [substeps];
-            more if the randomisation may draw it.
-        tell: is told when commands leave the range that the model was fitted to.
+        threads: number of parts of the worlds that are stepped in parallel.
+        randomisation: ranges drawn from in each episode: an object, the name of a shipped one, or
+            a YAML file.
+        longest_delay: greatest latency of commands that `data.delay` may be set to [substeps]; by
+            default the model's. Raised to the randomisation's greatest.
+        longest_age: greatest age of scan and odometry that `data.age` may be set to [substeps];
+            raised to the randomisation's greatest.
+        tell: called with a message when commands leave the range that the model was fitted to.
 
     Attributes:
-        data: all that changes, see `Worlds`.
+        data: all mutable state, see `State`.
         goals: (N, M, 2) of the episodes [m].
-        parts: the worlds that each thread moves.
+        parts: the worlds that each thread steps.
         sampler: draws the scenes.
-        drawn: name -> what the randomisation drew for the running episodes, (N, M) of each robot
-            or (N,) of a scene; empty without one.
+        drawn: name -> draws of the randomisation for the running episodes, (N, M) per robot or
+            (N,) per scene; empty without randomisation.
     """
 
     def __init__(
@@ -134,17 +136,17 @@ class FastSimulator:
 
     @cached_property
     def packed(self) -> dict[int, Any]:
-        """What the kernels take, by the first world of each part."""
+        """Packed arguments of the kernels, by the first world of each part."""
         walls, motions = self.world.all_walls(), self.sampler.motions
         moves = any(motion is not None for motion in motions)
         low_x, low_y, high_x, high_y = self.world.extent
         half = np.array([max(-low_x, high_x), max(-low_y, high_y)])
-        movers = (moves, plan_arrays(motions), half, distance_arrays(self.world.grid))
+        movers = Movers(moves, plan_arrays(motions), half, distance_arrays(self.world.grid))
         of = (self.data, self.model, self._scanner, walls, movers, self._sizes)
-        return {part.start: kernels.pack(arguments(*of, part)) for part in self.parts}
+        return {part.start: step_kernels.pack(part_of(*of, part)) for part in self.parts}
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what a copy has to make anew."""
+        """Returns the state without `packed`, which a copy rebuilds."""
         return {name: value for name, value in vars(self).items() if name != "packed"}
 
     def reset(
@@ -153,15 +155,15 @@ class FastSimulator:
         worlds: ArrayLike | None = None,
         starts: ArrayLike | None = None,
     ) -> Scenes:
-        """Begins episodes. Threads may do so at the same time, each in worlds of another part.
+        """Begins episodes. Threads may call it in parallel, each for worlds of a different part.
 
         Args:
             seeds: of each episode (n,); a seed fixes scene, start, goal, noise and randomisation.
-            worlds: which worlds begin anew (n,), all by default.
+            worlds: (n,) indices of the worlds to reset, all by default.
             starts: (n, M, 3) poses to begin at instead of the scene's.
 
         Returns:
-            The scene of each.
+            The scene of each episode.
 
         Raises:
             ConfigError: the seeds or starts do not fit, or the world has no room for a scene.
@@ -181,11 +183,11 @@ class FastSimulator:
             of_part = chosen[(chosen >= part.start) & (chosen < part.stop)]
             if len(of_part):
                 self._boxes[part.start].begin()
-                kernels.begin(self.packed[part.start], of_part)
+                step_kernels.begin(self.packed[part.start], of_part)
         return scenes
 
     def scenes(self, seeds: ArrayLike) -> Scenes:
-        """The scenes that `reset` would begin with for some seeds (n,)."""
+        """Returns the scenes that `reset` would begin with for seeds (n,)."""
         return self._draw(seeds)[0]
 
     def _draw(self, seeds: ArrayLike) -> tuple[Scenes, Draws | None]:
@@ -196,7 +198,7 @@ class FastSimulator:
 
     @property
     def obstacles(self) -> Array:
-        """(N, K, 7) the obstacles as they stand now, as `scenes` tells where they began."""
+        """(N, K, 7) the obstacles at their present poses, in the format of `scenes`."""
         bodies = self.data.bodies[:, : self.sampler.count].copy()
         index = np.zeros(int(self._in_table.max()) + 1)
         index[self._in_table[:-1]] = np.arange(len(self.sampler.shapes))
@@ -218,7 +220,7 @@ class FastSimulator:
         self.goals[chosen] = scenes.goals
 
     def _assign(self, chosen: Indices, draws: Draws) -> None:
-        """Gives the robots of some worlds what was drawn for them."""
+        """Assigns the draws to the robots of some worlds."""
         data = self.data
         data.coefficient[chosen], data.noise[chosen] = draws.coefficient, draws.noise
         data.delay[chosen], data.age[chosen] = draws.delay, draws.age
@@ -239,32 +241,32 @@ class FastSimulator:
         self._check_shape(commands, len(self.data.steps))
         self._boxes[0].check(commands)
         if len(self.parts) == 1:
-            kernels.step_worlds(self.packed[0], commands, 0)
+            step_kernels.step_worlds(self.packed[0], commands, 0)
         else:
             self.run_parts(
-                lambda part: kernels.step_worlds(
+                lambda part: step_kernels.step_worlds(
                     self.packed[part.start], commands[part], part.start
                 )
             )
 
     def run_parts(self, function: Callable[[slice], R]) -> list[R]:
-        """What a function gives for each of `parts`, each run by a thread of its own."""
+        """Runs a function for each of `parts`, one thread per part; returns the results."""
         return self._crew.run(function, self.parts)
 
     def step_part(self, part: slice, commands: ArrayLike) -> None:
-        """Moves the worlds of one part by one control period, in the thread that calls.
+        """Moves the worlds of one part by one control period, in the calling thread.
 
         Args:
-            part: one of `parts`; different ones may be moved at the same time.
+            part: one of `parts`; different parts may be stepped in parallel.
             commands: (n, M, C) of the worlds of the part.
         """
         commands = np.ascontiguousarray(commands, dtype=np.float64)
         self._check_shape(commands, part.stop - part.start)
         self._boxes[part.start].check(commands)
-        kernels.step_worlds(self.packed[part.start], commands, part.start)
+        step_kernels.step_worlds(self.packed[part.start], commands, part.start)
 
     def _check_shape(self, commands: Array, worlds: int) -> None:
-        """Raises ConfigError where the kernels would read beyond the commands."""
+        """Raises ConfigError if the kernels would read beyond the commands."""
         robots, _, width = self.data.history.shape[1:]
         if commands.shape != (worlds, robots, width):
             raise ConfigError(

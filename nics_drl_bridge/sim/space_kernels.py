@@ -1,15 +1,15 @@
-"""Compiled questions about free space: is a place free, and is there a way between two?
+"""Compiled queries of free space: a body fits at a pose, a path exists between two points.
 
-Whether a place is free is decided by true distances between outlines; a grid of distances only
-spares most of that.
+Free poses are decided by true distances between outlines; the grid of distances only saves most of
+that work.
 
 Shared arguments. `static` is what stands in every scene: for each cell of the grid the distance
-from its centre to the nearest wall or solid cell of the map, and the number of the area that it
-belongs to, 0 where a robot does not fit, (rows, columns) each; frame (5,) x, y [m], cosine, sine of
-the outer corner of cell (0, 0), side of a cell [m]; bounds (4,) least x, y and greatest x, y of the
-field; walls (W, 4); the map, see `collision_kernels`. `outlines` is corners, where each outline
-begins, radii (H,) of all shapes, the last of which is a disc. `spare` is scratch, see
-`collision_kernels`.
+from its centre to the nearest wall or solid cell of the map, and the number of its area of
+connected free space, 0 where a robot does not fit, (rows, columns) each; frame (5,) x, y [m],
+cosine, sine of the outer corner of cell (0, 0), side of a cell [m]; bounds (4,) least x, y and
+greatest x, y of the field; walls (W, 4); the map, see `collision_kernels`. `outlines` is corners,
+first corner of each outline, radii (H,) of all shapes, the last of which is a disc. `spare` is
+scratch, see `collision_kernels`.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.sim.collision_kernels import body_gap, map_gap, wall_gap
 
 FLOAT32 = 1e-6
-"""Distances of the grid are rounded to so many parts of themselves."""
+"""Relative rounding error of the distances of the grid."""
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def wall_distance(x, y, walls):  # type: ignore[no-untyped-def]
-    """Distance from a point to the nearest straight wall (W, 4); inf when there is none."""
+    """Distance from a point to the nearest straight wall (W, 4) [m]; inf if there is none."""
     least = np.inf
     for w in range(walls.shape[0]):
         ax, ay = walls[w, 0], walls[w, 1]
@@ -40,25 +40,25 @@ def wall_distance(x, y, walls):  # type: ignore[no-untyped-def]
     return least
 
 
-@njit(cache=True, nogil=True)
+@kernel(allocates=True)
 def wall_distances(distance, frame, walls):  # type: ignore[no-untyped-def]
-    """Lowers distances (rows, columns) of cells to those to the walls."""
+    """Lowers distances (rows, columns) of cells to the distances to the walls, in place."""
     for i in range(distance.shape[0]):
         for j in range(distance.shape[1]):
             x, y = place_in(i + 0.5, j + 0.5, frame)
             distance[i, j] = min(distance[i, j], wall_distance(x, y, walls))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def place_in(row, column, frame):  # type: ignore[no-untyped-def]
-    """x, y [m] of a place in the grid, in parts of cells."""
+    """Returns x, y [m] of a place in the grid, given as fractional row and column."""
     u, v = column * frame[4], row * frame[4]
     return frame[0] + frame[2] * u - frame[3] * v, frame[1] + frame[3] * u + frame[2] * v
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def cell_of(x, y, frame):  # type: ignore[no-untyped-def]
-    """Row and column of a point, and how far it is from the centre of that cell [m]."""
+    """Returns row and column of a point, and its distance from the centre of that cell [m]."""
     dx, dy = x - frame[0], y - frame[1]
     u = (frame[2] * dx + frame[3] * dy) / frame[4]
     v = (frame[2] * dy - frame[3] * dx) / frame[4]
@@ -66,9 +66,9 @@ def cell_of(x, y, frame):  # type: ignore[no-untyped-def]
     return i, j, frame[4] * math.sqrt((u - j - 0.5) ** 2 + (v - i - 0.5) ** 2)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def _within(x, y, static):  # type: ignore[no-untyped-def]
-    """Whether a point lies in the field and in the grid; its distance to walls, less, and more."""
+    """True if a point is in field and grid; with lower and upper bound of its distance to walls."""
     distance, _, frame, bounds, _, _ = static
     i, j, off = cell_of(x, y, frame)
     inside = 0 <= i < distance.shape[0] and 0 <= j < distance.shape[1]
@@ -79,9 +79,9 @@ def _within(x, y, static):  # type: ignore[no-untyped-def]
     return True, middle * (1.0 - FLOAT32) - off, middle * (1.0 + FLOAT32) + off
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def clear_of_walls(body, room, static, outlines, spare):  # type: ignore[no-untyped-def]
-    """Whether a body (7,) lies in the field and keeps `room` [m] to walls and map."""
+    """True if a body (7,) lies in the field and keeps `room` [m] from walls and map."""
     corners, corner, _ = outlines
     inside, low, high = _within(body[0], body[1], static)
     round_ = corner[int(body[6])] == corner[int(body[6]) + 1]
@@ -89,7 +89,7 @@ def clear_of_walls(body, room, static, outlines, spare):  # type: ignore[no-unty
         return True
     if round_ and (not inside or high < body[5] + room):
         return False
-    if not round_:  # its origin may lie beside it
+    if not round_:  # its origin may lie outside its outline
         first = corners[corner[int(body[6])]]
         x = body[0] + body[3] * first[0] - body[4] * first[1]
         y = body[1] + body[4] * first[0] + body[3] * first[1]
@@ -101,9 +101,9 @@ def clear_of_walls(body, room, static, outlines, spare):  # type: ignore[no-unty
     return map_gap(body, static[5], corners, corner, room, spare) >= room
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def clear_of_bodies(body, room, bodies, gaps, outlines, spare):  # type: ignore[no-untyped-def]
-    """Whether a body (7,) keeps `room` [m], or its gap if that is more, to each of (K, 7)."""
+    """True if a body (7,) keeps max(`room`, gap of the other) [m] from each of `bodies` (K, 7)."""
     corners, corner, _ = outlines
     mine = corner[int(body[6])] == corner[int(body[6]) + 1]
     for k in range(bodies.shape[0]):
@@ -121,9 +121,9 @@ def clear_of_bodies(body, room, bodies, gaps, outlines, spare):  # type: ignore[
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def clear_of_still(disc, room, still, bodies, outlines, spare):  # type: ignore[no-untyped-def]
-    """Whether a disc (7,) keeps `room` [m] to those of the bodies that count."""
+    """True if a disc (7,) keeps `room` [m] from all static obstacles."""
     corners, corner, _ = outlines
     for k in range(bodies.shape[0]):
         if bodies[k, 5] <= 0.0 or still[k] == 0:
@@ -138,9 +138,9 @@ def clear_of_still(disc, room, still, bodies, outlines, spare):  # type: ignore[
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def area_of(x, y, static):  # type: ignore[no-untyped-def]
-    """The number of the area that a point lies in; 0 for none."""
+    """Returns the number of the area that contains a point; 0 for none."""
     i, j, _ = cell_of(x, y, static[2])
     label = static[1]
     if 0 <= i < label.shape[0] and 0 <= j < label.shape[1]:
@@ -148,20 +148,20 @@ def area_of(x, y, static):  # type: ignore[no-untyped-def]
     return 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@kernel
 def joined(x, y, gx, gy, disc, room, still, static, bodies, none, outlines, search, spare):  # type: ignore[no-untyped-def]
-    """Whether a disc can move from one point to another among obstacles, from cell to cell.
+    """True if a disc can move between two points among obstacles, from cell to cell.
 
-    It looks from both ends, in the direction of the other first: where there is no way, one of them
-    is often shut in and soon done. The cells of both points count as free.
+    Searches from both ends, each towards the other first: where there is no path, one end is often
+    enclosed and its search ends soon. The cells of both points count as free.
 
     Args:
         x, y, gx, gy: the points [m], in one area.
-        disc: (7,) the robot, moved about.
-        room: free space around it in the centre of a cell [m].
-        still: (K,) 1 for the obstacles that count.
-        search: in which search each cell was seen last (rows * columns), two stacks of as many,
-            the number of the latest search (1,).
+        disc: (7,) the robot; its position is overwritten.
+        room: free space required around it at the centre of a cell [m].
+        still: (K,) 1 for static obstacles; others are ignored.
+        search: number of the search that last visited each cell (rows * columns), two stacks of as
+            many, the number of the latest search (1,).
     """
     label, frame = static[1], static[2]
     seen, stack, latest = search
@@ -183,7 +183,7 @@ def joined(x, y, gx, gy, disc, room, still, static, bodies, none, outlines, sear
         ti, tj = (gi, gj) if side == 0 else (start // columns, start % columns)
         up, right = (1 if ti >= i else -1), (1 if tj >= j else -1)
         steep = abs(ti - i) >= abs(tj - j)
-        for way in range(4):  # the last one is looked at first
+        for way in range(4):  # the last one is popped first
             toward = 1 if way > 1 else -1
             along = (way == 0 or way == 3) == steep
             row = i + (toward * up if along else 0)

@@ -1,4 +1,4 @@
-"""Validity: warns when a simulator is asked for what its model's drive never showed."""
+"""Validity: warns of commands outside the range that the model's recording covered."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.kinematics import features
-from nics_drl_bridge.kinematics.model import TaylorModel
-from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.taylor import TaylorModel
 
 Array = NDArray[np.float64]
 
 TOLERANCE = 0.05
-"""Share of a command's limits by which it may leave the range that was driven."""
+"""Tolerance beyond the recorded range, as a share of the command's limits."""
 EVERY = 16
-"""Commands are looked at in the first step after a reset and then every so many steps."""
+"""Commands are checked in the first step after a reset and then at this interval [steps]."""
 
 
 class OutsideValidityWarning(UserWarning):
@@ -26,19 +26,19 @@ class OutsideValidityWarning(UserWarning):
 
 
 def warn(message: str) -> None:
-    """Says it to whoever steps a simulator in their own program."""
+    """Issues an OutsideValidityWarning to the caller that steps the simulator."""
     warnings.warn(message, OutsideValidityWarning, stacklevel=4)
 
 
 class CommandBox:
     """The range of commands that a model was fitted to.
 
-    Variables whose effect was assumed, not learnt, are let through.
+    Variables whose effect was assumed, not learnt, are not checked.
 
     Args:
         model: the kinematics.
         robot: names and limits of the commands.
-        tell: is given what there is to say.
+        tell: called with the message of a warning.
     """
 
     def __init__(
@@ -58,11 +58,11 @@ class CommandBox:
         self._steps, self._armed = 0, True
 
     def begin(self) -> None:
-        """Begins an episode: the next step is looked at, and may warn once."""
+        """Begins an episode: the next step is checked, and one warning may be issued."""
         self._steps, self._armed = 0, True
 
     def check(self, commands: Array) -> None:
-        """Warns once per episode of commands (..., C) outside the range."""
+        """Warns once per episode if commands (..., C) are outside the range."""
         steps, self._steps = self._steps, self._steps + 1
         if not self._armed or steps % EVERY:
             return
@@ -81,7 +81,7 @@ class CommandBox:
 
 
 def require_sane_speed(model: TaylorModel, robot: RobotSpec, extent: tuple[float, ...]) -> None:
-    """Raises ConfigError where a robot could cross a whole world in one step of its kinematics.
+    """Raises ConfigError if a robot could cross a whole world in one step of its kinematics.
 
     Args:
         model: the kinematics.
@@ -105,5 +105,5 @@ def require_sane_speed(model: TaylorModel, robot: RobotSpec, extent: tuple[float
 
 def _assumed(model: TaylorModel) -> set[str]:
     """Names of the variables in assumed terms."""
-    powers = [features.parse_term(term, model.variables) for _, term in model.assumed]
+    powers = [taylor.parse_term(term, model.variables) for _, term in model.assumed]
     return {model.variables[v] for row in powers for v in np.flatnonzero(row)}

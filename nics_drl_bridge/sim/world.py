@@ -1,4 +1,4 @@
-"""World files: where episodes take place, and what stands there."""
+"""World files: the field of the episodes and its obstacles."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
-from nics_drl_bridge.lidar.maps import load_map
-from nics_drl_bridge.lidar.maps_grid import GridMap
+from nics_drl_bridge.lidar.maps import GridMap, load_map
 from nics_drl_bridge.lidar.shapes import LARGEST, MOST_SHAPES, Coordinate, Heading, Shape
-from nics_drl_bridge.sim.motion import Motion, Patrol
+from nics_drl_bridge.sim.obstacles import Motion, Patrol
 from nics_drl_bridge.sim.space_kernels import wall_distance
 
 Array = NDArray[np.float64]
@@ -25,7 +24,7 @@ MOST_OBSTACLES = 10_000
 MOST_WALLS = 10_000
 MOST_PLACES = 10_000
 SMALLEST_FIELD = 0.01
-"""Side of a field [m]."""
+"""Least side of a field [m]."""
 Distance = Annotated[float, Field(ge=0.0, le=LARGEST)]
 Side = Annotated[float, Field(ge=SMALLEST_FIELD, le=LARGEST)]
 Pose = tuple[Coordinate, Coordinate, Heading]
@@ -34,14 +33,14 @@ Region = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
 
 class Obstacles(Schema):
-    """A group of obstacles that have something in common.
+    """A group of obstacles with common properties.
 
     Attributes:
         shapes: each obstacle of the group takes one of them at random.
-        count: how many, or the least and the greatest number, of which each episode draws one.
+        count: number of obstacles, or [least, greatest], from which each episode draws.
         gap: free space between one of them and any other obstacle [m].
-        at: x, y [m], heading [rad] where they always stand, instead of `count` at random.
-        motion: how they move, see `sim.motion`; by default not at all.
+        at: fixed poses, x, y [m], heading [rad], instead of `count` at random.
+        motion: their motion, see `sim.obstacles`; by default they stand still.
     """
 
     shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_SHAPES)
@@ -78,7 +77,7 @@ class Obstacles(Schema):
 
 
 class Starts(Schema):
-    """Where robots begin: somewhere in one of the regions, or at one of the poses.
+    """Starts of the robots: anywhere in one of the regions, or at one of the poses.
 
     Attributes:
         regions: x1, y1, x2, y2 of opposite corners [m].
@@ -95,7 +94,7 @@ class Starts(Schema):
 
 
 class Goals(Schema):
-    """Where goals lie: somewhere in one of the regions, or at one of the points.
+    """Goals of the robots: anywhere in one of the regions, or at one of the points.
 
     Attributes:
         regions: x1, y1, x2, y2 of opposite corners [m].
@@ -117,19 +116,19 @@ def _either(regions: tuple[Region, ...], at: tuple[object, ...]) -> None:
 
 
 class World(Schema):
-    """Where episodes take place; everything is in the frame `map`.
+    """World of the episodes; everything is in the frame `map`.
 
     Attributes:
-        name: what users call it.
+        name: the name users refer to it by.
         size: width along x and depth along y of a walled field around the origin [m].
         walls: further straight walls, x1, y1, x2, y2 [m].
         map: a static map, the YAML file of Nav2's map_server: the name of a shipped one, or a
-            path from the folder of the world file. A world has a `size`, a `map`, or both.
-        obstacles: groups of them, see `Obstacles`.
-        clearance: free space around the footprint at start and goal, and on a way between [m].
-        goal_distance: least and greatest distance from start to goal, as the crow flies [m].
-        starts: where robots begin; by default anywhere.
-        goals: where goals lie; by default anywhere.
+            path relative to the folder of the world file. A world has a `size`, a `map`, or both.
+        obstacles: groups of obstacles, see `Obstacles`.
+        clearance: free space around the footprint at start and goal, and on a path between [m].
+        goal_distance: least and greatest straight-line distance from start to goal [m].
+        starts: places of the starts; by default anywhere.
+        goals: places of the goals; by default anywhere.
     """
 
     name: str
@@ -155,19 +154,19 @@ class World(Schema):
 
     @property
     def source(self) -> str:
-        """What errors call it: its file, or its name."""
+        """Name of the world in error messages: its file, or its name."""
         return self._file or f"world {self.name!r}"
 
     @cached_property
     def grid(self) -> GridMap | None:
-        """The static map. Raises ConfigError when its file is missing or wrong."""
+        """The static map. Raises ConfigError if its file is missing or invalid."""
         return None if self.map is None else load_map(self.map)
 
     @property
     def fingerprint(self) -> str:
-        """Tells two worlds apart: the name, and the first 8 digits of a SHA-256 over all of it.
+        """Identifier: the name, and the first 8 digits of a SHA-256 over the whole content.
 
-        Of a map the cells count, not the path.
+        A map enters by its cells and frame, not by its path.
         """
         content = self.model_dump_json(exclude={"map"}).encode()
         if self.grid is not None:
@@ -177,12 +176,12 @@ class World(Schema):
 
     @property
     def shapes(self) -> tuple[Shape, ...]:
-        """Every shape that an obstacle may have, each once."""
+        """The distinct shapes of the obstacles."""
         return tuple(dict.fromkeys(shape for group in self.obstacles for shape in group.shapes))
 
     @property
     def extent(self) -> Region:
-        """Least x, least y, greatest x, greatest y of the field, or else of the map [m]."""
+        """Least x, least y, greatest x, greatest y of the field, or without one of the map [m]."""
         if self.size is not None:
             x, y = self.size[0] / 2.0, self.size[1] / 2.0
             return -x, -y, x, y
@@ -195,7 +194,7 @@ class World(Schema):
         return float(x1), float(y1), float(x2), float(y2)
 
     def all_walls(self) -> Array:
-        """(W, 4) the four sides of the field, if any, then the further walls [m]."""
+        """Returns (W, 4) the four sides of the field, if any, then the further walls [m]."""
         sides: list[Region] = []
         if self.size is not None:
             x, y = self.size[0] / 2.0, self.size[1] / 2.0
@@ -204,26 +203,27 @@ class World(Schema):
 
 
 def load_world(name: str | Path) -> World:
-    """Loads a shipped world by name (`arena`), or any by the path of its YAML file.
+    """Loads a shipped world by name (`arena`), or any other by the path of its YAML file.
 
     Raises:
-        ConfigError: the file or its map is missing or wrong.
+        ConfigError: the file or its map is missing or invalid.
     """
     path = find_config(name, "worlds")
     world = load_yaml(path, World)
     if world.map is not None and Path(world.map).suffix in (".yaml", ".yml"):
         world = world.model_copy(update={"map": str(path.parent / world.map)})
     world._file = str(path)
-    _ = world.grid  # a wrong map, too, is found now, not in the first episode
+    _ = world.grid  # find an invalid map now, not in the first episode
     check_places(world)
     return world
 
 
 def check_places(world: World) -> None:
-    """Sees whether obstacles and waypoints whose places the file gives lie where they can be.
+    """Checks that the fixed obstacles and waypoints of the file lie in free places.
 
     Raises:
-        ConfigError: an obstacle of `at` stands outside, or a patrol can't get to a waypoint.
+        ConfigError: an obstacle of `at` stands outside the world, or an obstacle of a patrol does
+            not fit at a waypoint.
     """
     for g, group in enumerate(world.obstacles):
         for n, at in enumerate(group.at):
@@ -244,12 +244,12 @@ def check_places(world: World) -> None:
 
 
 def _room_at(world: World, point: Sequence[float], static: bool = True) -> float:
-    """Free space around a point [m], negative outside of the world.
+    """Free space around a point [m], negative outside the world.
 
     Args:
-        world: where.
+        world: the field and its static map.
         point: x, y [m].
-        static: whether walls within and a map's solid cells count, or the outside alone.
+        static: whether inner walls and a map's solid cells count, or the outer bounds alone.
     """
     x, y = point[:2]
     x1, y1, x2, y2 = world.extent
@@ -257,13 +257,13 @@ def _room_at(world: World, point: Sequence[float], static: bool = True) -> float
     if not static or room < 0.0:
         return room
     if world.size is None:
-        room = np.inf  # a map has no sides but its cells
+        room = np.inf  # a map is bounded by its cells alone
     room = min(room, wall_distance(x, y, world.all_walls()))
     if world.grid is not None:
         i, j = world.grid.world_to_cell([x, y])
         rows, columns = world.grid.cells.shape
         if not (0 <= i < rows and 0 <= j < columns):
             return -1.0
-        # Between centres the distance may be more, by no more than the way.
+        # Off the centre of a cell the distance may be greater, by at most the offset.
         room = min(room, float(world.grid.distance_field[i, j]) + world.grid.resolution)
     return float(room)

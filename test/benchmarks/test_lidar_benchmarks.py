@@ -12,7 +12,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.bake import bake
 
 from .runs import asked, fails
 
@@ -221,11 +221,10 @@ def test_sensor_models_are_compared_with_none_in_one_run():
         "--rotations", "16",
     )  # fmt: skip
     tables = ["no model", "incidence dropout", "intensity", "both"]
-    assert list(result["scans_per_s"]) == [*tables, "both, with intensities"]
+    assert list(result["scans_per_s"]) == tables
     assert result["times_as_long"]["no model"] == 1.0
     assert min(result["scans_per_s"].values()) > 0.0
     assert result["table_bytes"]["no model"] == result["table_bytes"]["incidence dropout"]
-    assert result["table_bytes"]["no model"] < result["table_bytes"]["intensity"]
     assert not missed_but(result, "times as long")
 
 

@@ -10,7 +10,7 @@ from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
-from nics_drl_bridge.env.registration import MAX_EPISODE_STEPS, NAVIGATION, register_envs
+from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS, NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, ModelError

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from shapely.geometry import LineString, Polygon
 
-from nics_drl_bridge.env.contact import contact_ranges
-from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.env.task import contact_ranges
 from nics_drl_bridge.lidar.spec import load_lidar
+from nics_drl_bridge.robot.spec import load_robot
 
 TRUCK = ((0.5, 0.2), (0.5, -0.2), (-0.3, -0.2), (-0.3, 0.2))
 ARROW = ((0.6, 0.0), (-0.3, -0.3), (0.0, 0.0), (-0.3, 0.3))

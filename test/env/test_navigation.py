@@ -6,7 +6,7 @@ from robots import DIRECT, FOOTPRINT, lidar
 
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.robot.spec import load_robot
 
 B = 72
 

@@ -11,7 +11,7 @@ from robots import direct_model, field
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.robot.spec import RobotSpec
 
 BLUE = np.array([0x1F, 0x6F, 0xB2])
 

@@ -12,12 +12,11 @@ from robots import DIRECT, direct_model, field, lidar
 
 from nics_drl_bridge.env.actions import DRIVES, discrete_commands, still
 from nics_drl_bridge.env.navigation import Navigation
-from nics_drl_bridge.env.registration import ENVIRONMENTS, TASK
+from nics_drl_bridge.env.registry import ENVIRONMENTS, TASK, make_task
 from nics_drl_bridge.env.task import bearing, distance
-from nics_drl_bridge.env.tasks import make_task
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.robot.spec import load_robot
 
 OWN = Path(__file__).resolve().parents[2] / "examples" / "own_task.py"
 PATROL = f"{OWN}:Patrol"

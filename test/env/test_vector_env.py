@@ -15,7 +15,7 @@ from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
-from nics_drl_bridge.env.registration import ENVIRONMENTS, NAVIGATION
+from nics_drl_bridge.env.registry import ENVIRONMENTS, NAVIGATION
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 

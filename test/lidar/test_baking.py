@@ -6,7 +6,7 @@ from lidar_scenes import POLYGONS
 from robots import lidar
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.lidar.baking import bake, with_shapes
+from nics_drl_bridge.lidar.bake import bake, with_shapes
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle, Polygon
 from nics_drl_bridge.lidar.table import Density, LidarTable, padding
@@ -81,7 +81,7 @@ def test_shapes_are_added_at_the_density_of_the_table():
     [Density(distances=10_000, rotations=100_000, phases=8)],
 )
 def test_a_table_that_no_index_can_reach_is_refused(density, monkeypatch):
-    monkeypatch.setattr("nics_drl_bridge.lidar.baking.MOST_NUMBERS", 1000)
+    monkeypatch.setattr("nics_drl_bridge.lidar.bake.MOST_NUMBERS", 1000)
     with pytest.raises(ConfigError, match="is too large; lower `distances`"):
         bake(SPEC, [SQUARE], density.model_copy(update={"distances": 50, "rotations": 40}))
 

@@ -5,14 +5,7 @@ import pytest
 from robots import lidar
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.lidar.canonical import (
-    LAYOUTS,
-    Reader,
-    ScanLayout,
-    layout_of,
-    plan_of,
-    reader_of,
-)
+from nics_drl_bridge.lidar.sectors import LAYOUTS, Reader, ScanLayout, layout_of, plan_of, reader_of
 from nics_drl_bridge.lidar.spec import ScanHeader, load_lidar
 
 AROUND = ScanLayout(sectors=72, range_max=3.0)

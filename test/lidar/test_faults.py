@@ -6,13 +6,7 @@ from robots import direct_model, field, lidar
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.lidar import fault_kernels
-from nics_drl_bridge.lidar.faults import (
-    LidarFaults,
-    distort,
-    scan_skewed,
-    slice_edges,
-    slice_poses,
-)
+from nics_drl_bridge.lidar.faults import LidarFaults, distort, scan_skewed, slice_edges, slice_poses
 from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.sim.simulator import FastSimulator
 

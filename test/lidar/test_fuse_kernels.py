@@ -11,7 +11,7 @@ BETWEEN_FORBIDDEN_PAGES = """
 import ctypes, mmap, sys
 from dataclasses import replace
 import numpy as np
-from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import Circle, Rectangle
 from nics_drl_bridge.lidar.spec import LidarSpec

@@ -5,7 +5,7 @@ import pytest
 import shapely
 
 from nics_drl_bridge.lidar import map_kernels
-from nics_drl_bridge.lidar.maps_grid import NO_MAP, GridMap
+from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
 
 BEAMS = 37
 EDGE = 1e-6  # beams that pass a corner this closely [m] may go either way

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from nics_drl_bridge.lidar.maps_grid import GridMap
+from nics_drl_bridge.lidar.maps import GridMap
 
 TURNED = (1.0, -2.0, 0.7)
 

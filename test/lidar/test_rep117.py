@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from robots import lidar
 
-from nics_drl_bridge.lidar.rep117 import from_device, to_device
-from nics_drl_bridge.lidar.spec import load_lidar
+from nics_drl_bridge.lidar.spec import from_device, load_lidar, to_device
 
 CONVENTIONS = {"inf": np.inf, "zero": 0.0, "nan": np.nan, "range_max": 3.0}
 DEVICES = ["rplidar_a1", "rplidar_a2", "hokuyo_ust_10lx", "sick_tim571", "turtlebot3_lds_02"]

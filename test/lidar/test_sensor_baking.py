@@ -4,15 +4,13 @@ import numpy as np
 import pytest
 from robots import lidar
 
-from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.files import write_bytes
-from nics_drl_bridge.lidar.baking import bake, with_shapes
-from nics_drl_bridge.lidar.budget import choose, expected_rmse, table_bytes
+from nics_drl_bridge.lidar.bake import bake, with_shapes
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.sensor_models import IncidenceDropout, Intensity
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle
 from nics_drl_bridge.lidar.table import Density, LidarTable
-from nics_drl_bridge.npz import npz_arrays, npz_bytes
+from nics_drl_bridge.npz import npz_arrays
 
 SPEC = lidar(beams=720, range_min=0.0)
 SMALL = Density(distances=12, rotations=16)
@@ -76,17 +74,14 @@ def test_a_function_and_a_named_model_that_say_the_same_bake_the_same_rows():
 def test_the_sensor_model_of_the_lidar_is_baked_unless_another_is_given():
     spec = SPEC.model_copy(update={"sensor_model": (BRIGHT,)})
     assert bake(spec, [SQUARE], SMALL).sensor_model == (BRIGHT,)
-    assert bake(spec, [SQUARE], SMALL).reflectance is not None
-    assert bake(spec, [SQUARE], SMALL, ()).reflectance is None
+    assert bake(spec, [SQUARE], SMALL, ()).sensor_model == ()
 
 
 def test_shapes_are_added_with_the_sensor_model_of_the_table():
     table = bake(SPEC, [SQUARE], SMALL, [BRIGHT])
     more = with_shapes(SPEC, table, [STRIP])
     assert more.sensor_model == (BRIGHT,)
-    assert np.array_equal(
-        more.reflectance, bake(SPEC, (SQUARE, STRIP), SMALL, [BRIGHT]).reflectance
-    )
+    assert np.array_equal(more.rows, bake(SPEC, (SQUARE, STRIP), SMALL, [BRIGHT]).rows)
 
 
 @pytest.fixture
@@ -96,34 +91,12 @@ def path(tmp_path):
     return tmp_path / "table.npz"
 
 
-def test_a_table_with_intensities_reads_back_to_the_same_bits_and_is_mapped(path):
+def test_a_table_with_a_sensor_model_reads_back_to_the_same_bits(path):
     table = bake(SPEC, (SQUARE, Circle(radius=0.2, reflectivity=0.9)), SMALL, [BRIGHT])
     back = LidarTable.load(path)
     assert back.shapes == table.shapes
     assert back.sensor_model == (BRIGHT,)
-    assert np.array_equal(back.reflectance, table.reflectance)
     assert back.dump() == table.dump()
-    base = back.reflectance
-    while not isinstance(base, np.memmap):
-        base = base.base
-    assert base.mode == "c"
-
-
-@pytest.mark.parametrize(
-    ("damage", "reason"),
-    [
-        (lambda a: a.pop("reflectance"), "its reflectance does not belong to its sensor model"),
-        (lambda a: a.update(reflectance=a["reflectance"][:-1]), "does not fit its rows"),
-        (lambda a: a.update(reflectance=a["reflectance"].astype(float)), "does not fit its rows"),
-        (lambda a: a.update(reflectance=a["reflectance"] * np.float32(0.5)), "were damaged"),
-    ],
-)
-def test_a_damaged_reflectance_is_noticed(path, damage, reason):
-    arrays = dict(npz_arrays(path.read_bytes()))
-    damage(arrays)
-    write_bytes(path, npz_bytes(arrays, packed=False))
-    with pytest.raises(ModelError, match=reason):
-        LidarTable.load(path)
 
 
 def test_a_table_without_a_sensor_model_is_written_as_before():
@@ -131,16 +104,3 @@ def test_a_table_without_a_sensor_model_is_written_as_before():
     assert list(npz_arrays(table.dump())) == ["about", "grid", "start", "cell", "rows"]
     assert "sensor_model" not in table._about()
     assert "reflectivity" not in table._about()
-
-
-def test_a_budget_counts_intensities_and_the_error_is_that_of_the_geometry():
-    losing = (IncidenceDropout(greatest_incidence=0.5), BRIGHT)
-    spec = SPEC.model_copy(update={"sensor_model": losing})
-    assert table_bytes(spec, [SQUARE], SMALL) == bake(spec, [SQUARE], SMALL).memory
-    assert expected_rmse(spec, bake(spec, [SQUARE], SMALL)) == expected_rmse(
-        SPEC, bake(SPEC, [SQUARE], SMALL)
-    )
-    choice = choose(spec, [SQUARE], 300_000)
-    assert len(choice.table.dump()) <= 300_000
-    assert choice.table.sensor_model == losing
-    assert choice.rmse < 0.02

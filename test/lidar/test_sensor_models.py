@@ -9,7 +9,6 @@ from nics_drl_bridge.lidar.sensor_models import (
     IncidenceDropout,
     Intensity,
     SensorModelFile,
-    intensity_of,
     load_sensor_models,
     returned,
 )
@@ -39,8 +38,6 @@ def test_each_model_loses_its_own_returns_and_together_they_lose_all_of_them():
     ):
         assert returned(models, RANGES, INCIDENCE, None).tolist() == expected
     assert returned((dim,), RANGES, INCIDENCE, 1.0).tolist() == [1.0, 1.0, 2.0, INF]
-    assert intensity_of((grazing, dim)) is dim
-    assert intensity_of((grazing,)) is None
 
 
 def test_a_file_of_sensor_models_reads_to_what_it_says(tmp_path):
@@ -48,11 +45,11 @@ def test_a_file_of_sensor_models_reads_to_what_it_says(tmp_path):
     path.write_text(
         "sensor_model:\n"
         "  - {kind: incidence_dropout, greatest_incidence: 1.3}\n"
-        "  - {kind: intensity, gain: 200.0, threshold: 0.5, saturation: 255}\n"
+        "  - {kind: intensity, gain: 200.0, threshold: 0.5}\n"
     )
     grazing, bright = load_sensor_models(path)
     assert grazing == IncidenceDropout(greatest_incidence=1.3)
-    assert bright == Intensity(gain=200.0, threshold=0.5, saturation=255.0)
+    assert bright == Intensity(gain=200.0, threshold=0.5)
     assert str(grazing) == "nothing from beyond 74.48 deg of incidence"
     assert str(bright) == "intensity 200 at 1 m, below 0.5 nothing, reflectivity 0.5"
 
@@ -67,8 +64,6 @@ def test_a_file_of_sensor_models_reads_to_what_it_says(tmp_path):
         ("[{kind: incidence_dropout, greatest_incidence: 75}]", "must lie between 0 and a right "
          "angle, in radians, not 75."),
         ("[{kind: intensity}, {kind: intensity}]", "one model of the kind intensity; keep one"),
-        ("[{kind: intensity, threshold: 2, saturation: 1}]", "threshold must be at most "
-         "saturation"),
         ("[{kind: intensity, reflectivity: 0}]", "should be greater than 0, not 0."),
     ],
 )  # fmt: skip

@@ -11,7 +11,7 @@ from robots import lidar
 
 from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.files import sha256, write_bytes
-from nics_drl_bridge.lidar.baking import bake
+from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, Circle, Polygon
 from nics_drl_bridge.lidar.table import Density, LidarTable

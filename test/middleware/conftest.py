@@ -4,7 +4,7 @@ import pytest
 from robots import direct_model
 
 from middleware.rig import SECOND
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.middleware.middleware import Middleware
 
 
 @pytest.fixture

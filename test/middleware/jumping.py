@@ -10,9 +10,9 @@ from robots import field
 
 from middleware.rig import PERIOD, SECOND
 from nics_drl_bridge import geometry
-from nics_drl_bridge.calibration.noise_model import Level, Noise
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.middleware.middleware import Middleware
+from nics_drl_bridge.robot.noise import Level, Noise
 from nics_drl_bridge.sim.simulator import FastSimulator
 
 NOISE = Noise(

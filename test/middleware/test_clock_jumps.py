@@ -13,9 +13,9 @@ from middleware.jumping import Setting, campaign, errors_after, noisy_model
 from middleware.rig import PERIOD, RANGES, SECOND, assert_same, state
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.middleware.belief import JITTER_S, greatest_twist
 from nics_drl_bridge.middleware.ekf import LONGEST_GAP_S
-from nics_drl_bridge.middleware.unseen import JITTER_S, greatest_twist
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.sim.simulator import FastSimulator
 
 CHI2_999 = 16.27

@@ -9,12 +9,12 @@ from robots import direct_model, field
 from scipy.stats import chi2
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.calibration.noise_model import Level, Noise
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.kinematics.kernels import SERIES, rates, scratch, term_arrays
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.ekf import Estimator
-from nics_drl_bridge.middleware.measurement import Outcome
+from nics_drl_bridge.middleware.measurement import Acceptance
+from nics_drl_bridge.robot.kernels import SERIES, rates, scratch, term_arrays
+from nics_drl_bridge.robot.noise import Level, Noise
 from nics_drl_bridge.sim.simulator import FastSimulator
 
 ROBOTS = ("ackermann", "differential", "mecanum")
@@ -340,7 +340,7 @@ def test_what_is_foreseen_is_not_worked_out_again(monkeypatch):
     monkeypatch.setattr(kernels, "expect", None)
     estimator.predict(PERIOD)
     monkeypatch.setattr(estimator._filter, "update", None)
-    assert estimator.update_twist(np.zeros(3)).outcome is Outcome.USED
+    assert estimator.update_twist(np.zeros(3)).outcome is Acceptance.USED
     assert estimator.time_ns == PERIOD
     with pytest.raises(TypeError):
         estimator.update_twist(np.zeros(3))  # that was for one

@@ -7,7 +7,7 @@ import pytest
 from robots import direct_model
 
 from middleware.rig import PERIOD, RANGES, SECOND, STILL, assert_same, refused, state
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.middleware.middleware import Middleware
 
 SENSORS = {
     "odom": lambda m, stamp, value: m.odometry(stamp, 0, np.zeros(3), np.full(3, value)),

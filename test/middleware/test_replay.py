@@ -10,9 +10,15 @@ from robots import direct_model
 
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.middleware.ekf import Estimator
-from nics_drl_bridge.middleware.measurement import Kind, Measurement, Outcome
-from nics_drl_bridge.middleware.replay import BEFORE_START, DUPLICATE, HISTORY_NS, TOO_OLD, Timeline
-from nics_drl_bridge.middleware.view import Middleware
+from nics_drl_bridge.middleware.measurement import Acceptance, Kind, Measurement
+from nics_drl_bridge.middleware.middleware import Middleware
+from nics_drl_bridge.middleware.timeline import (
+    BEFORE_START,
+    DUPLICATE,
+    HISTORY_NS,
+    TOO_OLD,
+    Timeline,
+)
 
 SECOND = 1_000_000_000
 MILLISECOND = 1_000_000
@@ -203,7 +209,7 @@ def test_the_past_is_as_long_as_a_second_and_no_longer(timeline):
     for k in range(1, 1001):
         timeline.measure(SECOND + k * 10 * MILLISECOND, twist())
     assert len(timeline._entries) == 102
-    assert timeline.outcomes()[Kind.TWIST, Outcome.USED] == 1000
+    assert timeline.outcomes()[Kind.TWIST, Acceptance.USED] == 1000
 
 
 def test_a_late_command_after_a_silence_finds_the_commands_before_it():

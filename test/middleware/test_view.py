@@ -6,7 +6,7 @@ from robots import direct_model
 
 from middleware.rig import PERIOD, RANGES, SECOND, STILL, assert_same, refused, state
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.middleware.view import Middleware, rehearse
+from nics_drl_bridge.middleware.middleware import Middleware, rehearse
 
 
 def test_before_any_datum_the_view_says_that_nothing_is_known(middleware):

@@ -17,10 +17,10 @@ from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 
-from nics_drl_bridge.kinematics.bag_file import opened
-from nics_drl_bridge.kinematics.bag_info import bag_info
+from nics_drl_bridge.extras.bags.info import bag_info
 from nics_drl_bridge.middleware.playback import estimate
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.recording.bag_file import opened
 from nodes.peer import stamp_ns
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
@@ -33,7 +33,7 @@ def nics(domain_id, *words):
     environment = os.environ | {
         "ROS_DOMAIN_ID": str(domain_id), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }  # fmt: skip
-    command = [sys.executable, "-m", "nics_drl_bridge.cli", *map(str, words)]
+    command = [sys.executable, "-m", "nics_drl_bridge.commands.cli", *map(str, words)]
     return subprocess.Popen(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

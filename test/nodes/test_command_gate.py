@@ -11,6 +11,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from nics_drl_bridge.interface import NS_PER_S
+
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -21,12 +23,12 @@ from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.gate.black_box import replay
+from nics_drl_bridge.gate.inputs import Press, Tick
 from nics_drl_bridge.generator import save_model
 from nics_drl_bridge.nodes import command_gate, conversions, qos
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.nodes.wire import TwistWriter
-from nics_drl_bridge.safety.black_box import replay
-from nics_drl_bridge.safety.inputs import Press, Tick
 from nodes.peer import DEADLINE_S
 
 pytestmark = pytest.mark.ros
@@ -67,7 +69,7 @@ class Robot:
         speed = self.passed[-1].linear.x if self.passed else 0.0
         before, self.stamp_ns = self.stamp_ns, START_NS + time.monotonic_ns()
         # A busy machine leaves out some periods; the robot drives on all the same.
-        self.x += speed * min((self.stamp_ns - before) / conversions.NANO, MOST_S)
+        self.x += speed * min((self.stamp_ns - before) / NS_PER_S, MOST_S)
         odometry = conversions.odometry_to_ros(
             [self.x, 0.0, 0.0], [speed, 0.0, 0.0], self.stamp_ns, ("odom", "base_link"), (1e-4,) * 4
         )
@@ -169,7 +171,7 @@ def test_it_does_not_listen_before_its_shield_is_compiled(domain_id):
     code = f"""
 from nics_drl_bridge.nodes.command_gate import CommandGate
 from nics_drl_bridge.nodes.runner import open_context
-from nics_drl_bridge.safety.shield_kernels import free
+from nics_drl_bridge.gate.shield_kernels import free
 CommandGate._listen = lambda _: print(len(free.signatures))
 node = CommandGate(open_context([], domain_id={domain_id}))
 node.destroy_node()
@@ -248,7 +250,7 @@ def test_a_component_that_the_robot_has_no_use_for_becomes_zero(robot):
     robot.gets(0.5, 0.0, 0.1)
 
 
-@pytest.mark.parametrize("off_ns", [1_000_000, 3600 * conversions.NANO])
+@pytest.mark.parametrize("off_ns", [1_000_000, 3600 * NS_PER_S])
 def test_a_command_stamped_with_an_unknown_scan_becomes_zero(robot, off_ns):
     robot.drives()
     # In the future too: a stamp alone proves nothing.
@@ -347,7 +349,7 @@ def test_after_a_burst_of_stops_it_ends_at_once_and_the_first_of_them_is_in_the_
     assert again.entries[-1].decision.cause.rule == "command_malformed"
     assert [one.decision.cause for one in again.entries[-20:-1]] == [None] * 19
     assert stops >= 12
-    assert (tmp_path / first).stat().st_mtime_ns - began < 10 * conversions.NANO
+    assert (tmp_path / first).stat().st_mtime_ns - began < 10 * NS_PER_S
     assert all(name.endswith(".jsonl") for name in named)
 
 

@@ -11,9 +11,9 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, LaserScan
 
-from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.nodes import conversions
+from nics_drl_bridge.robot.spec import load_robot
 
 pytestmark = pytest.mark.ros
 
@@ -98,14 +98,6 @@ def test_ranges_keep_their_infinities_nan_and_bits():
     back = conversions.scan_from_ros(spec, message)
     assert back.dtype == np.float32
     assert back.tobytes() == ranges.tobytes()
-
-
-def test_intensities_travel_with_the_ranges_and_without_them_the_field_is_empty():
-    ranges = np.ones(FORWARD.beams, np.float32)
-    light = np.linspace(0.0, 4.0, 2 * FORWARD.beams, dtype=np.float32)[::2]
-    message = over_the_wire(conversions.scan_to_ros(FORWARD, ranges, 0, "laser", light))
-    assert np.array_equal(np.array(message.intensities, np.float32), light)
-    assert len(conversions.scan_to_ros(FORWARD, ranges, 0, "laser").intensities) == 0
 
 
 def test_ranges_of_a_slice_are_those_of_the_slice():

@@ -9,6 +9,8 @@ import gymnasium
 import numpy as np
 import pytest
 
+from nics_drl_bridge.interface import NS_PER_S
+
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import Twist
@@ -21,7 +23,7 @@ from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.errors import BackendError, ModelError, StaleDataError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import Start
-from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.dds_backend import DdsBackend, _Mailbox
 from nics_drl_bridge.nodes.executor import HANDED_OVER
 from nics_drl_bridge.sim.world import load_world
@@ -161,7 +163,7 @@ def test_each_view_is_of_the_step_and_one_control_period_after_the_last(connect,
         assert (view.scan_age_s, view.odom_age_s) == (0.0, 0.0)
         assert view.stamp_s == facts["stamp_ns"] * 1e-9
         stamps.append(facts["stamp_ns"])
-    assert set(np.diff(stamps)) == {round(model.control_period * conversions.NANO)}
+    assert set(np.diff(stamps)) == {round(model.control_period * NS_PER_S)}
 
     with pytest.raises(BackendError, match=r"refused the episode.*episode_seed"):
         backend.reset(Start(-1, START.pose))
@@ -223,7 +225,7 @@ def test_a_lost_asking_is_made_again(connect, monkeypatch):
             return Future()
         return ask(request)
 
-    monkeypatch.setattr("nics_drl_bridge.nodes.episodes.LOST_S", 0.1)
+    monkeypatch.setattr("nics_drl_bridge.nodes.observer.LOST_S", 0.1)
     monkeypatch.setattr(backend._mail, "put", lossy)
     monkeypatch.setattr(backend._episodes._repeat, "call_async", deaf)
     view, facts = backend.step(np.array([0.5, 0.1]))
@@ -256,12 +258,12 @@ def test_the_executor_rests_only_for_a_caller_that_waits_and_now_has_all():
     mail = _Mailbox(("odom", "scan"), lambda stamp, *_: worked.append(stamp))
     mail._core.help = lambda: None  # this thread is not to be kept on one core
     assert mail.put("odom", stamped(1)) is mail.put("scan", stamped(1)) is None
-    caller = threading.Thread(target=lambda: got.append(mail.wait(2 * conversions.NANO, TIMEOUT_S)))
+    caller = threading.Thread(target=lambda: got.append(mail.wait(2 * NS_PER_S, TIMEOUT_S)))
     caller.start()
     while mail._awaited_ns < 0:
         os.sched_yield()
     assert mail.put("odom", stamped(2)) is None
-    assert worked == [2 * conversions.NANO]
+    assert worked == [2 * NS_PER_S]
     assert mail.put("scan", stamped(2)) is HANDED_OVER
     caller.join(TIMEOUT_S)
     assert got[0].keys() == {"odom", "scan"}

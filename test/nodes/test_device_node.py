@@ -8,6 +8,8 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
+from nics_drl_bridge.interface import NS_PER_S
+
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from domains import claimed_domain
@@ -18,15 +20,14 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.kinematics.latency import Delay, Latency
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.device_parameters import declare_device, timing
 from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.robot.noise import Delay, Latency
 from nodes.peer import stamp_ns
 
 pytestmark = pytest.mark.ros
 
-NANO = conversions.NANO
 NAMES = ("left", "right")
 
 
@@ -88,7 +89,7 @@ def test_a_fleet_moves_when_each_of_its_robots_has_a_command(fleet):
         assert fleet.peer.set_parameters("simulator_node", episode_seed=0).successful
     assert fleet.stamps() == {now}
     fleet.command("right", 0.0)
-    fleet.peer.until(lambda: fleet.stamps() == {now + NANO // 10}, "a step of the fleet")
+    fleet.peer.until(lambda: fleet.stamps() == {now + NS_PER_S // 10}, "a step of the fleet")
     assert fleet.x("left") > 0.0
 
 
@@ -165,7 +166,7 @@ def test_scan_and_odometry_have_rates_of_their_own(stamped):
     known = len(stamped.stamps("scan"))
     stamped.peer.until(lambda: len(stamped.stamps("scan")) > known + 5, "scans")
     for topic, rate in (("scan", 10), ("odom", 50)):
-        steps = np.diff(stamped.stamps(topic)) / (NANO // rate)
+        steps = np.diff(stamped.stamps(topic)) / (NS_PER_S // rate)
         # A listener on a busy machine may miss one.
         assert np.array_equal(steps, steps.round())
         assert np.median(steps) == steps.min() == 1.0
@@ -179,7 +180,7 @@ def test_a_scan_is_told_as_late_as_the_latency_says_but_stamped_when_it_was_meas
         if topic == "clock":
             clock = stamp
         elif topic == "scan" and clock:
-            late.append((clock - stamp) / NANO)
+            late.append((clock - stamp) / NS_PER_S)
     assert np.median(late) >= 0.02  # the clock ticks every 20 ms
     assert stamped.odom[-1].header.frame_id == "car/odom"
 
@@ -222,9 +223,9 @@ def test_a_stamped_command_drives_the_robot(stamped, age_ns):
 
 def test_a_command_whose_stamp_is_older_than_the_timeout_is_ignored_and_said_to_be(stamped):
     for _ in range(300):
-        if abs(stamped.drive(2 * NANO)) < 0.05:
+        if abs(stamped.drive(2 * NS_PER_S)) < 0.05:
             break
-    assert max(abs(stamped.drive(2 * NANO)) for _ in range(20)) < 0.1
+    assert max(abs(stamped.drive(2 * NS_PER_S)) for _ in range(20)) < 0.1
     assert "older than command_timeout" in stamped.process.log.read_text()
 
 

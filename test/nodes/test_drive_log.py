@@ -5,23 +5,25 @@ import math
 import numpy as np
 import pytest
 
+from nics_drl_bridge.interface import NS_PER_S
+
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import Imu
 
 from nics_drl_bridge.errors import BackendError, RecordingError
-from nics_drl_bridge.kinematics.recording import check
-from nics_drl_bridge.kinematics.spec import load_robot
-from nics_drl_bridge.kinematics.topic_roles import TopicRoles
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.drive_log import DriveLog
+from nics_drl_bridge.recording.recording import check
+from nics_drl_bridge.recording.topic_roles import TopicRoles
+from nics_drl_bridge.robot.spec import load_robot
 
 pytestmark = pytest.mark.ros
 
 CAR, WHEELED = load_robot("ackermann"), load_robot("differential")
-START_NS = 1_795_000_000 * conversions.NANO
-PERIOD_NS = conversions.NANO // 10
+START_NS = 1_795_000_000 * NS_PER_S
+PERIOD_NS = NS_PER_S // 10
 FRAMES, VARIANCE = ("odom", "base_link"), (0.0,) * 4
 
 

@@ -15,7 +15,7 @@ from geometry_msgs.msg import Twist
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
-from nics_drl_bridge.env.registration import COOPERATIVE_REACHING, NAVIGATION
+from nics_drl_bridge.env.registry import COOPERATIVE_REACHING, NAVIGATION
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import link, qos

@@ -11,9 +11,8 @@ from geometry_msgs.msg import Quaternion, TwistStamped
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Bool
 
-from nics_drl_bridge.lidar.rep117 import from_device
-from nics_drl_bridge.lidar.spec import load_lidar
-from nics_drl_bridge.nodes import conversions, gate_inputs, wire
+from nics_drl_bridge.lidar.spec import from_device, load_lidar
+from nics_drl_bridge.nodes import command_gate, conversions, wire
 
 STAMP_NS = 1_763_000_000_123_456_789
 LIDAR = load_lidar("paper")
@@ -31,7 +30,7 @@ def test_a_scan_is_what_the_device_says_in_the_words_of_the_package():
     ranges = np.linspace(0.0, 4.0, LIDAR.beams, dtype=np.float32)
     ranges[:3] = np.nan, np.inf, -np.inf
     message = conversions.scan_to_ros(LIDAR, ranges, STAMP_NS, "laser")
-    read = gate_inputs.scan(LIDAR, serialize_message(message))
+    read = command_gate.scan(LIDAR, serialize_message(message))
     assert read.stamp_ns == STAMP_NS
     assert read.angles == pytest.approx((message.angle_min, message.angle_increment), rel=1e-6)
     assert read.ranges.tobytes() == from_device(message.ranges, LIDAR).tobytes()
@@ -40,7 +39,7 @@ def test_a_scan_is_what_the_device_says_in_the_words_of_the_package():
 
 def test_an_odometry_is_pose_and_twist():
     message = odometry()
-    read = gate_inputs.odometry(serialize_message(message))
+    read = command_gate.odometry(serialize_message(message))
     pose, twist = conversions.odometry_from_ros(message)
     assert (read.stamp_ns, read.pose.tobytes(), read.twist.tobytes()) == (
         STAMP_NS, pose.tobytes(), twist.tobytes(),
@@ -51,12 +50,12 @@ def test_an_odometry_is_pose_and_twist():
 def test_an_odometry_without_a_rotation_has_no_pose(quaternion):
     message = odometry()
     message.pose.pose.orientation = Quaternion(**dict(zip("xyzw", quaternion, strict=True)))
-    assert np.isnan(gate_inputs.odometry(serialize_message(message)).pose).all()
+    assert np.isnan(command_gate.odometry(serialize_message(message)).pose).all()
 
 
 def test_an_estimate_is_a_twist_and_how_uncertain_its_pose_is():
     message = odometry()
-    read = gate_inputs.estimate(serialize_message(message))
+    read = command_gate.estimate(serialize_message(message))
     assert read.std.tolist() == np.sqrt([7.0, 35.0]).tolist()
     assert read.twist.tolist() == [0.3, -0.1, 0.2]
 
@@ -64,15 +63,15 @@ def test_an_estimate_is_a_twist_and_how_uncertain_its_pose_is():
 def test_a_command_and_a_word_of_the_e_stop():
     message = TwistStamped(twist=conversions.twist_to_ros([0.5, 0.0, np.nan]))
     message.header.stamp = conversions.stamp_to_ros(STAMP_NS)
-    read = gate_inputs.command(serialize_message(message))
+    read = command_gate.command(serialize_message(message))
     assert read.stamp_ns == STAMP_NS
     assert np.array_equal(read.twist, [0.5, 0.0, np.nan], equal_nan=True)
-    assert gate_inputs.e_stop(serialize_message(Bool(data=True))).pressed
+    assert command_gate.e_stop(serialize_message(Bool(data=True))).pressed
 
 
 @pytest.mark.parametrize(
-    "read", [lambda content: gate_inputs.scan(LIDAR, content), gate_inputs.odometry,
-             gate_inputs.estimate, gate_inputs.command, gate_inputs.e_stop],
+    "read", [lambda content: command_gate.scan(LIDAR, content), command_gate.odometry,
+             command_gate.estimate, command_gate.command, command_gate.e_stop],
 )  # fmt: skip
 def test_bytes_that_end_too_early_are_unreadable(read):
     for content in (b"", b"\x00\x01", b"\x00\x01\x00\x00", b"\x00\x07\x00\x00" + bytes(800)):
@@ -84,4 +83,4 @@ def test_bytes_that_end_too_early_are_unreadable(read):
 def test_an_estimate_one_of_whose_variances_is_no_number_is_uncertain(place, variance):
     message = odometry()
     message.pose.covariance[place] = variance
-    assert np.isnan(gate_inputs.estimate(serialize_message(message)).std).any()
+    assert np.isnan(command_gate.estimate(serialize_message(message)).std).any()

@@ -10,11 +10,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
-from safety.rig import Rig, config
+from gate.rig import Rig, config
 
+from nics_drl_bridge.gate.black_box import Entry, replay, write
 from nics_drl_bridge.nodes import gate_log
 from nics_drl_bridge.nodes.gate_log import BURST_S, FILES_KEPT, LINE_S, GateLog, prune
-from nics_drl_bridge.safety.black_box import Entry, replay, write
 
 DEADLINE_S = 20.0
 LONG_S = 60.0

@@ -7,6 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from nics_drl_bridge.interface import NS_PER_S
+
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -154,7 +156,7 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(launch, meet, domain_
     assert status().hardware_id == "ackermann"
 
     def drive(x, second):
-        stamp = int(second * conversions.NANO)
+        stamp = int(second * NS_PER_S)
         odom.publish(conversions.odometry_to_ros(
             [x, 0.0, 0.0], [0.0, 0.0, 0.0], stamp, ("odom", "car"), VARIANCE
         ))  # fmt: skip
@@ -168,13 +170,11 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(launch, meet, domain_
     assert conversions.odometry_from_ros(filtered[-1])[0] == pytest.approx([1.0, 0.0, 0.0])
     ranges = np.ones(model.lidar.beams, np.float32)
     for stamp, beams in ((3, model.lidar.beams), (3, model.lidar.beams), (4, 7)):
-        message = conversions.scan_to_ros(
-            model.lidar, ranges[:beams], stamp * conversions.NANO, "laser"
-        )
+        message = conversions.scan_to_ros(model.lidar, ranges[:beams], stamp * NS_PER_S, "laser")
         scan.publish(message)
     for x, second in ((math.nan, 3), (1.0, 2.75), (1.0, 2.75)):
         drive(x, second)
-    peer.until(lambda: stamp_ns(filtered[-1]) == 2.75 * conversions.NANO, "the estimate at 2.75 s")
+    peer.until(lambda: stamp_ns(filtered[-1]) == 2.75 * NS_PER_S, "the estimate at 2.75 s")
     for second in (2.5, 3.5, 2.25):
         drive(1.0, second)
     wanted = {
@@ -196,7 +196,7 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(launch, meet, domain_
     # After a reset an odometry from before counts, as after a restart of the robot.
     assert peer.call(Trigger, "middleware_node/reset").success
     drive(5.0, 1)
-    peer.until(lambda: stamp_ns(filtered[-1]) == conversions.NANO, "an estimate after the reset")
+    peer.until(lambda: stamp_ns(filtered[-1]) == NS_PER_S, "an estimate after the reset")
     assert conversions.odometry_from_ros(filtered[-1])[0] == pytest.approx([5.0, 0.0, 0.0])
 
 
@@ -219,7 +219,7 @@ def sensed(launch, meet, domain_id):
 
     def stand(tenths, deadline_s=30.0):
         """An odometry of a robot that stands; returns the estimate after it."""
-        stamp = tenths * conversions.NANO // 10
+        stamp = tenths * NS_PER_S // 10
         speakers["odom"].publish(conversions.odometry_to_ros(
             [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], stamp, ("odom", "base_link"), VARIANCE
         ))  # fmt: skip
@@ -250,7 +250,7 @@ def sensed(launch, meet, domain_id):
 
 def measured_pose(x, y, heading, tenths, std):
     message = PoseWithCovarianceStamped()
-    message.header.stamp = conversions.stamp_to_ros(tenths * conversions.NANO // 10)
+    message.header.stamp = conversions.stamp_to_ros(tenths * NS_PER_S // 10)
     message.pose.pose.position.x, message.pose.pose.position.y = x, y
     message.pose.pose.orientation = conversions.heading_to_ros(heading)
     covariance = np.zeros((6, 6))
@@ -261,7 +261,7 @@ def measured_pose(x, y, heading, tenths, std):
 
 def measured_rate(rate, tenths, missing=False):
     message = Imu()
-    message.header.stamp = conversions.stamp_to_ros(tenths * conversions.NANO // 10)
+    message.header.stamp = conversions.stamp_to_ros(tenths * NS_PER_S // 10)
     message.angular_velocity.z = rate
     message.angular_velocity_covariance[0] = -1.0 if missing else 0.0
     message.angular_velocity_covariance[8] = 1e-4

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from nics_drl_bridge.nodes import one_core
-from nics_drl_bridge.nodes.one_core import OneCore
+from nics_drl_bridge.nodes import dds_backend
+from nics_drl_bridge.nodes.dds_backend import OneCore
 
-CORES = os.sched_getaffinity(0) if one_core.CAN_CHOOSE else set()
+CORES = os.sched_getaffinity(0) if dds_backend.CAN_CHOOSE else set()
 
 
 class Helper:
@@ -104,7 +104,7 @@ def test_interrupted_right_after_a_core_was_chosen_it_is_free_too(core, helper, 
         if len(calls) == after + 1:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(one_core, "_allow", interrupted)
+    monkeypatch.setattr(dds_backend, "_allow", interrupted)
     with pytest.raises(KeyboardInterrupt):
         core.wait(Waiting(helper), 1.0)
     assert os.sched_getaffinity(0) == CORES
@@ -113,7 +113,7 @@ def test_interrupted_right_after_a_core_was_chosen_it_is_free_too(core, helper, 
 @choosing
 @pytest.mark.parametrize("nowhere", [-1, 10**6])
 def test_where_no_core_can_be_told_or_chosen_it_only_waits(core, helper, monkeypatch, nowhere):
-    monkeypatch.setattr(one_core, "_core_now", lambda: nowhere)
+    monkeypatch.setattr(dds_backend, "_core_now", lambda: nowhere)
     event = Waiting(helper)
     assert core.wait(event, 1.0)
     assert event.own == event.other == os.sched_getaffinity(0) == CORES
@@ -145,6 +145,6 @@ def test_without_a_helper_or_such_a_system_it_only_waits(core, monkeypatch):
     event.set()
     assert core.wait(event, 0.0)
     core.help()
-    monkeypatch.setattr(one_core, "CAN_CHOOSE", False)
-    monkeypatch.setattr(one_core, "_allowed", None, raising=False)
+    monkeypatch.setattr(dds_backend, "CAN_CHOOSE", False)
+    monkeypatch.setattr(dds_backend, "_allowed", None, raising=False)
     assert core.wait(event, 0.0)

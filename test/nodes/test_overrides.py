@@ -7,8 +7,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
-from nics_drl_bridge.nodes.overrides import warn_of_unknown
-from nics_drl_bridge.nodes.runner import declare, open_context
+from nics_drl_bridge.nodes.runner import declare, open_context, warn_of_unknown
 
 pytestmark = pytest.mark.ros
 

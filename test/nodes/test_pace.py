@@ -2,27 +2,28 @@ from __future__ import annotations
 
 import pytest
 
-from nics_drl_bridge.nodes.pace import NANO, Pace, RealTime, common_step
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.nodes.device_parameters import RealTime, TopicPace, common_step
 
-STEP = NANO // 50
+STEP = NS_PER_S // 50
 
 
 def due(pace, seconds, step=STEP):
-    return [now for now in range(0, seconds * NANO, step) if pace.due(now)]
+    return [now for now in range(0, seconds * NS_PER_S, step) if pace.due(now)]
 
 
 def test_where_the_step_divides_the_period_messages_are_regular():
-    assert due(Pace(NANO // 10, STEP), 1) == list(range(0, NANO, NANO // 10))
+    assert due(TopicPace(NS_PER_S // 10, STEP), 1) == list(range(0, NS_PER_S, NS_PER_S // 10))
 
 
 def test_where_it_does_not_the_mean_rate_is_still_the_asked_one():
-    times = due(Pace(round(NANO / 5.5), STEP), 20)
+    times = due(TopicPace(round(NS_PER_S / 5.5), STEP), 20)
     assert len(times) == 110
-    assert all(abs(now - k * NANO / 5.5) <= STEP / 2 for k, now in enumerate(times))
+    assert all(abs(now - k * NS_PER_S / 5.5) <= STEP / 2 for k, now in enumerate(times))
 
 
 def test_after_a_reset_a_message_is_due_at_once():
-    pace = Pace(NANO, STEP)
+    pace = TopicPace(NS_PER_S, STEP)
     assert pace.due(0)
     assert not pace.due(STEP)
     pace.begin(2 * STEP)
@@ -48,10 +49,10 @@ def test_time_runs_as_many_times_faster_as_the_rate_says():
     clock = RealTime(STEP, 4.0)
     clock.begin(0, 0)
     assert clock.behind(STEP, 0) == 4
-    assert clock.time_at(NANO) == 4 * NANO
+    assert clock.time_at(NS_PER_S) == 4 * NS_PER_S
 
 
 def test_a_world_that_is_seconds_behind_is_lost():
     clock = RealTime(STEP, 1.0)
     clock.begin(0, 0)
-    assert clock.lost(NANO, 0)
+    assert clock.lost(NS_PER_S, 0)

@@ -11,12 +11,12 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 import yaml
 from rclpy.node import Node
 
-from nics_drl_bridge.nodes import overrides
+from nics_drl_bridge.extras.mujoco.node import mujoco_node
+from nics_drl_bridge.nodes import runner
 from nics_drl_bridge.nodes.command_gate import CommandGate
-from nics_drl_bridge.nodes.drive_parameters import declare_drive
 from nics_drl_bridge.nodes.middleware_node import MiddlewareNode
-from nics_drl_bridge.nodes.mujoco_node import mujoco_node
 from nics_drl_bridge.nodes.policy_node import PolicyNode
+from nics_drl_bridge.nodes.record_node import declare_drive
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.nodes.simulator_node import simulator_node
 
@@ -51,7 +51,7 @@ def test_a_node_has_every_parameter_that_a_shipped_file_gives_it(
     context = open_context(["node", "--ros-args", "--params-file", str(file)], domain_id)
     try:
         node = MAKERS[name](context)
-        assert overrides.unknown(node) == []
+        assert runner.unknown(node) == []
         for key, value in section.get("ros__parameters", {}).items():
             assert node.get_parameter(key).value == pytest.approx(value, nan_ok=True), key
             assert node.describe_parameter(key).description

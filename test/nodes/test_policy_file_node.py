@@ -18,9 +18,9 @@ from nav_msgs.msg import Odometry
 from policy.policy_rig import network
 from sensor_msgs.msg import LaserScan
 
-from nics_drl_bridge.env.tasks import make_task
+from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.middleware.view import rehearse
+from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.train_export import export_policy

@@ -9,7 +9,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Bool
 
 from nics_drl_bridge.nodes import qos
-from nics_drl_bridge.nodes.qos_watch import QosWatch
+from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import open_context
 
 pytestmark = pytest.mark.ros

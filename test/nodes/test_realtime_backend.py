@@ -15,11 +15,11 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import SetBool
 
-from nics_drl_bridge.env.registration import NAVIGATION
+from nics_drl_bridge.env.registry import NAVIGATION
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import conversions, qos, realtime_backend
-from nics_drl_bridge.nodes.episodes import Episodes
+from nics_drl_bridge.nodes.observer import EpisodeServices
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.sim.world import load_world
 
@@ -127,8 +127,10 @@ def test_silence_of_a_topic_is_named_with_its_age_and_a_reset_goes_on(connect, s
 def test_a_simulator_whose_services_are_found_late_is_no_vehicle(connect, monkeypatch):
     monkeypatch.setattr(realtime_backend, "SERVICES_S", 0.0)
     unseen = iter([False] * 20)
-    seen = Episodes.there.fget
-    monkeypatch.setattr(Episodes, "there", property(lambda self: next(unseen, True) and seen(self)))
+    seen = EpisodeServices.there.fget
+    monkeypatch.setattr(
+        EpisodeServices, "there", property(lambda self: next(unseen, True) and seen(self))
+    )
     elsewhere = Start(seed=4, pose=np.array([-0.5, 0.5, 0.0]))
     backend = connect(stale_after_s=PATIENCE_S)
     assert backend.reset(elsewhere).pose == pytest.approx(elsewhere.pose, abs=0.2)

@@ -16,13 +16,13 @@ from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from robots import open_field
 
-from nics_drl_bridge.calibration.identify import identify
 from nics_drl_bridge.generator import builtin_model, save_model
-from nics_drl_bridge.kinematics.coverage import coverage
-from nics_drl_bridge.kinematics.readers import read_recording
-from nics_drl_bridge.kinematics.recording import check
-from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.identify.excitation import coverage
+from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.recording.recording import check
+from nics_drl_bridge.robot.spec import load_robot
 from nodes.peer import DEADLINE_S
 
 pytestmark = pytest.mark.ros
@@ -187,7 +187,7 @@ class Nics:
             "ROS_DOMAIN_ID": str(domain_id),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         }
-        command = [sys.executable, "-m", "nics_drl_bridge.cli", "record", "--yes"]
+        command = [sys.executable, "-m", "nics_drl_bridge.commands.cli", "record", "--yes"]
         with self._said.open("wb") as log:
             self.process = subprocess.Popen(
                 [*command, *map(str, options)],

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.kinematics.spec import load_robot
-from nics_drl_bridge.kinematics.textbook import record
 from nics_drl_bridge.nodes import recorder
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.robot.spec import load_robot
 
 CAR = load_robot("ackermann")
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def nics(*words, cwd, **environment):
-    command = [sys.executable, "-m", "nics_drl_bridge.cli", "record", *map(str, words)]
+    command = [sys.executable, "-m", "nics_drl_bridge.commands.cli", "record", *map(str, words)]
     return subprocess.run(
         command, cwd=cwd, env=os.environ | environment, capture_output=True, text=True,
         timeout=100, input="n\n",
@@ -81,7 +81,7 @@ def test_what_can_not_be_done_is_one_sentence(tmp_path, words, hint):
 
 
 def test_an_order_becomes_parameters_and_arguments_of_the_node():
-    order = recorder.Order("mecanum", Path("drive.npz"), bound=3.0, use_sim_time=True)
+    order = recorder.RecordOrder("mecanum", Path("drive.npz"), bound=3.0, use_sim_time=True)
     assert order.parameters["use_sim_time"] is True
     assert (order.parameters["robot"], order.parameters["bound"]) == ("mecanum", 3.0)
     assert order.arguments == ["nics"]
@@ -92,7 +92,7 @@ def test_an_order_becomes_parameters_and_arguments_of_the_node():
 
 
 def test_the_summary_tells_each_command_and_the_next_step():
-    order = recorder.Order("ackermann", Path("runs/drive.npz"))
+    order = recorder.RecordOrder("ackermann", Path("runs/drive.npz"))
     drive = record(CAR, np.random.default_rng(0), duration=30.0)
     measured, speed, steering, after = recorder.summary(drive, CAR, order)
     assert measured.startswith("measured: a path of ")
@@ -114,7 +114,7 @@ def test_an_outcome_becomes_lines_or_an_error(monkeypatch, complete):
             )  # fmt: skip
 
     monkeypatch.setattr(recorder, "import_module", lambda _: Node)
-    order = recorder.Order("ackermann", Path("drive.npz"))
+    order = recorder.RecordOrder("ackermann", Path("drive.npz"))
     assert recorder.drive(order) == (("over",), complete)
     Node.failure = BackendError("odom")
     with pytest.raises(BackendError, match=r"^over$"):

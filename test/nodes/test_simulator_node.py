@@ -12,6 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nics_drl_bridge.interface import NS_PER_S
+
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from domains import claimed_domain
@@ -21,9 +23,9 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool, Trigger
 
-from nics_drl_bridge.calibration.noise_model import Noise
 from nics_drl_bridge.generator import save_model
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.sim.world import load_world
 from nodes.peer import stamp_ns
 
@@ -104,7 +106,7 @@ def realtime(launch, meet):
 
 @pytest.fixture
 def period_ns(model):
-    return round(model.control_period * conversions.NANO)
+    return round(model.control_period * NS_PER_S)
 
 
 def test_it_is_ready_within_seconds(lockstep):
@@ -333,7 +335,7 @@ def test_in_real_time_it_stops_the_robot_when_commands_end(realtime):
     ended = stamp_ns(odom[-1])
     while abs(speed) > 0.05:
         speed = realtime.peer.another(odom, "odometry").twist.twist.linear.x
-        assert stamp_ns(odom[-1]) - ended < 10 * conversions.NANO
+        assert stamp_ns(odom[-1]) - ended < 10 * NS_PER_S
     assert 0.4 < (stamp_ns(odom[-1]) - ended) * 1e-9 < 2.0  # simulated; the limit is 0.5 s
 
 
@@ -358,7 +360,7 @@ def test_as_fast_as_possible_it_outruns_the_clock(launch, meet, domain_id):
     scans = peer.listen(LaserScan, "scan")
     peer.until(lambda: scans, "a scan")
     began, first = time.monotonic(), stamp_ns(scans[-1])
-    peer.until(lambda: stamp_ns(scans[-1]) - first > 20 * conversions.NANO, "20 simulated s")
+    peer.until(lambda: stamp_ns(scans[-1]) - first > 20 * NS_PER_S, "20 simulated s")
     factor = 20.0 / (time.monotonic() - began)
     print(f"{factor:.0f} times faster than the clock")
     assert factor > 2.0

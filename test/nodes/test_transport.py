@@ -19,10 +19,11 @@ from nics_drl_bridge.nodes.transport import (
     TRANSPORTS,
     UDP,
     chosen,
+    multicast_port,
+    ports_of,
     stay_on_this_machine,
     stays_here,
 )
-from nics_drl_bridge.nodes.udp import multicast_port, ports_of
 
 pytestmark = pytest.mark.ros
 
@@ -153,7 +154,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes.runner import open_context
-from nics_drl_bridge.nodes.udp import multicast_port, ports_of
+from nics_drl_bridge.nodes.transport import multicast_port, ports_of
 
 def ours(where=None):
     if where is not None:

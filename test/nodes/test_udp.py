@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import socket
 
-from nics_drl_bridge.nodes.udp import domains_in_use, multicast_port, ports_of
+from nics_drl_bridge.nodes.transport import domains_in_use, multicast_port, ports_of
 
 
 def test_a_domain_is_in_use_while_a_port_of_it_is_bound():

@@ -12,6 +12,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, wire
 
 STAMP_NS = 1_763_000_000_123_456_789
@@ -109,7 +110,7 @@ def test_bytes_in_the_other_order_are_read_too():
     numbers[[0, 1, 6, wire.TWIST]] = 1.0, 2.0, 1.0, 3.0
     content = bytes([0, 0, 0, 0]) + odom + numbers.astype(">f8").tobytes()
     pose, twist = wire.odometry_of(content)
-    assert wire.stamp_of(content) == 3 * conversions.NANO + 4
+    assert wire.stamp_of(content) == 3 * NS_PER_S + 4
     assert pose.tolist() == [1.0, 2.0, 0.0]
     assert twist.tolist() == [3.0, 0.0, 0.0]
     assert wire.twist_of(bytes(4) + struct.pack(">6d", *range(6))) == (0.0, 1.0, 5.0)

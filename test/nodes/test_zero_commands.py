@@ -24,7 +24,7 @@ DRIVER = """
 import gc, sys
 import gymnasium
 import numpy as np
-from nics_drl_bridge.env.registration import NAVIGATION, register_envs
+from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 
 what = sys.argv[1]
 register_envs()

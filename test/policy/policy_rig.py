@@ -10,7 +10,7 @@ import onnx
 import torch
 from robots import direct_model, lidar
 
-from nics_drl_bridge.env.tasks import make_task
+from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.policy import contract, onnx_graph
 from nics_drl_bridge.policy.train_export import export_policy
 

@@ -7,9 +7,9 @@ from robots import lidar
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.policy.evaluation_batch import drive_worlds
 from nics_drl_bridge.policy.policies import POLICIES, make_policy
+from nics_drl_bridge.robot.spec import load_robot
 
 ROBOTS = ("ackermann", "differential", "mecanum")
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nics_drl_bridge.policy.comparison import record_of, tallies
 from nics_drl_bridge.policy.evaluation import Episode
+from nics_drl_bridge.policy.statistics import record_of, tallies
 
 
 def episode(seed, result, points):

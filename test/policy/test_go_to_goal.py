@@ -9,10 +9,10 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.kinematics.spec import load_robot
 from nics_drl_bridge.policy.evaluation import drive_all, successes
 from nics_drl_bridge.policy.go_to_goal import GoToGoal
 from nics_drl_bridge.policy.policies import make_policy
+from nics_drl_bridge.robot.spec import load_robot
 
 ROBOTS = ("ackermann", "differential", "mecanum")
 

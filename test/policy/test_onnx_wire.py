@@ -4,7 +4,7 @@ import onnx
 import pytest
 
 from nics_drl_bridge.errors import PolicyError
-from nics_drl_bridge.policy.onnx_wire import MOST_NESTED, MOST_PACKED, MOST_PARTS, check_wire
+from nics_drl_bridge.policy.onnx_graph import MOST_NESTED, MOST_PACKED, MOST_PARTS, check_wire
 from nics_drl_bridge.policy.policy_file import load_policy, shipped
 
 GRAPH, NODE, ATTRIBUTE, SUBGRAPH = 7, 1, 5, 6

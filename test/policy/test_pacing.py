@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nics_drl_bridge.policy.pacing import Answer, Deadline, Pace
+from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 
 
 def actions(pace, times):
@@ -15,7 +15,7 @@ def actions(pace, times):
 
 
 def test_data_that_come_faster_are_acted_on_at_the_rate():
-    done = actions(Pace(0.1), np.arange(0.0, 10.0, 0.01))
+    done = actions(ActionPace(0.1), np.arange(0.0, 10.0, 0.01))
     assert len(done) in (100, 101)
 
 
@@ -23,7 +23,7 @@ def test_jitter_of_the_data_does_not_slow_it_down():
     rng = np.random.default_rng(0)
     polled = np.arange(0.0, 20.0, 0.01)
     arrivals = 0.1 * np.arange(200) + rng.uniform(0.0, 0.03, 200)
-    pace, done, used = Pace(0.1), 0, -1
+    pace, done, used = ActionPace(0.1), 0, -1
     for now in polled:
         newest = int(np.searchsorted(arrivals, now, side="right")) - 1
         if newest > used and pace.due(now):
@@ -33,11 +33,11 @@ def test_jitter_of_the_data_does_not_slow_it_down():
 
 
 def test_late_data_are_acted_on_at_once_and_not_made_up_for():
-    assert actions(Pace(0.1), [0.0, 0.35, 0.36, 0.4, 0.45, 0.5]) == [0.0, 0.35, 0.45]
+    assert actions(ActionPace(0.1), [0.0, 0.35, 0.36, 0.4, 0.45, 0.5]) == [0.0, 0.35, 0.45]
 
 
 def test_without_a_period_everything_is_acted_on():
-    assert actions(Pace(0.0), [0.0, 0.001, 0.002]) == [0.0, 0.001, 0.002]
+    assert actions(ActionPace(0.0), [0.0, 0.001, 0.002]) == [0.0, 0.001, 0.002]
 
 
 def test_a_late_answer_is_dropped_and_several_in_a_row_stop_the_robot():

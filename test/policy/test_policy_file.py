@@ -14,7 +14,7 @@ import pytest
 import torch
 from robots import DIRECT, lidar
 
-from nics_drl_bridge.env.tasks import make_task
+from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.policy import onnx_graph

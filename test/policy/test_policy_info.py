@@ -8,7 +8,14 @@ from policy.policy_rig import SECTORS, export
 
 
 def info(*words: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "nics_drl_bridge.cli", "policy", "info", *map(str, words)]
+    command = [
+        sys.executable,
+        "-m",
+        "nics_drl_bridge.commands.cli",
+        "policy",
+        "info",
+        *map(str, words),
+    ]
     return subprocess.run(command, capture_output=True, text=True, timeout=100)
 
 

@@ -151,7 +151,7 @@ def test_the_command_writes_a_table_a_picture_and_json(recorded, tmp_path):
     words = ["evaluate", "go_to_goal", "--shadow", str(bag), "--model", "ackermann"]
     words += [f"--goal={goal[0]},{goal[1]}", "--out", str(tmp_path / "out")]
     done = subprocess.run(
-        [sys.executable, "-m", "nics_drl_bridge.cli", *words],
+        [sys.executable, "-m", "nics_drl_bridge.commands.cli", *words],
         capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -11,9 +11,8 @@ from robots import direct_model, field
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sealed
 from nics_drl_bridge.policy import train as training
-from nics_drl_bridge.policy.train import CHECKPOINT, evaluate, train
+from nics_drl_bridge.policy.train import CHECKPOINT, TrainOrder, evaluate, run, train
 from nics_drl_bridge.policy.train_checkpoint import FORMAT, read_checkpoint
-from nics_drl_bridge.policy.train_run import TrainOrder, run
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
 MODEL, WORLD = direct_model(odometry=(0.02, 0.02)), field(count=2)
@@ -63,7 +62,7 @@ def test_an_interrupted_training_comes_to_the_same_weights(algorithm, tmp_path, 
             raise BrokenOffError
 
     # Told of every rollout, whatever the clock says.
-    monkeypatch.setattr("nics_drl_bridge.policy.train_progress.TOLD_S", 0.0)
+    monkeypatch.setattr("nics_drl_bridge.policy.train_checkpoint.TOLD_S", 0.0)
     with pytest.raises(BrokenOffError):
         train(settings(algorithm), 1, tmp_path / "broken", interrupt)
     kept = read_checkpoint(tmp_path / "broken" / CHECKPOINT)["counters"]["num_timesteps"]

@@ -5,10 +5,9 @@ import pytest
 import torch
 from robots import direct_model
 
-from nics_drl_bridge.env.tasks import make_task
+from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.policy.policy_file import load_policy
-from nics_drl_bridge.policy.train_actor import Actor
-from nics_drl_bridge.policy.train_algorithms import act_of
+from nics_drl_bridge.policy.train_algorithms import Actor, act_of
 from nics_drl_bridge.policy.train_export import export_policy
 
 MODEL = direct_model()

@@ -7,7 +7,7 @@ from robots import field
 from stable_baselines3 import PPO, SAC
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.tasks import make_task
+from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.train_export import Deployed, export_policy

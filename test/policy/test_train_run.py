@@ -6,7 +6,7 @@ from importlib.util import find_spec
 import pytest
 from typer.testing import CliRunner
 
-from nics_drl_bridge.cli import app
+from nics_drl_bridge.commands.cli import app
 from nics_drl_bridge.policy.policy_file import load_policy
 
 SETTINGS = """

@@ -10,7 +10,7 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-from nics_drl_bridge.env.registration import ENVIRONMENTS
+from nics_drl_bridge.env.registry import ENVIRONMENTS
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv

@@ -9,15 +9,17 @@ import pytest
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "calibration"))
 
-from drives import drive, with_wheels
+from identify.drives import drive, with_wheels
 
-from nics_drl_bridge.calibration.curves import timing_curves
-from nics_drl_bridge.calibration.estimates import estimates
-from nics_drl_bridge.calibration.fit_report import fit_report
-from nics_drl_bridge.calibration.identify import Identified, identify
-from nics_drl_bridge.kinematics.spec import RobotSpec, load_robot
-from nics_drl_bridge.kinematics.textbook import record
-from nics_drl_bridge.report.calibration_pictures import CAPTIONS, calibration_pictures
+from nics_drl_bridge.identify.identify import Identified, identify
+from nics_drl_bridge.identify.report import estimates, fit_report
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.report.calibration_pictures import (
+    CAPTIONS,
+    calibration_pictures,
+    timing_curves,
+)
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 Found = tuple[RobotSpec, Identified]
 PNG = b"\x89PNG"

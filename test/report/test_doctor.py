@@ -10,11 +10,17 @@ pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 import bags
 
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.kinematics.bag_qos import Offer
-from nics_drl_bridge.lidar.canonical import ScanLayout
+from nics_drl_bridge.lidar.sectors import ScanLayout
+from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.report.doctor import examine
-from nics_drl_bridge.report.doctor_expected import Expected, expected_of_model
-from nics_drl_bridge.report.doctor_facts import Endpoints, Facts, facts_of_bag, names_in
+from nics_drl_bridge.report.doctor_facts import (
+    Endpoints,
+    Expected,
+    Facts,
+    expected_of_model,
+    facts_of_bag,
+    names_in,
+)
 
 SECONDS = 8.0
 RELIABLE, BEST_EFFORT = Offer(), Offer(reliable=False)

@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from nics_drl_bridge.kinematics.drive_plan import DrivePlan
-from nics_drl_bridge.kinematics.spec import load_robot
-from nics_drl_bridge.report.drive_picture import drive_picture
+from nics_drl_bridge.recording.drive_plan import DrivePlan
+from nics_drl_bridge.report.pictures import drive_picture
+from nics_drl_bridge.robot.spec import load_robot
 
 
 @pytest.mark.parametrize("name", ["ackermann", "mecanum"])

@@ -3,11 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nics_drl_bridge.calibration.fit_report import fit_report, with_error
-from nics_drl_bridge.calibration.identify import identify
-from nics_drl_bridge.kinematics.spec import load_robot
-from nics_drl_bridge.kinematics.textbook import record
+from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.report import fit_report, with_error
+from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.report.fit_pictures import fit_pictures, write_pictures
+from nics_drl_bridge.robot.spec import load_robot
 
 PNG = b"\x89PNG"
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from nics_drl_bridge.report.training_picture import Point, training_curve
+from nics_drl_bridge.report.pictures import Point, training_curve
 
 
 @pytest.mark.parametrize(

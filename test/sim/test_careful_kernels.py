@@ -10,7 +10,7 @@ from robots import DIRECT, direct_model, field, lidar
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import compose, exp, rotate
-from nics_drl_bridge.kinematics.spec import RobotSpec
+from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.simulator import FastSimulator
 
 DT = 0.01

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from shapely import affinity, geometry
 
-from nics_drl_bridge.lidar.maps_grid import GridMap
+from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Polygon, Rectangle, Segment, place
 from nics_drl_bridge.sim import collision_kernels as kernels
 

@@ -5,7 +5,7 @@ import pytest
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.sim.dead_reckoning import propagate, step_covariance, variances
+from nics_drl_bridge.sim.device import propagate, step_covariance, variances
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
 

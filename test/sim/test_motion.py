@@ -10,11 +10,11 @@ from shapely import LineString, MultiLineString, box, unary_union
 
 from nics_drl_bridge.config import Schema, validate
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.lidar.maps_grid import GridMap
+from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import place
-from nics_drl_bridge.sim import motion_kernels as kernels
-from nics_drl_bridge.sim import motion_layout as at
-from nics_drl_bridge.sim.motion import (
+from nics_drl_bridge.sim import obstacle_kernels as kernels
+from nics_drl_bridge.sim import separation_kernels as at
+from nics_drl_bridge.sim.obstacles import (
     MARK,
     NO_DISTANCES,
     Motion,

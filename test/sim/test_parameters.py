@@ -10,10 +10,10 @@ from robots import FOOTPRINT, RADIUS, direct_model, field, lidar
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.kinematics.spec import RobotSpec
-from nics_drl_bridge.lidar.maps_grid import GridMap
+from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.sim import worlds as sizes
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.sim import allocation as sizes
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nics_drl_bridge.sim.pedestrian_kernels import FAR, repulsion
+from nics_drl_bridge.sim.obstacle_kernels import FAR, repulsion
 
 STRENGTH, REACH = 2.1, 0.3
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nics_drl_bridge.kinematics.model import TaylorModel
-from nics_drl_bridge.kinematics.spec import load_robot
+from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim.validity import EVERY, CommandBox, OutsideValidityWarning
 
 

@@ -1,0 +1,77 @@
+"""The command line: `nics ...`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated
+
+import typer
+
+from nics_drl_bridge import __version__, extensions
+from nics_drl_bridge.commands.console import EXIT_BAD_INPUT
+from nics_drl_bridge.commands.demo import demo
+from nics_drl_bridge.commands.doctor import doctor
+from nics_drl_bridge.commands.evaluate import evaluate
+from nics_drl_bridge.commands.model import generate, urdf
+from nics_drl_bridge.commands.policy import policy
+from nics_drl_bridge.commands.record import record
+from nics_drl_bridge.commands.replay import replay
+from nics_drl_bridge.commands.train import train
+from nics_drl_bridge.errors import LONGEST, shortened
+
+app = typer.Typer(
+    help="From a recording of a robot to a fast simulator, and back to the robot over ROS 2.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
+    ] = False,
+) -> None:
+    """Options of every command."""
+
+
+for command in (generate, record, replay, doctor, urdf, train, evaluate, demo):
+    app.command()(command)
+app.add_typer(policy, name="policy")
+for name, extension in extensions.known("commands").items():
+    app.add_typer(extension.load(), name=name)
+
+
+def main() -> None:
+    """Entry point of the executable; a wrong option also gives one sentence and exit code 2."""
+    try:
+        code = app(prog_name="nics", standalone_mode=False)
+    except typer.Abort:
+        typer.echo("Aborted.", err=True)
+        raise SystemExit(1) from None
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # stdout is flushed at exit
+        raise SystemExit(1) from None
+    except Exception as error:
+        if not hasattr(error, "format_message"):  # no option error of click or typer
+            raise
+        if told := error.format_message().strip():  # otherwise its help has been shown
+            told = shortened(told.rstrip(".?"), LONGEST)
+            typer.echo(f"nics: {told}; see `nics --help`.", err=True)
+        raise SystemExit(EXIT_BAD_INPUT) from None
+    raise SystemExit(code if isinstance(code, int) else 0)
+
+
+if __name__ == "__main__":
+    main()

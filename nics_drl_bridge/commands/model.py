@@ -1,0 +1,116 @@
+"""`nics generate`.
+
+`nics urdf`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nics_drl_bridge import extensions
+from nics_drl_bridge.commands.console import (
+    RobotOption,
+    TopicOption,
+    TopicsOption,
+    WorldOption,
+    one_sentence,
+)
+
+
+def generate(
+    recording: Annotated[
+        Path, typer.Argument(help="A rosbag2, an .npz recording, or a folder of CSV files.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder of the model to write.")],
+    robot: RobotOption = "ackermann",
+    topics: TopicsOption = None,
+    topic: TopicOption = None,
+    world: WorldOption = "arena",
+    lidar: Annotated[str, typer.Option(help="A shipped lidar (paper) or a YAML file.")] = "paper",
+    order: Annotated[int, typer.Option(min=1, max=4, help="Order of the Taylor model.")] = 2,
+    alpha: Annotated[
+        str, typer.Option(help="Pruning threshold of Eq. 2, 0 to 1, or auto for the knee.")
+    ] = "auto",
+    assume_textbook: Annotated[
+        bool, typer.Option(help="Fill in from the textbook what the drive did not show.")
+    ] = False,
+    strict: Annotated[
+        bool, typer.Option(help="Refuse a drive that did not move every input on its own.")
+    ] = False,
+    salvage: Annotated[
+        bool,
+        typer.Option("--salvage", help="Take what is intact of a damaged bag; tell the rest."),
+    ] = False,
+    anyway: Annotated[
+        bool,
+        typer.Option(
+            "--anyway", help="Write the model even if its predictions of unseen data are of no use."
+        ),
+    ] = False,
+    pictures: Annotated[
+        bool, typer.Option(help="Draw the fit into the folder pictures of the model.")
+    ] = False,
+) -> None:
+    """Generates a simulator from a recording and writes it as a folder."""
+    with one_sentence():
+        from nics_drl_bridge.generator import check_place, save_model
+        from nics_drl_bridge.generator import generate as generate_model
+        from nics_drl_bridge.identify.dof import parse_alpha
+        from nics_drl_bridge.lidar.spec import load_lidar
+        from nics_drl_bridge.recording.readers import read_recording
+        from nics_drl_bridge.recording.topic_roles import topic_roles
+        from nics_drl_bridge.robot.spec import load_robot
+        from nics_drl_bridge.sim.world import load_world
+
+        check_place(out)
+        spec, sensor, threshold = load_robot(robot), load_lidar(lidar), parse_alpha(alpha)
+        shapes = load_world(world).shapes
+        with _intact(recording, salvage) as whole:
+            drive = read_recording(whole, spec, topic_roles(topics, topic or ()))
+        drive = replace(drive, source=str(recording))
+        model, identified = generate_model(
+            drive, spec, sensor, shapes, order, threshold,
+            assume=assume_textbook, strict=strict, anyway=anyway,
+        )  # fmt: skip
+        save_model(model, out)
+        if pictures:
+            from nics_drl_bridge.report.fit_pictures import write_pictures
+
+            write_pictures(spec, identified, out / "pictures")
+        typer.echo(model.report.rstrip())
+        typer.echo(f"model written to {out}")
+
+
+@contextmanager
+def _intact(recording: Path, salvage: bool) -> Iterator[Path]:
+    """The recording; or what is intact of a damaged bag, if that is wanted."""
+    if not salvage:
+        yield recording
+        return
+    with extensions.load("salvage", "bag")(recording, True) as (whole, lines):
+        for line in lines:
+            typer.echo(line, err=True)
+        yield whole
+
+
+def urdf(
+    model: Annotated[str, typer.Argument(help="A shipped robot, or the folder of a model.")],
+    out: Annotated[Path | None, typer.Option(help="The file to write; <robot>.urdf.")] = None,
+) -> None:
+    """Writes a robot's URDF, for RViz and robot_state_publisher."""
+    with one_sentence():
+        from nics_drl_bridge.files import write_text
+        from nics_drl_bridge.generator import open_model
+        from nics_drl_bridge.robot.urdf import urdf_of
+
+        opened = open_model(model)
+        file = out or Path(f"{opened.robot.name}.urdf")
+        lidar = opened.lidar
+        write_text(file, urdf_of(opened.robot, lidar.mount, lidar.frame))
+        typer.echo(f"{file}: the URDF of {opened.robot.name}")

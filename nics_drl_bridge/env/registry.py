@@ -1,0 +1,233 @@
+"""Tasks by name, and user-defined ones by the path of their file.
+
+Makes the environments known to `gymnasium.make` and `gymnasium.make_vec`.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from inspect import Parameter, signature
+from pathlib import Path
+from traceback import extract_tb
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from nics_drl_bridge.env.task import Task
+from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.files import sha256
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.sectors import layout_of
+
+TASKS = {
+    "navigation": "nics_drl_bridge.env.navigation:Navigation",
+    "cooperative_reaching": "nics_drl_bridge.env.teams:CooperativeReaching",
+    "pursuit_evasion": "nics_drl_bridge.env.pursuit_evasion:PursuitEvasion",
+}
+"""Module and class of each shipped task."""
+
+
+def make_task(
+    task: str | type[Task] | Task, model: SimulatorModel, options: dict[str, Any] | None = None
+) -> Task:
+    """Makes a task for the robot of a model.
+
+    Args:
+        task: the name of a shipped one (`navigation`), `path/to/file.py:ClassName`, a class, or a
+            Task.
+        model: gives the robot and the lidar.
+        options: further arguments of the class; `scan` may also be a number of sectors, the name
+            of a layout or its fields, see `canonical.layout_of`.
+
+    Raises:
+        ConfigError: no such task, an unknown argument, or a Task for another robot.
+    """
+    if isinstance(task, Task):
+        return _checked(task, model, options)
+    found = task if isinstance(task, type) else _class_of(task)
+    options = dict(options or {})
+    _check_options(found, options)
+    if "scan" in options:
+        options["scan"] = layout_of(options["scan"], model.lidar)
+    try:
+        return found(model.robot, model.lidar, **options)
+    except TypeError as error:
+        reason = str(error).removeprefix(f"{found.__name__}.__init__() ")
+        raise ConfigError(f"task {found.__name__}, task_options {options}: {reason}.") from None
+
+
+def _check_options(found: type[Task], options: dict[str, Any]) -> None:
+    """Raises ConfigError for an option that the class does not have, or of the wrong type."""
+    known = signature(found).parameters
+    free = any(one.kind is Parameter.VAR_KEYWORD for one in known.values())
+    for name, value in options.items():
+        if name not in known and not free:
+            hint = nearest(name, set(known) - {"robot", "lidar"})
+            raise ConfigError(f"task {found.__name__}: unknown task option {name!r}; {hint}")
+        annotation = known[name].annotation if name in known else None
+        kind = str(getattr(annotation, "__name__", annotation))
+        if kind in KINDS and not KINDS[kind][0](value):
+            raise ConfigError(f"task option {name}={value!r}: must be {KINDS[kind][1]}.")
+
+
+def _is_flag(value: object) -> bool:
+    return isinstance(value, bool | np.bool_)
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, int | np.integer) and not _is_flag(value)
+
+
+def _is_finite(value: object) -> bool:
+    number = _is_whole(value) or isinstance(value, float | np.floating)
+    return number and bool(np.isfinite(value))  # type: ignore[call-overload]
+
+
+KINDS = {
+    "bool": (_is_flag, "True or False"),
+    "int": (_is_whole, "a whole number"),
+    "float": (_is_finite, "a finite number"),
+}
+"""Annotation of an option -> its check, and its name in errors."""
+
+
+def _checked(task: Task, model: SimulatorModel, options: dict[str, Any] | None) -> Task:
+    name = type(task).__name__
+    if options:
+        raise ConfigError(f"task {name} is already made; give {sorted(options)} to it, not beside.")
+    if task.robot != model.robot or task.lidar != model.lidar:
+        raise ConfigError(
+            f"task {name} is of the robot {task.robot.name!r} with {task.lidar.beams} beams, the "
+            f"model of {model.robot.name!r} with {model.lidar.beams}; make it with model.robot and "
+            "model.lidar."
+        )
+    return task
+
+
+def _class_of(name: str) -> type[Task]:
+    path, colon, attribute = name.rpartition(":")
+    if not colon:
+        if name not in TASKS:
+            hint = nearest(name, TASKS)
+            raise ConfigError(f"unknown task {name!r}; {hint} Or give path/to/file.py:ClassName.")
+        return _class_of(TASKS[name])
+    module = _load(Path(path)) if path.endswith(".py") else _import(path)
+    found = getattr(module, attribute, None)
+    if not (isinstance(found, type) and issubclass(found, Task)):
+        tasks = [n for n, v in vars(module).items() if isinstance(v, type) and _own(v, module)]
+        raise ConfigError(f"task {name!r}: {path} has no such Task; {nearest(attribute, tasks)}")
+    return found
+
+
+def _own(found: type, module: Any) -> bool:
+    return issubclass(found, Task) and found.__module__ == module.__name__
+
+
+def _import(name: str) -> Any:
+    try:
+        return import_module(name)
+    except (ImportError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"task {name!r}: can't be imported ({error}); give path/to/file.py:ClassName."
+        ) from None
+
+
+def _load(path: Path) -> Any:
+    """Loads the module of a file, again only if the file has changed.
+
+    Raises:
+        ConfigError: the file is missing, or fails to run as Python; names the line.
+    """
+    if not path.is_file():
+        raise ConfigError(f"task {str(path)!r}: no such file; give path/to/file.py:ClassName.")
+    digest = sha256(str(path.resolve()).encode() + path.read_bytes())[:16]
+    name = f"nics_drl_bridge_task_{digest}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ConfigError(f"task {str(path)!r}: can't be imported; it must be a Python file.")
+    module = sys.modules[name] = module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except BaseException as error:
+        del sys.modules[name]
+        if not isinstance(error, Exception):
+            raise
+        raise ConfigError(_unfit(path, error)) from error
+    return module
+
+
+def _unfit(path: Path, error: Exception) -> str:
+    """Error message for a user's file that can't be imported, with the line."""
+    frames = extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if Path(frame.filename) == path.absolute()]
+    line = error.lineno if isinstance(error, SyntaxError) else (lines or [None])[-1]
+    place = f"{path}, line {line}" if line else str(path)
+    reason = " ".join(str(error).split())
+    return f"task {place}: can't be imported ({type(error).__name__}: {reason}); mend the file."
+
+
+NAVIGATION = "NicsBridge/Navigation-v0"
+COOPERATIVE_REACHING = "NicsBridge/CooperativeReaching-v0"
+PURSUIT_EVASION = "NicsBridge/PursuitEvasion-v0"
+TASK = "NicsBridge/Task-v0"
+ENVIRONMENTS = {
+    NAVIGATION: {"task": "navigation"},
+    COOPERATIVE_REACHING: {"task": "cooperative_reaching"},
+    PURSUIT_EVASION: {"task": "pursuit_evasion"},
+    TASK: {},
+}
+"""Id -> arguments that define the environment."""
+MAX_EPISODE_STEPS = 300
+
+
+def register_envs() -> None:
+    """Registers every environment; importing this module does so too."""
+    for name, arguments in ENVIRONMENTS.items():
+        if name not in gymnasium.registry:
+            gymnasium.register(
+                name,
+                entry_point="nics_drl_bridge.env.bridge_env:BridgeEnv",
+                vector_entry_point="nics_drl_bridge.env.vector_env:BridgeVectorEnv",
+                max_episode_steps=MAX_EPISODE_STEPS,
+                kwargs=dict(arguments),
+            )
+
+
+register_envs()
+
+
+def make(task: str = "navigation", **arguments: Any) -> gymnasium.Env[Any, Any]:
+    """An env of a task, with Gymnasium's own wrappers around it.
+
+    Args:
+        task: a name, or `path/to/file.py:ClassName`.
+        arguments: of `BridgeEnv`, as `model`, `world` and `backend`.
+
+    Raises:
+        ConfigError, ModelError: an unknown name or a wrong file.
+    """
+    made: gymnasium.Env[Any, Any] = gymnasium.make(TASK, task=task, **arguments)
+    return made
+
+
+def make_vec(num_envs: int, task: str = "navigation", **arguments: Any) -> Any:
+    """A task in many worlds at once, for training.
+
+    Args:
+        num_envs: N.
+        task: a name, or `path/to/file.py:ClassName`.
+        arguments: of `BridgeVectorEnv`, as `model`, `world` and `threads`.
+
+    Returns:
+        A `BridgeVectorEnv`.
+
+    Raises:
+        ConfigError, ModelError: an unknown name or a wrong file.
+    """
+    vectors = import_module("nics_drl_bridge.env.vector_env")  # which imports this module
+    return vectors.BridgeVectorEnv(num_envs, task=task, **arguments)

@@ -1,0 +1,1 @@
+"""Tools for rosbag2 recordings: record, play, describe and salvage."""

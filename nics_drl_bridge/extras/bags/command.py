@@ -1,0 +1,182 @@
+"""`nics bag record|info|replay|salvage`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from nics_drl_bridge.commands.console import needs_ros, one_sentence, roles_of, table
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.extras.bags.info import BagInfo, BagTopic
+
+bag = typer.Typer(help="Records, describes, replays and saves bags.", no_args_is_help=True)
+
+BagArgument = Annotated[Path, typer.Argument(help="Folder or file of a rosbag2.")]
+SalvageOption = Annotated[
+    bool, typer.Option("--salvage", help="Take what is intact of a damaged bag, and tell the rest.")
+]
+StorageOption = Annotated[
+    str, typer.Option(help="mcap, which carries checksums, or sqlite3.", metavar="mcap|sqlite3")
+]
+NamespaceOption = Annotated[str, typer.Option(help="Namespace of the robot's topics.")]
+
+
+@bag.command()
+def record(
+    out: Annotated[Path, typer.Argument(help="Folder of the bag to write.")],
+    topics: Annotated[
+        list[str] | None, typer.Option(help="A topic to record; may be given several times.")
+    ] = None,
+    everything: Annotated[bool, typer.Option("--all", help="Record every topic.")] = False,
+    namespace: NamespaceOption = "",
+    duration: Annotated[
+        float | None, typer.Option(min=0.0, help="Stop after so long [s]; else at Ctrl-C.")
+    ] = None,
+    storage: StorageOption = "mcap",
+    use_sim_time: Annotated[
+        bool, typer.Option("--use-sim-time", help="Take times of receipt from /clock.")
+    ] = False,
+) -> None:
+    """Records the topics of a robot as they are, without driving it."""
+    with one_sentence():
+        kind = _storage(storage)
+        with needs_ros("nics bag record"):
+            from nics_drl_bridge.extras.bags.record import BagOrder, record_bag
+        order = BagOrder(
+            out, tuple(topics or ()), everything, namespace, duration, kind, use_sim_time
+        )
+        recorded = record_bag(order, lambda line: typer.echo(line, err=True))
+        for topic, count in sorted(recorded.counts.items()):
+            typer.echo(f"{topic}: {count} messages")
+        typer.echo(f"bag written to {out}")
+
+
+@bag.command()
+def info(
+    path: BagArgument,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    salvage: SalvageOption = False,
+) -> None:
+    """Tells what is in a bag: topics, rates, gaps, and whose clock stamped them."""
+    with one_sentence():
+        from nics_drl_bridge.extras.bags.info import bag_info
+        from nics_drl_bridge.extras.bags.salvage import salvaged
+
+        with salvaged(path, salvage) as (whole, lines):
+            told = bag_info(whole)
+        for line in lines:
+            typer.echo(line, err=True)
+        if as_json:
+            typer.echo(json.dumps(asdict(told) | {"path": str(path)}))
+        else:
+            _print(told, path)
+
+
+@bag.command()
+def replay(
+    path: BagArgument,
+    rate: Annotated[float, typer.Option(min=0.001, help="Seconds of the bag per second.")] = 1.0,
+    loop: Annotated[bool, typer.Option("--loop", help="Begin anew at the end.")] = False,
+    clock: Annotated[bool, typer.Option(help="Publish the bag's time on /clock.")] = True,
+    topics: Annotated[
+        list[str] | None, typer.Option(help="Play this topic only; may be given several times.")
+    ] = None,
+    namespace: Annotated[str, typer.Option(help="Put in front of the topics' names.")] = "",
+    lockstep: Annotated[
+        str | None,
+        typer.Option(metavar="NODE", help="Wait after each message until this node has taken it."),
+    ] = None,
+    estimate: Annotated[
+        bool, typer.Option("--estimate", help="Run the middleware on it in process instead.")
+    ] = False,
+    model: Annotated[
+        str, typer.Option(help="For --estimate: folder of a model, or a shipped robot.")
+    ] = "ackermann",
+    topic: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ROLE=TOPIC",
+            help="For --estimate: as odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="For --estimate: .npz or .csv file to write.")
+    ] = None,
+    salvage: SalvageOption = False,
+) -> None:
+    """Plays a bag over ROS 2, or gives the estimate that the middleware makes of it."""
+    with one_sentence():
+        from nics_drl_bridge.extras.bags.salvage import salvaged
+
+        with salvaged(path, salvage) as (whole, lines):
+            for line in lines:
+                typer.echo(line, err=True)
+            if estimate:
+                _estimate(whole, model, topic or [], out)
+                return
+            with needs_ros("nics bag replay"):
+                from nics_drl_bridge.extras.bags.play import PlayOrder, play_bag
+            order = PlayOrder(whole, tuple(topics or ()), rate, loop, clock, namespace, lockstep)
+            sent = play_bag(order, lambda line: typer.echo(line, err=True))
+            typer.echo(f"{sent} messages were published")
+
+
+@bag.command()
+def salvage(
+    path: BagArgument,
+    out: Annotated[Path, typer.Argument(help="Folder of the bag to write.")],
+    storage: StorageOption = "mcap",
+) -> None:
+    """Writes what is intact of a damaged bag as a new one, and says how much is lost."""
+    with one_sentence():
+        from nics_drl_bridge.extras.bags import salvage as bag_salvage
+
+        kept = bag_salvage.salvage(path, out, _storage(storage))
+        for line in kept.lines():
+            typer.echo(line)
+        typer.echo(f"bag written to {out}")
+
+
+def _storage(name: str) -> Literal["mcap", "sqlite3"]:
+    from nics_drl_bridge.errors import ConfigError, nearest
+
+    storages: dict[str, Literal["mcap", "sqlite3"]] = {"mcap": "mcap", "sqlite3": "sqlite3"}
+    if name in storages:
+        return storages[name]
+    raise ConfigError(f"--storage {name!r}: {nearest(name, storages)}")
+
+
+def _estimate(path: Path, model: str, topics: list[str], out: Path | None) -> None:
+    from nics_drl_bridge.generator import open_model
+    from nics_drl_bridge.middleware import playback
+
+    made = playback.estimate(path, open_model(model), roles_of(topics))
+    if out is not None:
+        playback.write_estimate(made, out)
+    for reason, count in sorted(made.rejected.items()):
+        typer.echo(f"not used: {count} of {reason}")
+    x, y, heading = made.pose[-1]
+    typer.echo(f"{len(made.stamp_ns)} estimates; the last is {x:.3f} m, {y:.3f} m, {heading:.3f}")
+    typer.echo(f"sha256 {made.digest}")
+
+
+def _print(told: BagInfo, path: Path) -> None:
+    typer.echo(
+        f"{path}: {told.messages} messages in {told.duration_s:.3f} s, "
+        f"{told.size_bytes / 1e6:.2f} MB"
+    )
+    heads = ("topic", "type", "count", "Hz", "from, to [s]", "gaps", "clock", "delay [ms]")
+    typer.echo(table(heads, [_row(each) for each in told.topics]))
+
+
+def _row(each: BagTopic) -> tuple[str, ...]:
+    span = "" if each.first_s is None else f"{each.first_s:.2f}, {each.last_s:.2f}"
+    gaps = "" if each.longest_gap_s is None else f"{each.gaps}, longest {each.longest_gap_s:.2f} s"
+    delay = "" if each.delay_s is None else f"{1e3 * each.delay_s:.1f} ± {5e2 * each.jitter_s:.1f}"  # type: ignore[operator]
+    rate = "" if each.rate_hz is None else f"{each.rate_hz:.2f}"
+    return each.topic, each.type, str(each.count), rate, span, gaps, each.clock, delay

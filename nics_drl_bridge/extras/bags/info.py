@@ -1,0 +1,142 @@
+"""Contents of a bag: its topics with their message counts, rates and clocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.interface import S_PER_NS
+from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
+from nics_drl_bridge.recording.messages import stamp
+from nics_drl_bridge.recording.stamping import MAX_WANDER_S, SAME_CLOCK_S
+
+Nanoseconds = NDArray[np.int64]
+
+GAP = 3.0
+"""A silence longer than this many usual periods is a gap."""
+NO_HEADER, UNSTAMPED, UNKNOWN = "no header", "never stamped", "unknown type"
+RECORDER, FOREIGN, SEVERAL = "recorder's", "another", "several"
+
+
+@dataclass(frozen=True)
+class BagTopic:
+    """A topic of a bag.
+
+    Attributes:
+        topic: its name.
+        type: of its messages.
+        count: number of messages.
+        rate_hz: inverse of the median time between receipts [Hz]; None for fewer than two
+            messages.
+        first_s, last_s: receipt of the first and last message, from the start of the bag [s].
+        gaps: number of silences of more than three usual periods.
+        longest_gap_s: longest time between two messages [s].
+        clock: of the header stamps: the recorder's, another one or several; otherwise why there
+            are no stamps.
+        delay_s: median of receipt minus stamp [s]; None without stamps.
+        jitter_s: from the 5 % to the 95 % quantile of that delay [s].
+        backwards: number of stamps earlier than their predecessor.
+    """
+
+    topic: str
+    type: str
+    count: int
+    rate_hz: float | None = None
+    first_s: float | None = None
+    last_s: float | None = None
+    gaps: int = 0
+    longest_gap_s: float | None = None
+    clock: str = UNKNOWN
+    delay_s: float | None = None
+    jitter_s: float | None = None
+    backwards: int = 0
+
+
+@dataclass(frozen=True)
+class BagInfo:
+    """Contents of a bag.
+
+    Attributes:
+        path: of the bag.
+        size_bytes: of all its files.
+        start_ns: receipt of the first message, on the recorder's clock [ns].
+        duration_s: from that to the receipt of the last message [s].
+        messages: number of messages.
+        topics: by name.
+    """
+
+    path: str
+    size_bytes: int
+    start_ns: int
+    duration_s: float
+    messages: int
+    topics: tuple[BagTopic, ...]
+
+
+def bag_info(path: str | Path) -> BagInfo:
+    """Reads a whole bag and describes its contents.
+
+    Raises:
+        RecordingError: it is damaged.
+    """
+    path = Path(path)
+    with opened(path) as bag:
+        received = {topic: _received(bag, topic) for topic in sorted(bag.types)}
+        times = np.concatenate([ns for ns, _ in received.values()])
+        start, end = int(times.min()), int(times.max())
+        topics = tuple(
+            _topic(topic, bag.types[topic], ns - start, stamps)
+            for topic, (ns, stamps) in received.items()
+        )
+    files = [path] if path.is_file() else [file for file in path.iterdir() if file.is_file()]
+    size = sum(file.stat().st_size for file in files)
+    return BagInfo(str(path), size, start, (end - start) * S_PER_NS, len(times), topics)
+
+
+def _received(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]:
+    """Returns times of receipt [ns], and receipt minus stamp [ns] or why there are no stamps."""
+    if not bag.knows(topic):
+        return np.array([ns for ns, _ in bag.serialized(topic)], dtype=np.int64), UNKNOWN
+    messages = bag.messages(topic)
+    receive = np.array([m.receive_ns for m in messages], dtype=np.int64)
+    stamps = _stamps(messages)
+    return receive, stamps if isinstance(stamps, str) else receive - stamps
+
+
+def _stamps(messages: list[Message]) -> Nanoseconds | str:
+    if not messages or not hasattr(messages[0].content, "header"):
+        return NO_HEADER
+    stamps = np.array([stamp(m.content) for m in messages], dtype=np.int64)
+    return stamps if stamps.any() else UNSTAMPED
+
+
+def _topic(topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str) -> BagTopic:
+    """Describes a topic from receipts since the bag's start (T,) and delays (T,), both [ns]."""
+    clock, delay, jitter, backwards = delays if isinstance(delays, str) else "", None, None, 0
+    if not isinstance(delays, str):
+        low, middle, high = np.percentile(delays * S_PER_NS, (5.0, 50.0, 95.0))
+        delay, jitter = float(middle), float(high - low)
+        backwards = int((np.diff(since - delays) < 0).sum())
+        clock = clock_of(delay, jitter)
+    if not len(since):
+        return BagTopic(topic, kind, 0, clock=clock)
+    apart = np.diff(since) * S_PER_NS
+    usual = float(np.median(apart)) if len(apart) else 0.0
+    return BagTopic(
+        topic, kind, len(since),
+        rate_hz=1.0 / usual if usual > 0.0 else None,
+        first_s=float(since[0] * S_PER_NS), last_s=float(since[-1] * S_PER_NS),
+        gaps=int((apart > GAP * usual).sum()) if usual > 0.0 else 0,
+        longest_gap_s=float(apart.max()) if len(apart) else None,
+        clock=clock, delay_s=delay, jitter_s=jitter, backwards=backwards,
+    )  # fmt: skip
+
+
+def clock_of(delay_s: float, jitter_s: float) -> str:
+    """Returns the clock of stamps with the given median delay to receipt and its jitter [s]."""
+    if jitter_s > MAX_WANDER_S:
+        return SEVERAL
+    return RECORDER if SAME_CLOCK_S[0] <= delay_s <= SAME_CLOCK_S[1] else FOREIGN

@@ -1,0 +1,1 @@
+"""High-precision robots in MuJoCo: wheels with contact, friction and motors."""

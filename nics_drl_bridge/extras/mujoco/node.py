@@ -1,0 +1,42 @@
+"""mujoco_node: robots in MuJoCo behind the topics of the hardware."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import cast
+
+from rclpy.context import Context
+from rclpy.node import Node
+
+from nics_drl_bridge.extras.mujoco.machine import Physics
+from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import Simulator
+from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
+from nics_drl_bridge.nodes.device_node import DeviceNode
+from nics_drl_bridge.nodes.device_parameters import choice
+from nics_drl_bridge.nodes.runner import declare, run_node
+from nics_drl_bridge.sim.world import World
+
+
+def mujoco_simulator(node: Node, model: SimulatorModel, world: World, robots: int) -> Simulator:
+    """Makes robots in MuJoCo, with the lidar and the floor that the parameters name."""
+    declare(node, "renderer", "exact", "Lidar: baked or exact.", read_only=True)
+    floor = "Friction between tyres and floor; ice has 0.1."
+    friction = declare(node, "friction", 1.0, floor, low=0.01, high=2.0, read_only=True)
+    renderer = cast(Renderer, choice(node, "renderer", RENDERERS))
+    return MujocoSimulator(model, world, robots, renderer, replace(Physics(), friction=friction))
+
+
+def mujoco_node(context: Context) -> DeviceNode:
+    """Makes the node `mujoco_node`; see `DeviceNode`."""
+    return DeviceNode("mujoco_node", context, mujoco_simulator)
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point of the executable."""
+    run_node(mujoco_node, args, "mujoco_node")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,253 @@
+"""A scene in MuJoCo: robots with their bumpers, walls, map and obstacles.
+
+A bumper is the footprint of the RobotSpec, at the height of the axles; it collides with walls,
+obstacles and the bumpers of other robots. Wheels touch only the floor.
+
+Convex parts of outlines and rectangles of maps, because MuJoCo's bodies are convex.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.extras.mujoco.machine import Machine, Physics
+from nics_drl_bridge.lidar.maps import GridMap
+from nics_drl_bridge.lidar.shapes import (
+    RADIUS,
+    SHAPE,
+    Circle,
+    Rectangle,
+    Segment,
+    Shape,
+    convex_hull,
+)
+
+Array = NDArray[np.float64]
+
+HEIGHT = 0.5
+"""Height of walls and obstacles [m]."""
+THICKNESS = 0.002
+"""Thickness of walls, which have none for the lidar [m]."""
+BUMPER = 4
+"""Bit of MuJoCo's `contype` and `conaffinity` for contacts of bumpers."""
+BUMPER_FRICTION = 0.3
+
+
+@dataclass(frozen=True)
+class Scenery:
+    """Walls, map and obstacles of a world in one episode.
+
+    Attributes:
+        walls: (W, 4) x1, y1, x2, y2 [m].
+        grid: a static map, if any.
+        shapes: of the obstacles.
+        bodies: (K, 7) obstacles as in `lidar.shapes.BODY`.
+        moving: (K,) True for moving obstacles, whose poses are prescribed (mocap).
+    """
+
+    walls: Array
+    grid: GridMap | None
+    shapes: tuple[Shape, ...]
+    bodies: Array
+    moving: NDArray[np.bool_]
+
+
+def prefix_of(robot: int) -> str:
+    """Prefix of the names of a robot's parts."""
+    return f"robot_{robot}/" if robot else ""
+
+
+def obstacle_name(k: int) -> str:
+    """Name of the body of obstacle k."""
+    return f"obstacle_{k}"
+
+
+def bumper_name(part: int) -> str:
+    """Name of one geom of a robot's bumper."""
+    return f"bumper_{part}"
+
+
+def compile_scene(
+    mujoco: Any, machine: Machine, footprint: Shape, robots: int, scenery: Scenery, physics: Physics
+) -> Any:
+    """Compiles the MuJoCo model of robots of one kind in a scene.
+
+    Args:
+        mujoco: the module.
+        machine: of each robot.
+        footprint: a circle or a polygon.
+        robots: M; the parts of robot m have names with `prefix_of(m)`.
+        scenery: walls, map and obstacles.
+        physics: of the machine.
+    """
+    spec = mujoco.MjSpec.from_string(machine.xml)
+    maker = _Maker(mujoco, spec, physics)
+    maker.bumper(spec.body("base_link"), footprint)
+    for m in range(1, robots):
+        another = mujoco.MjSpec.from_string(machine.xml)
+        another.delete(another.geom("floor"))
+        _Maker(mujoco, another, physics).bumper(another.body("base_link"), footprint)
+        spec.attach(another, prefix=prefix_of(m), frame=spec.worldbody.add_frame())
+    for wall in scenery.walls:
+        maker.wall(spec.worldbody, wall[:2], wall[2:])
+    if scenery.grid is not None:
+        maker.map(scenery.grid)
+    for k, body in enumerate(scenery.bodies):
+        if body[RADIUS] > 0.0:
+            maker.obstacle(k, scenery.shapes[int(body[SHAPE])], body[:3], bool(scenery.moving[k]))
+    return spec.compile()
+
+
+def bumpers(model: Any, robots: int) -> NDArray[np.int64]:
+    """(geoms,) index of the robot whose bumper each geom of a scene belongs to; -1 for none."""
+    names = [model.geom(i).name for i in range(model.ngeom)]
+    own = {f"{prefix_of(m)}{bumper_name(0)}".rstrip("0"): m for m in range(robots)}
+    found = [next((m for head, m in own.items() if n.startswith(head)), -1) for n in names]
+    return np.array(found, dtype=np.int64)
+
+
+class _Maker:
+    """Adds geoms to an MjSpec."""
+
+    def __init__(self, mujoco: Any, spec: Any, physics: Physics) -> None:
+        self._kinds, self._spec = mujoco.mjtGeom, spec
+        self._solref = [physics.softness, 1.0]
+
+    def bumper(self, base: Any, footprint: Shape) -> None:
+        """Adds the footprint of a robot, without mass, which belongs to the chassis."""
+        half = 0.5 * float(base.pos[2])
+        own = {"contype": BUMPER, "mass": 0.0}
+        if isinstance(footprint, Circle):
+            # Its round edge touches a wall in one point, at the height of the axles.
+            size = [footprint.radius, footprint.radius, half]
+            kind = self._kinds.mjGEOM_ELLIPSOID
+            self._add(base, type=kind, size=size, name=bumper_name(0), **own)
+            return
+        for i, part in enumerate(convex_parts(footprint.outline)):
+            self._prism(base, part, (-half, half), name=bumper_name(i), **own)
+
+    def wall(self, body: Any, start: Array, end: Array) -> None:
+        """Adds a straight wall between two points (2,) [m]."""
+        middle, along = 0.5 * (start + end), end - start
+        size = [0.5 * float(np.hypot(*along)), 0.5 * THICKNESS, 0.5 * HEIGHT]
+        self._box(body, middle, float(np.arctan2(along[1], along[0])), size)
+
+    def map(self, grid: GridMap) -> None:
+        """Adds the blocked cells of a map."""
+        heading, side = grid.origin[2], grid.resolution
+        for first_row, first, row, column in rectangles(grid.blocked):
+            middle = grid.cell_to_world([0.5 * (first_row + row - 1), 0.5 * (first + column - 1)])
+            size = [0.5 * side * (column - first), 0.5 * side * (row - first_row), 0.5 * HEIGHT]
+            self._box(self._spec.worldbody, middle, heading, size)
+
+    def obstacle(self, k: int, shape: Shape, pose: Array, moves: bool) -> None:
+        """Adds an obstacle at a pose (3,)."""
+        x, y, heading = pose
+        body = self._spec.worldbody.add_body(
+            name=obstacle_name(k), pos=[x, y, 0.0], quat=quaternion(heading), mocap=moves
+        )
+        if isinstance(shape, Circle):
+            size = [shape.radius, 0.5 * HEIGHT, 0.0]
+            self._add(body, type=self._kinds.mjGEOM_CYLINDER, size=size, pos=[0, 0, 0.5 * HEIGHT])
+        elif isinstance(shape, Rectangle):
+            self._box(body, np.zeros(2), 0.0, [*(0.5 * s for s in shape.size), 0.5 * HEIGHT])
+        elif isinstance(shape, Segment):
+            self.wall(body, *shape.outline)
+        else:
+            for part in convex_parts(shape.outline):
+                self._prism(body, part, (0.0, HEIGHT))
+
+    def _box(self, body: Any, middle: Array, heading: float, size: Sequence[float]) -> None:
+        pos = [middle[0], middle[1], 0.5 * HEIGHT]
+        self._add(
+            body, type=self._kinds.mjGEOM_BOX, size=size, pos=pos, quat=quaternion(heading)
+        )  # fmt: skip
+
+    def _prism(self, body: Any, corners: Array, z: tuple[float, float], **others: Any) -> None:
+        """Adds the prism over a convex outline (v, 2) between two heights [m]."""
+        mesh = self._spec.add_mesh(name=f"prism_{len(self._spec.meshes)}")
+        mesh.uservert = np.concatenate(
+            [np.column_stack([corners, np.full(len(corners), height)]) for height in z]
+        ).ravel()
+        self._add(body, type=self._kinds.mjGEOM_MESH, meshname=mesh.name, **others)
+
+    def _add(self, body: Any, **values: Any) -> None:
+        common = {"conaffinity": BUMPER, "condim": 3, "friction": [BUMPER_FRICTION, 0.005, 0.0001]}
+        body.add_geom(**common, solref=self._solref, **values)
+
+
+def quaternion(heading: float) -> list[float]:
+    """Quaternion w, x, y, z of a rotation about the vertical [rad]."""
+    return [float(np.cos(0.5 * heading)), 0.0, 0.0, float(np.sin(0.5 * heading))]
+
+
+SLIVER = 1e-9
+"""Triangles of less area, relative to the square of the outline's size, are omitted."""
+
+
+def convex_parts(outline: Array) -> list[Array]:
+    """Splits an outline (V, 2), counter-clockwise, into convex outlines (v, 2) that fill it.
+
+    A convex outline is its only part; others are cut into triangles by ear clipping (Meisters
+    1975).
+    """
+    if len(convex_hull(outline)) == len(outline):
+        return [outline]
+    rest, parts = list(range(len(outline))), []
+    least = SLIVER * float(np.ptp(outline, axis=0).max()) ** 2
+    while len(rest) > 3:
+        at = next((i for i in range(len(rest)) if _is_ear(outline, rest, i)), 0)
+        parts.append(outline[[rest[at - 1], rest[at], rest[(at + 1) % len(rest)]]])
+        del rest[at]
+    parts.append(outline[rest])
+    return [part for part in parts if _area(*part) > least]
+
+
+def _area(a: Array, b: Array, c: Array) -> float:
+    """Twice the signed area of a triangle; positive counter-clockwise."""
+    return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
+
+
+def _is_ear(outline: Array, rest: list[int], i: int) -> bool:
+    """True if corner i of `rest` can be cut off: convex, with no other corner within."""
+    before, here, after = rest[i - 1], rest[i], rest[(i + 1) % len(rest)]
+    a, b, c = outline[before], outline[here], outline[after]
+    if _area(a, b, c) <= 0.0:
+        return False
+    others = (outline[k] for k in rest if k not in (before, here, after))
+    return not any(
+        _area(a, b, p) >= 0.0 and _area(b, c, p) >= 0.0 and _area(c, a, p) >= 0.0 for p in others
+    )
+
+
+def rectangles(blocked: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Rectangles that together cover exactly the blocked cells of a map.
+
+    They are runs along the rows; equal runs in consecutive rows are merged.
+
+    Args:
+        blocked: (rows, columns).
+
+    Returns:
+        (R, 4) first row, first column, and those after the last.
+    """
+    done: list[tuple[int, int, int, int]] = []
+    open_runs: dict[tuple[int, int], int] = {}
+    for row in range(len(blocked) + 1):
+        runs = _runs(blocked[row]) if row < len(blocked) else set()
+        for run in [run for run in open_runs if run not in runs]:
+            done.append((open_runs.pop(run), run[0], row, run[1]))
+        for run in runs:
+            open_runs.setdefault(run, row)
+    return np.array(sorted(done), dtype=np.int64).reshape(-1, 4)
+
+
+def _runs(row: NDArray[np.bool_]) -> set[tuple[int, int]]:
+    """First column of each run of blocked cells, and the one after its last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(np.int8)))
+    return {(int(a), int(b)) for a, b in edges.reshape(-1, 2)}

@@ -1,0 +1,323 @@
+"""Training on a Ray cluster: RLlib's PPO, with the worlds spread over its machines.
+
+Settings, normaliser, network, evaluation and policy file are those of training on one machine.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import ray
+import torch
+from numpy.typing import NDArray
+from ray.rllib.algorithms.ppo import PPO, PPOConfig
+from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
+from stable_baselines3.common.logger import configure
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extras.ray.cluster import connected
+from nics_drl_bridge.extras.ray.runner import (
+    COLLISION,
+    ENDED,
+    STEPPING,
+    SUCCESS,
+    ActorCritic,
+    WorldsRunner,
+)
+from nics_drl_bridge.generator import SimulatorModel, open_model
+from nics_drl_bridge.policy.train import (
+    CHECKPOINT,
+    SEEDS,
+    Tell,
+    Trained,
+    check_same,
+    make_train_env,
+)
+from nics_drl_bridge.policy.train_algorithms import LEAST_RATE, RECENT, check_serves, observed
+from nics_drl_bridge.policy.train_checkpoint import Progress, read_checkpoint, write_content
+from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
+from nics_drl_bridge.policy.training_settings import TrainingSettings
+from nics_drl_bridge.sim.world import World, load_world
+
+Array = NDArray[np.float64]
+FORMAT = "nics_drl_bridge/ray_checkpoint/1"
+VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5
+"""Parameters of the loss, as in Stable-Baselines3."""
+SILENCE_S = 600.0
+"""A run ends after this time without a step from any env runner [s]; it can be resumed."""
+PROBE_S = 1.0
+"""Time that a roll-out waits for a lost env runner [s]; later ones try again."""
+
+
+@contextmanager
+def learner(
+    address: str | None, env_runners: int | None, worlds: int
+) -> Iterator[Callable[..., Trained]]:
+    """Connects with a cluster, and gives the function that trains one policy on it.
+
+    Args:
+        address: of the cluster, see `cluster.connected`.
+        env_runners: processes that share the worlds.
+        worlds: how many.
+    """
+    with connected(address, env_runners, worlds) as runners:
+        yield functools.partial(train_on_ray, runners=runners)
+
+
+def train_on_ray(
+    settings: TrainingSettings,
+    seed: int,
+    folder: Path,
+    tell: Tell = lambda _: None,
+    resumed: bool = False,
+    runners: int = 1,
+) -> Trained:
+    """Trains one policy on the cluster that this process is connected to.
+
+    An env runner whose process or machine is lost is restarted, if necessary on another machine;
+    the others continue meanwhile. The steps that are learned from then depend on the time of the
+    loss: two runs with one seed agree only as long as no runner is lost.
+
+    Args:
+        settings: what to learn.
+        seed: of all random numbers.
+        folder: for checkpoint and TensorBoard logs; created if missing.
+        tell: called with the progress after each roll-out.
+        resumed: True continues from the checkpoint in `folder`.
+        runners: number of processes that share the worlds.
+
+    Raises:
+        ConfigError: the settings are inconsistent, no checkpoint fits them, or no env runner
+            answers.
+    """
+    if settings.algorithm != "ppo":
+        raise ConfigError(
+            f"--engine ray learns with ppo, not {settings.algorithm!r}; leave it out."
+        )
+    begin, path = time.perf_counter(), folder / CHECKPOINT
+    about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
+    content = read_checkpoint(path, FORMAT) if resumed else None
+    if content is not None:
+        check_same(content["about"], about, path)
+    algorithm = _algorithm(settings, seed, 0 if content is None else content["steps"], runners)
+    try:
+        learning = Learning(algorithm, settings, seed, path, runners)
+        if content is not None:
+            learning.resume(content)
+        learning.run(tell, about)
+        actor = learning.module.actor.eval().cpu()
+    finally:
+        algorithm.stop()
+    return Trained(actor, learning.steps, time.perf_counter() - begin, learning.stepping_s)
+
+
+@dataclass
+class Learning:
+    """A training in progress.
+
+    Attributes:
+        algorithm: RLlib's.
+        settings, seed, path, runners: settings and seed of the training, path of the checkpoint,
+            number of env runners.
+        steps: environment steps so far.
+        stepping_s: time in the simulator, averaged over the env runners [s].
+        recent: per roll-out, for the last ones: episodes ended, successes, collisions.
+    """
+
+    algorithm: PPO
+    settings: TrainingSettings
+    seed: int
+    path: Path
+    runners: int
+    steps: int = 0
+    stepping_s: float = 0.0
+    recent: deque[tuple[int, int, int]] = field(default_factory=deque)
+
+    @property
+    def learner(self) -> Any:
+        """RLlib's learner, which runs in this process."""
+        return (
+            self.algorithm.learner_group.foreach_learner(lambda one: one).result_or_errors[0].get()
+        )
+
+    @property
+    def module(self) -> ActorCritic:
+        """The network in training."""
+        network: ActorCritic = self.learner.module[DEFAULT_MODULE_ID].unwrapped()
+        return network
+
+    def run(self, tell: Tell, about: dict[str, Any]) -> None:
+        """Learns until all steps are done, and saves checkpoints."""
+        logger = configure(str(self.path.parent), ["tensorboard"])
+        begin = heard = time.perf_counter()
+        first = saved = self.steps
+        while self.steps < self.settings.steps:
+            before = self.steps
+            self._take(self.algorithm.train())
+            now = time.perf_counter()
+            if self.steps == before:
+                self._check_silence(now - heard, about)
+                continue
+            heard = now
+            progress = self._progress(first, now - begin)
+            tell(progress)
+            for name in ("success", "collision", "steps_per_s", "env_share"):
+                logger.record(f"rollout/{name}", getattr(progress, name))
+            logger.dump(self.steps)
+            if (
+                self.steps // self.settings.checkpoint_every
+                > saved // self.settings.checkpoint_every
+            ):
+                self.save(about)
+                saved = self.steps
+        self.save(about)
+        logger.close()
+
+    def _take(self, result: Mapping[str, Any]) -> None:
+        """Adds the results of a roll-out of all env runners."""
+        told = result.get(ENV_RUNNER_RESULTS, {})
+        self.steps += int(told.get(NUM_ENV_STEPS_SAMPLED, 0))
+        self.stepping_s += float(told.get(STEPPING, 0.0)) / self.runners
+        ended, success, collision = (int(told.get(n, 0)) for n in (ENDED, SUCCESS, COLLISION))
+        self.recent.append((ended, success, collision))
+        while sum(one[0] for one in self.recent) - self.recent[0][0] >= RECENT:
+            self.recent.popleft()
+
+    def _check_silence(self, silent_s: float, about: dict[str, Any]) -> None:
+        if silent_s > SILENCE_S:
+            self.save(about)
+            raise ConfigError(
+                f"no env runner has answered for {silent_s:.0f} s; look at the machines with "
+                f"'ray status', and go on from {self.path} with --resume."
+            )
+
+    def _progress(self, first: int, taken: float) -> Progress:
+        ended, success, collision = np.sum(list(self.recent), axis=0)
+        return Progress(
+            self.seed,
+            self.steps,
+            self.settings.steps,
+            float(success / ended) if ended else np.nan,
+            float(collision / ended) if ended else np.nan,
+            (self.steps - first) / taken,
+            self.stepping_s / taken,
+        )
+
+    def save(self, about: dict[str, Any]) -> None:
+        """Saves network and optimiser."""
+        content = {
+            "format": FORMAT,
+            "about": json.dumps(about),
+            "steps": self.steps,
+            "network": self.module.state_dict(),
+            "optimiser": self.learner.get_optimizer().state_dict(),
+        }
+        write_content(self.path, content)
+
+    def resume(self, content: dict[str, Any]) -> None:
+        """Continues with network and optimiser of a checkpoint; the worlds start afresh."""
+        self.steps = int(content["steps"])
+        self.module.load_state_dict(content["network"])
+        self.learner.get_optimizer().load_state_dict(content["optimiser"])
+        self.algorithm.env_runner_group.sync_weights(
+            from_worker_or_learner_group=self.algorithm.learner_group, inference_only=True
+        )
+
+
+def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -> PPO:
+    """RLlib's PPO, after `done` steps of the training."""
+    torch.set_num_threads(settings.threads)
+    model = open_model(settings.robot)
+    scenes = {name: load_world(name) for name in settings.worlds}
+    rng = np.random.default_rng(seed)
+    env = make_train_env(settings, model, scenes)
+    check_serves(settings, env)
+    env.seed(int(rng.integers(SEEDS)))
+    normaliser = observed(env, rng)
+    spaces = env.observation_space, env.action_space
+    env.close()
+    make = ray.put(functools.partial(share_of_worlds, settings, model, scenes))
+    config = _config(settings, seed, done, normaliser, spaces).env_runners(
+        env_runner_cls=WorldsRunner,
+        num_env_runners=runners,
+        rollout_fragment_length="auto",
+        sample_timeout_s=SILENCE_S,
+    )
+    config.environment(
+        env_config={
+            "make": make,
+            "rollout": settings.ppo.rollout,
+            "seed": (seed, done),
+            "threads": settings.threads,
+        }
+    )
+    algorithm = config.build_algo()
+    Path(algorithm.logdir).rmdir()  # RLlib creates it and leaves it empty
+    return algorithm
+
+
+def share_of_worlds(
+    settings: TrainingSettings,
+    model: SimulatorModel,
+    scenes: Mapping[str, World],
+    runner: int,
+    runners: int,
+) -> TrainVecEnv:
+    """The worlds of env runner number `runner`: every `runners`-th."""
+    names = [name for name, count in settings.worlds.items() for _ in range(count)]
+    share = dict(Counter(names[runner::runners]))
+    return make_train_env(settings.model_copy(update={"worlds": share}), model, scenes)
+
+
+def _config(
+    settings: TrainingSettings,
+    seed: int,
+    done: int,
+    normaliser: tuple[Array, Array],
+    spaces: tuple[gymnasium.Space[Any], gymnasium.Space[Any]],
+) -> PPOConfig:
+    """Translates the settings into RLlib's configuration."""
+    chosen, left = settings.ppo, max(settings.steps - done, 1)
+    rate = chosen.learning_rate
+    now = rate * max(1.0 - done / settings.steps, LEAST_RATE)
+    network = {"hidden": settings.hidden, "normaliser": normaliser, "log_std": chosen.log_std}
+    return (
+        PPOConfig()
+        .framework("torch")
+        .environment(observation_space=spaces[0], action_space=spaces[1])
+        .rl_module(rl_module_spec=RLModuleSpec(module_class=ActorCritic, model_config=network))
+        .learners(num_learners=0)
+        .training(
+            lr=[[0, now], [left, rate * LEAST_RATE]],
+            train_batch_size_per_learner=chosen.rollout * settings.num_envs,
+            minibatch_size=chosen.batch,
+            num_epochs=chosen.epochs,
+            gamma=chosen.discount,
+            lambda_=chosen.gae_lambda,
+            clip_param=chosen.clip,
+            entropy_coeff=chosen.entropy,
+            vf_loss_coeff=VALUE_WEIGHT,
+            vf_clip_param=np.inf,
+            use_kl_loss=False,
+            grad_clip=GRADIENT_LIMIT,
+            grad_clip_by="global_norm",
+        )
+        .fault_tolerance(
+            restart_failed_env_runners=True,
+            delay_between_env_runner_restarts_s=PROBE_S,
+            env_runner_health_probe_timeout_s=PROBE_S,
+        )
+        .debugging(seed=seed, log_level="ERROR")
+    )

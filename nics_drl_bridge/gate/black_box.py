@@ -1,0 +1,245 @@
+"""The black box: the last half minute of the gate, written at each stop, for replay.
+
+Conversion of the gate's records to plain data for JSON and back, bit-identical.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from nics_drl_bridge.config import read_text
+from nics_drl_bridge.errors import ConfigError, shortened
+from nics_drl_bridge.files import sha256, write_parts
+from nics_drl_bridge.gate import inputs, limits, state
+from nics_drl_bridge.gate.gate import decide
+from nics_drl_bridge.gate.inputs import Input
+from nics_drl_bridge.gate.state import Decision, GateConfig, GateState
+
+FORMAT = "nics_drl_bridge/black_box/3"
+KEPT_S = 30.0
+LATEST_S = 1e12
+MOST_BYTES = 64 * 2**20
+"""Greatest size of a file that is replayed."""
+MOST_VALUES = 1_000_000
+"""Greatest number of values in such a file; 30 s of a gate have some 100,000."""
+MOST_INPUTS = 20_000
+"""Greatest number of inputs that are decided on again; each takes some 30 us."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One input of the gate.
+
+    Attributes:
+        now: steady time [s].
+        given: the input.
+        before: the state before the input.
+        decision: the gate's answer.
+    """
+
+    now: float
+    given: Input
+    before: GateState
+    decision: Decision
+
+
+class BlackBox:
+    """Keeps the latest entries; their states share data, so memory stays small.
+
+    Args:
+        config: of the gate.
+        kept_s: time span that is kept [s].
+    """
+
+    def __init__(self, config: GateConfig, kept_s: float = KEPT_S) -> None:
+        self.config, self._kept_s = config, kept_s
+        self._entries: deque[Entry] = deque()
+
+    def note(self, entry: Entry) -> None:
+        """Adds an entry and drops those that are too old."""
+        self._entries.append(entry)
+        while entry.now - self._entries[0].now > self._kept_s:
+            self._entries.popleft()
+
+    def copy(self) -> tuple[Entry, ...]:
+        """Returns the present entries, oldest first."""
+        return tuple(self._entries)
+
+
+def write(config: GateConfig, entries: tuple[Entry, ...], path: str | Path) -> None:
+    """Writes entries (at least one) to a file, completely or not at all."""
+    write_parts(path, _sealed(_records(config, entries)))
+
+
+def _records(config: GateConfig, entries: tuple[Entry, ...]) -> Iterator[dict[str, Any]]:
+    """Yields the lines of a file one by one, so that the gate's memory does not grow at a stop."""
+    yield {"format": FORMAT, "config": to_plain(config), "state": to_plain(entries[0].before)}
+    for entry in entries:
+        parts = {"now": entry.now, "given": entry.given, "decision": entry.decision}
+        yield {key: to_plain(part) for key, part in parts.items()}
+
+
+def _sealed(records: Iterable[dict[str, Any]]) -> Iterator[bytes]:
+    """Yields the lines, and a last one with their checksum."""
+    digest = hashlib.sha256()
+    for record in records:
+        line = (json.dumps(record) + "\n").encode()
+        digest.update(line)
+        yield line
+    yield _seal(digest.hexdigest()).encode()
+
+
+def _seal(digest: str) -> str:
+    """Returns the last line of a file."""
+    return json.dumps({"sha256": digest}) + "\n"
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Content of a black box, and its difference from the decisions of the present gate.
+
+    Attributes:
+        entries: times and inputs, with the recorded decisions.
+        differing: indices of the entries that are now decided differently.
+    """
+
+    entries: tuple[Entry, ...]
+    differing: tuple[int, ...]
+
+    @property
+    def story(self) -> list[str]:
+        """One line for each change between passing and stopping, and one about the replay."""
+        if not self.entries:
+            return ["no inputs"]
+        end, lines, before = self.entries[-1].now, [], "nothing"
+        for entry in self.entries:
+            cause = entry.decision.cause
+            rule = "" if cause is None else cause.rule
+            if rule != before:
+                line = "commands pass" if cause is None else f"stopped by {cause.line}"
+                lines.append(f"{entry.now - end:+8.3f} s  {line}")
+            before = rule
+        total, other = len(self.entries), len(self.differing)
+        same = "all decided the same again"
+        verdict = same if not other else f"{other} decided otherwise, first {self.differing[0]}"
+        return [*lines, f"{total} inputs over {end - self.entries[0].now:.3f} s: {verdict}"]
+
+
+def replay(path: str | Path) -> Replay:
+    """Decides again on every input in a file.
+
+    Raises:
+        ConfigError: the file is missing, damaged, or not a black box.
+    """
+    head, *lines = _lines(path)
+    try:
+        config, state = from_plain(head["config"]), from_plain(head["state"])
+        given = [(line["now"], from_plain(line["given"]), line["decision"]) for line in lines]
+        recorded = [from_plain(decision) for *_, decision in given]
+        _check_kinds(config, state, given, recorded)
+    except (KeyError, RecursionError, TypeError, ValueError) as error:
+        raise _damaged(path, error) from None
+    entries, differing = [], []
+    for index, ((now, event, plain), decision) in enumerate(zip(given, recorded, strict=True)):
+        entries.append(Entry(now, event, state, decision))
+        try:
+            state, anew = decide(config, state, event, now)
+        except Exception as error:  # noqa: BLE001 - false records break the rules in any way
+            raise _damaged(path, error) from None
+        if json.dumps(to_plain(anew)) != json.dumps(plain):
+            differing.append(index)
+    return Replay(tuple(entries), tuple(differing))
+
+
+def _damaged(path: str | Path, error: Exception) -> ConfigError:
+    reason = shortened(f"{error}", 120)
+    return ConfigError(f"{path}: is damaged ({reason}); it can't be replayed.")
+
+
+def _check_kinds(config: Any, state: Any, given: list[Any], recorded: list[Any]) -> None:
+    """Raises TypeError or ValueError unless everything that was read belongs in a black box."""
+    if len(given) > MOST_INPUTS:
+        raise ValueError(f"{len(given)} inputs, where at most {MOST_INPUTS} are replayed")
+    kinds = ((config, GateConfig), (state, GateState), *((one, Decision) for one in recorded))
+    for value, kind in kinds:
+        if not isinstance(value, kind):
+            raise TypeError(f"a {type(value).__name__} stands for a {kind.__name__}")
+    for now, event, _ in given:
+        if not (isinstance(now, float | int) and abs(now) < LATEST_S):
+            raise ValueError("the time of an input is no time")
+        if not isinstance(event, get_args(Input)):
+            raise TypeError(f"a {type(event).__name__} is no input")
+
+
+def _lines(path: str | Path) -> list[dict[str, Any]]:
+    text = read_text(path, MOST_BYTES)
+    values = sum(map(text.count, ",[{"))
+    if values > MOST_VALUES:
+        raise ConfigError(f"{path}: holds {values} values, no black box more than {MOST_VALUES}.")
+    try:
+        lines = [json.loads(line) for line in text.splitlines()]
+    except (ValueError, RecursionError):
+        raise ConfigError(f"{path}: is no JSON, line by line; it can't be replayed.") from None
+    if not lines or not isinstance(lines[0], dict) or lines[0].get("format") != FORMAT:
+        raise ConfigError(f"{path}: is no black box of the gate ({FORMAT}).")
+    rest = text[: -len(_seal(sha256(b"")))]
+    if text != rest + _seal(sha256(rest.encode())):
+        raise ConfigError(f"{path}: is damaged (its checksum does not fit); it can't be replayed.")
+    return lines[:-1]
+
+
+KIND = "kind"
+KINDS: dict[str, type] = {
+    kind.__name__: kind
+    for kind in (
+        inputs.Scan, inputs.Odometry, inputs.Estimate, inputs.Command, inputs.EStop, inputs.Press,
+        inputs.Arm, inputs.Reset, inputs.Tick, limits.Limits, state.ShieldConfig, state.GateConfig,
+        state.Cause, state.Arrivals, state.Sameness, state.Push, state.View, state.EStopState,
+        state.GateState, state.Decision,
+    )
+}  # fmt: skip
+
+
+def to_plain(value: Any) -> Any:
+    """Returns a record of the gate as dictionaries, lists, numbers and text.
+
+    Arrays keep their bits; a float survives JSON unchanged.
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        content = {each.name: to_plain(getattr(value, each.name)) for each in fields(value)}
+        return {KIND: type(value).__name__, **content}
+    if isinstance(value, np.ndarray):
+        data = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode()
+        return {KIND: "array", "type": value.dtype.str, "shape": list(value.shape), "data": data}
+    if isinstance(value, tuple):
+        return [to_plain(each) for each in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    return value
+
+
+def from_plain(value: Any) -> Any:
+    """Returns the record that `to_plain` was given. Raises ValueError if it is damaged."""
+    if isinstance(value, list):
+        return tuple(from_plain(each) for each in value)
+    if not isinstance(value, dict):
+        return value
+    content = dict(value)
+    kind = content.pop(KIND, None)
+    try:
+        if kind == "array":
+            data = base64.b64decode(content["data"])
+            array = np.frombuffer(data, np.dtype(content["type"])).reshape(content["shape"])
+            return array.copy()
+        return KINDS[kind](**{name: from_plain(each) for name, each in content.items()})
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{kind!r} can't be read ({error})") from None

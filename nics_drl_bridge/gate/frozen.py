@@ -1,0 +1,222 @@
+"""Data that arrive but are dead: repeated scans, jumps of odometry, no motion when commanded.
+
+Detection of old scans that a lidar shows again although the robot has moved.
+
+A lidar without noise may well show the same between two long walls, or in the middle of a round
+room. So an old scan is moved by the motion from odometry, and only those of its beams count whose
+length must have changed by now, whatever the error of the heading.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.gate.records import replace
+from nics_drl_bridge.gate.state import Cause, GateConfig, GateState, Push, Sameness
+from nics_drl_bridge.gate.stops import ODOM, SCAN
+from nics_drl_bridge.geometry import between, compose
+
+Array = NDArray[np.float64]
+Ranges = NDArray[np.float32]
+IDENTICAL = 3
+"""Least number of scans that show a frozen picture."""
+PICTURES = 16
+"""Number of remembered pictures: a lidar may repeat several in turn."""
+RESPONSE = 0.1
+"""Least share of the commanded distance or angle that a robot covers."""
+LEAST_PATH, LEAST_TURN = 0.03, 0.25
+"""Least motion commanded within the window for the robot to be judged [m, rad]."""
+WINDOW = 0.75
+"""Length of the window as a share of `stuck_s`; the rest is for the delay of odometry."""
+MARK_S = 0.05
+PAUSE_S = 0.2
+"""Time between two marks, and least time without commanded motion between two pushes [s]."""
+STILL_LINEAR, STILL_TURN = 0.05, 0.1
+"""A robot slower than this, plus the noise of its odometry, stands still [m/s, rad/s]."""
+NOISE = 3.0
+"""Noise of odometry that is allowed for, in standard deviations."""
+
+
+def look(
+    config: GateConfig, seen: tuple[Sameness, ...], ranges: Ranges, pose: Array | None
+) -> tuple[tuple[Sameness, ...], str]:
+    """Compares a scan with the last pictures, bit for bit. A scan without returns is ignored.
+
+    Args:
+        config: of the gate.
+        seen: pictures so far, newest last.
+        ranges: (B,) of the scan [m].
+        pose: (3,) present pose by odometry; None if there is none yet.
+
+    Returns:
+        The pictures, and the reason why the scan is an old one; empty if it may be new.
+    """
+    if not np.isfinite(ranges).any():
+        return seen, ""
+    known = next((one for one in reversed(seen) if same(one.ranges, ranges)), None)
+    if known is None:
+        return (*seen[1 - PICTURES :], Sameness(ranges, 1, pose)), ""
+    others = tuple(one for one in seen if one is not known)
+    known = replace(
+        known, count=known.count + 1, first=pose if known.first is None else known.first
+    )
+    if pose is None or known.first is None or known.count < IDENTICAL:
+        return (*others, known), ""
+    moved = between(known.first, pose)
+    path = max(float(np.hypot(moved[0], moved[1])), abs(float(moved[2])))
+    if path <= config.frozen_distance:
+        return (*others, known), ""
+    if shown_again(config, known.ranges, ranges, moved):
+        return (*others, known), (
+            f"{known.count} scans are the same over a motion of {path:.2f} m or rad"
+        )
+    return (*others, Sameness(ranges, 1, pose)), ""  # the scene may really look the same
+
+
+def stands_still(config: GateConfig, twist: NDArray[np.float64]) -> bool:
+    """True if a body twist (3,) is that of a robot at rest, within the noise of odometry."""
+    linear, turn = (NOISE * std for std in config.odom_std)
+    slow = np.hypot(twist[0], twist[1]) < STILL_LINEAR + linear
+    return bool(slow and abs(twist[2]) < STILL_TURN + turn)
+
+
+def watch_motion(config: GateConfig, state: GateState, now: float) -> GateState:
+    """Integrates the commanded motion and marks the robot's poses."""
+    if state.odometry is None or config.limits is None:
+        return state
+    moving = np.zeros(3)
+    angles = ~(config.limits.linear | config.limits.turn)
+    moving[list(config.fields)] = np.where(angles, 0.0, state.value)
+    push = state.push
+    if push is None or now - push.moving_s > PAUSE_S:
+        if not moving.any():
+            return state if push is None else replace(state, push=None)
+        mark = (now, np.zeros(3), state.odometry.pose)
+        return replace(state, push=Push(now, now, now, np.zeros(3), (mark,)))
+    told: Array = push.told + (now - push.last_s) * moving
+    marks = push.marks
+    if now - marks[-1][0] >= MARK_S:
+        start = now - WINDOW * config.stuck_s
+        # The first mark that is kept lies at or before the start of the window.
+        first = next((k for k, one in enumerate(marks[1:]) if one[0] > start), len(marks) - 1)
+        marks = (*marks[first:], (now, told, state.odometry.pose))
+    moved_s = now if moving.any() else push.moving_s
+    return replace(state, push=replace(push, last_s=now, moving_s=moved_s, told=told, marks=marks))
+
+
+def odom_jumped(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """Odometry reports a pose that the robot can't have driven to."""
+    return Cause("odom_jumped", ODOM, state.leap) if state.leap else None
+
+
+def scan_frozen(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """The same scan repeats although odometry shows motion."""
+    return Cause("scan_frozen", SCAN, state.frozen) if state.frozen else None
+
+
+def no_motion(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """The robot is commanded to move but odometry shows none: stuck, unpowered, or frozen data."""
+    push = state.push
+    if push is None or state.odometry is None or now - push.since_s <= config.stuck_s:
+        return None
+    time, before, _ = push.marks[0]
+    told = push.told - before
+    path, turn = float(np.hypot(told[0], told[1])), abs(float(told[2]))
+    if path < LEAST_PATH and turn < LEAST_TURN:
+        return None
+    for _, _, pose in push.marks:  # there and back again is motion, too
+        moved = between(pose, state.odometry.pose)
+        drove = path >= LEAST_PATH and np.hypot(moved[0], moved[1]) >= RESPONSE * path
+        turned = turn >= LEAST_TURN and abs(moved[2]) >= RESPONSE * turn
+        if drove or turned:
+            return None
+    detail = f"no motion in {now - time:.2f} s, told were {path:.2f} m and {turn:.2f} rad"
+    return Cause("no_motion", ODOM, detail)
+
+
+SAME_SHARE = 0.99
+"""Two scans with this share of equal beams are the same; of few beams, one may differ."""
+TELLING_SHARE = 0.9
+"""A scan with this share unchanged, of the beams that must have changed, is an old one."""
+CHANGE = 0.02
+"""Least change of a beam that must have changed [m]."""
+HEADINGS = (-0.03, 0.0, 0.03)
+"""Errors of odometry's heading for all of which the beam must have changed [rad]."""
+NEIGHBOURS = 1.5
+"""An old beam is compared with beams at most this many beam spacings away."""
+LEAST_BEAMS = 3
+
+
+def same(one: Ranges, other: Ranges) -> bool:
+    """True if two scans (B,) are bit-identical, but for a few beams.
+
+    Only beams that return in at least one of them count.
+    """
+    returned = np.isfinite(one) | np.isfinite(other)
+    count = int(np.count_nonzero(returned))
+    equal = int(np.count_nonzero((one == other) & returned))
+    return _but_for_one(equal, count, SAME_SHARE)
+
+
+def shown_again(config: GateConfig, old: Ranges, ranges: Ranges, moved: Array) -> bool:
+    """True if a scan (B,) repeats an old one (B,) although the robot has moved (3,) [m, m, rad]."""
+    telling = must_differ(config, old, moved)
+    count = int(np.count_nonzero(telling))
+    equal = int(np.count_nonzero((old == ranges) & telling))
+    return count >= LEAST_BEAMS and _but_for_one(equal, count, TELLING_SHARE)
+
+
+def _but_for_one(equal: int, count: int, share: float) -> bool:
+    """True if this share of the beams is equal, or all but one of them."""
+    return equal > 0 and equal >= min(share * count, count - 1)
+
+
+def must_differ(config: GateConfig, ranges: Ranges, moved: Array) -> NDArray[np.bool_]:
+    """Returns which beams (B,) of a scan must have changed their length after a motion.
+
+    Args:
+        config: of the gate, for its lidar.
+        ranges: (B,) before the motion [m].
+        moved: (3,) relative pose of `base_link` since then [m, m, rad].
+    """
+    mount = np.array(config.mount)
+    moved = between(mount, compose(moved, mount))
+    open_ = np.isposinf(ranges)
+    known = np.isfinite(ranges) | open_
+    far = config.range_max or float(ranges[np.isfinite(ranges)].max())
+    length = np.where(open_, far, ranges)[known].astype(np.float64)
+    angles = config.beam_angles[known]
+    ends = np.stack([length * np.cos(angles), length * np.sin(angles), 0.0 * length], axis=1)
+    changed = np.isfinite(ranges)
+    for error in HEADINGS:
+        seen = between(moved + np.array([0.0, 0.0, error]), ends)
+        changed &= _changed(config.beam_angles, ranges, seen, open_[known])
+    return np.asarray(changed)
+
+
+def _changed(
+    angles: Array, ranges: Ranges, seen: Array, open_: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Returns which beams (B,) differ from the moved end points (K, 2 or more) of the old ones.
+
+    An open beam only shows that nothing is nearer.
+    """
+    bearing = np.arctan2(seen[:, 1], seen[:, 0])
+    order = np.argsort(bearing)
+    bearing, length = bearing[order], np.hypot(seen[order, 0], seen[order, 1])
+    turn = 2.0 * np.pi
+    bearing = np.concatenate([bearing[-1:] - turn, bearing, bearing[:1] + turn])
+    length = np.concatenate([length[-1:], length, length[:1]])
+    is_open = open_[order]
+    is_open = np.concatenate([is_open[-1:], is_open, is_open[:1]])
+    wrapped = np.mod(angles + np.pi, turn) - np.pi
+    above = np.clip(np.searchsorted(bearing, wrapped), 1, len(bearing) - 1)
+    below = above - 1
+    spacing = abs(angles[1] - angles[0]) if len(angles) > 1 else turn
+    low, high = np.minimum(length[below], length[above]), np.maximum(length[below], length[above])
+    nearest = np.where(wrapped - bearing[below] < bearing[above] - wrapped, below, above)
+    close = np.abs(wrapped - bearing[nearest]) <= NEIGHBOURS * spacing
+    nearer = (ranges < low - CHANGE) & close
+    farther = (ranges > high + CHANGE) & close & ~is_open[below] & ~is_open[above]
+    return np.asarray(nearer | farther)

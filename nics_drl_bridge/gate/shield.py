@@ -1,0 +1,182 @@
+"""The shield: passes only commands from which the robot can stop before the nearest obstacle.
+
+The robot is assumed to do anything between its recent commands, its motion by odometry and the
+present command, for as long as the scan is old, the next decision takes and the robot needs to
+react, and then to brake. A new command must also leave room to brake calmly, so that an approach
+ends slowly instead of in a series of full stops. The footprint is swept along the arcs of that
+whole family; a command is scaled down, on its path, until no obstacle in the scan lies in the swept
+area. The dynamic window of Fox, Burgard and Thrun (1997) tests the same for one arc.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.gate import moving, shield_kernels
+from nics_drl_bridge.gate.motion import Motion
+from nics_drl_bridge.gate.state import GateConfig, GateState, ShieldConfig, View
+from nics_drl_bridge.gate.stops import age
+
+Array = NDArray[np.float64]
+Ranges = NDArray[np.float32]
+Flags = NDArray[np.bool_]
+FINEST = 6
+"""Bisections of the scale."""
+SPEEDS, TURNS = 3, 9
+"""Arcs of the family: number of speeds along each axis, and number of turn rates."""
+MOVING = 0.1
+"""Above this speed the ratio of turn rate to speed gives the curvature [m/s]."""
+CALM = 0.5
+"""Share of its deceleration with which the robot should stop when nothing is sudden."""
+STEP = 0.02
+"""Distance between two checked places of the footprint on an arc [m]."""
+
+
+def returns(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
+    """Returns end points (P, 3) of the beams [m], and how fast each may approach [m/s]."""
+    hit = np.isfinite(ranges)
+    speeds = np.where(moves[hit], shield.obstacle_speed, 0.0)
+    return _ends(config, config.beam_angles[hit], ranges[hit].astype(np.float64), speeds)
+
+
+def too_close(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
+    """Returns points (P, 3) at the least range for beams too close to measure (`-inf`) [m]."""
+    near = np.isneginf(ranges)
+    return _ends(config, config.beam_angles[near], np.full(near.sum(), config.range_min), 0.0)
+
+
+def unknown(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
+    """Returns a wall (P, 3) on the footprint wherever too many beams, or all, are unknown.
+
+    So the robot does not drive into what it can't see, but can drive away from it.
+    """
+    grid = np.linspace(-np.pi, np.pi, len(ranges), endpoint=False)
+    angles = config.beam_angles[~np.isnan(ranges)] + config.mount[2]
+    known = np.sort(np.mod(angles + np.pi, 2.0 * np.pi) - np.pi)
+    if len(known) == 0:
+        blocked = grid
+    else:
+        around = np.concatenate([known - 2.0 * np.pi, known, known + 2.0 * np.pi])
+        half = shield.unknown_width / 2.0
+        seen = np.searchsorted(around, grid + half) - np.searchsorted(around, grid - half)
+        spacing = config.beam_angles[1] - config.beam_angles[0] if len(ranges) > 1 else 2.0 * np.pi
+        blocked = grid[seen < (1.0 - shield.unknown_share) * shield.unknown_width / spacing]
+    wall = shield.footprint_radius * np.stack([np.cos(blocked), np.sin(blocked)])
+    return np.stack([*wall, np.zeros_like(blocked)], axis=1)
+
+
+Evidence = Callable[[GateConfig, ShieldConfig, Ranges, Flags], Array]
+EVIDENCE: tuple[Evidence, ...] = (returns, too_close, unknown)
+
+
+def _ends(config: GateConfig, angles: Array, ranges: Array, speeds: Array | float) -> Array:
+    x, y, heading = config.mount
+    angles = angles + heading
+    speeds = np.broadcast_to(speeds, ranges.shape)
+    return np.stack([x + ranges * np.cos(angles), y + ranges * np.sin(angles), speeds], axis=1)
+
+
+def obstacles(config: GateConfig, ranges: Ranges, views: tuple[View, ...]) -> Array | None:
+    """Returns all obstacles (P, 3) in a scan (B,), and how fast each may approach.
+
+    Args:
+        config: of the gate.
+        ranges: of the scan.
+        views: that of the scan and earlier ones, see `moving`; empty before the first odometry.
+
+    Returns:
+        x, y in `base_link` [m], speed [m/s]; None without shield.
+    """
+    given = config.shield
+    if given is None:
+        return None
+    moves = moving.movers(config, given, views) if views else np.zeros(len(ranges), np.bool_)
+    return np.concatenate([evidence(config, given, ranges, moves) for evidence in EVIDENCE])
+
+
+def rehearse() -> None:
+    """Compiles what `shield` calls: that takes seconds, which a moving robot does not have."""
+    shield_kernels.free(np.zeros((1, 3)), np.zeros((1, 3)), 0.0, 1.0, 0.0, STEP)
+    moving.rehearse()
+
+
+def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
+    """Returns the greatest part of a motion from which the robot can still stop in time.
+
+    If necessary, it brakes harder than the limits of rate and jerk allow.
+    """
+    if config.shield is None or config.limits is None or state.obstacles is None:
+        return motion
+    speeds = config.limits.linear | config.limits.turn
+
+    def part(share: float) -> Array:
+        return np.where(speeds, share * motion.value, motion.value)
+
+    if not motion.value[speeds].any() or _safe(config, state, motion.value, now):
+        return motion
+    low, high = 0.0, 1.0
+    for _ in range(FINEST):
+        middle = (low + high) / 2.0
+        if _safe(config, state, part(middle), now):
+            low = middle
+        else:
+            high = middle
+    return replace(motion, value=part(low), slope=np.zeros_like(motion.slope), shielded=True)
+
+
+def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> bool:
+    """True if the robot could still stop, and could do so without a jolt."""
+    given, points = config.shield, state.obstacles
+    if given is None or points is None:
+        return True
+    room = given.footprint_radius + given.margin
+    odometry = np.zeros(3) if state.odometry is None else state.odometry.twist
+    old = max(0.0, age(state.scans, now))
+    # Commands that the scan does not show yet: since it was taken, or within the latency before.
+    since, ends = now - old - given.latency_s, [told for told, _ in state.recent[1:]]
+    past = [told[1] for told, end in zip(state.recent, [*ends, now], strict=False) if end >= since]
+    react = given.hold_s + given.latency_s
+    calm = 1.0 / config.scan_rate + react + given.latency_s
+    hard = old + react
+    standing = points * (1.0, 1.0, 0.0)  # static: against fast obstacles a calm stop is no use
+    for seen, commands, twist, blind, deceleration in (
+        (standing, [value], None, calm, CALM * given.deceleration),
+        (points, [*past, state.value, value], odometry, hard, given.deceleration),
+    ):
+        twists = _family(config, given, np.array(commands), twist)
+        if not shield_kernels.free(seen, twists, blind, deceleration, room, STEP):
+            return False
+    return True
+
+
+def _family(
+    config: GateConfig, given: ShieldConfig, commands: Array, odometry: Array | None
+) -> Array:
+    """Returns body twists (K, 3) between those of commands (n, C) and of odometry (3,), if any."""
+    told = np.zeros((len(commands), 3))
+    told[:, list(config.fields)] = commands
+    if given.wheelbase > 0.0:
+        return _car_family(given.wheelbase, told, odometry)
+    if odometry is not None:
+        told = np.concatenate([told, odometry[None]])
+    low, high = told.min(axis=0), told.max(axis=0)
+    axes = [np.linspace(low[i], high[i], SPEEDS if high[i] > low[i] else 1) for i in (0, 1)]
+    turns = np.linspace(low[2], high[2], TURNS if high[2] > low[2] else 1)
+    return np.stack(np.meshgrid(*axes, turns), axis=-1).reshape(-1, 3)
+
+
+def _car_family(wheelbase: float, told: Array, odometry: Array | None) -> Array:
+    """Returns a car's twists: curvature does not depend on speed; braking steers it straight."""
+    bends, speeds = [0.0, *np.tan(told[:, 2]) / wheelbase], list(told[:, 0])
+    if odometry is not None:
+        speeds.append(odometry[0])
+        if abs(odometry[0]) > MOVING:
+            bends.append(odometry[2] / odometry[0])
+    grid = np.linspace(min(bends), max(bends), 2 * TURNS if max(bends) > min(bends) else 1)
+    ends = [speed for speed in sorted({max(speeds), min(speeds)}) if speed != 0.0]
+    speed, bend = np.meshgrid(ends, grid)
+    return np.stack([speed, np.zeros_like(speed), speed * bend], axis=-1).reshape(-1, 3)

@@ -1,0 +1,162 @@
+"""Stopping behaviour of a robot: from its limits file, or derived with caution from its model.
+
+Check for settings with which the robot could never move, reported at the start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from nics_drl_bridge.config import find_config, load_yaml
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.gate.limits import SPEED, TURN, Limits, LimitsFile, Stopping
+from nics_drl_bridge.gate.state import GateConfig, ShieldConfig
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.taylor import TaylorModel, term_name
+
+ANGLE = "rad"
+UNKNOWN_LAG_S = 0.5
+"""Lag of a robot whose model shows none [s]."""
+SLOWEST_LAG_S = 5.0
+"""Slower modes are not lags but combinations that no command moves [s]."""
+UNKNOWN_DECELERATION = 0.5
+"""Deceleration of a robot whose limits are not known [m/s^2]."""
+HOLD_S = GateConfig.gap_s
+
+
+def shield_config(
+    model: SimulatorModel,
+    limits: Limits | None,
+    file: str | Path = "",
+    given: Mapping[str, float] | None = None,
+) -> tuple[ShieldConfig, str]:
+    """Returns a robot's shield configuration, and a sentence with its values and their source.
+
+    Args:
+        model: of the robot.
+        limits: of the robot, if any.
+        file: of the limits, as in `load_limits`; its `shield` gives the measured values.
+        given: values that override those of the file, by their names there.
+
+    Raises:
+        ConfigError: a value can't be used, or the shield does not know the robot's commands.
+    """
+    path = find_config(file, "limits") if file else None
+    told = None if path is None else load_yaml(path, LimitsFile).shield
+    values = told or _derived(model, limits)
+    values = values.model_copy(update=dict(given or {}))
+    for name, value in values.model_dump().items():
+        least = "greater than 0" if name == "deceleration" else "at least 0"
+        if not (np.isfinite(value) and value >= 0.0) or (value == 0.0 and name == "deceleration"):
+            raise ConfigError(f"parameter 'shield_{name}' is {value:g}; it must be {least}.")
+    lidar = model.lidar
+    config = ShieldConfig(
+        latency_s=values.latency,
+        deceleration=values.deceleration,
+        margin=values.margin,
+        hold_s=HOLD_S,
+        footprint_radius=model.robot.footprint_radius,
+        wheelbase=wheelbase(model.robot),
+        obstacle_speed=values.obstacle_speed,
+        range_max=lidar.range_max,
+        range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
+    )
+    source = f"measured, by {path}" if told is not None else "derived from model and limits"
+    if given:
+        source += f", but {', '.join(sorted(given))} by parameter"
+    told_s = ", ".join(f"{name} {value:g}" for name, value in values.model_dump().items())
+    return config, f"the shield is on: {told_s} ({source})"
+
+
+def _derived(model: SimulatorModel, limits: Limits | None) -> Stopping:
+    """Assumes that a base takes up one command per period, and brakes no harder than its limits."""
+    deceleration = UNKNOWN_DECELERATION
+    if limits is not None and limits.linear.any():
+        deceleration = float(limits.rate[limits.linear].min())
+    latency = model.calibration.command_latency_s + lag(model.kinematics) + model.control_period
+    return Stopping(latency=max(0.0, latency), deceleration=deceleration)
+
+
+def lag(kinematics: TaylorModel) -> float:
+    """Returns the slowest time constant [s] of the model's states; a guess if none shows.
+
+    It comes from the eigenvalues, at rest, of the Jacobian of the state's rates by the state.
+    """
+    states = kinematics.variables[: kinematics.state_size]
+    names = [term_name(row, kinematics.variables) for row in kinematics.powers]
+    own = np.zeros((len(states), len(states)))
+    for column, state in enumerate(states):
+        if state in names:
+            own[:, column] = kinematics.coefficients[3:, names.index(state)]
+    decays = -np.linalg.eigvals(own).real if states else np.zeros(0)
+    settling = decays[decays > 1.0 / SLOWEST_LAG_S]
+    return float(1.0 / settling.min()) if len(settling) else UNKNOWN_LAG_S
+
+
+def wheelbase(robot: RobotSpec) -> float:
+    """Returns the wheelbase of a robot commanded by steering angle [m]; 0 for other robots.
+
+    Raises:
+        ConfigError: the robot's file lacks it, or a command is no speed, turn rate or angle.
+    """
+    for variable in robot.command:
+        if variable.unit not in (SPEED, TURN, ANGLE):
+            raise ConfigError(
+                f"robot {robot.name!r}: the shield knows commands in m/s, rad/s and rad, and "
+                f"{variable.name!r} is in {variable.unit!r}; without it, set `shield: false`."
+            )
+    if all(variable.unit != ANGLE for variable in robot.command):
+        return 0.0
+    if not robot.parameters.get("wheelbase", 0.0) > 0.0:
+        raise ConfigError(
+            f"robot {robot.name!r}: the shield needs the parameter 'wheelbase' of a car; add it "
+            "under `parameters:` of the robot, or drive without a shield by `shield: false`."
+        )
+    return robot.parameters["wheelbase"]
+
+
+LEAST_DATA = 2
+"""Least number of data that must arrive while the gate settles, for their rate to be known."""
+
+
+def require_possible(config: GateConfig) -> None:
+    """Checks that the gate can be armed with its settings.
+
+    Raises:
+        ConfigError: it can't be armed; names the parameter, its value and what it needs.
+    """
+    for topic, rate, age in (
+        ("scan", config.scan_rate, config.scan_age_s),
+        ("odom", config.odom_rate, config.odom_age_s),
+    ):
+        declared = f"{topic} comes every {1.0 / rate:.3g} s ({rate:g} Hz are declared)"
+        if age <= 1.0 / rate:
+            raise ConfigError(
+                f"parameter '{topic}_age': {age:g} s: {declared}, so the robot could never move; "
+                f"give more than {1.0 / rate:.3g}."
+            )
+        if rate * config.settle_s < LEAST_DATA:
+            raise ConfigError(
+                f"{declared}, too seldom to be judged within {config.settle_s:g} s, so the robot "
+                f"could never move; the gate needs {LEAST_DATA / config.settle_s:g} Hz or more."
+            )
+
+
+def doubtful(config: GateConfig, control_period_s: float) -> str:
+    """Returns a warning about a setting that only suits an unusual policy; empty if there is none.
+
+    Args:
+        config: of the gate.
+        control_period_s: of the model; by default a policy commands at this period [s].
+    """
+    if config.command_age_s > control_period_s:
+        return ""
+    return (
+        f"parameter 'command_age': {config.command_age_s:g} s: a policy commands every "
+        f"{control_period_s:g} s unless it is told otherwise, and the robot would stop between any "
+        f"two commands; give more than {control_period_s:g}."
+    )

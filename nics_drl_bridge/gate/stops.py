@@ -1,0 +1,270 @@
+"""Age of data: from their arrival on the steady clock, and from their delay.
+
+The lead of a stamp over the steady clock is the offset of the two clocks minus the delay of the
+datum; the greatest lead, the envelope, is that of the fastest data (the idea of one-way delay
+estimation by the lower envelope). It is found before the gate is armed and then fixed: it follows
+at most the drift of real clocks. So stamps that creep ahead, or fall behind, become neither the new
+present nor the new normal.
+
+The gate's own clock: time that jumps, freezes or was slept through stops the robot.
+
+Watchdogs of the policy's commands: presence, validity, and age of the scan behind them.
+
+The emergency stop: latched when pressed, and treated as pressed when silent.
+"""
+
+from __future__ import annotations
+
+import math
+
+from nics_drl_bridge.gate.inputs import Input, Tick
+from nics_drl_bridge.gate.records import replace
+from nics_drl_bridge.gate.state import Arrivals, Cause, EStopState, GateConfig, GateState, Mark
+from nics_drl_bridge.interface import S_PER_NS
+
+SCAN, ODOM = "scan", "odom"
+KEPT = 64
+"""Number of remembered stamps; a command on an older scan is on an unknown one."""
+MARK_S = 0.05
+"""Time between two marks [s]."""
+DRIFT = 1e-3
+"""Greatest drift between two clocks [s/s]; that of real machines is 1e-4."""
+SIMULATED_LAG = 0.2
+"""Share of real time that a simulator may lose."""
+AHEAD_S = 0.1
+"""Data of an armed gate whose lead exceeds the envelope by this are from the future [s]."""
+
+
+def arrived(
+    config: GateConfig, arrivals: Arrivals, stamp_ns: int, now: float, gap_s: float, armed: bool
+) -> tuple[Arrivals, str]:
+    """Accounts for a datum, or returns why it is not used.
+
+    Args:
+        config: of the gate.
+        arrivals: known so far.
+        stamp_ns: of the datum [ns].
+        now: steady time [s].
+        gap_s: longest gap between two of them [s].
+        armed: whether the envelope is fixed.
+
+    Returns:
+        The arrivals, and `repeated`, `jumped` or "". After a jump only the new datum counts.
+    """
+    fresh = Arrivals(
+        (stamp_ns,), (now,), (0.0,), (stamp_ns, now), 1, 0.0, now, ((now, stamp_ns, 1, 0.0),)
+    )
+    if not arrivals.times:
+        return fresh, ""
+    step = (stamp_ns - arrivals.stamps_ns[-1]) * S_PER_NS
+    if step < -config.clock_jump_s:
+        return fresh, "jumped"
+    if step <= 0.0:
+        return arrivals, "repeated"
+    lead = _lead(config, arrivals, stamp_ns, now)
+    if lead - arrivals.envelope > (AHEAD_S if armed else config.clock_jump_s):
+        return fresh, "jumped"
+    marks = _marked(arrivals, stamp_ns, now, lead, config.settle_s)
+    if armed:
+        passed = now - arrivals.times[-1]
+        fall = SIMULATED_LAG if config.simulated else DRIFT
+        lowest, highest = arrivals.envelope - fall * passed, arrivals.envelope + DRIFT * passed
+        envelope = min(max(lead, lowest), highest)
+    else:
+        envelope = max(mark[3] for mark in marks)
+    return replace(
+        arrivals,
+        stamps_ns=(*arrivals.stamps_ns[1 - KEPT :], stamp_ns),
+        times=(*arrivals.times[1 - KEPT :], now),
+        late=(*arrivals.late[1 - KEPT :], max(0.0, envelope - lead)),
+        count=arrivals.count + 1,
+        envelope=envelope,
+        unbroken_s=now if now - arrivals.times[-1] > gap_s else arrivals.unbroken_s,
+        marks=marks,
+    ), ""
+
+
+def _lead(config: GateConfig, arrivals: Arrivals, stamp_ns: int, now: float) -> float:
+    first_ns, first_s = arrivals.origin
+    return (stamp_ns - first_ns) * S_PER_NS / config.clock_rate - (now - first_s)
+
+
+def _marked(
+    arrivals: Arrivals, stamp_ns: int, now: float, lead: float, settle_s: float
+) -> tuple[Mark, ...]:
+    """Returns the marks, with a datum merged into the last of them or as a new one."""
+    *before, (time, stamp, number, greatest) = arrivals.marks
+    if now - time < MARK_S:
+        if lead <= greatest:
+            return arrivals.marks
+        return (*before, (time, stamp, number, lead))
+    oldest = now - settle_s - 2.0 * MARK_S
+    kept = (mark for mark in arrivals.marks if mark[0] >= oldest)
+    return (*kept, (now, stamp_ns, arrivals.count + 1, lead))
+
+
+def settled(arrivals: Arrivals) -> Arrivals:
+    """Returns the arrivals with the envelope of the marked data alone, whatever it was before."""
+    if not arrivals.marks:
+        return arrivals
+    return replace(arrivals, envelope=max(mark[3] for mark in arrivals.marks))
+
+
+def age(arrivals: Arrivals, now: float, index: int = -1) -> float:
+    """Returns the age of a datum (the newest) with its delay [s]; inf if there is none."""
+    if not arrivals.times:
+        return float("inf")
+    return now - arrivals.times[index] + arrivals.late[index]
+
+
+def _silence(rule: str, topic: str, arrivals: Arrivals, now: float, limit: float) -> Cause | None:
+    old = age(arrivals, now)
+    return Cause(rule, topic, "no fresh data", old, limit) if not old <= limit else None
+
+
+def scan_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """The newest scan is too old: the lidar has stopped."""
+    return _silence("scan_silent", SCAN, state.scans, now, config.scan_age_s)
+
+
+def odom_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """The newest odometry is too old: it has stopped."""
+    return _silence("odom_silent", ODOM, state.odometries, now, config.odom_age_s)
+
+
+def stamps_jumped(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """A sensor's clock has jumped or runs ahead: its stamps lie in the future, or far back."""
+    if not state.jumped:
+        return None
+    return Cause("stamps_jumped", state.jumped, "its stamps have jumped, or run ahead of time")
+
+
+def gap_free(arrivals: Arrivals, now: float, settle_s: float, limit: float) -> bool:
+    """True if data have arrived for the settling time without a gap longer than a limit."""
+    if not arrivals.times:
+        return False
+    return now - arrivals.unbroken_s >= settle_s and now - arrivals.times[-1] <= limit
+
+
+def rate(arrivals: Arrivals, now: float, settle_s: float) -> tuple[float, float]:
+    """Returns the rate by arrival and by stamps over the settling time [Hz]; 0 if unknown."""
+    first = next((mark for mark in arrivals.marks if mark[0] >= now - settle_s), None)
+    if first is None or arrivals.count <= first[2]:
+        return 0.0, 0.0
+    count = arrivals.count - first[2]
+    passed = arrivals.times[-1] - first[0]
+    stamped = (arrivals.stamps_ns[-1] - first[1]) * S_PER_NS
+    return (count / passed if passed > 0.0 else float("inf")), count / stamped
+
+
+def creep(arrivals: Arrivals) -> float:
+    """Returns by how much the later half of the marks is further ahead of the steady clock [s]."""
+    half = len(arrivals.marks) // 2
+    if half == 0:
+        return 0.0
+    early, late = arrivals.marks[:half], arrivals.marks[half:]
+    return max(mark[3] for mark in late) - max(mark[3] for mark in early)
+
+
+FROZEN_INPUTS = 20
+"""A running clock does not give this many inputs in a row the same time."""
+
+
+def take_time(config: GateConfig, state: GateState, given: Input, now: float) -> GateState:
+    """Records the time of an input, and what is wrong with it."""
+    if not math.isfinite(now) or now < state.now_s:
+        return replace(state, clock_fault=f"the steady clock went from {state.now_s} to {now} s")
+    still = state.still_ticks + 1 if now == state.now_s else 0
+    fault = ""
+    if still >= FROZEN_INPUTS:
+        fault = f"the steady clock stands still at {now} s"
+    ticked, awake = state.tick_s, state.awake_s
+    if ticked is not None and now - ticked > config.gap_s:  # at whatever input wakes it up
+        fault, awake = f"no decision for {now - ticked:.3f} s, the limit is {config.gap_s} s", now
+    elif now - awake <= config.gap_s:  # a single zero may be lost: only the newest command counts
+        fault = f"awake again for only {now - awake:.3f} s"
+    if isinstance(given, Tick):
+        ticked = now
+    return replace(
+        state, now_s=now, tick_s=ticked, awake_s=awake, still_ticks=still, clock_fault=fault
+    )
+
+
+def own_clock(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """The gate's clock is not to be trusted, or the gate was asleep."""
+    return Cause("own_clock", "", state.clock_fault) if state.clock_fault else None
+
+
+RAW = "cmd_vel_raw"
+
+
+def command_malformed(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """The newest command is malformed."""
+    return Cause("command_malformed", RAW, state.malformed) if state.malformed else None
+
+
+def command_missing(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """No command has arrived yet."""
+    if state.command is not None or state.pending is not None:
+        return None
+    return Cause("command_missing", RAW, "no command yet")
+
+
+def command_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """The policy has stopped, or hangs."""
+    old, limit = now - state.command_s, config.command_age_s
+    if old <= limit or state.command is None:
+        return None
+    return Cause("command_silent", RAW, "no fresh command", old, limit)
+
+
+def scan_behind_unknown(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """Commands name scans that do not arrive, perhaps from the future. One may be in transit."""
+    if state.pending is None or state.pending_s is None:
+        return None
+    if now - state.pending_s <= config.race_s and state.command is not None:
+        return None
+    return Cause(
+        "scan_behind_unknown", RAW, f"the scan behind it ({state.pending.stamp_ns}) never arrived"
+    )
+
+
+def scan_behind_old(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """The scan behind the command is old, however fresh the command: a republisher, or a hang."""
+    if state.command is None:
+        return None
+    old, limit = now - state.behind_s, config.scan_age_s
+    if old <= limit:
+        return None
+    return Cause("scan_behind_old", SCAN, f"the scan behind {RAW} is old", old, limit)
+
+
+TOPIC = "e_stop"
+
+
+def hear(state: EStopState, pressed: bool, now: float) -> EStopState:
+    """Returns the state after a message on its topic."""
+    return EStopState(latched=state.latched or pressed, held=pressed, heard_s=now)
+
+
+def reset(state: EStopState) -> EStopState:
+    """Clears the latch, unless the emergency stop is still pressed."""
+    return replace(state, latched=state.held)
+
+
+def e_stop_pressed(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """The emergency stop was pressed."""
+    if not state.e_stop.latched:
+        return None
+    return Cause("e_stop_pressed", TOPIC, "pressed" if state.e_stop.held else "was pressed")
+
+
+def e_stop_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """The emergency stop is silent: a cut cable? An optional one must have been heard before."""
+    heard = state.e_stop.heard_s
+    if heard is None and not config.e_stop_required:
+        return None
+    old, limit = float("inf") if heard is None else now - heard, config.e_stop_silence_s
+    if old <= limit:
+        return None
+    return Cause("e_stop_silent", TOPIC, "its heartbeat is silent, as if pressed", old, limit)

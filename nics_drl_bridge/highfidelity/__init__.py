@@ -1,1 +1,0 @@
-"""High-precision robots in MuJoCo: wheels with contact, friction and motors (optional extra)."""

@@ -1,0 +1,269 @@
+"""Measurement of sensor noise, and of the motion that a model leaves unexplained.
+
+The drift is measured over a second: systematic errors of a model grow faster than noise, so over
+a longer horizon the same model seems to drift more.
+
+Noise of the odometry: the deviation of reported velocities from the motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.noise import pose_noise, white_noise
+from nics_drl_bridge.identify.open_loop import Windows, predict, windows
+from nics_drl_bridge.identify.repair import find_bursts
+from nics_drl_bridge.identify.windows import course_of, relative_ends, tracked_ends
+from nics_drl_bridge.recording.recording import Recording, Samples
+from nics_drl_bridge.robot.noise import ASSUMED_STATE_DRIFT, MEASURED, Level, Noise, assumed
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.taylor import TaylorModel
+
+Array = NDArray[np.float64]
+
+HORIZON_S = 1.0
+SPACING_S = 0.25
+GROWTH_S = (0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
+STATE_HORIZON_S = 0.1
+MIN_WINDOWS = 20
+OUTLYING = 10.0
+"""A window whose error is more than this many times the median contains a jump."""
+RUN_AWAY_M = 1e4
+"""A larger error of a prediction over a second is divergence, not drift."""
+BLOCKS = 8
+TINY = 1e-9
+NEGLIGIBLE = 1e-4
+"""A smaller level is rounding: a tenth of a millimetre after a second."""
+
+
+def measure_noise(
+    recording: Recording,
+    calibration: Calibration,
+    model: TaylorModel,
+    samples: Samples,
+    spec: RobotSpec,
+) -> Noise:
+    """Measures the noise in a recording; each level is marked as measured or assumed.
+
+    Args:
+        recording: the whole drive, repaired.
+        calibration: of the drive.
+        model: fitted to the drive.
+        samples: of the drive, aligned.
+        spec: the robot.
+    """
+    linear, angular = odometry_noise(recording, calibration, model, samples)
+    position, heading = _pose_levels(recording)
+    noise = Noise(
+        odom_linear=linear,
+        odom_angular=angular,
+        pose_position=position,
+        pose_heading=heading,
+        state_drift=_state_drift(recording, model, samples, spec),
+    )
+    drift = _pose_drift(recording, calibration, model, spec, noise)
+    if drift is None:
+        return noise
+    return noise.model_copy(update={"position_drift": drift[0], "heading_drift": drift[1]})
+
+
+def level(variances: Array, unit: str) -> Level:
+    """Returns a measured level from squares (n,) in order of time, sensor noise subtracted.
+
+    The uncertainty is that of the mean over blocks of the drive.
+    """
+    variance = max(float(variances.mean()), 0.0)
+    means = np.array([part.mean() for part in np.array_split(variances, BLOCKS)])
+    spread = float(means.std(ddof=1) / np.sqrt(BLOCKS))
+    std = float(np.sqrt(variance))
+    if std < NEGLIGIBLE:
+        std = 0.0
+    uncertainty = spread / (2.0 * std) if std**2 > spread else float(np.sqrt(max(spread, 0.0)))
+    return Level(std=std, unit=unit, source=MEASURED, uncertainty=uncertainty if std else 0.0)
+
+
+def _pose_levels(recording: Recording) -> tuple[Level, Level]:
+    """Returns the noise of the pose sensor; its uncertainty comes from blocks of the drive."""
+    t, values = recording.pose.t, recording.pose.values
+    bursts = find_bursts(t)
+    whole, default = pose_noise(values, bursts, t), Noise()
+    if whole is None:
+        return default.pose_position, default.pose_heading
+    parts = [
+        pose_noise(values[rows], find_bursts(t[rows]), t[rows])
+        for rows in np.array_split(np.arange(len(t)), BLOCKS)
+    ]
+    known = np.array([part for part in parts if part is not None])
+    spread = known.std(axis=0, ddof=1) / np.sqrt(len(known)) if len(known) > 1 else [None, None]
+    return tuple(  # type: ignore[return-value]
+        Level(std=std, unit=unit, source=MEASURED, uncertainty=None if u is None else float(u))
+        for std, unit, u in zip(whole, ("m", "rad"), spread, strict=True)
+    )
+
+
+def _pose_drift(
+    recording: Recording,
+    calibration: Calibration,
+    model: TaylorModel,
+    spec: RobotSpec,
+    noise: Noise,
+) -> tuple[Level, Level] | None:
+    """Returns the drift of position and heading; None if too short or the model diverges."""
+    duration = float(recording.pose.t[-1] - recording.pose.t[0])
+    chosen = windows(recording, calibration, 0.0, duration, HORIZON_S, SPACING_S)
+    if len(chosen.start_t) < MIN_WINDOWS:
+        return None
+    error = geometry.between(_predicted(recording, calibration, model, spec, chosen), chosen.end)
+    size = np.hypot(error[:, 0], error[:, 1])
+    if not (size < RUN_AWAY_M).all():
+        return None
+    inside = size <= OUTLYING * max(float(np.median(size)), TINY)
+    position, _, heading = noise.pose
+    away = np.sum((chosen.end - chosen.start)[inside, :2] ** 2, axis=1)
+    turn = error[inside, 2] ** 2 - 2.0 * heading**2
+    grown = max(float(turn.mean()), 0.0)
+    # Errors of the initial heading, and heading drift on the way, cause lateral errors.
+    aside = 0.5 * away * (heading**2 + grown / 3.0)
+    shift = 0.5 * size[inside] ** 2 - 2.0 * position**2 - aside
+    return level(shift / HORIZON_S, "m/sqrt(s)"), level(turn / HORIZON_S, "rad/sqrt(s)")
+
+
+def drift_growth(
+    recording: Recording, calibration: Calibration, model: TaylorModel, spec: RobotSpec
+) -> tuple[Array, Array, Array] | None:
+    """Returns the growth of prediction errors: horizons [s], position [m], heading [rad], all (n,).
+
+    The errors are root mean squares, of the position per axis. None if the drive is too short.
+    """
+    duration = float(recording.pose.t[-1] - recording.pose.t[0])
+    rows = []
+    for horizon in GROWTH_S:
+        chosen = windows(recording, calibration, 0.0, duration, horizon, SPACING_S)
+        if len(chosen.start_t) < MIN_WINDOWS:
+            break
+        ends = _predicted(recording, calibration, model, spec, chosen)
+        error = geometry.between(ends, chosen.end)
+        square = np.mean(error**2, axis=0)
+        rows.append((horizon, np.sqrt(0.5 * (square[0] + square[1])), np.sqrt(square[2])))
+    if not rows:
+        return None
+    horizons, position, heading = np.array(rows).T
+    return horizons, position, heading
+
+
+def _predicted(
+    recording: Recording,
+    calibration: Calibration,
+    model: TaylorModel,
+    spec: RobotSpec,
+    chosen: Windows,
+) -> Array:
+    """Predicts end poses (W, 3) from the measured state if there is one, else from commands.
+
+    The unexplained part of the state's rates is thus not counted twice.
+    """
+    if recording.state is None:
+        return predict(model, calibration, recording, spec, chosen)
+    course = course_of(model, calibration, recording, spec, chosen)
+    x, begin = course.x.copy(), chosen.start_t + calibration.clock_offset_s
+    t = begin[:, None] + model.dt * np.arange(x.shape[1])
+    for i, column in enumerate(recording.state.values.T):
+        x[:, :, i] = np.interp(t, recording.state.t, column)
+    course = replace(course, x=x)
+    return tracked_ends(course, calibration, relative_ends(course, model)[0])
+
+
+def _state_drift(
+    recording: Recording, model: TaylorModel, samples: Samples, spec: RobotSpec
+) -> dict[str, Level]:
+    """Returns the drift of a measured state; assumed levels for an unmeasured one."""
+    nominal = {
+        v.name: assumed(ASSUMED_STATE_DRIFT * (v.max - v.min), f"{v.unit}/sqrt(s)")
+        for v in spec.state
+    }
+    if recording.state is None:
+        return nominal
+    rest = (samples.dq - model.rates(samples.x))[:, 3:] * samples.dt
+    steps = max(1, round(STATE_HORIZON_S / samples.dt))
+    count = len(rest) // steps
+    next_to = np.append(np.diff(samples.t) < 1.5 * samples.dt, True)[: count * steps]
+    whole = next_to.reshape(count, steps)[:, :-1].all(axis=1)
+    sums = rest[: count * steps].reshape(count, steps, -1)[whole].sum(axis=1)
+    if len(sums) < MIN_WINDOWS:
+        return nominal
+    found = {}
+    for i, variable in enumerate(spec.state):
+        usual = OUTLYING * max(float(np.median(np.abs(sums[:, i]))), TINY)
+        kept = sums[np.abs(sums[:, i]) <= usual, i]
+        sensor = white_noise(recording.state.values[:, i])
+        found[variable.name] = level(
+            (kept**2 - 2.0 * sensor**2) / (steps * samples.dt), f"{variable.unit}/sqrt(s)"
+        )
+    return found
+
+
+WITHIN_SIGMA = 68.27
+"""Percentage of a normal distribution within one standard deviation."""
+MIN_ROWS = 40
+
+
+def odometry_noise(
+    recording: Recording, calibration: Calibration, model: TaylorModel, samples: Samples
+) -> tuple[Level, Level]:
+    """Returns linear and angular noise relative to the twist of the fitted model.
+
+    It comes from the recorded odometry; else from the wheels, if the calibration knows their
+    scale; else it is the assumed noise of `Noise`.
+    """
+    default = Noise()
+    rest = odometry_residual(recording, calibration, model, samples)
+    if rest is None:
+        return default.odom_linear, default.odom_angular
+    linear = max((_level(rest[:, i], "m/s") for i in (0, 1)), key=lambda found: found.std)
+    return linear, _level(rest[:, 2], "rad/s")
+
+
+def odometry_residual(
+    recording: Recording, calibration: Calibration, model: TaylorModel, samples: Samples
+) -> Array | None:
+    """Returns reported minus modelled twist (n, 3); None if there is nothing to compare."""
+    stream = recording.odometry
+    if stream is not None:
+        t, twist = stream.t, stream.values
+        if stream.clock == recording.pose.clock:
+            t = t + calibration.clock_offset_s
+    elif recording.wheels is not None and calibration.wheel_scale is not None:
+        t, wheels = recording.wheels.t, recording.wheels.values
+        twist = np.zeros((len(t), 3))
+        twist[:, 0] = calibration.wheel_scale * wheels.mean(axis=1)
+        twist[:, 2] = (calibration.turn_scale or 0.0) * (wheels[:, 1] - wheels[:, 0])
+    else:
+        return None
+    inside = (t >= samples.t[0]) & (t <= samples.t[-1])
+    if inside.sum() < MIN_ROWS:
+        return None
+    rates = model.rates(samples.x)[:, :3]
+    # The rates are means from each sample to the next, so they belong to the middle of the step.
+    middle = samples.t + samples.dt / 2.0
+    expected = np.stack([np.interp(t[inside], middle, column) for column in rates.T], axis=1)
+    return np.asarray(twist[inside] - expected)
+
+
+def _level(rest: Array, unit: str) -> Level:
+    """Returns a level that is robust against single outliers."""
+    parts = np.array([_sigma(part) for part in np.array_split(rest, BLOCKS)])
+    return Level(
+        std=_sigma(rest),
+        unit=unit,
+        source=MEASURED,
+        uncertainty=float(parts.std(ddof=1) / np.sqrt(BLOCKS)),
+    )
+
+
+def _sigma(rest: Array) -> float:
+    return float(np.percentile(np.abs(rest - np.median(rest)), WITHIN_SIGMA))

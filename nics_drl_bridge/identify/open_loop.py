@@ -1,0 +1,251 @@
+"""Open-loop prediction: the error of a model after some seconds of commands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.identify import repair
+from nics_drl_bridge.identify.align import states_at
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.signals import held
+from nics_drl_bridge.identify.timing import followed
+from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.taylor import TaylorModel
+
+Array = NDArray[np.float64]
+
+HORIZON_S = 5.0
+SPACING_S = 0.1
+SETTLE_S = 1.0
+"""Windows start no sooner than this after the first command if the state is inferred."""
+END_TOLERANCE = 0.6
+"""A window ends at the sample nearest to its horizon, if within this share of the period."""
+
+
+@dataclass(frozen=True)
+class OpenLoop:
+    """Errors of open-loop predictions on a part of a drive.
+
+    A prediction starts at a measured pose, knows the commands, and is compared with the
+    measured pose at the end of the horizon, both of the tracked point.
+
+    Attributes:
+        horizon_s: length of each prediction [s].
+        windows: number of predictions.
+        mean_position_error_m, median_position_error_m, max_position_error_m: at the end [m].
+        mean_heading_error_rad: mean absolute error of the heading at the end [rad].
+        mean_path_m: mean length of the measured path in the horizon [m].
+        median_displacement_m: median distance from the start to the end of that path [m], the
+            position error of predicting that the robot stands still.
+    """
+
+    horizon_s: float
+    windows: int
+    mean_position_error_m: float
+    median_position_error_m: float
+    max_position_error_m: float
+    mean_heading_error_rad: float
+    mean_path_m: float
+    median_displacement_m: float
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Pairs of measured poses, one `horizon` apart.
+
+    Attributes:
+        start_t, end_t: (W,) on the pose's clock [s].
+        start, end: (W, 3) poses of the tracked body.
+        path: (W,) length of the measured path between them [m].
+    """
+
+    start_t: Array
+    end_t: Array
+    start: Array
+    end: Array
+    path: Array
+
+
+def windows(
+    recording: Recording,
+    calibration: Calibration,
+    start: float,
+    stop: float,
+    horizon: float,
+    spacing: float,
+) -> Windows:
+    """Selects the windows between two times, counted from the first pose.
+
+    Args:
+        recording: the drive.
+        calibration: of this drive.
+        start: start of the part of the drive that contains the windows, from its first pose [s].
+        stop: its end [s].
+        horizon: length of a window [s].
+        spacing: minimum time between two starts [s].
+    """
+    best = repair.newest(recording.pose.t, repair.find_bursts(recording.pose.t))
+    t, pose = recording.pose.t[best], recording.pose.values[best]
+    origin, period = recording.pose.t[0], float(np.median(np.diff(t)))
+    first = origin + start
+    if calibration.responses:
+        first = max(first, recording.command.t[0] - calibration.clock_offset_s + SETTLE_S)
+    begin = np.flatnonzero((t >= first) & (t + horizon <= origin + stop + period / 2.0))
+    begin = begin[_spaced(t[begin], spacing)]
+    after = np.clip(np.searchsorted(t, t[begin] + horizon), 1, len(t) - 1)
+    before_is_nearer = t[begin] + horizon - t[after - 1] < t[after] - t[begin] - horizon
+    end = after - before_is_nearer
+    good = np.abs(t[end] - t[begin] - horizon) <= END_TOLERANCE * period
+    good &= t[end] <= origin + stop
+    begin, end = begin[good], end[good]
+    length = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
+    return Windows(t[begin], t[end], pose[begin], pose[end], length[end] - length[begin])
+
+
+def _spaced(t: Array, spacing: float) -> NDArray[np.intp]:
+    """Returns indices of times (T,) that are at least (nearly) `spacing` apart [s]."""
+    chosen: list[int] = []
+    for k, value in enumerate(t):
+        if not chosen or value - t[chosen[-1]] > 0.9 * spacing:
+            chosen.append(k)
+    return np.array(chosen, dtype=np.intp)
+
+
+def predict(
+    model: TaylorModel,
+    calibration: Calibration,
+    recording: Recording,
+    spec: RobotSpec,
+    chosen: Windows,
+) -> Array:
+    """Predicts poses (W, 3) of the tracked body at the ends of windows from the commands.
+
+    The state at the start is the measured one, or follows from the commands before it.
+    """
+    base = calibration.to_base(chosen.start)
+    by = _by_one_rollout if recording.state is None else _by_windows
+    relative = by(model, calibration, recording, spec, chosen)
+    return calibration.to_tracked(geometry.compose(base, relative))
+
+
+def _by_one_rollout(
+    model: TaylorModel,
+    calibration: Calibration,
+    recording: Recording,
+    spec: RobotSpec,
+    chosen: Windows,
+) -> Array:
+    """Returns relative poses (W, 3) from one roll-out: an inferred state needs commands only."""
+    start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
+    lead = np.ceil((max(0.0, start.min() - recording.command.t[0]) + 1.0) / model.dt)
+    # Whole steps before the first window: windows of regular poses then begin and end on the grid.
+    grid = start.min() + model.dt * np.arange(-lead, (end.max() - start.min()) / model.dt + 2.0)
+    begin = grid - calibration.command_latency_s
+    command = held(recording.command, spec, begin, begin + model.dt)
+    gains = np.array([r.gain for r in calibration.responses])
+    state = gains * command[0, followed(spec)]
+    path = _roll(model, state[None], command[None])[0][0, :-1]
+    at = [np.stack([np.interp(t, grid, column) for column in path.T], axis=1) for t in (start, end)]
+    return geometry.between(at[0], at[1])
+
+
+def from_measured_states(
+    model: TaylorModel,
+    calibration: Calibration,
+    recording: Recording,
+    spec: RobotSpec,
+    chosen: Windows,
+) -> tuple[Array, Array, Array, NDArray[np.intp], Array]:
+    """Rolls each window out from its own measured state.
+
+    Returns:
+        Poses (W, T + 1, 3) from the origin, states (W, T + 1, S), commands (W, T, C), whole steps
+        (W,) to the end and the remaining fraction (W,) of one more.
+    """
+    start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
+    steps = int(np.ceil(float((end - start).max()) / model.dt - 1e-6)) + 1
+    begin = start[:, None] + model.dt * np.arange(steps) - calibration.command_latency_s
+    command = held(recording.command, spec, begin, begin + model.dt)
+    poses, states = _roll(model, states_at(recording, calibration, spec, start), command)
+    exact = (end - start) / model.dt
+    step = np.floor(exact + 1e-6).astype(np.intp)
+    return poses, states, command, step, np.clip(exact - step, 0.0, 1.0)
+
+
+def _by_windows(
+    model: TaylorModel,
+    calibration: Calibration,
+    recording: Recording,
+    spec: RobotSpec,
+    chosen: Windows,
+) -> Array:
+    """Returns relative poses (W, 3), each window started from its measured state."""
+    poses, _, _, step, share = from_measured_states(model, calibration, recording, spec, chosen)
+    row, share = np.arange(len(step)), share[:, None]
+    return np.asarray((1.0 - share) * poses[row, step] + share * poses[row, step + 1])
+
+
+def _roll(model: TaylorModel, state: Array, command: Array) -> tuple[Array, Array]:
+    """Rolls out poses (W, T + 1, 3) from the origin and states (W, T + 1, S).
+
+    The commands are (W, T, C). Headings are unwrapped.
+    """
+    count, steps = command.shape[:2]
+    poses, states = np.zeros((count, steps + 1, 3)), np.empty((count, steps + 1, state.shape[1]))
+    states[:, 0] = state
+    rollout(poses, states, np.ascontiguousarray(command), term_arrays(model), SERIES, model.dt)
+    return poses, states
+
+
+def open_loop_error(
+    model: TaylorModel,
+    calibration: Calibration,
+    recording: Recording,
+    spec: RobotSpec,
+    start: float,
+    stop: float,
+    horizon: float = HORIZON_S,
+) -> OpenLoop:
+    """Predicts a part of a drive open-loop and compares the end poses.
+
+    Args:
+        model: the model.
+        calibration: of this drive.
+        recording: the drive.
+        spec: the robot.
+        start: start of the part of the drive to use, from its first pose [s].
+        stop: its end [s].
+        horizon: length of each prediction [s].
+
+    Returns:
+        The errors over windows that start every 0.1 s.
+
+    Raises:
+        RecordingError: the part is too short for a window.
+    """
+    chosen = windows(recording, calibration, start, stop, horizon, SPACING_S)
+    if len(chosen.start_t) == 0:
+        raise RecordingError(
+            f"{recording.source}: the {stop - start:.1f} s from {start:.1f} s on hold no window of "
+            f"{horizon:g} s; record a longer drive or shorten the horizon."
+        )
+    error = predict(model, calibration, recording, spec, chosen) - chosen.end
+    position = np.hypot(error[:, 0], error[:, 1])
+    moved = chosen.end - chosen.start
+    return OpenLoop(
+        horizon_s=horizon,
+        windows=len(position),
+        mean_position_error_m=float(position.mean()),
+        median_position_error_m=float(np.median(position)),
+        max_position_error_m=float(position.max()),
+        mean_heading_error_rad=float(np.abs(geometry.wrap_angle(error[:, 2])).mean()),
+        mean_path_m=float(chosen.path.mean()),
+        median_displacement_m=float(np.median(np.hypot(moved[:, 0], moved[:, 1]))),
+    )

@@ -1,0 +1,124 @@
+"""Signals on a common time axis: held commands, lagged responses, poses between samples."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+from scipy.signal import lfilter
+
+from nics_drl_bridge.recording.recording import Stream
+from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.spec import RobotSpec
+
+Array = NDArray[np.float64]
+SMOOTHING_BATCH = 64
+
+
+def held(command: Stream, spec: RobotSpec, start: Array, end: Array) -> Array:
+    """Returns the mean of a held command over intervals.
+
+    Before its first command a robot stands still: commands that ever change are zero then.
+    A command that never changes is assumed to have had that value before.
+
+    Args:
+        command: (T, C) commands, each held until the next.
+        spec: gives the limits of the commands.
+        start: (...) of the intervals, on the commands' clock [s].
+        end: (...) [s].
+
+    Returns:
+        (..., C).
+    """
+    values = np.concatenate([_before(command, spec)[None], command.values])
+    return _means_of_held(command.t, values, start, end)
+
+
+def held_features(
+    command: Stream, spec: RobotSpec, powers: NDArray[np.int64], start: Array, end: Array
+) -> Array:
+    """Returns means (..., K) of features (K, C) of held commands over intervals, as in `held`."""
+    values = np.concatenate([_before(command, spec)[None], command.values])
+    return _means_of_held(command.t, taylor.evaluate(values, powers), start, end)
+
+
+def _before(command: Stream, spec: RobotSpec) -> Array:
+    """Returns the command (C,) in effect before the first one."""
+    still = np.clip(0.0, spec.command_low, spec.command_high)
+    return np.asarray(np.where(np.ptp(command.values, axis=0) > 0.0, still, command.values[0]))
+
+
+def _means_of_held(t: Array, values: Array, start: Array, end: Array) -> Array:
+    """Returns means (..., K) over intervals of values (T + 1, K) that change at times (T,)."""
+    low, high = min(start.min(), t[0]) - 1.0, max(end.max(), t[-1]) + 1.0
+    edges = np.concatenate([[low], t, [high]])
+    area = np.concatenate(
+        [np.zeros((1, values.shape[1])), np.cumsum(values * np.diff(edges)[:, None], 0)]
+    )
+    mean = [
+        (np.interp(end, edges, column) - np.interp(start, edges, column)) / (end - start)
+        for column in area.T
+    ]
+    return np.stack(mean, axis=-1)
+
+
+def lagged(signal: Array, lags: Array, dt: float, initial: Array) -> Array:
+    """Returns first-order responses to a signal that is constant over each step.
+
+    Args:
+        signal: (T, S) input of each response.
+        lags: (S,) time constants [s].
+        dt: step [s].
+        initial: (S,) response at the start.
+
+    Returns:
+        (T, S) response at the start of each step.
+    """
+    decay = np.exp(-dt / np.maximum(lags, 1e-6))
+    columns = [
+        lfilter([0.0, 1.0 - a], [1.0, -a], signal[:, i], zi=[initial[i]])[0]
+        for i, a in enumerate(decay)
+    ]
+    return np.stack(columns, axis=1) if columns else np.zeros((len(signal), 0))
+
+
+def interval_means(t: Array, values: Array, start: Array, end: Array) -> Array:
+    """Returns means (n, K) over intervals (n,) of values (T, K), linear between stamps (T,)."""
+    steps = np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2.0
+    area = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
+    means = [
+        (np.interp(end, t, column) - np.interp(start, t, column)) / (end - start)
+        for column in area.T
+    ]
+    return np.stack(means, axis=1) if means else np.zeros((len(start), 0))
+
+
+def unwrapped(pose: Array) -> Array:
+    """Returns poses (T, 3) with unwrapped headings."""
+    return np.concatenate([pose[:, :2], np.unwrap(pose[:, 2])[:, None]], axis=1)
+
+
+def resample(t: Array, pose: Array, at: Array, half_width: float) -> Array:
+    """Resamples unwrapped poses (T, 3) at times (T,), never decreasing, to poses (n, 3).
+
+    Args:
+        t: (T,) sample times [s].
+        pose: (T, 3), heading unwrapped.
+        at: (n,) times [s].
+        half_width: of a local parabola fitted to noisy samples [s]; 0 interpolates.
+    """
+    distinct = np.concatenate([[True], np.diff(t) > 0.0])
+    t, pose = t[distinct], pose[distinct]
+    if half_width == 0.0:
+        return np.asarray(make_interp_spline(t, pose, k=3)(at))
+    low = np.searchsorted(t, at - half_width)
+    low = np.clip(np.minimum(low, np.searchsorted(t, at) - 2), 0, max(len(t) - 4, 0))
+    high = np.maximum(np.searchsorted(t, at + half_width), low + 4)
+    index = low[:, None] + np.arange(min(SMOOTHING_BATCH, int((high - low).max())))
+    weight = (index < high[:, None]) & (index < len(t))
+    index = np.minimum(index, len(t) - 1)
+    tau = (t[index] - at[:, None]) / half_width
+    basis = tau[..., None] ** np.arange(3)
+    normal = np.einsum("nki,nk,nkj->nij", basis, weight, basis) + 1e-9 * np.eye(3)
+    right = np.einsum("nki,nk,nkd->nid", basis, weight, pose[index] - pose[low][:, None])
+    return np.asarray(np.linalg.solve(normal, right)[:, 0] + pose[low])

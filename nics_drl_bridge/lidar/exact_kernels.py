@@ -1,0 +1,273 @@
+"""Compiled inner loops of the lidar: the exact ranges of one object in one scan.
+
+Each function lowers the beams that hit its object in a scan `out` (B,), float32, in metres, and
+leaves the others unchanged, so that calling them one after the other is the fusion by minimum of
+Eq. 4. Positions are in the frame of the lidar. `beams` is the geometry of the beams: angle_min,
+angle_increment, and 1.0 for a full circle.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from nics_drl_bridge.kernels import kernel
+
+TWO_PI = 2.0 * math.pi
+ROUNDING = 1e-6
+"""Beams this near to an edge, in beams, are candidates; the exact test decides."""
+
+
+HALF_PI = 0.5 * math.pi
+TINY = 1e-300
+"""Avoids NaN for the angle of a zero vector."""
+ATAN = (
+    0.9999999996145,
+    -0.3333332366563,
+    0.1999959585417,
+    -0.1427904841688,
+    0.1105378475317,
+    -0.0879611755717,
+    0.0671011398839,
+    -0.0442736682632,
+    0.0222034549106,
+    -0.0071661648959,
+    0.0010844927512,
+)
+
+
+@kernel(inline=True)
+def arctan2(y, x):  # type: ignore[no-untyped-def]
+    """Angle of (x, y) within 3e-10 rad, without branches, so that loops over it are vectorised.
+
+    A polynomial in the square of the ratio of smaller to larger, fitted at Chebyshev nodes.
+    """
+    ax, ay = abs(x), abs(y)
+    ratio = min(ax, ay) / (max(ax, ay) + TINY)
+    s = ratio * ratio
+    r = ATAN[10]
+    r = r * s + ATAN[9]
+    r = r * s + ATAN[8]
+    r = r * s + ATAN[7]
+    r = r * s + ATAN[6]
+    r = r * s + ATAN[5]
+    r = r * s + ATAN[4]
+    r = r * s + ATAN[3]
+    r = r * s + ATAN[2]
+    r = r * s + ATAN[1]
+    r = (r * s + ATAN[0]) * ratio
+    r = HALF_PI - r if ay > ax else r
+    r = math.pi - r if x < 0.0 else r
+    return math.copysign(r, y)
+
+
+@kernel
+def _lower(out, i, value):  # type: ignore[no-untyped-def]
+    """Fuses one return into beam i."""
+    if value < out[i]:
+        out[i] = value
+
+
+@kernel
+def beam_span(low, high, beams, count):  # type: ignore[no-untyped-def]
+    """Returns the first beam and the number of beams in the angles [low, high].
+
+    In a full circle the beams may cross the seam: indices are modulo the count.
+    """
+    first = math.ceil((low - beams[0]) / beams[1] - ROUNDING)
+    last = math.floor((high - beams[0]) / beams[1] + ROUNDING)
+    if beams[2] > 0.0:
+        return first % count, min(last - first + 1, count)
+    first, last = max(first, 0), min(last, count - 1)
+    return first, max(last - first + 1, 0)
+
+
+@kernel
+def circle(out, directions, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
+    """Fuses the exact ranges to a circle at (x, y)."""
+    d2 = x * x + y * y
+    r2 = radius * radius
+    d = math.sqrt(d2)
+    if d - radius > range_max or radius <= 0.0:
+        return
+    count = out.shape[0]
+    if d2 <= r2:  # the lidar is inside: every beam hits the far side
+        for i in range(count):
+            c, s = directions[i, 0], directions[i, 1]
+            across = c * y - s * x
+            _lower(out, i, c * x + s * y + math.sqrt(max(r2 - across * across, 0.0)))
+        return
+    bearing = math.atan2(y, x)
+    half = math.asin(radius / d)
+    turns = 1 if beams[2] > 0.0 else 3
+    for turn in range(turns):
+        shift = 0.0 if turns == 1 else (turn - 1) * TWO_PI
+        first, hits = beam_span(bearing - half + shift, bearing + half + shift, beams, count)
+        for k in range(hits):
+            i = first + k
+            if i >= count:
+                i -= count
+            c, s = directions[i, 0], directions[i, 1]
+            across = c * y - s * x
+            rest = r2 - across * across
+            if rest >= 0.0:
+                _lower(out, i, c * x + s * y - math.sqrt(rest))
+
+
+@kernel
+def segment(out, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
+    """Fuses the exact ranges to the straight wall from (x1, y1) to (x2, y2)."""
+    edge(out, directions, beams, x1, y1, arctan2(y1, x1), x2, y2, arctan2(y2, x2), False)
+
+
+@kernel(inline=True)
+def edge(out, directions, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore[no-untyped-def]
+    """Like `segment`, with directions of its ends [rad]; `one_sided`: visible from its right."""
+    count = out.shape[0]
+    ex, ey = x2 - x1, y2 - y1
+    cross = x1 * ey - y1 * ex
+    if cross == 0.0 or (one_sided and cross > 0.0):  # seen edge-on, or from behind
+        return
+    low, high = (angle1, angle2) if cross > 0.0 else (angle2, angle1)
+    if high < low:
+        high += TWO_PI
+    turns = 1 if beams[2] > 0.0 else 3
+    for turn in range(turns):
+        shift = 0.0 if turns == 1 else (turn - 1) * TWO_PI
+        first, hits = beam_span(low + shift, high + shift, beams, count)
+        if hits > 0:
+            _cross(out, directions, first, min(first + hits, count), cross, ex, ey)
+            _cross(out, directions, 0, first + hits - count, cross, ex, ey)
+
+
+@kernel(inline=True)
+def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyped-def]
+    """Fuses a straight line into the beams from `begin` to `end`, in a vectorised loop."""
+    for k in range(end - begin):
+        i = np.uintp(begin + k)
+        distance = np.float32(cross / (directions[i, 0] * ey - directions[i, 1] * ex))
+        distance = distance if distance >= 0.0 else np.float32(np.inf)
+        held = out[i]
+        out[i] = distance if distance < held else held
+
+
+@kernel
+def polygon(out, directions, beams, x, y, c, s, corners):  # type: ignore[no-untyped-def]
+    """Fuses the exact ranges to the outline `corners` (V, 2), turned by (c, s), at (x, y)."""
+    last, cull = corners.shape[0] - 1, beside_convex(x, y, c, s, corners)
+    ax, ay = turned(x, y, c, s, corners[last])
+    angle = arctan2(ay, ax)
+    for v in range(last + 1):
+        bx, by = turned(x, y, c, s, corners[v])
+        next_angle = arctan2(by, bx)
+        edge(out, directions, beams, ax, ay, angle, bx, by, next_angle, cull)
+        ax, ay, angle = bx, by, next_angle
+
+
+@kernel
+def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
+    """True if an outline is convex and does not enclose the lidar; see `polygon`.
+
+    Then a ray first meets a side that has the lidar to its right. False if a side points at the
+    lidar, which may lie on it.
+    """
+    last, rounds = corners.shape[0] - 1, 0
+    bx, by = turned(x, y, c, s, corners[max(last - 1, 0)])
+    ax, ay = turned(x, y, c, s, corners[last])
+    ex, ey = ax - bx, ay - by
+    for v in range(last + 1):
+        bx, by = turned(x, y, c, s, corners[v])
+        gx, gy, cross = bx - ax, by - ay, ax * by - ay * bx
+        if ex * gy - ey * gx < 0.0 or cross == 0.0:
+            return False
+        if (ay <= 0.0) != (by <= 0.0):  # it crosses the ray ahead, or the one behind
+            rounds += int(ay <= 0.0 and cross > 0.0) - int(ay > 0.0 and cross < 0.0)
+        ax, ay, ex, ey = bx, by, gx, gy
+    return rounds == 0
+
+
+@kernel(inline=True)
+def turned(x, y, c, s, corner):  # type: ignore[no-untyped-def]
+    """Position of a corner (2,) of a shape turned by (c, s) and placed at (x, y)."""
+    return x + c * corner[0] - s * corner[1], y + s * corner[0] + c * corner[1]
+
+
+@kernel
+def clear(ranges, n, m):  # type: ignore[no-untyped-def]
+    """Sets the scan of robot m in world n of `ranges` (N, M, B) to no return."""
+    nothing = np.float32(np.inf)
+    for i in range(ranges.shape[2]):
+        ranges[n, m, i] = nothing
+
+
+@kernel
+def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
+    """Applies the limits to a scan (B,): too far becomes `inf`, too close `-inf` (REP-117)."""
+    low, high = np.float32(range_min), np.float32(range_max)
+    for i in range(out.shape[0]):
+        value = out[i]
+        value = value if value <= high else np.float32(np.inf)
+        out[i] = value if value >= low else np.float32(-np.inf)
+
+
+@kernel(inline=True)
+def sensor_pose(poses, n, m, mount):  # type: ignore[no-untyped-def]
+    """Returns x, y, heading of a lidar in its world, from poses (N, M, 3) and the mount (3,)."""
+    x, y, heading = poses[n, m, 0], poses[n, m, 1], poses[n, m, 2]
+    if mount[0] != 0.0 or mount[1] != 0.0:
+        c, s = math.cos(heading), math.sin(heading)
+        x, y = x + c * mount[0] - s * mount[1], y + s * mount[0] + c * mount[1]
+    return x, y, heading + mount[2]
+
+
+@kernel
+def to_sensor(poses, n, m, mount):  # type: ignore[no-untyped-def]
+    """Like `sensor_pose`, with cos and sin of the heading."""
+    x, y, heading = sensor_pose(poses, n, m, mount)
+    return x, y, heading, math.cos(heading), math.sin(heading)
+
+
+@kernel
+def walls_into(out, directions, beams, sx, sy, c, s, walls, range_max):  # type: ignore[no-untyped-def]
+    """Fuses straight walls (W, 4), given in the world, into a scan from (sx, sy, c, s).
+
+    Only beams that can meet the part of a wall within `range_max` are computed.
+
+    Returns:
+        Number of walls within range.
+    """
+    near = 0
+    for w in range(walls.shape[0]):
+        ax, ay = walls[w, 0] - sx, walls[w, 1] - sy
+        bx, by = walls[w, 2] - sx, walls[w, 3] - sy
+        ax, ay = c * ax + s * ay, c * ay - s * ax
+        bx, by = c * bx + s * by, c * by - s * bx
+        ex, ey = bx - ax, by - ay
+        length2, cross = ex * ex + ey * ey, ax * ey - ay * ex
+        chord2 = range_max * range_max * length2 - cross * cross
+        if chord2 < 0.0 or length2 == 0.0:
+            continue
+        # As shares of its length: the wall is nearest at `foot`, and in range within +-`half`.
+        foot, half = -(ax * ex + ay * ey) / length2, math.sqrt(chord2) / length2 + ROUNDING
+        first, last = max(foot - half, 0.0), min(foot + half, 1.0)
+        if first <= last:
+            near += 1
+            one = arctan2(ay + first * ey, ax + first * ex)
+            other = arctan2(ay + last * ey, ax + last * ex)
+            edge(out, directions, beams, ax, ay, one, bx, by, other, False)
+    return near
+
+
+@kernel
+def body_into(out, directions, beams, sx, sy, c, s, body, corners, corner, range_max):  # type: ignore[no-untyped-def]
+    """Fuses one body (7,), see `shapes.BODY`, into a scan from (sx, sy, c, s)."""
+    dx, dy = body[0] - sx, body[1] - sy
+    x, y = c * dx + s * dy, c * dy - s * dx
+    shape = int(body[6])
+    begin, end = corner[shape], corner[shape + 1]
+    if begin == end:
+        circle(out, directions, beams, x, y, body[5], range_max)
+    else:
+        cos, sin = body[3] * c + body[4] * s, body[4] * c - body[3] * s
+        polygon(out, directions, beams, x, y, cos, sin, corners[begin:end])

@@ -1,0 +1,106 @@
+"""Compiled inner loops of the canonical scan: from the beams of a lidar to sectors of a layout.
+
+Ranges follow REP-117: `inf` no return, `-inf` too close, NaN unknown. Shapes: B beams, S sectors.
+`plan` is `sectors.SectorPlan.arguments`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from nics_drl_bridge.kernels import kernel
+
+TURN = 2.0 * math.pi
+
+
+@kernel(allocates=True)
+def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
+    """Writes the nearest return in each sector (S,) of one scan (B,)."""
+    first, count, directions, shift, ring = plan
+    if shift[0] != 0.0 or shift[1] != 0.0:
+        _by_place(out, ranges, directions, shift, ring)
+    else:
+        _by_beam(out, ranges, first, count)
+
+
+@kernel(allocates=True)
+def resample_all(out, ranges, plan):  # type: ignore[no-untyped-def]
+    """Applies `resample` to scans (R, B), into (R, S)."""
+    for i in range(ranges.shape[0]):
+        resample(out[i], ranges[i], plan)
+
+
+@kernel(allocates=True)
+def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
+    """Fills each sector from `count` beams from `first` on, wrapping around to beam 0."""
+    beams = ranges.shape[0]
+    for s in range(out.shape[0]):
+        near, known = np.float32(np.inf), np.int32(0)
+        end = first[s] + count[s]
+        for b in range(first[s], min(end, beams)):
+            near = min(near, ranges[b]) if ranges[b] == ranges[b] else near
+            known |= np.int32(ranges[b] == ranges[b])
+        for b in range(end - beams):
+            near = min(near, ranges[b]) if ranges[b] == ranges[b] else near
+            known |= np.int32(ranges[b] == ranges[b])
+        out[s] = near if known != 0 else np.float32(np.nan)
+
+
+@kernel(allocates=True)
+def _by_place(out, ranges, directions, shift, ring):  # type: ignore[no-untyped-def]
+    """Fills each sector from the returns that lie in it as seen from the layout's viewpoint.
+
+    A sector left empty between the returns of two neighbouring beams takes the nearer of the two.
+
+    Args:
+        out: (S,) result.
+        ranges: (B,).
+        directions: (B, 2) of the beams in `base_link`.
+        shift: (2,) of the lidar from the viewpoint [m].
+        ring: angle_min and width of the sectors [rad], limits of the lidar [m], 1 if the last beam
+            and the first are neighbours.
+    """
+    sectors, beams = out.shape[0], ranges.shape[0]
+    where, value = np.empty(beams, np.int32), np.empty(beams, np.float32)
+    own = np.zeros(sectors, np.bool_)
+    for s in range(sectors):
+        out[s] = np.nan
+    for b in range(beams):
+        where[b], value[b] = _seen(ranges[b], directions[b], shift, ring)
+        s = where[b]
+        if 0 <= s < sectors:
+            own[s] = True
+            out[s] = _nearer(out[s], value[b])
+    around = round(TURN / ring[1])
+    for b in range(beams if ring[4] > 0.0 else beams - 1):
+        after = b + 1 if b + 1 < beams else 0
+        if where[b] < 0 or where[after] < 0:
+            continue
+        gap = (where[after] - where[b]) % around
+        step = 1 if gap <= around // 2 else -1
+        near = min(value[b], value[after])
+        s = where[b]
+        for _ in range((gap if step > 0 else around - gap) - 1):
+            s = (s + step) % around
+            if s < sectors and not own[s]:
+                out[s] = _nearer(out[s], near)
+
+
+@kernel(allocates=True)
+def _seen(r, direction, shift, ring):  # type: ignore[no-untyped-def]
+    """Sector of a return seen from the viewpoint, -1 if unknown, and its distance from there."""
+    if r != r:
+        return -1, np.float32(np.nan)
+    reach = min(max(float(r), 0.5 * ring[2]), ring[3])
+    x, y = shift[0] + reach * direction[0], shift[1] + reach * direction[1]
+    angle = (math.atan2(y, x) - ring[0]) % TURN
+    s = int(angle / ring[1]) if angle < TURN else 0  # a tiny negative angle is rounded to TURN
+    return s, np.float32(math.sqrt(x * x + y * y)) if math.isfinite(r) else r
+
+
+@kernel(allocates=True)
+def _nearer(one, other):  # type: ignore[no-untyped-def]
+    """Returns the lesser of two; `other` if `one` is NaN."""
+    return one if one <= other else other

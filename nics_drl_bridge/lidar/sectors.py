@@ -1,0 +1,297 @@
+"""The canonical scan: sectors around the robot, independent of the lidar.
+
+A policy learns on the sectors of one `ScanLayout`. The scan of any lidar is resampled into them by
+angle: simulator, middleware and deployment all use this module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from nics_drl_bridge.config import Schema, validate
+from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.geometry import wrap_angle
+from nics_drl_bridge.lidar import sector_kernels as kernels
+from nics_drl_bridge.lidar.shapes import LARGEST, Place
+from nics_drl_bridge.lidar.spec import FULL_CIRCLE_TOLERANCE, LidarSpec, ScanHeader
+
+Array = NDArray[np.float64]
+Ranges = NDArray[np.float32]
+
+COARSEST_RAD = 0.21
+"""Beams farther apart than this are rejected: at 1 m they would miss objects 0.2 m wide."""
+BORDER_RAD = 1e-4
+"""A beam this near to a border counts in both sectors; headers carry angles in float32."""
+RANGE_TOLERANCE = 1e-5
+"""Share by which a lidar's range may be less than the layout's, as rounded to float32."""
+
+
+class ScanLayout(Schema):
+    """The scan that a policy sees: the nearest return in each sector.
+
+    Sector 0 begins at `angle_min`, the others follow counter-clockwise. The angles are those of
+    `base_link`, seen from the viewpoint.
+
+    Attributes:
+        sectors: S.
+        angle_min: begin of the first sector [rad].
+        angle_max: end of the last sector [rad].
+        range_max: farther returns count as none [m].
+        viewpoint: x, y in `base_link` [m].
+    """
+
+    sectors: int = Field(ge=4, le=1440)
+    angle_min: float = -np.pi
+    angle_max: float = np.pi
+    range_max: float = Field(ge=1e-3, le=LARGEST)
+    viewpoint: tuple[Place, Place] = (0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> ScanLayout:
+        if not 0.0 < self.angle_max - self.angle_min <= 2.0 * np.pi + FULL_CIRCLE_TOLERANCE:
+            raise ValueError("angle_max must exceed angle_min by at most a full circle, in radians")
+        if max(-self.angle_min, self.angle_max) > 2.0 * np.pi + FULL_CIRCLE_TOLERANCE:
+            raise ValueError("angle_min and angle_max must lie within -2 pi and 2 pi")
+        return self
+
+    @property
+    def width(self) -> float:
+        """Width of a sector [rad]."""
+        return (self.angle_max - self.angle_min) / self.sectors
+
+    @cached_property
+    def angles(self) -> Array:
+        """(S,) middle of each sector in `base_link` [rad]."""
+        return np.asarray(self.angle_min + self.width * (np.arange(self.sectors) + 0.5))
+
+
+LAYOUTS = {
+    "around": ScanLayout(sectors=72, range_max=3.0),
+    "front": ScanLayout(sectors=54, angle_min=-0.75 * np.pi, angle_max=0.75 * np.pi, range_max=3.0),
+}
+"""Layouts by name: the full circle, and the 270 deg that most front-mounted lidars cover."""
+
+
+def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
+    """Returns the layout for a user's setting.
+
+    Args:
+        given: None, a ScanLayout, the name of one of `LAYOUTS`, its fields, or a number of sectors
+            over the lidar's field of view, seen from its mount.
+        lidar: used with a number of sectors.
+
+    Raises:
+        ConfigError: none of these.
+    """
+    if given is None or isinstance(given, ScanLayout):
+        return given
+    if isinstance(given, str):
+        if given not in LAYOUTS:
+            raise ConfigError(
+                f"task option scan={given!r}: no such layout; {nearest(given, LAYOUTS)}"
+            )
+        return LAYOUTS[given]
+    if isinstance(given, Mapping):
+        return validate(dict(given), ScanLayout, "task option scan")
+    if isinstance(given, int | np.integer) and not isinstance(given, bool):
+        x, y, heading = lidar.mount
+        middle = 0.5 * (lidar.angle_min + lidar.angle_max)
+        begin = lidar.angle_min + float(wrap_angle(middle + heading)) - middle
+        span = lidar.angle_max - lidar.angle_min
+        fields = {"angle_min": begin, "angle_max": begin + span, "range_max": lidar.range_max}
+        return validate(
+            {"sectors": int(given), "viewpoint": (x, y), **fields}, ScanLayout, "task option scan"
+        )
+    raise ConfigError(
+        f"task option scan={given!r}: must be a number of sectors, a mapping, or one of "
+        f"{', '.join(map(repr, LAYOUTS))}."
+    )
+
+
+@dataclass(frozen=True)
+class SectorPlan:
+    """Assignment of the beams of one lidar to the sectors of one layout; computed once.
+
+    Attributes:
+        first: (S,) int32, the first beam of each sector.
+        count: (S,) int32, number of its beams; they continue with beam 0 after the last.
+        directions: (B, 2) of the beams in `base_link`.
+        shift: (2,) of the lidar from the viewpoint [m]; if zero, sectors are filled by beam.
+        ring: (5,) angle_min and width of the sectors [rad], limits of the lidar [m], and 1 if
+            the last beam and the first are neighbours.
+    """
+
+    first: NDArray[np.int32]
+    count: NDArray[np.int32]
+    directions: Array
+    shift: Array
+    ring: Array
+
+    @property
+    def arguments(self) -> tuple[NDArray[Any], ...]:
+        """Arguments of the kernels."""
+        return self.first, self.count, self.directions, self.shift, self.ring
+
+    def resample(self, ranges: Ranges) -> Ranges:
+        """Resamples scans (..., B) to the nearest return (..., S) in each sector [m], REP-117.
+
+        A sector without a beam takes the nearer return of the two adjacent beams. NaN stays where
+        nothing was measured.
+        """
+        rows = np.ascontiguousarray(ranges, np.float32).reshape(-1, len(self.directions))
+        out = np.empty((len(rows), len(self.first)), np.float32)
+        kernels.resample_all(out, rows, self.arguments)
+        return out.reshape(*np.shape(ranges)[:-1], -1)
+
+
+NO_PLAN = SectorPlan(
+    np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(2), np.zeros(5)
+)
+"""Plan without sectors, for policies that observe the beams themselves."""
+
+
+def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
+    """Returns the plan by which a lidar fills a layout.
+
+    Raises:
+        ConfigError: the lidar does not cover every sector, its range is too short, or its beams
+            are more than `COARSEST_RAD` apart.
+    """
+    x, y, heading = lidar.mount
+    angles = lidar.angles + heading
+    _check(lidar, layout, angles)
+    first, count = np.zeros((2, layout.sectors), np.int32)
+    for s, middle in enumerate(layout.angles):
+        first[s], count[s] = _beams_of(wrap_angle(angles - middle), 0.5 * layout.width + BORDER_RAD)
+    left_open = 2.0 * np.pi - (lidar.angles[-1] - lidar.angles[0])
+    closed = left_open <= max(COARSEST_RAD, lidar.angle_increment)
+    return SectorPlan(
+        first,
+        count,
+        np.stack([np.cos(angles), np.sin(angles)], axis=1),
+        np.array([x - layout.viewpoint[0], y - layout.viewpoint[1]]),
+        np.array([layout.angle_min, layout.width, lidar.range_min, lidar.range_max, float(closed)]),
+    )
+
+
+def _beams_of(away: Array, half: float) -> tuple[int, int]:
+    """First beam and number of beams within `half` of a direction, or the adjacent beams if none.
+
+    Args:
+        away: (B,) angle of each beam from the middle of the sector [rad], wrapped.
+        half: half the width of the sector [rad].
+    """
+    inside = np.abs(away) <= half
+    if not inside.any():
+        below = int(np.argmax(np.where(away < 0.0, away, -np.inf)))
+        above = int(np.argmin(np.where(away >= 0.0, away, np.inf)))
+        beside = [b for b in (below, above) if abs(away[b]) <= COARSEST_RAD]
+        return beside[0], len(beside)
+    begins = np.flatnonzero(inside & ~np.roll(inside, 1))
+    return (int(begins[0]) if len(begins) else 0), int(inside.sum())
+
+
+def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
+    apart = lidar.angle_increment if lidar.beams > 1 else np.inf
+    if apart > COARSEST_RAD:
+        raise ConfigError(
+            f"the beams of the lidar {lidar.name!r} are {np.degrees(apart):.3g} deg apart, a scan "
+            f"layout needs at most {np.degrees(COARSEST_RAD):.3g}; use a finer lidar."
+        )
+    if lidar.range_max < layout.range_max * (1.0 - RANGE_TOLERANCE):
+        raise ConfigError(
+            f"range_max of the lidar {lidar.name!r} is {lidar.range_max:g} m, the scan layout "
+            f"needs {layout.range_max:g} m; use a lidar that sees farther, or another layout."
+        )
+    steps = max(layout.sectors, int(np.ceil((layout.angle_max - layout.angle_min) / apart)))
+    wanted = np.linspace(layout.angle_min, layout.angle_max, steps + 1)
+    ordered = np.sort(np.mod(angles, 2.0 * np.pi))
+    ordered = np.concatenate([ordered[-1:] - 2.0 * np.pi, ordered, ordered[:1] + 2.0 * np.pi])
+    place = np.mod(wanted, 2.0 * np.pi)
+    after = np.searchsorted(ordered, place).clip(1, len(ordered) - 1)
+    gap = np.minimum(place - ordered[after - 1], ordered[after] - place)
+    if (gap > apart + BORDER_RAD).any():
+        begin, end = np.degrees([angles[0], angles[-1]])
+        raise ConfigError(
+            f"the lidar {lidar.name!r} looks from {begin:.4g} to {end:.4g} deg in base_link, the "
+            f"scan layout needs {np.degrees(layout.angle_min):.4g} to "
+            f"{np.degrees(layout.angle_max):.4g}; use a wider lidar, or another layout."
+        )
+
+
+@dataclass(frozen=True)
+class Reader:
+    """Converts the ranges of a device to the beam order of a LidarSpec.
+
+    Attributes:
+        lidar: the device.
+        backwards: whether its beams are in clockwise order.
+    """
+
+    lidar: LidarSpec
+    backwards: bool
+
+    def ordered(self, values: Ranges) -> Ranges:
+        """Returns ranges (..., B) in counter-clockwise order."""
+        return values[..., ::-1] if self.backwards else values
+
+
+def reader_of(header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool = False) -> Reader:
+    """Returns the reader for scans with a given header.
+
+    Args:
+        header: of a LaserScan. A negative `angle_increment` means clockwise beams.
+        beams: B.
+        like: provides the properties that headers lack: mount, frame, the value for no return.
+        upside_down: whether the device is mounted with its z axis down, so that it turns clockwise.
+
+    Raises:
+        ConfigError: the header does not describe a lidar.
+    """
+    begin, step = header.angle_min, header.angle_increment
+    if upside_down:
+        begin, step = -begin, -step
+    if not (np.isfinite([begin, step]).all() and step != 0.0 and beams > 1):
+        raise ConfigError(
+            f"LaserScan of {beams} beams, angle_min {header.angle_min:g}, angle_increment "
+            f"{header.angle_increment:g}: describes no lidar; mend the driver's parameters."
+        )
+    backwards = step < 0.0
+    if backwards:
+        begin, step = begin + step * (beams - 1), -step
+    turn = 2.0 * np.pi
+    if begin < -turn or begin + step * (beams - 1) > turn:
+        begin = -(-begin % turn)
+    span = step * (beams - 1)
+    if abs(span + step - turn) < 0.1 * step:
+        span = turn  # the next beam would be the first again
+    elif turn - FULL_CIRCLE_TOLERANCE < span < turn + 0.1 * step:
+        span = turn - 2.0 * FULL_CIRCLE_TOLERANCE  # first and last beam coincide
+    fields = like.model_dump() | {
+        "name": "scan", "beams": beams, "angle_min": begin, "angle_max": begin + span,
+        "range_min": header.range_min, "range_max": header.range_max,
+    }  # fmt: skip
+    return Reader(validate(fields, LidarSpec, "LaserScan"), backwards)
+
+
+def reader_beside(
+    header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool = False
+) -> Reader:
+    """Like `reader_of`, but returns exactly the expected lidar if the header agrees with it."""
+    found = reader_of(header, beams, like, upside_down)
+    limits = np.array([found.lidar.range_min, found.lidar.range_max])
+    same = found.lidar.beams == like.beams and np.allclose(
+        limits, [like.range_min, like.range_max], rtol=1e-4, atol=1e-4
+    )
+    turned = found.lidar.angles - like.angles if same else np.ones(1)
+    whole = 2.0 * np.pi * np.round(turned[0] / (2.0 * np.pi))  # the same beams, off by full turns
+    if same and np.abs(turned - whole).max() < 0.1 * like.angle_increment:
+        return Reader(like, found.backwards)
+    return found

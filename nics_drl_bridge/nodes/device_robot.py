@@ -1,0 +1,356 @@
+"""RobotPort: the data of one simulated robot, written into prepared messages.
+
+CommandInlet: the commands of one robot, in any supported message.
+
+Outbox: messages that a device publishes later than it measured them.
+
+Transforms of a device: `/tf` and `/tf_static`, if the message package is installed.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import math
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TransformStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import ArrayLike, NDArray
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState, LaserScan
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.lidar.spec import to_device
+from nics_drl_bridge.nodes import conversions, qos, wire
+from nics_drl_bridge.nodes.device_parameters import DeviceTiming, Frames
+from nics_drl_bridge.nodes.qos import owner
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.sim.device import LEAST_VARIANCE, Sensed, variances
+
+PLANAR = np.array([0, 1, 5])
+DIAGONAL = np.arange(0, 36, 7)
+
+
+class RobotPort:
+    """Publishes `scan`, `odom`, `joint_states` and `ground_truth` of one robot.
+
+    The last two cost nothing without subscribers.
+
+    Args:
+        node: that publishes.
+        namespace: of the robot below the node's, empty or with a slash at its end.
+        model: of the robot.
+        frames: of the robot.
+        time: timing of the device.
+    """
+
+    def __init__(
+        self, node: Node, namespace: str, model: SimulatorModel, frames: Frames, time: DeviceTiming
+    ) -> None:
+        self._model, self._time, self.frames = model, time, frames
+        quality = qos.SENSOR_RELIABLE
+        self._scans = node.create_publisher(LaserScan, f"{namespace}scan", quality)
+        self._odoms = node.create_publisher(Odometry, f"{namespace}odom", quality)
+        self._truths = node.create_publisher(Odometry, f"{namespace}ground_truth", quality)
+        self._joints = node.create_publisher(JointState, f"{namespace}joint_states", quality)
+        scan, odom = scan_message(model, frames.laser, time), odometry_message(frames)
+        # Beam 0 of a device that turns counter-clockwise was measured first.
+        sweep_s = max(0.0, scan.time_increment) * (model.lidar.beams - 1)
+        self._sweep_ns = 0 if time.lockstep else round(sweep_s * NS_PER_S)
+        odom.twist.covariance[DIAGONAL[PLANAR]] = variances(model.noise.odometry)
+        self._scan, self._odom = wire.ScanWriter(scan), wire.OdometryWriter(odom)
+        self._truth = wire.OdometryWriter(truth_message(frames))
+        self._moving = [transform_message(frames.odom, frames.base)]
+        if node.get_parameter("publish_map_to_odom").value:
+            self._moving.append(transform_message(frames.map, frames.odom))
+
+    def mount(self) -> TransformStamped:
+        """Returns the transform base_link -> laser."""
+        message = transform_message(self.frames.base, self.frames.laser)
+        return fill(message, self._model.lidar.mount, Time())
+
+    def moving(self, now: Time, sensed: Sensed) -> list[TransformStamped]:
+        """Returns the transforms odom -> base_link, and map -> odom if requested."""
+        fill(self._moving[0], sensed.odom, now)
+        for message in self._moving[1:]:
+            # The transform from the odometry pose to the true one.
+            home = geometry.between(sensed.odom, np.zeros(3))
+            fill(message, geometry.compose(sensed.pose, home), now)
+        return self._moving
+
+    def tell_odometry(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
+        """Publishes odometry, and joints and true pose if they have subscribers."""
+        late_ns = self._time.odom_late_ns
+        odometry = self._odom.write(now_ns, sensed.odom, sensed.twist, sensed.covariance)
+        outbox.send(self._odoms, odometry, now_ns, late_ns)
+        if self._joints.get_subscription_count():
+            joints = conversions.joints_to_ros(self._model.robot, sensed.state, now_ns)
+            outbox.send(self._joints, joints, now_ns, late_ns)
+        if self._truths.get_subscription_count():
+            self._truths.publish(self._truth.write(now_ns, sensed.pose, sensed.true_twist))
+
+    def tell_scan(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
+        """Publishes the robot's scan, stamped with the time of beam 0."""
+        ranges = to_device(sensed.ranges, self._model.lidar)
+        message = self._scan.write(now_ns - self._sweep_ns, ranges)
+        outbox.send(self._scans, message, now_ns, self._time.scan_late_ns)
+
+
+def scan_message(model: SimulatorModel, frame: str, time: DeviceTiming) -> LaserScan:
+    """Returns a scan whose ranges and stamp are still to be filled in."""
+    free = np.full(model.lidar.beams, np.inf, np.float32)
+    message = conversions.scan_to_ros(model.lidar, free, 0, frame)
+    message.scan_time = time.scan_ns / NS_PER_S
+    return message
+
+
+def odometry_message(frames: Frames) -> Odometry:
+    """Returns an odometry to be filled in; its out-of-plane values are marked as unknown."""
+    return _planar_message(frames.odom, frames.base)
+
+
+def truth_message(frames: Frames) -> Odometry:
+    """Returns the same for the exact pose and twist."""
+    message = _planar_message(frames.map, frames.base)
+    for covariance in (message.pose.covariance, message.twist.covariance):
+        covariance[DIAGONAL[PLANAR]] = LEAST_VARIANCE
+    return message
+
+
+def _planar_message(parent: str, child: str) -> Odometry:
+    message = Odometry(child_frame_id=child)
+    message.header.frame_id = parent
+    for covariance in (message.pose.covariance, message.twist.covariance):
+        covariance[DIAGONAL] = conversions.UNUSED_VARIANCE
+    return message
+
+
+Array = NDArray[np.float64]
+TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+SWITCH = {STAMPED: "enable_stamped_cmd_vel:=false", TWIST: "enable_stamped_cmd_vel:=true"}
+"""By the expected type: the setting that selects the other type."""
+QUIET_S = 5.0
+
+
+class CommandInlet:
+    """Listens to `cmd_vel`, and to `ackermann_cmd` if the robot steers and the message exists.
+
+    A stamped command is treated as by ros2_control's drive controllers: a stamp of zero counts as
+    now, and a command older than the command timeout is ignored.
+
+    Args:
+        node: that listens; its parameter `enable_stamped_cmd_vel` selects the type.
+        namespace: of the robot below the node's, empty or with a slash at its end.
+        robot: defines the commands.
+        quality: of the subscriptions.
+        take: called with each command (C,).
+        too_old: returns whether a stamp [ns] is too old to be obeyed.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        namespace: str,
+        robot: RobotSpec,
+        quality: QoSProfile,
+        take: Callable[[Array], None],
+        too_old: Callable[[int], bool],
+    ) -> None:
+        self._node, self._robot, self._take, self._too_old = node, robot, take, too_old
+        stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
+        self._kind = STAMPED if stamped else TWIST
+        kind, hear = (TwistStamped, self._on_stamped) if stamped else (Twist, self._on_bytes)
+        self._topic: str = node.create_subscription(
+            kind, f"{namespace}cmd_vel", hear, quality, raw=not stamped
+        ).topic_name
+        self._warned: set[str] = set()
+        self._steering = steering_of(robot)
+        if self._steering is not None:
+            self._listen_to_ackermann(f"{namespace}ackermann_cmd", quality)
+
+    def _listen_to_ackermann(self, topic: str, quality: QoSProfile) -> None:
+        try:
+            kind = import_module("ackermann_msgs.msg").AckermannDriveStamped
+        except ModuleNotFoundError:
+            return  # an optional package
+        self._node.create_subscription(kind, topic, self._on_ackermann, quality)
+
+    def _on_bytes(self, content: bytes) -> None:
+        try:
+            self._obey(wire.twist_of(content))
+        except wire.UNREADABLE as error:
+            self._complain(f"a message that can't be read ({error}) is ignored")
+
+    def _obey(self, twist: tuple[float, float, float]) -> None:
+        if all(map(math.isfinite, twist)):
+            self._take(self._robot.from_cmd_vel(twist))
+        else:
+            self._complain("NaN or inf ignored")
+
+    def _on_stamped(self, message: TwistStamped) -> None:
+        if self._is_fresh(message.header.stamp):
+            twist = message.twist
+            self._obey((twist.linear.x, twist.linear.y, twist.angular.z))
+
+    def _on_ackermann(self, message: Any) -> None:
+        command = np.empty(2)
+        command[list(self._steering or ())] = message.drive.speed, message.drive.steering_angle
+        if not np.isfinite(command).all():
+            self._complain("NaN or inf ignored")
+        elif self._is_fresh(message.header.stamp):
+            self._take(command)
+
+    def _is_fresh(self, stamp: Any) -> bool:
+        stamp_ns = conversions.stamp_from_ros(stamp)
+        if stamp_ns and self._too_old(stamp_ns):
+            self._complain(
+                "a command is ignored, because its stamp is older than command_timeout; do both "
+                "ends take their time from the same clock (use_sim_time)?"
+            )
+            return False
+        return True
+
+    def _complain(self, what: str) -> None:
+        self._node.get_logger().warning(f"{self._topic}: {what}", throttle_duration_sec=QUIET_S)
+
+    def watch(self) -> None:
+        """Warns once of each node that publishes the other type, which is never received."""
+        for end in self._node.get_publishers_info_by_topic(self._topic):
+            kind, who = end.topic_type, owner(end)
+            if kind == self._kind or who is None or f"{who} {kind}" in self._warned:
+                continue
+            self._warned.add(f"{who} {kind}")
+            switch = SWITCH[self._kind] if kind in SWITCH else "another type there"
+            self._node.get_logger().warning(
+                f"{self._topic}: {who} publishes {kind}, but {self._kind} is expected here, so "
+                f"that its commands are not heard; let it publish that, or set {switch}."
+            )
+
+
+def steering_of(robot: RobotSpec) -> tuple[int, int] | None:
+    """Returns the indices of speed [m/s] and steering angle [rad]; None for other commands."""
+    units = [variable.unit for variable in robot.command]
+    return (units.index("m/s"), units.index("rad")) if sorted(units) == ["m/s", "rad"] else None
+
+
+class Outbox:
+    """Publishes messages after a latency and a jitter, each topic in order.
+
+    Without either, a message is published at once. Otherwise its bytes are kept, so that the
+    caller may reuse it.
+
+    Args:
+        seed: of the random jitter.
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        self._random = np.random.default_rng(seed)
+        self._waiting: list[tuple[int, int, Publisher, bytes]] = []
+        self._latest: dict[Publisher, int] = {}
+        self._numbers = itertools.count()
+
+    def send(
+        self, publisher: Publisher, message: Any, now_ns: int, late_ns: tuple[int, int]
+    ) -> None:
+        """Publishes a message now, or schedules it.
+
+        Args:
+            publisher: to publish with.
+            message: to publish, or its bytes.
+            now_ns: present time.
+            late_ns: least delay, and greatest additional one, drawn uniformly for each message.
+        """
+        delay, jitter = late_ns
+        if jitter:
+            delay += int(self._random.integers(jitter + 1))
+        if not delay:
+            publisher.publish(message)
+            return
+        due = max(now_ns + delay, self._latest.get(publisher, 0))
+        self._latest[publisher] = due
+        content = message if isinstance(message, bytes) else serialize_message(message)
+        heapq.heappush(self._waiting, (due, next(self._numbers), publisher, content))
+
+    def flush(self, now_ns: int) -> None:
+        """Publishes what is due."""
+        while self._waiting and self._waiting[0][0] <= now_ns:
+            _, _, publisher, content = heapq.heappop(self._waiting)
+            publisher.publish(content)
+
+    def clear(self) -> None:
+        """Drops the waiting messages: they are from an episode that is over."""
+        self._waiting.clear()
+        self._latest.clear()
+
+
+MISSING = (
+    "the message package tf2_msgs is not installed, so that neither /tf nor /tf_static is "
+    "published; install it with your ROS 2 distribution."
+)
+
+
+def transform_message(parent: str, child: str) -> TransformStamped:
+    """Returns a transform between two frames that is still to be filled in."""
+    message = TransformStamped(child_frame_id=child)
+    message.header.frame_id = parent
+    return message
+
+
+def fill(message: TransformStamped, pose: ArrayLike, stamp: Any) -> TransformStamped:
+    """Writes a pose (3,) of the child in the parent into a transform."""
+    x, y, heading = np.asarray(pose, np.float64).tolist()
+    message.header.stamp = stamp
+    message.transform.translation.x, message.transform.translation.y = x, y
+    message.transform.rotation = conversions.heading_to_ros(heading)
+    return message
+
+
+class Transforms:
+    """Publishes transforms; if it can't, it logs the reason once.
+
+    Args:
+        node: that publishes.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._moving: Any = None
+        try:
+            self._kind = import_module("tf2_msgs.msg").TFMessage
+        except ModuleNotFoundError:
+            node.get_logger().warning(MISSING)
+            return
+        self._message = self._kind()
+        self._moving = node.create_publisher(self._kind, "/tf", qos.TRANSFORMS)
+        self._fixed = node.create_publisher(self._kind, "/tf_static", qos.FIXED_TRANSFORMS)
+
+    @property
+    def published(self) -> bool:
+        """True if transforms are published."""
+        return self._moving is not None
+
+    def tell_fixed(self, transforms: list[TransformStamped]) -> None:
+        """Publishes once what never changes; late joiners get it, too."""
+        if self.published:
+            self._fixed.publish(self._kind(transforms=transforms))
+
+    def tell(
+        self,
+        transforms: list[TransformStamped],
+        outbox: Outbox,
+        now_ns: int,
+        late_ns: tuple[int, int],
+    ) -> None:
+        """Publishes what changes, with the delay of the odometry that it comes from."""
+        if self.published:
+            self._message.transforms = transforms
+            outbox.send(self._moving, self._message, now_ns, late_ns)

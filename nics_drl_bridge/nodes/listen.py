@@ -1,0 +1,86 @@
+"""Collection of facts about a live robot, by listening, for `report.doctor`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from nics_drl_bridge.nodes.message_types import message_type
+from nics_drl_bridge.nodes.qos import offer_of
+from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.report.doctor_facts import KINDS, Endpoints, Facts, names_in
+
+NAME = "nics_doctor"
+SPIN_S = 0.1
+LOOK_S = 0.5
+DISCOVERY_S = 10.0
+QUEUE = 100
+
+ANY_PUBLISHER = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=QUEUE, reliability=ReliabilityPolicy.BEST_EFFORT
+)
+"""Matches any offer, so that a topic is never silent because of the doctor."""
+
+
+def listen(seconds: float, namespace: str = "", domain_id: int | None = None) -> Facts:
+    """Listens to a robot without sending anything.
+
+    Args:
+        seconds: duration from the first message on, which is awaited for at most 10 s.
+        namespace: of the robot.
+        domain_id: DDS domain; the environment's by default.
+    """
+    context = open_context([], domain_id)
+    node = Node(NAME, context=context, start_parameter_services=False)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    facts = Facts(f"the robot in {namespace or '/'}", True, names_in(namespace))
+    subscribed: set[str] = set()
+    began, looked, end = time.monotonic(), 0.0, None
+    try:
+        while time.monotonic() < (began + DISCOVERY_S if end is None else end):
+            if time.monotonic() - looked > LOOK_S:
+                looked = time.monotonic()
+                _look(node, facts, subscribed)
+            executor.spin_once(timeout_sec=SPIN_S)
+            if end is None and facts.heard:
+                end = time.monotonic() + seconds
+        _look(node, facts, subscribed)
+    finally:
+        executor.shutdown(timeout_sec=1.0)
+        node.destroy_node()
+        context.try_shutdown()
+    facts.end_ns = time.time_ns()
+    return facts
+
+
+def _look(node: Node, facts: Facts, subscribed: set[str]) -> None:
+    """Notes the publishers and subscribers; subscribes to topics of types that can be judged."""
+    for topic, kinds in node.get_topic_names_and_types():
+        offers = node.get_publishers_info_by_topic(topic)
+        asks = [i for i in node.get_subscriptions_info_by_topic(topic) if i.node_name != NAME]
+        told = {info.topic_type for info in offers} or set(kinds)
+        facts.topics[topic] = Endpoints(
+            tuple(sorted(told)),
+            tuple(offer_of(info.qos_profile) for info in offers),
+            tuple(offer_of(info.qos_profile) for info in asks),
+        )
+    for role, topic in facts.names.items():
+        there = facts.topics.get(topic, Endpoints(()))
+        wanted = [kind for kind in there.types if kind in KINDS[role]]
+        if there.offers and wanted and role not in subscribed:
+            subscribed.add(role)
+            kind = message_type(wanted[0])
+            node.create_subscription(kind, topic, _taker(facts, role), ANY_PUBLISHER)
+
+
+def _taker(facts: Facts, role: str) -> Callable[[Any, Any], None]:
+    def take(message: Any, info: Any) -> None:
+        facts.take(role, int(info.get("received_timestamp") or time.time_ns()), message)
+
+    return take

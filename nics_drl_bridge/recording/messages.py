@@ -1,0 +1,139 @@
+"""Conversion of a bag's messages to rows of numbers, and message types that rosbags lacks.
+
+Quality of service offered by publishers, as stored in a bag.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.recording import topic_roles
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Qos
+    from rosbags.typesys.store import Typestore
+
+Row = tuple[float, float, float]
+
+ACKERMANN_DEFINITION = (
+    "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
+    "float32 acceleration\nfloat32 jerk\n"
+)
+ACKERMANN_STAMPED_DEFINITION = "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
+
+
+def typestore() -> Typestore:
+    """Returns the message types of ROS 2, and those of Ackermann drives."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(ACKERMANN_DEFINITION, topic_roles.ACKERMANN))
+    store.register(get_types_from_msg(ACKERMANN_STAMPED_DEFINITION, topic_roles.ACKERMANN_STAMPED))
+    return store
+
+
+def frames(transform: Any) -> tuple[str, str]:
+    """Returns parent and child of a transform, without the leading slash of old publishers."""
+    return transform.header.frame_id.strip("/"), transform.child_frame_id.strip("/")
+
+
+def stamp(message: Any) -> int:
+    """Returns the stamp of a message's header [ns]."""
+    time = message.header.stamp
+    return int(time.sec) * NS_PER_S + int(time.nanosec)
+
+
+def command_row(message: Any) -> Row:
+    """Returns linear.x, linear.y, angular.z; of an Ackermann drive speed, 0, steering angle."""
+    drive = getattr(message, "drive", message)
+    if hasattr(drive, "steering_angle"):
+        return drive.speed, 0.0, drive.steering_angle
+    twist = getattr(message, "twist", message)
+    return twist.linear.x, twist.linear.y, twist.angular.z
+
+
+def _place(message: Any) -> tuple[Any, Any]:
+    """Returns position and quaternion of any message that has them."""
+    if hasattr(message, "transform"):
+        return message.transform.translation, message.transform.rotation
+    pose = getattr(message.pose, "pose", message.pose)
+    return pose.position, pose.orientation
+
+
+def quaternion(message: Any) -> tuple[float, float, float, float]:
+    """Returns x, y, z, w of a message's orientation."""
+    q = _place(message)[1]
+    return q.x, q.y, q.z, q.w
+
+
+def pose_row(message: Any) -> Row:
+    """Returns position x, y [m] and heading [rad]."""
+    position, q = _place(message)
+    heading = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+    return position.x, position.y, heading
+
+
+def twist_row(message: Any) -> Row:
+    """Returns body velocity x, y [m/s] and yaw rate [rad/s] of an Odometry."""
+    twist = message.twist.twist
+    return twist.linear.x, twist.linear.y, twist.angular.z
+
+
+def imu_row(message: Any) -> Row:
+    """Returns acceleration along x and y [m/s^2] and yaw rate [rad/s]."""
+    acceleration = message.linear_acceleration
+    return acceleration.x, acceleration.y, message.angular_velocity.z
+
+
+@dataclass(frozen=True)
+class Offer:
+    """Quality of service that a publisher offers, as far as it decides which subscribers match.
+
+    Attributes:
+        depth: of its history.
+        reliable: False for best effort.
+        transient_local: late subscribers get earlier messages; False for volatile.
+    """
+
+    depth: int = 10
+    reliable: bool = True
+    transient_local: bool = False
+
+
+def offers_of(profiles: Sequence[Qos]) -> tuple[Offer, ...]:
+    """Converts profiles of rosbags to offers."""
+    from rosbags.interfaces import QosDurability, QosReliability
+
+    return tuple(
+        Offer(
+            max(int(profile.depth), 1),
+            profile.reliability is not QosReliability.BEST_EFFORT,
+            profile.durability is QosDurability.TRANSIENT_LOCAL,
+        )
+        for profile in profiles
+    )
+
+
+def profile_of(offer: Offer) -> Qos:
+    """Converts an offer to a profile of rosbags; the other policies keep their defaults."""
+    from rosbags.interfaces import (
+        Qos,
+        QosDurability,
+        QosHistory,
+        QosLiveliness,
+        QosReliability,
+        QosTime,
+    )
+
+    forever = QosTime(9223372036, 854775807)
+    return Qos(
+        QosHistory.KEEP_LAST,
+        offer.depth,
+        QosReliability.RELIABLE if offer.reliable else QosReliability.BEST_EFFORT,
+        QosDurability.TRANSIENT_LOCAL if offer.transient_local else QosDurability.VOLATILE,
+        forever, forever, QosLiveliness.AUTOMATIC, forever, False,
+    )  # fmt: skip

@@ -1,0 +1,278 @@
+"""Recording: the recorded data of a drive; Samples: the input of a fit.
+
+A `Recording` contains separately stamped streams, as a robot delivers them. Calibration turns it
+into `Samples`, the paper's data `D_t = (t, Q_t, X_t, dQ_t)` (Sec. IV-A) on one time axis.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.config import no_device
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.npz import is_sealed, npz_arrays, npz_bytes, read_file
+from nics_drl_bridge.robot.noise import Latency
+from nics_drl_bridge.robot.spec import RobotSpec
+
+Array = NDArray[np.float64]
+FORMAT = "nics_drl_bridge/recording/2"
+UNSEALED_FORMAT = "nics_drl_bridge/recording/1"
+"""Format of files without a checksum, which can still be read."""
+LARGEST_TURN = 1.5
+"""A larger turn between neighbouring samples [rad] is implausible,"""
+TOO_FAST = 20.0
+"""and so is a speed of more than this many times the greatest command."""
+SPEED_OVER_S = 0.5
+SLOWEST_SAMPLING_S = 2.0
+IRREGULAR = 0.5
+"""A step whose length differs from the median by this share is a gap or a repetition."""
+JITTER = 1e-4
+ROUNDING_S = 1e-6
+"""Steps whose lengths differ by less are equally long, apart from rounding of their stamps."""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Values with stamps.
+
+    Attributes:
+        t: (T,) stamps [s], never decreasing.
+        values: (T, D).
+        clock: name of the clock of the stamps. Streams of one clock share an origin; between two
+            clocks there is an unknown offset.
+    """
+
+    t: Array
+    values: Array
+    clock: str = "robot"
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A drive of a robot.
+
+    Attributes:
+        command: (T, C) commands, in the order of the RobotSpec.
+        pose: (T, 3) x [m], y [m], heading [rad] of the tracked body, in a fixed frame.
+        state: (T, S) measured state in the order of the RobotSpec, if any.
+        wheels: (T, 2) left and right wheel speed in the encoder's units, if any.
+        imu: (T, 3) acceleration along x and y [m/s^2] and yaw rate [rad/s] of the sensor, if any.
+        odometry: (T, 3) body twist reported by the wheels, vx, vy [m/s] and yaw rate [rad/s], if
+            it was recorded in addition to a separate pose.
+        source: origin of the recording, for reports and errors.
+        variables: names of X = [state, command] of the recorded robot, if known.
+        latency: of its scan and odometry, if the recording shows it.
+    """
+
+    command: Stream
+    pose: Stream
+    state: Stream | None = None
+    wheels: Stream | None = None
+    imu: Stream | None = None
+    odometry: Stream | None = None
+    source: str = "recording"
+    variables: tuple[str, ...] = ()
+    latency: Latency = field(default_factory=Latency)
+
+    @property
+    def streams(self) -> dict[str, Stream]:
+        """Available streams, by name."""
+        named = {"command": self.command, "pose": self.pose}
+        if self.state is not None:
+            named["state"] = self.state
+        if self.wheels is not None:
+            named["wheels"] = self.wheels
+        if self.imu is not None:
+            named["imu"] = self.imu
+        if self.odometry is not None:
+            named["odometry"] = self.odometry
+        return named
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The paper's data: one row per time step.
+
+    Attributes:
+        t: (T,) start of each step [s].
+        q: (T, 3 + S) pose of `base_link` and state at the start of the step.
+        x: (T, S + C) X = [state, command] during the step.
+        dq: (T, 3 + S) dQ/dt: the constant body twist whose exact arc leads from this pose to
+            the next (`geometry.log`), and the mean rate of the state.
+        dt: length of a step [s].
+    """
+
+    t: Array
+    q: Array
+    x: Array
+    dq: Array
+    dt: float
+    notes: tuple[str, ...] = field(default=())
+
+    def rows(self, keep: NDArray[np.bool_]) -> Samples:
+        """Returns the samples of the steps for which `keep` (T,) is true."""
+        return Samples(self.t[keep], self.q[keep], self.x[keep], self.dq[keep], self.dt, self.notes)
+
+
+def samples_on_one_clock(t: Array, pose: Array, state: Array, command: Array) -> Samples:
+    """Builds Samples from series that share stamps.
+
+    Args:
+        t: (T,) stamps [s], uniform apart from gaps, repetitions and jitter.
+        pose: (T, 3) pose of `base_link` at each stamp.
+        state: (T, S) state at each stamp.
+        command: (T, C) command held from each stamp to the next.
+
+    Returns:
+        A row for each of the T - 1 steps of about the median length; gaps and repeated stamps
+        are omitted.
+    """
+    span = np.diff(t)
+    dt = float(np.median(span[span > 0.0])) if (span > 0.0).any() else 0.0
+    regular = np.abs(span - dt) < IRREGULAR * dt
+    length = np.where(np.abs(span - dt) < JITTER * dt + ROUNDING_S, dt, span)[regular, None]
+    first, last = np.flatnonzero(regular), np.flatnonzero(regular) + 1
+    twist = geometry.log(geometry.between(pose[first], pose[last])) / length
+    rates = (state[last] - state[first]) / length
+    return Samples(
+        t=t[first],
+        q=np.concatenate([pose, state], axis=1)[first],
+        x=np.concatenate([state, command], axis=1)[first],
+        dq=np.concatenate([twist, rates], axis=1),
+        dt=dt,
+    )
+
+
+def check(recording: Recording, spec: RobotSpec) -> Recording:
+    """Verifies that a recording can be used for a robot.
+
+    Returns:
+        The recording.
+
+    Raises:
+        RecordingError: it is of another robot, a stream is empty, contains NaN, runs backwards or
+            has the wrong width, or the pose has wrong units; one sentence with the place.
+    """
+    if recording.variables and recording.variables != spec.variable_names:
+        raise RecordingError(
+            f"{recording.source}: is a drive of a robot with {', '.join(recording.variables)}; "
+            f"the robot {spec.name!r} has {', '.join(spec.variable_names)}: choose the robot that "
+            "drove."
+        )
+    width = {"command": len(spec.command), "state": len(spec.state)}
+    width |= {"pose": 3, "wheels": 2, "imu": 3, "odometry": 3}
+    for name, stream in recording.streams.items():
+        _check_stream(f"{recording.source}: {name}", stream, width[name])
+    _check_units(recording, spec)
+    return recording
+
+
+def _check_units(recording: Recording, spec: RobotSpec) -> None:
+    """Refuses a pose that only degrees, millimetres or milliseconds can explain."""
+    pose, place = recording.pose, f"{recording.source}: pose"
+    turn = np.percentile(np.abs(geometry.wrap_angle(np.diff(pose.values[:, 2]))), 95)
+    if turn > LARGEST_TURN:
+        raise RecordingError(
+            f"{place}: the heading jumps by {turn:.1f} rad between neighbouring samples; it must "
+            "be in radians (degrees look like this)."
+        )
+    speeds = [v for v in spec.command if v.unit == "m/s"]
+    fastest = max((max(abs(v.min), abs(v.max)) for v in speeds), default=np.inf)
+    every = np.unique(np.searchsorted(pose.t, np.arange(pose.t[0], pose.t[-1], SPEED_OVER_S)))
+    step, took = np.diff(pose.values[every, :2], axis=0), np.diff(pose.t[every])
+    speed = np.percentile(np.hypot(*step.T) / np.maximum(took, 1e-9), 90) if len(took) else 0.0
+    if speed > TOO_FAST * fastest:
+        raise RecordingError(
+            f"{place}: moves at {speed:.3g} m/s, a robot whose commands end at {fastest:g} m/s; "
+            "positions must be in metres and stamps in seconds."
+        )
+    if np.median(np.diff(pose.t)) > SLOWEST_SAMPLING_S:
+        raise RecordingError(
+            f"{place}: there are {np.median(np.diff(pose.t)):.3g} s between samples; stamps must "
+            "be in seconds (milliseconds look like this)."
+        )
+
+
+def _check_stream(place: str, stream: Stream, width: int) -> None:
+    if stream.values.ndim != 2 or stream.values.shape != (len(stream.t), width):
+        raise RecordingError(
+            f"{place}: has the shape {stream.values.shape} where ({len(stream.t)}, {width}) is "
+            "needed; check that the recording is of this robot."
+        )
+    if len(stream.t) < 2:
+        raise RecordingError(
+            f"{place}: has {len(stream.t)} samples; record a drive of 20 s or more."
+        )
+    for row in np.flatnonzero(~np.isfinite(stream.values).all(axis=1) | ~np.isfinite(stream.t))[:1]:
+        raise RecordingError(
+            f"{place}: row {row} holds NaN or inf; remove the row, or find out why it was recorded."
+        )
+    for row in np.flatnonzero(np.diff(stream.t) < 0.0)[:1]:
+        raise RecordingError(
+            f"{place}: time runs backwards at row {row + 1} ({stream.t[row]:.6f} s, then "
+            f"{stream.t[row + 1]:.6f} s); sort the rows, or cut the file there."
+        )
+
+
+def save_recording(recording: Recording, path: str | Path) -> None:
+    """Writes a recording as `.npz`: `NAME_t` and `NAME` per stream, and `meta` as JSON text."""
+    arrays: dict[str, NDArray[Any]] = {}
+    clocks = {}
+    for name, stream in recording.streams.items():
+        arrays[f"{name}_t"], arrays[name] = stream.t, stream.values
+        clocks[name] = stream.clock
+    meta = {
+        "format": FORMAT,
+        "source": recording.source,
+        "clocks": clocks,
+        "variables": recording.variables,
+    }
+    if recording.latency.measured:
+        meta["latency"] = recording.latency.model_dump(mode="json")
+    write_bytes(path, npz_bytes({"meta": np.array(json.dumps(meta)), **arrays}))
+
+
+def load_recording(path: str | Path) -> Recording:
+    """Reads a recording written by `save_recording`.
+
+    Raises:
+        RecordingError: there is no such file, or it is not an `.npz`, damaged or incomplete.
+    """
+    try:
+        data = read_file(no_device(Path(path)))
+        sealed, arrays = is_sealed(data), npz_arrays(data, seal_needed=False)
+        meta = json.loads(str(arrays["meta"]))
+        if meta["format"] == FORMAT and not sealed:
+            raise ValueError("there is no checksum at its end")
+        if meta["format"] not in (FORMAT, UNSEALED_FORMAT):
+            raise RecordingError(
+                f"{path}: format {meta['format']!r} is not {FORMAT!r}; record it anew or use the "
+                "version of the package that wrote it."
+            )
+        streams = {
+            name: Stream(arrays[f"{name}_t"].astype(float), arrays[name].astype(float), clock)
+            for name, clock in meta["clocks"].items()
+        }
+        latency = Latency.model_validate(meta.get("latency", {}))
+        return Recording(
+            **streams, source=str(path), variables=tuple(meta["variables"]), latency=latency
+        )
+    except FileNotFoundError:
+        raise RecordingError(f"{path}: no such file; check the path.") from None
+    except (AttributeError, KeyError, RecursionError, TypeError) as error:
+        raise RecordingError(
+            f"{path}: is not a recording of this package ({error}); write it with "
+            "nics_drl_bridge.recording.recording.save_recording."
+        ) from None
+    except (ValueError, OSError) as error:
+        raise RecordingError(
+            f"{path}: can't be read as .npz ({error}); it may be damaged."
+        ) from None

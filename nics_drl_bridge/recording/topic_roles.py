@@ -1,0 +1,230 @@
+"""TopicRoles: assignment of a robot's topics to command, pose, state and IMU."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from nics_drl_bridge.config import Schema, load_yaml, validate
+from nics_drl_bridge.errors import ConfigError, RecordingError, nearest
+
+Stamps = Literal["auto", "header", "receive"]
+NONE = "none"
+ROLES = ("cmd_vel", "pose", "odom", "joint_states", "imu")
+REQUIRED = "cmd_vel"
+MOST_LISTED = 20
+"""Maximum number of topics listed in an error."""
+TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+ACKERMANN = "ackermann_msgs/msg/AckermannDrive"
+ACKERMANN_STAMPED = f"{ACKERMANN}Stamped"
+POSE, POSE_COVARIANCE = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+)
+TRANSFORM, TRANSFORMS = "geometry_msgs/msg/TransformStamped", "tf2_msgs/msg/TFMessage"
+ODOMETRY = "nav_msgs/msg/Odometry"
+JOINTS, IMU = "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu"
+TYPES = {
+    "cmd_vel": (TWIST, TWIST_STAMPED, ACKERMANN_STAMPED, ACKERMANN),
+    "pose": (POSE, POSE_COVARIANCE, TRANSFORM, TRANSFORMS, ODOMETRY),
+    "odom": (ODOMETRY,),
+    "joint_states": (JOINTS,),
+    "imu": (IMU,),
+}
+"""Allowed message types of each role."""
+NEVER_GUESSED = {"pose": (ODOMETRY, TRANSFORMS)}
+"""Types that have a role only if the user assigns it."""
+
+USUAL = {
+    "cmd_vel": (r"/cmd_vel$", r"/cmd_vel_stamped$", r"/(ackermann_cmd|drive)$"),
+    "pose": (r"(vrpn|mocap|optitrack|vicon|qualisys)", r"/pose$"),
+    "odom": (r"/odom$", r"/(odom|odometry)[^/]*$", r"odom"),
+    "joint_states": (r"/joint_states$", r"/joint_state[^/]*$"),
+    "imu": (r"/imu(/data)?$", r"/imu[^/]*$", r"imu"),
+}
+"""Patterns of usual names, the most reliable first; the first that matches a topic decides."""
+
+
+class JointSource(Schema):
+    """Source of a state variable in joint messages.
+
+    Attributes:
+        joint: name of the joint.
+        field: `velocity` or `position`; by default chosen by the variable's unit.
+        scale: factor from the message's unit to the variable's.
+    """
+
+    joint: str
+    field: Literal["velocity", "position"] | None = None
+    scale: float = 1.0
+
+
+class TopicRoles(Schema):
+    """Roles of topics. Missing roles are guessed by type and usual names; `none` disables one.
+
+    Attributes:
+        cmd_vel: the commands: Twist, TwistStamped, AckermannDrive or AckermannDriveStamped.
+        pose: of motion capture or localisation: PoseStamped, PoseWithCovarianceStamped,
+            TransformStamped; or TFMessage and Odometry if named here. Has priority over `odom`.
+        odom: Odometry; its pose is used if there is no `pose`. If named in addition to a `pose`,
+            its twist shows the noise of the odometry.
+        joint_states: JointState, for measured state and wheel speeds.
+        imu: Imu.
+        frame: parent of the transforms to use, for a `pose` topic with several.
+        child_frame: their child, the robot.
+        state: joint of each state variable; by default guessed by the joints' names.
+        wheels: left and right joint whose velocities are the wheel speeds; likewise.
+        stamps: `header` takes all times from the messages' headers, `receive` from their receipt
+            by the bag, `auto` from the header if there is one.
+    """
+
+    cmd_vel: str | None = None
+    pose: str | None = None
+    odom: str | None = None
+    joint_states: str | None = None
+    imu: str | None = None
+    frame: str | None = None
+    child_frame: str | None = None
+    state: dict[str, JointSource | str] = Field(default_factory=dict)
+    wheels: tuple[str, str] | None = None
+    stamps: Stamps = "auto"
+
+
+def topic_roles(file: str | Path | None = None, options: Iterable[str] = ()) -> TopicRoles:
+    """Reads roles from a YAML file and the command-line options `ROLE=TOPIC`.
+
+    Args:
+        file: with the keys of `TopicRoles`.
+        options: override the file.
+
+    Raises:
+        ConfigError: the file, a role or a value is wrong.
+    """
+    roles = load_yaml(file, TopicRoles) if file else TopicRoles()
+    given: dict[str, str] = {}
+    for option in options:
+        role, equals, topic = (part.strip() for part in option.partition("="))
+        if not equals or not topic:
+            raise ConfigError(f"--topic {option!r}: must be ROLE=TOPIC, as in cmd_vel=/cmd_vel.")
+        if role not in ROLES:
+            raise ConfigError(f"--topic {option!r}: unknown role {role!r}; {nearest(role, ROLES)}")
+        if role in given:
+            raise ConfigError(f"--topic {option!r}: {role} was given before; give it once.")
+        given[role] = topic
+    return validate({**roles.model_dump(exclude_none=True), **given}, TopicRoles, "topics")
+
+
+def assign(
+    roles: TopicRoles, types: Mapping[str, str], empty: Collection[str], place: str
+) -> dict[str, str]:
+    """Assigns topics to roles.
+
+    Args:
+        roles: as given by the user.
+        types: message type of each topic.
+        empty: topics without messages, which have no role.
+        place: the recording's name, for errors.
+
+    Returns:
+        role -> topic. There is a `cmd_vel`, and a `pose` or an `odom` or both.
+
+    Raises:
+        RecordingError: a topic is missing, of a wrong type, or several fit a role; one sentence
+            with the available topics and the fix.
+    """
+    table = _Topics(types, empty, place)
+    found = {}
+    for role in ROLES:
+        if role == "odom" and "pose" in found and roles.odom is None:
+            continue
+        topic = table.choose(role, getattr(roles, role))
+        if topic is not None:
+            found[role] = topic
+    for needed, words in ((("cmd_vel",), "commands"), (("pose", "odom"), "poses")):
+        if not found.keys() & set(needed):
+            raise table.missing(needed, words)
+    return found
+
+
+@dataclass(frozen=True)
+class _Topics:
+    """Topics of a bag."""
+
+    types: Mapping[str, str]
+    empty: Collection[str]
+    place: str
+
+    def choose(self, role: str, wanted: str | None) -> str | None:
+        """Returns the topic of a role: the wanted one, or a guess."""
+        if wanted == NONE:
+            return None
+        if wanted is None:
+            return self._guess(role)
+        topic = wanted if wanted.startswith("/") else f"/{wanted}"
+        if topic not in self.types:
+            raise RecordingError(
+                f"{self.place}: has no topic {topic!r} ({role}); {self._listed((role,))}"
+            )
+        if topic in self.empty:
+            raise RecordingError(
+                f"{self.place}: holds no messages of the topic {topic!r} ({role}); "
+                f"{self._listed((role,))}"
+            )
+        if self.types[topic] not in TYPES[role]:
+            raise RecordingError(
+                f"{self.place}: the topic {topic!r} is of type {self.types[topic]}; {role} must "
+                f"be one of {', '.join(TYPES[role])}."
+            )
+        return topic
+
+    def _guess(self, role: str) -> str | None:
+        """Returns the only topic with the most reliable usual name; None if no name matches."""
+        allowed = set(TYPES[role]) - set(NEVER_GUESSED.get(role, ()))
+        full = [t for t, kind in self.types.items() if kind in allowed and t not in self.empty]
+        for pattern in USUAL[role]:
+            found = sorted(t for t in full if re.search(pattern, t))
+            if len(found) > 1:
+                without = "" if role == REQUIRED else f", or {role}={NONE} for none"
+                several = ", ".join(f"{t} ({self.types[t]})" for t in found)
+                raise RecordingError(
+                    f"{self.place}: each of several topics could be {role}: {several}; say which "
+                    f"with --topic {role}={found[0]}{without}."
+                )
+            if found:
+                return found[0]
+        return None
+
+    def missing(self, roles: Sequence[str], words: str) -> RecordingError:
+        """Returns the error that no topic has any of the roles, with the fix."""
+        fitting = [(role, topic) for role in roles for topic in self._fitting(role)]
+        if fitting:
+            role, topic = fitting[0]
+            advice = f"say which does, as in --topic {role}={topic}"
+        else:
+            kinds = dict.fromkeys(kind for role in roles for kind in TYPES[role])
+            advice = f"record one of type {', '.join(kinds)}"
+        return RecordingError(
+            f"{self.place}: no topic is known to hold the {words}; {advice}; {self._listed(roles)}"
+        )
+
+    def _fitting(self, role: str) -> list[str]:
+        """Returns the topics with messages of a type allowed in the role."""
+        return sorted(
+            t for t, kind in self.types.items() if kind in TYPES[role] and t not in self.empty
+        )
+
+    def _listed(self, roles: Sequence[str]) -> str:
+        """Lists the topics with their types, those that fit a role first."""
+        fitting = {topic for role in roles for topic in self._fitting(role)}
+        topics = sorted(self.types, key=lambda topic: (topic not in fitting, topic))
+        told = [
+            f"{topic} ({self.types[topic]}{', empty' if topic in self.empty else ''})"
+            for topic in topics[:MOST_LISTED]
+        ]
+        more = len(topics) - len(told)
+        return f"its topics are {', '.join(told)}{f' and {more} more' if more else ''}."

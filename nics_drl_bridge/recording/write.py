@@ -1,0 +1,347 @@
+"""Output of a drive: an `.npz` file, or the folder of a rosbag2.
+
+Writer of a recording as a rosbag2, without ROS, for third-party tools.
+
+Incremental writer of a rosbag2 recording: complete at the end, salvageable before.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.errors import ConfigError, RecordingError
+from nics_drl_bridge.files import check_above, sync_folder
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.recording import topic_roles
+from nics_drl_bridge.recording.joints import POSITION_UNITS, WHEELS
+from nics_drl_bridge.recording.mcap import seal
+from nics_drl_bridge.recording.messages import Offer, profile_of, typestore
+from nics_drl_bridge.recording.recording import Recording, Stream, save_recording
+from nics_drl_bridge.robot.spec import RobotSpec
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys.store import Typestore
+
+NPZ = ".npz"
+
+
+def check_out(path: str | Path) -> Path:
+    """Checks an output path of a recording: an `.npz` file or the folder of a rosbag2.
+
+    Raises:
+        ConfigError: it exists already, has another suffix, or needs rosbags, which is missing.
+    """
+    path = Path(path)
+    if path.exists():
+        raise ConfigError(f"{path}: is there already; give another name, or remove it.")
+    if path.suffix not in (NPZ, ""):
+        raise ConfigError(
+            f"{path}: unknown kind of recording {path.suffix!r}; name a file *{NPZ}, or the "
+            "folder of a rosbag2 without suffix."
+        )
+    if path.suffix != NPZ and find_spec("rosbags") is None:
+        raise ConfigError(
+            f"{path}: writing a rosbag2 needs the library rosbags; install it with pip install "
+            f"'nics_drl_bridge[bags]', or name a file *{NPZ}."
+        )
+    return path
+
+
+def write_drive(recording: Recording, path: str | Path, spec: RobotSpec) -> None:
+    """Writes a recording, completely or not at all: `.npz`, or else a rosbag2 in MCAP.
+
+    Raises:
+        RecordingError: it can't be written.
+    """
+    path = Path(path)
+    if path.suffix == NPZ:
+        save_recording(recording, path)
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as temporary:
+        folder = Path(temporary) / path.name
+        write_bag(recording, folder, spec)
+        os.rename(folder, path)
+
+
+Array = NDArray[np.float64]
+Make = Callable[[Any, Array], Any]
+
+START_NS = 1_700_000_000 * NS_PER_S
+"""Time stamp of second 0 of the commands' clock."""
+FRAMES = ("odom", "base_link")
+
+
+def write_bag(
+    recording: Recording,
+    path: str | Path,
+    spec: RobotSpec,
+    storage: Storage = "mcap",
+) -> None:
+    """Writes a recording as a bag that `load_bag` reads back.
+
+    Commands become `/cmd_vel`, the pose `/odom`; or `/pose` if it has a separate clock or if
+    there is odometry, whose twist is then in `/odom`. State, or else wheels, become
+    `/joint_states`, the IMU `/imu`. Headers contain the streams' stamps.
+
+    Args:
+        recording: of the robot.
+        path: folder to create.
+        spec: the robot.
+        storage: format of the file in the folder.
+
+    Raises:
+        RecordingError: the folder exists already, or rosbags is not installed.
+    """
+    with bag_sink(path, storage) as sink:
+        from rosbags.typesys import Stores, get_typestore
+
+        store = get_typestore(Stores.ROS2_JAZZY)
+        for topic, kind, stream, make in _topics(recording, spec, messages := _Messages(store)):
+            sink.add_topic(topic, kind)
+            stamps = np.round(stream.t * NS_PER_S).astype(np.int64) + START_NS
+            receive = stamps + _to_commands_clock(recording, stream)
+            for k, values in enumerate(stream.values):
+                message = make(messages.header(int(stamps[k])), values)
+                sink.write(topic, int(receive[k]), bytes(store.serialize_cdr(message, kind)))
+
+
+def _topics(
+    recording: Recording, spec: RobotSpec, messages: _Messages
+) -> list[tuple[str, str, Stream, Make]]:
+    """Returns topic, type, stream and the function that makes a message of a row."""
+    beside = recording.odometry is not None or recording.pose.clock != recording.command.clock
+    topics: list[tuple[str, str, Stream, Make]] = [
+        (
+            "/cmd_vel", topic_roles.TWIST, recording.command,
+            lambda _, row: messages.twist(spec.to_cmd_vel(row)),
+        ),
+        ("/pose", topic_roles.POSE, recording.pose, messages.pose_stamped)
+        if beside
+        else ("/odom", topic_roles.ODOMETRY, recording.pose, messages.odometry),
+    ]  # fmt: skip
+    if recording.odometry is not None:
+        topics.append(("/odom", topic_roles.ODOMETRY, recording.odometry, messages.speeds))
+    if recording.state is not None:
+        names = [v.name for v in spec.state]
+        still = np.array([v.unit in POSITION_UNITS for v in spec.state])
+        topics.append((
+            "/joint_states", topic_roles.JOINTS, recording.state,
+            lambda header, row: messages.joints(header, names, row * still, row * ~still),
+        ))  # fmt: skip
+    elif recording.wheels is not None:
+        topics.append((
+            "/joint_states", topic_roles.JOINTS, recording.wheels,
+            lambda header, row: messages.joints(header, list(WHEELS), 0.0 * row, row),
+        ))  # fmt: skip
+    if recording.imu is not None:
+        topics.append(("/imu", topic_roles.IMU, recording.imu, messages.imu))
+    return topics
+
+
+def _to_commands_clock(recording: Recording, stream: Stream) -> int:
+    """Returns the offset from stamp to receipt [ns]: streams of other clocks start together."""
+    if stream.clock == recording.command.clock:
+        return 0
+    return round(float(recording.command.t[0] - stream.t[0]) * NS_PER_S)
+
+
+class _Messages:
+    """Conversion of rows to messages."""
+
+    def __init__(self, store: Typestore) -> None:
+        self._types = store.types
+
+    def _new(self, kind: str, *values: Any) -> Any:
+        package, name = kind.split("/")
+        return self._types[f"{package}/msg/{name}"](*values)
+
+    def header(self, stamp_ns: int) -> Any:
+        stamp = self._new("builtin_interfaces/Time", stamp_ns // NS_PER_S, stamp_ns % NS_PER_S)
+        return self._new("std_msgs/Header", stamp, FRAMES[0])
+
+    def _vector(self, x: float, y: float, z: float) -> Any:
+        return self._new("geometry_msgs/Vector3", x, y, z)
+
+    def twist(self, row: Array) -> Any:
+        x, y, w = (float(value) for value in row)
+        return self._new("geometry_msgs/Twist", self._vector(x, y, 0.0), self._vector(0.0, 0.0, w))
+
+    def _pose(self, row: Array) -> Any:
+        x, y, heading = (float(value) for value in row)
+        position = self._new("geometry_msgs/Point", x, y, 0.0)
+        half = heading / 2.0
+        turned = (0.0, 0.0, float(np.sin(half)), float(np.cos(half)))
+        return self._new(
+            "geometry_msgs/Pose", position, self._new("geometry_msgs/Quaternion", *turned)
+        )
+
+    def pose_stamped(self, header: Any, row: Array) -> Any:
+        return self._new("geometry_msgs/PoseStamped", header, self._pose(row))
+
+    def odometry(self, header: Any, row: Array) -> Any:
+        return self._odometry(header, row, np.zeros(3), np.zeros(36))
+
+    def speeds(self, header: Any, row: Array) -> Any:
+        """Makes an odometry message of which only the twist was recorded."""
+        unknown = np.zeros(36)
+        unknown[0] = -1.0
+        return self._odometry(header, np.zeros(3), row, unknown)
+
+    def _odometry(self, header: Any, pose: Array, twist: Array, pose_covariance: Array) -> Any:
+        where = self._new("geometry_msgs/PoseWithCovariance", self._pose(pose), pose_covariance)
+        speed = self._new("geometry_msgs/TwistWithCovariance", self.twist(twist), np.zeros(36))
+        return self._new("nav_msgs/Odometry", header, FRAMES[1], where, speed)
+
+    def joints(self, header: Any, names: list[str], position: Array, velocity: Array) -> Any:
+        return self._new("sensor_msgs/JointState", header, names, position, velocity, np.zeros(0))
+
+    def imu(self, header: Any, row: Array) -> Any:
+        ax, ay, w = (float(value) for value in row)
+        unknown = np.full(9, -1.0)
+        return self._new(
+            "sensor_msgs/Imu", header,
+            self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0), unknown,
+            self._vector(0.0, 0.0, w), np.zeros(9), self._vector(ax, ay, 0.0), np.zeros(9),
+        )  # fmt: skip
+
+
+Storage = Literal["mcap", "sqlite3"]
+
+NO_HASH = f"RIHS01_{'0' * 64}"
+"""Hash of a type that is known only by its text."""
+CHUNK_BYTES = 1 << 16
+"""Damage costs a whole chunk, since each checksum covers a whole chunk."""
+
+
+class BagSink:
+    """An open bag, created by `bag_sink`.
+
+    Args:
+        writer: open writer of rosbags.
+    """
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer, self._store = writer, typestore()
+        self._connections: dict[str, Connection] = {}
+        self.counts: dict[str, int] = {}
+
+    def add_topic(
+        self,
+        topic: str,
+        kind: str,
+        offers: Sequence[Offer] = (),
+        texts: Mapping[str, str] | None = None,
+        definition: str | None = None,
+    ) -> None:
+        """Adds a topic.
+
+        Args:
+            topic: its name.
+            kind: type of its messages, such as `nav_msgs/msg/Odometry`.
+            offers: of its publishers.
+            texts: `.msg` texts of the type and its component types, if unknown to rosbags.
+            definition: complete definition of the type as stored in a bag, instead.
+        """
+        if kind not in self._store.fielddefs and texts:
+            self._register(texts)
+        known = kind in self._store.fielddefs
+        given = {} if known else {"msgdef": definition or "", "rihs01": NO_HASH}
+        self._connections[topic] = self._writer.add_connection(
+            topic, kind, typestore=self._store, **given,
+            offered_qos_profiles=[profile_of(offer) for offer in offers],
+        )  # fmt: skip
+        self.counts[topic] = 0
+
+    def _register(self, texts: Mapping[str, str]) -> None:
+        from rosbags.typesys import get_types_from_msg
+
+        for name, text in texts.items():
+            if name not in self._store.fielddefs:
+                self._store.register(get_types_from_msg(text, name))
+
+    def write(self, topic: str, receive_ns: int, data: bytes) -> None:
+        """Writes a serialized message."""
+        self._writer.write(self._connections[topic], receive_ns, data)
+        self.counts[topic] += 1
+        storage: Any = self._writer.storage
+        if hasattr(storage, "close_chunk") and storage.chunk.bio.tell() > CHUNK_BYTES:
+            storage.close_chunk()
+
+    def flush(self) -> None:
+        """Flushes written messages to the file, so that a crash of this process can't lose them."""
+        storage: Any = self._writer.storage
+        if hasattr(storage, "close_chunk"):
+            if storage.chunk.msgs:
+                storage.close_chunk()
+            storage.bio.flush()
+        else:
+            storage.conn.commit()
+
+
+@contextmanager
+def bag_sink(path: str | Path, storage: Storage = "mcap") -> Iterator[BagSink]:
+    """Yields a bag to write to, which is moved to `path` when the block ends without error.
+
+    It is written to a hidden folder `.NAME.*` next to `path`. After an error nothing is left; a
+    killed process or a full disk leaves that folder, from which `salvage` recovers the flushed
+    messages.
+
+    Args:
+        path: folder to create.
+        storage: format of the file in the folder. MCAP has checksums, so that any damage is
+            found; SQLite has none.
+
+    Raises:
+        RecordingError: the folder exists already or can't be written, or rosbags is not installed.
+    """
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+    except ImportError:
+        raise RecordingError(
+            f"{path}: writing a bag needs the library rosbags; install it with "
+            "pip install 'nics_drl_bridge[bags]'."
+        ) from None
+    path = Path(path)
+    if path.exists():
+        raise RecordingError(f"{path}: is there already; give the name of a new folder.")
+    check_above(path)
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    unfinished = beside / path.name
+    try:
+        with Writer(unfinished, version=8, storage_plugin=plugin) as writer:
+            yield BagSink(writer)
+        if storage == "mcap":
+            seal(unfinished / f"{path.name}.mcap")
+        sync_folder(unfinished)
+        if path.exists():
+            raise RecordingError(f"{path}: was made meanwhile; give the name of a new folder.")
+        os.rename(unfinished, path)
+    except OSError as error:
+        raise RecordingError(
+            f"{path}: {error.strerror or error}; what was written until then lies in {unfinished}, "
+            "save it with `nics bag salvage` where there is room."
+        ) from None
+    except BaseException:
+        _remove(beside)
+        raise
+    _remove(beside)
+
+
+def _remove(folder: Path) -> None:
+    for file in sorted(folder.rglob("*"), reverse=True):
+        file.rmdir() if file.is_dir() else file.unlink()
+    folder.rmdir()

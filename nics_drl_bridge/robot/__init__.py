@@ -1,0 +1,1 @@
+"""The robot: its specification, its Taylor model, its noise and delays."""

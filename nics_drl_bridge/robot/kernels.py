@@ -1,0 +1,275 @@
+"""Compiled motion: the pruned model's rates, and the exact arc of a body twist.
+
+Only the kept terms cost time. A step of one robot consists of scalar functions, `rates` then
+`move`; `run` does the same for a batch of robots, term by term, so that vector instructions
+process several robots at a time. Both give bit-identical results for every batch size: one robot
+is a batch of one.
+
+Shared arguments: `terms` are `Terms`; `x` contains state, command and a last
+entry of 1; `dq` are the rates; `series` is `SERIES` in the type of the other arrays.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import types
+from numba.extending import overload
+from numpy.typing import NDArray
+
+from nics_drl_bridge.errors import ModelError
+from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.robot.taylor import TaylorModel
+
+Array = NDArray[np.float64]
+
+SERIES: Array = np.array([1 / 6, 1 / 120, 1 / 5040, 1 / 2, 1 / 24, 1 / 720])
+"""Coefficients of sin(t) / t and (1 - cos(t)) / t; exact to 1e-14 for turns below 0.1 rad per
+step, to 1e-8 below `WIDE_TURN`."""
+WIDE_TURN = 0.5
+"""For larger turns per step the series are inaccurate and sine and cosine are used [rad]."""
+GREATEST_ORDER = 4
+
+
+class Terms(NamedTuple):
+    """The kept terms of a model.
+
+    Attributes:
+        dof: (T,) degree of freedom of each.
+        coefficient: (T,), or (T, n) of n robots.
+        factors: (T, order) indices into `x`; unused ones point to its last entry, which is 1.
+        degree: (T,) number of factors.
+    """
+
+    dof: NDArray[np.int64]
+    coefficient: Array
+    factors: NDArray[np.int64]
+    degree: NDArray[np.int64]
+
+
+def term_arrays(model: TaylorModel) -> Terms:
+    """Returns the kept terms of a model.
+
+    Raises:
+        ModelError: a term is of a higher order than the kernels support.
+    """
+    one = len(model.variables)
+    order = max(1, int(model.powers.sum(axis=1).max(initial=1)))
+    if order > GREATEST_ORDER:
+        raise ModelError(
+            f"the kinematics have a term of order {order}; the greatest is {GREATEST_ORDER}: "
+            "generate the model anew."
+        )
+    dofs, places = np.nonzero(model.coefficients)
+    factors = np.full((len(dofs), order), one, dtype=np.int64)
+    for row, k in enumerate(places):
+        used = np.repeat(np.arange(one), model.powers[k])
+        factors[row, : len(used)] = used
+    count = (factors != one).sum(axis=1)
+    return Terms(dofs.astype(np.int64), model.coefficients[dofs, places], factors, count)
+
+
+def scratch(model: TaylorModel) -> tuple[Array, Array]:
+    """Returns scratch memory for `x` and `dq` of one robot."""
+    x = np.zeros(len(model.variables) + 1)
+    x[-1] = 1.0
+    return x, np.zeros(len(model.dofs))
+
+
+@kernel
+def rates(dq, x, terms):  # type: ignore[no-untyped-def]
+    """Computes dQ/dt (3 + S,) of one robot."""
+    dq[:] = 0.0
+    for k in range(terms.dof.shape[0]):
+        product = terms.coefficient[k]
+        for factor in range(terms.degree[k]):
+            product *= x[terms.factors[k, factor]]
+        dq[terms.dof[k]] += product
+
+
+@kernel
+def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
+    """Returns position and direction after the exact arc of a constant body twist.
+
+    Args:
+        x, y: position [m].
+        c, s: cosine and sine of the heading.
+        vx, vy: body velocity [m/s].
+        turn: turn rate x duration [rad].
+        dt: duration [s].
+        series: see the module.
+    """
+    if abs(turn) > WIDE_TURN:
+        one = series[3] + series[3]
+        sine, versine = math.sin(turn), one - math.cos(turn)
+        return _along(x, y, c, s, vx, vy, sine / turn, versine / turn, sine, versine, dt)
+    return _move_little(x, y, c, s, vx, vy, turn, dt, series)
+
+
+@kernel
+def _move_little(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
+    """Does the same as `move` for turns up to `WIDE_TURN`."""
+    t2 = turn * turn
+    a = series[0] - t2 * (series[1] - t2 * series[2])
+    a = (series[3] + series[3]) - t2 * a
+    b = turn * (series[3] - t2 * (series[4] - t2 * series[5]))
+    return _along(x, y, c, s, vx, vy, a, b, turn * a, turn * b, dt)
+
+
+@kernel
+def _along(x, y, c, s, vx, vy, a, b, sine, versine, dt):  # type: ignore[no-untyped-def]
+    """Returns the end of an arc from a = sin(t) / t, b = (1 - cos(t)) / t, t a and t b."""
+    ahead, aside = (a * vx - b * vy) * dt, (b * vx + a * vy) * dt
+    x, y = x + (c * ahead - s * aside), y + (s * ahead + c * aside)
+    return x, y, c - (c * versine + s * sine), s - (s * versine - c * sine)
+
+
+@kernel
+def wrap(heading):  # type: ignore[no-untyped-def]
+    """Wraps a heading [rad] to [-pi, pi)."""
+    return heading - 2.0 * math.pi * math.floor((heading + math.pi) / (2.0 * math.pi))
+
+
+@kernel
+def advance(pose, twist, dt, series):  # type: ignore[no-untyped-def]
+    """Moves a pose (3,) in place along the exact arc of a body twist (3,)."""
+    turn = twist[2] * dt
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    pose[0], pose[1], _, _ = move(pose[0], pose[1], c, s, twist[0], twist[1], turn, dt, series)
+    pose[2] = wrap(pose[2] + turn)
+
+
+def own(value: Any, lane: int) -> Any:
+    """Returns the value of a lane: its entry of an array, or the scalar shared by all lanes."""
+    return value[lane] if np.ndim(value) else value
+
+
+@overload(own)
+def _own(value, lane):  # type: ignore[no-untyped-def]
+    if isinstance(value, types.Array):
+        return lambda value, lane: value[lane]
+    return lambda value, lane: value
+
+
+@kernel
+def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
+    """Moves a batch of robots by the same number of steps, each under a constant command.
+
+    Args:
+        pose: (6, n) x, y [m], cosine and sine of the heading, heading [rad], and an upper bound
+            of the path length [m], updated in place; the heading is not wrapped.
+        x: (S + C + 1, n); the state is updated in place.
+        dq: (3 + S, n) scratch memory; contains the rates of the last step afterwards.
+        terms, series: see the module; coefficients may be (T, n), one per robot.
+        dt: length of a step [s].
+        steps: number of steps.
+    """
+    for _ in range(steps):
+        _rates_of_all(dq, x, terms)
+        _move_all(pose, dq, dt, series)
+        for d in range(3, dq.shape[0]):
+            state, rate = x[d - 3], dq[d]
+            for i in range(state.shape[0]):
+                state[i] += dt * rate[i]
+
+
+@kernel
+def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
+    factors, n = terms.factors, x.shape[1]
+    for d in range(dq.shape[0]):
+        rate = dq[d]
+        for i in range(n):
+            rate[i] = 0.0
+    for k in range(terms.dof.shape[0]):
+        rate, value, one = dq[terms.dof[k]], terms.coefficient[k], x[factors[k, 0]]
+        if terms.degree[k] == 1:
+            for i in range(n):
+                rate[i] += own(value, i) * one[i]
+        elif terms.degree[k] == 2:
+            other = x[factors[k, 1]]
+            for i in range(n):
+                rate[i] += own(value, i) * one[i] * other[i]
+        elif terms.degree[k] == 3:
+            other, third = x[factors[k, 1]], x[factors[k, 2]]
+            for i in range(n):
+                rate[i] += own(value, i) * one[i] * other[i] * third[i]
+        elif terms.degree[k] == 4:
+            other, third, last = x[factors[k, 1]], x[factors[k, 2]], x[factors[k, 3]]
+            for i in range(n):
+                rate[i] += own(value, i) * one[i] * other[i] * third[i] * last[i]
+        else:  # the constant
+            for i in range(n):
+                rate[i] += own(value, i)
+
+
+@kernel
+def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
+    px, py, pc, ps, heading, length = pose[0], pose[1], pose[2], pose[3], pose[4], pose[5]
+    vx, vy, wz = dq[0], dq[1], dq[2]
+    wide = np.int32(0)
+    for i in range(px.shape[0]):
+        wide |= np.int32(abs(wz[i] * dt) > WIDE_TURN)
+    if wide:
+        _move_widely(pose, dq, dt, series)
+        return
+    for i in range(px.shape[0]):
+        turn = wz[i] * dt
+        px[i], py[i], pc[i], ps[i] = _move_little(
+            px[i], py[i], pc[i], ps[i], vx[i], vy[i], turn, dt, series
+        )
+        heading[i] += turn
+        length[i] += (abs(vx[i]) + abs(vy[i])) * dt
+
+
+@kernel
+def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
+    """Does the same as `_move_all` if some turns are wide: in a separate loop, as it is slower."""
+    px, py, pc, ps, heading, length = pose[0], pose[1], pose[2], pose[3], pose[4], pose[5]
+    vx, vy, wz = dq[0], dq[1], dq[2]
+    for i in range(px.shape[0]):
+        turn = wz[i] * dt
+        px[i], py[i], pc[i], ps[i] = move(
+            px[i], py[i], pc[i], ps[i], vx[i], vy[i], turn, dt, series
+        )
+        heading[i] += turn
+        length[i] += (abs(vx[i]) + abs(vy[i])) * dt
+
+
+@kernel(allocates=True)
+def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-untyped-def]
+    """Rolls out robots open-loop under their commands, one robot after the other.
+
+    Args:
+        poses: (W, T + 1, 3), the first given, the others written; headings are not wrapped.
+        states: (W, T + 1, S), likewise.
+        commands: (W, T, C), one row per step.
+        terms, series: see the module.
+        dt: length of a step [s].
+    """
+    size, width = states.shape[2], commands.shape[2]
+    x, dq = np.ones(size + width + 1), np.zeros(3 + size)
+    for w in range(poses.shape[0]):
+        px, py, heading = poses[w, 0]
+        c, s = math.cos(heading), math.sin(heading)
+        x[:size] = states[w, 0]
+        for n in range(commands.shape[1]):
+            for i in range(width):
+                x[size + i] = commands[w, n, i]
+            rates(dq, x, terms)
+            turn = dq[2] * dt
+            px, py, c, s = move(px, py, c, s, dq[0], dq[1], turn, dt, series)
+            heading += turn
+            for i in range(size):
+                x[i] += dt * dq[3 + i]
+                states[w, n + 1, i] = x[i]
+            poses[w, n + 1, 0], poses[w, n + 1, 1], poses[w, n + 1, 2] = px, py, heading
+
+
+@kernel
+def delayed(substep, delay, substeps, periods):  # type: ignore[no-untyped-def]
+    """Returns the index, newest first, of the one of the last `periods` commands in effect."""
+    if delay <= substep:
+        return 0
+    return min((delay - substep + substeps - 1) // substeps, periods - 1)

@@ -1,0 +1,156 @@
+"""Noise of a robot, drawn by the simulator and expected by the estimator.
+
+Latency of a robot's scan and odometry, from measurement to receipt.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from nics_drl_bridge.config import Schema
+from nics_drl_bridge.robot.spec import RobotSpec
+
+MEASURED: Literal["measured"] = "measured"
+ASSUMED: Literal["assumed"] = "assumed"
+ASSUMED_STATE_DRIFT = 0.1
+"""Assumed drift of an unmeasured state within a second, as a share of its range."""
+
+
+class Level(Schema):
+    """One standard deviation.
+
+    Attributes:
+        std: its value.
+        unit: of the value.
+        source: `measured` in the recording, or `assumed` if the recording did not show it.
+        uncertainty: standard uncertainty of the value; None if it is assumed.
+    """
+
+    std: float = Field(ge=0.0)
+    unit: str
+    source: Literal["measured", "assumed"] = ASSUMED
+    uncertainty: float | None = Field(default=None, ge=0.0)
+
+    @property
+    def measured(self) -> bool:
+        """True if the level was measured in the recording."""
+        return self.source == MEASURED
+
+
+def assumed(std: float, unit: str) -> Level:
+    """Returns an assumed level."""
+    return Level(std=std, unit=unit)
+
+
+class Noise(Schema):
+    """Noise of a robot's sensors and motion.
+
+    The simulator draws the odometry noise, and the drift if it was measured: an assumed drift is
+    a margin for the estimator, not a motion of the robot. The estimator takes its R from odometry
+    and pose, its Q from the drift.
+
+    Attributes:
+        odom_linear: of each component of the measured velocity [m/s].
+        odom_angular: of the measured yaw rate [rad/s].
+        pose_position: of x and y of the pose sensor [m].
+        pose_heading: of its heading [rad].
+        position_drift: part of x and y that the model does not explain, growing with the square
+            root of time [m/sqrt(s)].
+        heading_drift: the same for the heading [rad/sqrt(s)].
+        state_drift: the same for each state variable, by name [its unit/sqrt(s)].
+    """
+
+    odom_linear: Level = assumed(0.01, "m/s")
+    odom_angular: Level = assumed(0.01, "rad/s")
+    pose_position: Level = assumed(0.01, "m")
+    pose_heading: Level = assumed(0.01, "rad")
+    position_drift: Level = assumed(0.02, "m/sqrt(s)")
+    heading_drift: Level = assumed(0.02, "rad/sqrt(s)")
+    state_drift: dict[str, Level] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _units(self) -> Noise:
+        for name, field in type(self).model_fields.items():
+            level = getattr(self, name)
+            if isinstance(level, Level) and level.unit != field.default.unit:
+                raise ValueError(f"{name} must be in {field.default.unit}")
+        return self
+
+    @property
+    def odometry(self) -> tuple[float, float]:
+        """Standard deviations, linear [m/s] and angular [rad/s]."""
+        return self.odom_linear.std, self.odom_angular.std
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """Standard deviations of a measured pose: x, y [m], heading [rad]."""
+        return self.pose_position.std, self.pose_position.std, self.pose_heading.std
+
+    def drift(self, spec: RobotSpec) -> NDArray[np.float64]:
+        """Returns the drift (3 + S,) of pose and state that the estimator expects in a second."""
+        states = [self._state(v.name, v.max - v.min, v.unit) for v in spec.state]
+        levels = (self.position_drift, self.position_drift, self.heading_drift, *states)
+        return np.array([level.std for level in levels])
+
+    def simulated_drift(self, spec: RobotSpec) -> NDArray[np.float64]:
+        """Returns the drift (3 + S,) that the simulator draws: measured levels, else zero."""
+        states = [self._state(v.name, v.max - v.min, v.unit) for v in spec.state]
+        levels = (self.position_drift, self.position_drift, self.heading_drift, *states)
+        return np.array([level.std if level.measured else 0.0 for level in levels])
+
+    def _state(self, name: str, reach: float, unit: str) -> Level:
+        return self.state_drift.get(name, assumed(ASSUMED_STATE_DRIFT * reach, f"{unit}/sqrt(s)"))
+
+    def sentences(self) -> list[str]:
+        """Returns one human-readable line per level."""
+        named = {name: getattr(self, name) for name in type(self).model_fields}
+        levels = {n: level for n, level in named.items() if isinstance(level, Level)}
+        levels |= {f"state_drift of {name}": level for name, level in self.state_drift.items()}
+        return [
+            f"{name.replace('_', ' '):<28} {level.std:.3g} {level.unit}"
+            + (f" (+- {level.uncertainty:.1g})" if level.uncertainty is not None else "")
+            + ("" if level.measured else ", assumed")
+            for name, level in levels.items()
+        ]
+
+
+class Delay(Schema):
+    """A uniform distribution of delays.
+
+    Attributes:
+        least: smallest delay [s].
+        jitter: greatest minus smallest delay [s].
+    """
+
+    least: float = Field(ge=0.0)
+    jitter: float = Field(ge=0.0)
+
+
+class Latency(Schema):
+    """Delays from measurement to receipt; None if unknown.
+
+    Attributes:
+        scan: of scans, from the last beam.
+        odom: of odometry, from its stamp.
+    """
+
+    scan: Delay | None = None
+    odom: Delay | None = None
+
+    @property
+    def measured(self) -> dict[str, Delay]:
+        """Known delays, by topic."""
+        named = {"scan": self.scan, "odom": self.odom}
+        return {topic: delay for topic, delay in named.items() if delay is not None}
+
+    def sentences(self) -> list[str]:
+        """Returns one human-readable line per topic."""
+        return [
+            f"{topic} comes {1e3 * delay.least:.1f} to {1e3 * (delay.least + delay.jitter):.1f} ms "
+            "after it was measured"
+            for topic, delay in self.measured.items()
+        ]

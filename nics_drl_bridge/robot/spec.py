@@ -1,0 +1,244 @@
+"""RobotSpec: the single definition of a robot's state and command: order, units and limits."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, field_validator, model_validator
+
+from nics_drl_bridge.config import Schema, find_config, load_yaml
+from nics_drl_bridge.errors import ConfigError
+
+CmdVelField = Literal["linear.x", "linear.y", "angular.z"]
+CMD_VEL_FIELDS: tuple[CmdVelField, ...] = ("linear.x", "linear.y", "angular.z")
+UNITS = ("m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1")
+"""SI units of a state or a command; 1 for a ratio or a count."""
+LARGEST = 1e3
+"""Maximum radius of a robot [m]."""
+MOST_CORNERS = 512
+"""Maximum number of corners of a footprint."""
+MOST_VARIABLES = 32
+"""Maximum number of variables of a state, and of a command."""
+FASTEST = 1e6
+"""Maximum absolute value of a variable, in its unit."""
+POSE_RATES = ("vx", "vy", "wz")
+POSE_UNITS = ("m/s", "m/s", "rad/s")
+
+
+class Variable(Schema):
+    """A component of the state or of the command."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    unit: str
+    min: float = Field(ge=-FASTEST, le=FASTEST)
+    max: float = Field(ge=-FASTEST, le=FASTEST)
+
+    @field_validator("unit")
+    @classmethod
+    def _si(cls, unit: str) -> str:
+        if unit not in UNITS:
+            raise ValueError(f"the unit must be one of {', '.join(UNITS)}")
+        return unit
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Variable:
+        if not self.min < self.max:
+            raise ValueError(f"min must be less than max of variable {self.name!r}")
+        return self
+
+
+class StateVariable(Variable):
+    """A component of the state.
+
+    Attributes:
+        follows: the command that it follows with a lag. A recording without measured state can
+            still be used if every state variable names one.
+    """
+
+    follows: str | None = None
+
+
+class CommandVariable(Variable):
+    """A component of the command.
+
+    Attributes:
+        cmd_vel: its field of `cmd_vel`; None for a robot that is not driven through ROS 2.
+    """
+
+    cmd_vel: CmdVelField | None = None
+
+
+class RobotSpec(Schema):
+    """Definition of a robot.
+
+    Attributes:
+        name: user-visible name.
+        description: one sentence.
+        textbook: the textbook kinematics for its synthetic recordings, whose structure may also
+            be assumed for motion that a drive did not show.
+        parameters: of the textbook kinematics [m, s], see `recording.textbook`.
+        footprint_radius: radius of the circular footprint around `base_link` [m]; optional with a
+            `footprint`, which it then circumscribes.
+        footprint: corners of a polygonal footprint instead, in `base_link` [m], in either
+            direction; edges may not cross.
+        state: S components, in the order of every state vector.
+        command: C components, in the order of every command vector.
+    """
+
+    name: str
+    description: str = ""
+    textbook: Literal["ackermann", "differential", "mecanum"] | None = None
+    parameters: dict[str, float] = Field(default_factory=dict)
+    footprint_radius: float = Field(ge=1e-3, le=LARGEST)
+    footprint: tuple[tuple[float, float], ...] | None = Field(
+        default=None, min_length=3, max_length=MOST_CORNERS
+    )
+    state: tuple[StateVariable, ...] = Field(default=(), max_length=MOST_VARIABLES)
+    command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MOST_VARIABLES)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _circumscribed(cls, data: Any) -> Any:
+        if (
+            not isinstance(data, dict)
+            or data.get("footprint") is None
+            or "footprint_radius" in data
+        ):
+            return data
+        try:
+            if len(data["footprint"]) > MOST_CORNERS:
+                return data
+            corners = np.array(data["footprint"], dtype=np.float64)
+            return data | {"footprint_radius": float(np.hypot(*corners.T).max())}
+        except (OverflowError, TypeError, ValueError):
+            return data  # the field's own check reports the error
+
+    @model_validator(mode="after")
+    def _outlined(self) -> RobotSpec:
+        if self.footprint is None:
+            return self
+        corners = np.array(self.footprint)
+        if _edges_cross(corners):
+            raise ValueError("edges of footprint cross or touch; list its corners in order")
+        radius = float(np.hypot(*corners.T).max())
+        if not math.isclose(radius, self.footprint_radius, rel_tol=1e-6):
+            raise ValueError(
+                f"footprint reaches {radius:.6g} m from base_link, footprint_radius is "
+                f"{self.footprint_radius:.6g} m; leave footprint_radius out"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _unique(self) -> RobotSpec:
+        names = self.variable_names
+        if len(set(names)) != len(names):
+            raise ValueError("every state and command variable needs a name of its own")
+        commands = [c.name for c in self.command]
+        for variable in self.state:
+            if variable.follows is not None and variable.follows not in commands:
+                raise ValueError(
+                    f"state {variable.name!r} follows {variable.follows!r}, which is no command"
+                )
+        fields = [c.cmd_vel for c in self.command if c.cmd_vel is not None]
+        if len(set(fields)) != len(fields):
+            raise ValueError("two commands share one field of cmd_vel")
+        return self
+
+    @property
+    def variable_names(self) -> tuple[str, ...]:
+        """Names of X = [S, C]."""
+        return tuple(v.name for v in (*self.state, *self.command))
+
+    @property
+    def variable_units(self) -> tuple[str, ...]:
+        """Units of X = [S, C]."""
+        return tuple(v.unit for v in (*self.state, *self.command))
+
+    @property
+    def dof_names(self) -> tuple[str, ...]:
+        """Names of dQ/dt: the body twist, then the rates of the state."""
+        return (*POSE_RATES, *(f"d_{v.name}" for v in self.state))
+
+    @property
+    def dof_units(self) -> tuple[str, ...]:
+        """Units of dQ/dt."""
+        return (*POSE_UNITS, *(f"{v.unit}/s" for v in self.state))
+
+    @cached_property
+    def command_low(self) -> NDArray[np.float64]:
+        """Least command (C,)."""
+        return np.array([c.min for c in self.command])
+
+    @cached_property
+    def command_high(self) -> NDArray[np.float64]:
+        """Greatest command (C,)."""
+        return np.array([c.max for c in self.command])
+
+    @cached_property
+    def _cmd_vel_index(self) -> NDArray[np.intp]:
+        fields = [c.cmd_vel for c in self.command if c.cmd_vel is not None]
+        if len(fields) < len(self.command):
+            raise ConfigError(
+                f"robot {self.name!r}: a command names no field of cmd_vel; add `cmd_vel:` to it."
+            )
+        return np.array([CMD_VEL_FIELDS.index(field) for field in fields], dtype=np.intp)
+
+    def to_cmd_vel(self, command: ArrayLike) -> NDArray[np.float64]:
+        """Converts a command (..., C) to `cmd_vel` (..., 3): linear.x, linear.y, angular.z."""
+        command = np.asarray(command, dtype=np.float64)
+        twist = np.zeros((*command.shape[:-1], 3))
+        twist[..., self._cmd_vel_index] = command
+        return twist
+
+    def from_cmd_vel(self, twist: ArrayLike) -> NDArray[np.float64]:
+        """Converts `cmd_vel` (..., 3) to a command (..., C); unused fields are dropped."""
+        return np.asarray(twist, dtype=np.float64)[..., self._cmd_vel_index]
+
+
+def _edges_cross(corners: NDArray[np.float64]) -> bool:
+    """True if two edges of an outline (V, 2) meet anywhere but at their common corner."""
+    start, stop = corners, np.roll(corners, -1, axis=0)
+    if (start == stop).all(axis=1).any():
+        return True
+
+    def side(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the side (V, V) of each edge (rows) on which each point lies."""
+        along, to = (stop - start)[:, None], points[None] - start[:, None]
+        return np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
+
+    low, high = np.minimum(start, stop), np.maximum(start, stop)
+    boxes = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=-1)
+    apart = side(start) * side(stop)
+    index = np.arange(len(corners))
+    gap = (index[None] - index[:, None]) % len(corners)
+    distant = (gap > 1) & (gap < len(corners) - 1)
+    # An edge may not run back along its predecessor.
+    folded = side(stop)[index, (index + 1) % len(corners)] == 0.0
+    ahead = ((stop - start) * (np.roll(stop - start, -1, axis=0))).sum(axis=1) > 0.0
+    return bool(
+        (boxes & (apart <= 0.0) & (apart.T <= 0.0) & distant).any() or (folded & ~ahead).any()
+    )
+
+
+def load_robot(name: str | Path) -> RobotSpec:
+    """Loads a shipped robot by name (`ackermann`), or any robot by the path of its YAML file.
+
+    Raises:
+        ConfigError: unknown name or wrong key, with the nearest valid one.
+    """
+    return load_yaml(find_config(name, "robots"), RobotSpec)
+
+
+def require_textbook(spec: RobotSpec) -> str:
+    """Returns the name of the robot's textbook kinematics. Raises ConfigError if it has none."""
+    if spec.textbook is None:
+        raise ConfigError(
+            f"robot {spec.name!r} names no textbook kinematics; add `textbook:` to its YAML file "
+            "or give a recording."
+        )
+    return spec.textbook

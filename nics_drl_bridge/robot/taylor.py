@@ -1,0 +1,290 @@
+"""TaylorModel: the rates of pose and state as a short polynomial of state and command.
+
+Features of the Taylor model: the products of the variables up to an order (Eq. 1).
+
+Quality: goodness of fit of a model, on its training part and on unseen data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from itertools import combinations_with_replacement
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import ModelError
+
+Array = NDArray[np.float64]
+
+
+def _unknown() -> Array:
+    return np.zeros((0, 0))
+
+
+@dataclass(frozen=True)
+class TaylorModel:
+    """`dQ/dt = A chi(X)` without the pruned terms (Eq. 1, 2).
+
+    Attributes:
+        variables: V names of X = [state, command].
+        dofs: D = 3 + S names of dQ/dt: vx, vy, wz of the body twist, then the state's rates.
+        dof_units: D units.
+        powers: (K, V) exponents of the terms that any degree of freedom keeps.
+        coefficients: (D, K); zero where a degree of freedom does not keep a term.
+        dt: the step for which the rates are valid [s]; the simulator's step.
+        low, high: (V,) the box of X that the recording covered.
+        assumed: terms (dof, term) that the drive could not show, filled in from the
+            textbook's structure on request.
+        std_errors: (D, K) standard errors of the coefficients; NaN for a kept one that was not
+            estimated but assumed or fixed by definition. Empty, (0, 0), if none is known.
+        quality: its goodness of fit; None if unknown.
+    """
+
+    variables: tuple[str, ...]
+    dofs: tuple[str, ...]
+    dof_units: tuple[str, ...]
+    powers: NDArray[np.int64]
+    coefficients: Array
+    dt: float
+    low: Array
+    high: Array
+    assumed: tuple[tuple[str, str], ...] = ()
+    std_errors: Array = field(default_factory=_unknown)
+    quality: Quality | None = None
+
+    @property
+    def state_size(self) -> int:
+        """Number of state variables, S."""
+        return len(self.dofs) - 3
+
+    @property
+    def terms_kept(self) -> int:
+        """Number of non-zero coefficients."""
+        return int(np.count_nonzero(self.coefficients))
+
+    def rates(self, x: ArrayLike) -> Array:
+        """Returns dQ/dt (..., D) at X (..., V)."""
+        return evaluate(x, self.powers) @ self.coefficients.T
+
+    def step(self, pose: ArrayLike, state: ArrayLike, command: ArrayLike) -> tuple[Array, Array]:
+        """Computes one step of `dt`; a readable reference for the simulator's kernel.
+
+        Args:
+            pose: (..., 3).
+            state: (..., S).
+            command: (..., C).
+
+        Returns:
+            Pose (..., 3), moved along the exact arc of the body twist, and state (..., S).
+        """
+        state = np.asarray(state, dtype=np.float64)
+        x = np.concatenate([state, np.asarray(command, dtype=np.float64)], axis=-1)
+        dq = self.rates(x) * self.dt
+        return geometry.compose(pose, geometry.exp(dq[..., :3])), state + dq[..., 3:]
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """Names of the K terms: `1`, `speed`, `speed*steering`."""
+        return tuple(term_name(row, self.variables) for row in self.powers)
+
+    @property
+    def named_errors(self) -> dict[str, dict[str, float]]:
+        """Known standard errors of the kept terms: dof -> term -> error."""
+        known = self.coefficients != 0.0
+        known &= np.isfinite(self.std_errors) if self.std_errors.size else False
+        names = self.term_names
+        return {
+            dof: {names[k]: float(self.std_errors[d, k]) for k in np.flatnonzero(known[d])}
+            for d, dof in enumerate(self.dofs)
+            if known[d].any()
+        }
+
+    def with_errors(self, errors: Mapping[str, Mapping[str, float]]) -> TaylorModel:
+        """Returns the model with standard errors by dof and term; NaN for kept terms without."""
+        if not errors:
+            return replace(self, std_errors=_unknown())
+        names = self.term_names
+        rows = [[errors.get(dof, {}).get(name, np.nan) for name in names] for dof in self.dofs]
+        known = np.array(rows, dtype=np.float64).reshape(self.coefficients.shape)
+        return replace(self, std_errors=np.where(self.coefficients != 0.0, known, 0.0))
+
+    def equations(self) -> list[str]:
+        """Returns one line per dof, with units: `wz = 4.6*speed*steering  [rad/s]`."""
+        lines = []
+        for d, dof in enumerate(self.dofs):
+            text = ""
+            for k in np.flatnonzero(self.coefficients[d]):
+                value, name = (
+                    self.coefficients[d, k],
+                    term_name(self.powers[k], self.variables),
+                )
+                sign = ("-" if value < 0 else "") if not text else (" - " if value < 0 else " + ")
+                mark = " (assumed)" if (dof, name) in self.assumed else ""
+                text += f"{sign}{abs(value):.5g}" + ("" if name == "1" else f"*{name}") + mark
+            lines.append(f"{dof} = {text or '0'}  [{self.dof_units[d]}]")
+        return lines
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain data for YAML; every number reads back bit-identical."""
+        terms = {
+            dof: {
+                term_name(self.powers[k], self.variables): float(self.coefficients[d, k])
+                for k in np.flatnonzero(self.coefficients[d])
+            }
+            for d, dof in enumerate(self.dofs)
+        }
+        box = {
+            name: [float(low), float(high)]
+            for name, low, high in zip(self.variables, self.low, self.high, strict=True)
+        }
+        data: dict[str, Any] = {
+            "dt": self.dt,
+            "units": dict(zip(self.dofs, self.dof_units, strict=True)),
+            "terms": terms,
+            "valid": box,
+            "assumed": [list(pair) for pair in self.assumed],
+        }
+        if self.std_errors.size:
+            data["standard_errors"] = self.named_errors
+        if self.quality is not None:
+            data["quality"] = self.quality.to_dict()
+        return data
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> TaylorModel:
+        """Reads the output of `to_dict`. Raises ModelError with the wrong key."""
+        try:
+            variables, dofs = tuple(data["valid"]), tuple(data["terms"])
+            terms = data["terms"]
+            parsed = {name: parse_term(name, variables) for dof in dofs for name in terms[dof]}
+            names = sorted(parsed, key=lambda name: canonical(parsed[name]))
+            powers = np.array([parsed[name] for name in names], dtype=np.int64)
+            powers = powers.reshape(len(names), len(variables))
+            coefficients = np.array(
+                [[float(terms[dof].get(name, 0.0)) for name in names] for dof in dofs]
+            )
+            box = np.array([data["valid"][name] for name in variables], dtype=np.float64)
+            box = box.reshape(len(variables), 2)
+            units, dt = tuple(data["units"][dof] for dof in dofs), float(data["dt"])
+            assumed = tuple((str(dof), str(term)) for dof, term in data["assumed"])
+            errors = {
+                str(dof): {str(term): float(value) for term, value in row.items()}
+                for dof, row in data.get("standard_errors", {}).items()
+            }
+            quality = Quality.from_dict(data["quality"]) if "quality" in data else None
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise ModelError(
+                f"kinematics: {error!s} is missing or wrong; generate the model anew."
+            ) from None
+        if not (np.isfinite(coefficients).all() and np.isfinite(box).all() and 0.0 < dt < np.inf):
+            raise ModelError("kinematics: holds NaN, inf or dt <= 0; generate the model anew.")
+        return cls(
+            variables, dofs, units, powers, coefficients.reshape(len(dofs), len(names)), dt,
+            box[:, 0], box[:, 1], assumed, quality=quality,
+        ).with_errors(errors)  # fmt: skip
+
+
+def exponents(variables: int, order: int) -> NDArray[np.int64]:
+    """Returns the distinct products of up to `order` variables.
+
+    `chi = vec([1, X] (x) [1, X])` of Eq. 1 contains every mixed product twice; here each occurs
+    once.
+
+    Args:
+        variables: V, the size of X.
+        order: of the Taylor expansion; the paper's is 2.
+
+    Returns:
+        (K, V) exponent of each variable in each term: the constant first, then by order.
+    """
+    rows = []
+    for degree in range(order + 1):
+        for chosen in combinations_with_replacement(range(variables), degree):
+            rows.append(np.bincount(np.array(chosen, dtype=np.int64), minlength=variables))
+    return np.array(rows, dtype=np.int64).reshape(len(rows), variables)
+
+
+def evaluate(x: ArrayLike, powers: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Returns the features chi (..., K) of variables x (..., V) for exponents (K, V)."""
+    x = np.asarray(x, dtype=np.float64)
+    chi = np.ones((*x.shape[:-1], len(powers)))
+    for k, row in enumerate(powers):
+        for variable in np.flatnonzero(row):
+            chi[..., k] *= x[..., variable] ** row[variable]
+    return chi
+
+
+def term_name(row: NDArray[np.int64], names: tuple[str, ...]) -> str:
+    """Returns a term as text: `1`, `speed`, `speed*steering`, `speed^2`."""
+    factors = [names[v] if row[v] == 1 else f"{names[v]}^{row[v]}" for v in np.flatnonzero(row)]
+    return "*".join(factors) or "1"
+
+
+def canonical(row: NDArray[np.int64]) -> tuple[int, ...]:
+    """Returns a sort key for exponents (V,) in the order of `exponents`: order, then variable."""
+    return (int(row.sum()), *(-int(power) for power in row))
+
+
+def parse_term(text: str, names: tuple[str, ...]) -> NDArray[np.int64]:
+    """Parses a term written by `term_name` to exponents (V,). Raises ValueError otherwise."""
+    row = np.zeros(len(names), dtype=np.int64)
+    if text == "1":
+        return row
+    for factor in text.split("*"):
+        name, _, power = factor.partition("^")
+        if name not in names:
+            raise ValueError(f"term {text!r} names the unknown variable {name!r}")
+        times = int(power or 1)
+        if times < 1:
+            raise ValueError(f"term {text!r} has a power below 1")
+        row[names.index(name)] += times
+    return row
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Figures of merit, by degree of freedom where they are mappings.
+
+    Attributes:
+        samples: number of rows that the fit used.
+        outliers: share of the rows that were dropped as outliers.
+        condition: condition number of the standardised kept features.
+        rmse: of the rates on the training part, in the unit of the rate.
+        r2: share of the variance of the rates that is explained there.
+        held_out_rmse, held_out_r2: the same on data that the fit never saw; empty if none.
+        open_loop_horizon_s: length of the open-loop predictions on that data [s]; 0 if none.
+        open_loop_position_error_m: mean position error at their ends [m].
+        open_loop_heading_error_rad: mean heading error [rad].
+        open_loop_path_m: mean length of the measured path [m].
+    """
+
+    samples: int
+    outliers: dict[str, float]
+    condition: dict[str, float]
+    rmse: dict[str, float]
+    r2: dict[str, float]
+    held_out_rmse: dict[str, float]
+    held_out_r2: dict[str, float]
+    open_loop_horizon_s: float = 0.0
+    open_loop_position_error_m: float = 0.0
+    open_loop_heading_error_rad: float = 0.0
+    open_loop_path_m: float = 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns plain data for YAML."""
+        return {k: dict(v) if isinstance(v, dict) else v for k, v in vars(self).items()}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Quality:
+        """Reads the output of `to_dict`. Raises KeyError, TypeError or ValueError otherwise."""
+        values: dict[str, Any] = {
+            name: {str(k): float(v) for k, v in value.items()}
+            if isinstance(value, dict)
+            else float(value)
+            for name, value in data.items()
+        }
+        return cls(**{**values, "samples": int(values["samples"])})

@@ -1,1 +1,0 @@
-"""Rules that stand between a policy and a robot, as pure functions."""

@@ -1,0 +1,152 @@
+"""DeviceWorld: one world of a simulator as seen by the devices in it, whatever moves them.
+
+With the covariance of a pose by odometry after a drive, given the noise of the measured twist.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import Simulator
+from nics_drl_bridge.sim.robot_kernels import propagate_in_place
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sensed:
+    """Measurements and true state of one robot at a time.
+
+    Attributes:
+        odom: (3,) pose by odometry.
+        covariance: (3, 3) of `odom`.
+        twist: (3,) measured body twist.
+        state: (S,) true state.
+        ranges: (B,) scan.
+        pose: (3,) true pose in `map`.
+        before: (3,) true pose one step earlier.
+        period: length of a step [s].
+    """
+
+    odom: Array
+    covariance: Array
+    twist: Array
+    state: Array
+    ranges: NDArray[np.float32]
+    pose: Array
+    before: Array
+    period: float
+
+    @property
+    def true_twist(self) -> Array:
+        """(3,) mean true body twist over the last step."""
+        return geometry.log(geometry.between(self.before, self.pose)) / self.period
+
+
+class DeviceWorld:
+    """Keeps the last command of each robot and the covariance of its odometry.
+
+    Args:
+        simulator: moves the robots.
+        model: of the robots, with the step of the simulator.
+        robots: M.
+
+    Attributes:
+        commands: (M, C) commands for the next step.
+    """
+
+    def __init__(self, simulator: Simulator, model: SimulatorModel, robots: int) -> None:
+        self._simulator, self._period = simulator, model.control_period
+        self._added = step_covariance(model.noise.odometry, self._period)
+        self.commands: Array = np.zeros((robots, len(model.robot.command)))
+        self._covariance = np.tile(self._added, (robots, 1, 1))
+        self._before = simulator.data.pose[0].copy()
+
+    @property
+    def robots(self) -> int:
+        """M."""
+        return len(self.commands)
+
+    @property
+    def touched(self) -> list[bool]:
+        """Per robot, true if it has touched something in this episode."""
+        return [bool(one) for one in self._simulator.data.collided[0]]
+
+    def begin(self, seed: int, starts: Array | None) -> None:
+        """Begins the episode of a seed, at x, y, heading of each robot (3 M,) if given.
+
+        Raises:
+            ConfigError: the starts are for another number of robots.
+        """
+        if starts is not None and starts.size != 3 * self.robots:
+            raise ConfigError(
+                f"episode_start has {starts.size} numbers; {self.robots} robots need "
+                f"{3 * self.robots}: x, y, heading of each."
+            )
+        placed = None if starts is None else starts.reshape(1, self.robots, 3)
+        self._simulator.reset([seed], starts=placed)
+        self.commands[:] = 0.0
+        self._covariance[:] = self._added
+        self._before[:] = self._simulator.data.pose[0]
+
+    def advance(self) -> None:
+        """Moves all robots by one step."""
+        data = self._simulator.data
+        self._before[:] = data.pose[0]
+        odom = data.odom[0].copy()
+        self._simulator.step(self.commands[None])
+        data = self._simulator.data
+        self._covariance = propagate(self._covariance, odom, data.odom[0], self._added)
+
+    def sensed(self, robot: int) -> Sensed:
+        """Returns the present values of one robot; the next step may overwrite them."""
+        data = self._simulator.data
+        return Sensed(
+            data.odom[0, robot],
+            self._covariance[robot],
+            data.twist[0, robot],
+            data.state[0, robot],
+            data.ranges[0, robot],
+            data.pose[0, robot],
+            self._before[robot],
+            self._period,
+        )
+
+
+LEAST_VARIANCE = 1e-9
+"""Variance of odometry without noise: in ROS, a covariance of zeros means unknown."""
+
+
+def variances(std: tuple[float, float]) -> Array:
+    """Variances (3,) of a measured twist, from its linear [m/s] and angular [rad/s] deviation."""
+    linear, angular = (max(one * one, LEAST_VARIANCE) for one in std)
+    return np.array([linear, linear, angular])
+
+
+def step_covariance(std: tuple[float, float], period: float) -> Array:
+    """Covariance (3, 3) that one period [s] adds to that of x, y [m] and heading [rad]."""
+    return np.diag(np.maximum(variances(std) * period * period, LEAST_VARIANCE))
+
+
+def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Array) -> Array:
+    """Propagates the covariances (M, 3, 3) of poses by odometry by one period.
+
+    A heading error rotates the motion that follows: P' = F P F^T + Q, with F the derivative of
+    the new pose with respect to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4).
+
+    Args:
+        covariance: (M, 3, 3) before the period.
+        before: (M, 3) poses by odometry before it.
+        after: (M, 3) poses by odometry after it.
+        added: (3, 3) of one period, see `step_covariance`.
+    """
+    after_that = np.array(covariance, np.float64)
+    poses = (np.ascontiguousarray(pose, np.float64) for pose in (before, after))
+    propagate_in_place(after_that, *poses, added)
+    return after_that

@@ -1,0 +1,350 @@
+"""Compiled motion of obstacles: one call at reset, and one per world and control period.
+
+Shared arguments: `marks` (N, K, F) the obstacles' memory, and `plans`, the rows (K, P) and
+waypoints (Q, 2) of `obstacles.plan_arrays`; their columns are in `separation_kernels`. `bodies`
+(N, K + M, 7), obstacles, then from index `first` the robots, see `lidar.shapes.BODY`. Each
+obstacle is represented by its enclosing circle. All draws depend on seed, step and k alone.
+
+Compiled pedestrians: the social force model of Helbing and Molnar (1995).
+
+"Social force model for pedestrian dynamics", Phys. Rev. E 51, 4282; equation numbers are theirs.
+A walker is driven towards its goal (2), repelled by others along ellipses that anticipate their
+next step (3, 4) and by walls (5), less by what is out of sight (8), and disturbed by a
+fluctuation. Bodies are discs of any size, so distances are between surfaces. The anticipated step
+is that of the relative motion (Johansson, Helbing, Shukla 2007): with the other's motion alone, a
+walker reacts too late to a robot that stands in its way, and pushes against it.
+"""
+
+from __future__ import annotations
+
+import math
+
+from nics_drl_bridge import random_kernels as random
+from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.sim import separation_kernels as at
+from nics_drl_bridge.sim.separation_kernels import (
+    clearance,
+    map_direction,
+    map_distance,
+    on_wall,
+    restrain,
+)
+
+DRAWS = 64
+"""Greatest number of draws per obstacle and period."""
+TURN = 2.0
+"""Greatest turn rate of an obstacle [rad/s]."""
+LOOK = 1.0
+"""A wandering obstacle looks ahead by the distance of this time [s], plus its radius."""
+MARGIN = 0.1
+"""Free space that it keeps at its sides [m]."""
+TRIES = 8
+"""Directions that it tries in one period."""
+MOST_CORNERS = 32
+"""Greatest number of waypoints that a patrol passes in a period."""
+
+
+@kernel(allocates=True)
+def _wrap(angle):  # type: ignore[no-untyped-def]
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+@kernel(allocates=True)
+def _share(seed, counter):  # type: ignore[no-untyped-def]
+    return random.uniform(seed, random.MOTION_STREAM, counter)
+
+
+@kernel(allocates=True)
+def begin(marks, n, bodies, plans, half, seed):  # type: ignore[no-untyped-def]
+    """Begins an episode of world n: draws the speed and initial direction of each obstacle.
+
+    Args:
+        half: (2,) half the size of the field [m].
+        seed: of the episode.
+    """
+    rows, _ = plans
+    for k in range(marks.shape[1]):
+        mark, row, counter = marks[n, k], rows[k], k * DRAWS
+        mark[:] = 0.0
+        if row[at.KIND] == at.STILL:
+            continue
+        low, high = row[at.SPEED_LOW], row[at.SPEED_HIGH]
+        mark[at.SPEED] = low + (high - low) * _share(seed, counter)
+        mark[at.DIRECTION] = (2.0 * _share(seed, counter + 1) - 1.0) * math.pi
+        mark[at.AIM] = mark[at.DIRECTION]
+        mark[at.GOAL_X], mark[at.GOAL_Y] = bodies[n, k, 0], bodies[n, k, 1]
+        mark[at.UNTIL], mark[at.WAY] = -1.0, 1.0
+
+
+@kernel(allocates=True)
+def steer(velocity, marks, n, bodies, first, speeds, plans, walls, half, seed, step, period, distances):  # type: ignore[no-untyped-def]  # fmt: skip  # noqa: E501
+    """Sets the velocities of the obstacles of world n for one control period.
+
+    Moving by its velocity for the period, an obstacle neither leaves the field nor crosses a wall
+    nor touches another obstacle, and does not run into a robot that keeps its velocity.
+
+    Args:
+        velocity: (N, K, 3) result [m/s, m/s, rad/s] in `map`; 0 for those that stand still.
+        speeds: (M, 2) velocity of its robots in `map` [m/s].
+        walls: (W, 4).
+        half: (2,) half the size of the field [m].
+        seed: of the episode.
+        step: control periods since the reset, from 0 or 1.
+        period: [s].
+        distances: of a static map, see `obstacles.distance_arrays`.
+    """
+    rows, waypoints = plans
+    count = velocity.shape[1]
+    scene = (bodies[n], walls, half, distances)
+    draws = (step + 1) * count
+    for k in range(count):  # walkers first: they react to the velocities of the last period
+        velocity[n, k, :] = 0.0
+        if rows[k, at.KIND] == at.PEDESTRIAN and bodies[n, k, 5] > 0.0:
+            velocity[n, k, 0], velocity[n, k, 1] = walk(
+                marks[n], k, scene, first, speeds, rows[k], seed, (draws + k) * DRAWS, step,
+                period,
+            )  # fmt: skip
+    for k in range(count):
+        kind, mark = rows[k, at.KIND], marks[n, k]
+        if kind == at.STILL or bodies[n, k, 5] <= 0.0:
+            continue
+        dx, dy = velocity[n, k, 0] * period, velocity[n, k, 1] * period
+        if kind == at.WANDER:
+            dx, dy = _wander(mark, k, scene, seed, (draws + k) * DRAWS, period)
+        elif kind == at.PATROL:
+            dx, dy = _follow(mark, bodies[n, k], rows[k], waypoints, period, False)
+        wished_x, wished_y = dx, dy
+        dx, dy = restrain(dx, dy, k, scene, first, speeds, rows, period, kind != at.PATROL)
+        if kind == at.PATROL and dx == wished_x and dy == wished_y:
+            _follow(mark, bodies[n, k], rows[k], waypoints, period, True)
+        mark[at.VX], mark[at.VY] = dx / period, dy / period
+        velocity[n, k, 0], velocity[n, k, 1] = mark[at.VX], mark[at.VY]
+        if dx != 0.0 or dy != 0.0:  # it faces the direction of motion
+            turn = _wrap(math.atan2(dy, dx) - bodies[n, k, 2]) / period
+            velocity[n, k, 2] = min(max(turn, -TURN), TURN)
+
+
+@kernel(allocates=True)
+def _blocked(x, y, angle, reach, here, room, k, scene):  # type: ignore[no-untyped-def]
+    """True if something is near the path ahead, and nearer than at the outset."""
+    for part in (0.5, 1.0):
+        way = part * reach
+        free, _, _ = clearance(x + way * math.cos(angle), y + way * math.sin(angle), k, scene)
+        if free < room and free < here:
+            return True
+    return False
+
+
+@kernel(allocates=True)
+def _wander(mark, k, scene, seed, counter, period):  # type: ignore[no-untyped-def]
+    """Displacement of a wandering obstacle: ahead, turning to a free direction if blocked."""
+    body, speed = scene[0][k], mark[at.SPEED]
+    x, y, radius = body[0], body[1], body[5]
+    here, nx, ny = clearance(x, y, k, scene)
+    reach = LOOK * speed + radius
+    aim, near = mark[at.AIM], here < reach + radius + MARGIN
+    if near and _blocked(x, y, aim, reach, here, radius + MARGIN, k, scene):
+        away = math.atan2(-ny, -nx)
+        for i in range(TRIES):
+            aim = away + (_share(seed, counter + i) - 0.5) * math.pi
+            if not _blocked(x, y, aim, reach, here, radius + MARGIN, k, scene):
+                break
+        mark[at.AIM] = aim
+    turn = _wrap(aim - mark[at.DIRECTION])
+    mark[at.DIRECTION] = _wrap(mark[at.DIRECTION] + min(max(turn, -TURN * period), TURN * period))
+    # It slows down in turns, so that it does not move far off its intended direction.
+    way = speed * period * max(math.cos(aim - mark[at.DIRECTION]), 0.0)
+    return way * math.cos(mark[at.DIRECTION]), way * math.sin(mark[at.DIRECTION])
+
+
+@kernel(allocates=True)
+def _follow(mark, body, row, waypoints, period, keep):  # type: ignore[no-untyped-def]
+    """Displacement of a patrol along its path, by the arc length of a period.
+
+    Args:
+        keep: whether its progress along the waypoints is stored.
+    """
+    index, way, rest = int(mark[at.INDEX]), mark[at.WAY], mark[at.REST]
+    x, y, left = body[0], body[1], period
+    for _ in range(MOST_CORNERS):
+        pause = min(rest, left)
+        rest, left = rest - pause, left - pause
+        if left <= 0.0:
+            break
+        goal = waypoints[int(row[at.FIRST]) + index]
+        away, reach = math.hypot(goal[0] - x, goal[1] - y), mark[at.SPEED] * left
+        if away > reach:
+            x, y = x + (goal[0] - x) * reach / away, y + (goal[1] - y) * reach / away
+            break
+        x, y, left, rest = goal[0], goal[1], left - away / mark[at.SPEED], row[at.PAUSE]
+        index, way = _after(index, way, row)
+    if keep:
+        mark[at.INDEX], mark[at.WAY], mark[at.REST] = index, way, rest
+    return x - body[0], y - body[1]
+
+
+@kernel(allocates=True)
+def _after(index, way, row):  # type: ignore[no-untyped-def]
+    """Returns the next waypoint and the direction along the list: 1, or -1 for backwards."""
+    count = int(row[at.COUNT])
+    if row[at.LOOP] != 0.0:
+        return (index + 1) % count, 1.0
+    if not 0 <= index + way < count:
+        way = -way
+    return index + int(way), way
+
+
+NEAREST = 1e-3
+"""Least distance for which a force is computed [m]: at 0 it has no direction."""
+FAR = 8.0
+"""Forces beyond this many ranges are neglected."""
+STRONGEST = 5.0
+"""Greatest acceleration [m/s^2]: people reach no more, and the model's is unbounded."""
+ARRIVED = 0.3
+"""A goal is reached within this distance [m]."""
+ROOM = 0.2
+"""Free space around a walker at a new goal [m]."""
+LEAST_WALK = 1.0
+"""Least distance of a new goal [m], if such a goal is found."""
+PATIENCE = 5.0
+"""A walker gives up a goal after twice the time of the straight path plus this time [s]."""
+CANDIDATES = 16
+
+
+@kernel(allocates=True)
+def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-untyped-def]
+    """Computes the force (3, 4) of another walker; 2 b = sqrt((|r| + |r - v dt|)^2 - (v dt)^2).
+
+    Args:
+        rx, ry: from the other to this one [m], not zero.
+        vx, vy: velocity of the other, relative to this one [m/s].
+        foresight: dt [s].
+        strength: V0 [m^2/s^2].
+        reach: sigma [m].
+
+    Returns:
+        Acceleration [m/s^2], - V0 grad exp(-b / sigma).
+    """
+    sx, sy = vx * foresight, vy * foresight
+    qx, qy = rx - sx, ry - sy
+    one, two = math.sqrt(rx * rx + ry * ry), max(math.sqrt(qx * qx + qy * qy), NEAREST)
+    both = one + two
+    b = 0.5 * math.sqrt(max(both * both - sx * sx - sy * sy, NEAREST * NEAREST))
+    if b > FAR * reach:
+        return 0.0, 0.0
+    size = strength / reach * math.exp(-b / reach) * both / (4.0 * b)
+    return size * (rx / one + qx / two), size * (ry / one + qy / two)
+
+
+@kernel(allocates=True)
+def _sight(ex, ey, fx, fy, row):  # type: ignore[no-untyped-def]
+    """Weight (8) of a force on a walker that looks along e: 1, or less from behind."""
+    seen = -(ex * fx + ey * fy) >= row[at.VIEW] * math.sqrt(fx * fx + fy * fy)
+    return 1.0 if seen else row[at.BEHIND]
+
+
+@kernel(allocates=True)
+def _from_bodies(k, ex, ey, bodies, marks, first, speeds, row):  # type: ignore[no-untyped-def]
+    """Sums the forces of all other bodies on walker k: walkers, obstacles, robots."""
+    ax, ay = 0.0, 0.0
+    for j in range(bodies.shape[0]):
+        if j == k or bodies[j, 5] <= 0.0:
+            continue
+        rx, ry = bodies[k, 0] - bodies[j, 0], bodies[k, 1] - bodies[j, 1]
+        if j < first:
+            vx, vy = marks[j, at.VX], marks[j, at.VY]
+        else:
+            vx, vy = speeds[j - first, 0], speeds[j - first, 1]
+        vx, vy = vx - marks[k, at.VX], vy - marks[k, at.VY]
+        near = bodies[k, 5] + bodies[j, 5]
+        far = near + FAR * row[at.RANGE] + math.sqrt(vx * vx + vy * vy) * row[at.FORESIGHT]
+        away2 = rx * rx + ry * ry
+        if away2 > far * far or away2 == 0.0:
+            continue
+        away = math.sqrt(away2)
+        share = max(away - near, NEAREST) / away
+        fx, fy = repulsion(
+            rx * share, ry * share, vx, vy, row[at.FORESIGHT], row[at.REPULSION], row[at.RANGE]
+        )
+        weight = _sight(ex, ey, fx, fy, row)
+        ax, ay = ax + weight * fx, ay + weight * fy
+    return ax, ay
+
+
+@kernel(allocates=True)
+def _from_walls(x, y, radius, walls, distances, row):  # type: ignore[no-untyped-def]
+    """Sums the forces (5) of the nearest point of each wall, and of the static map."""
+    ax, ay, reach = 0.0, 0.0, row[at.WALL_RANGE]
+    far = radius + FAR * reach
+    for w in range(walls.shape[0]):
+        px, py = on_wall(x, y, walls[w])
+        ox, oy = x - px, y - py
+        away2 = ox * ox + oy * oy
+        if 0.0 < away2 < far * far:
+            away = math.sqrt(away2)
+            size = row[at.WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
+            ax, ay = ax + size * ox / away, ay + size * oy / away
+    away = map_distance(x, y, distances)
+    if away < far:
+        nx, ny = map_direction(x, y, distances)
+        size = row[at.WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
+        ax, ay = ax - size * nx, ay - size * ny
+    return ax, ay
+
+
+@kernel(allocates=True)
+def _new_goal(mark, k, scene, seed, counter, step, period):  # type: ignore[no-untyped-def]
+    """Draws the next goal of walker k; the last draw is kept if none is free."""
+    bodies, _, half, _ = scene
+    x, y, radius = bodies[k, 0], bodies[k, 1], bodies[k, 5]
+    wide, deep = max(half[0] - radius - ROOM, 0.0), max(half[1] - radius - ROOM, 0.0)
+    for i in range(CANDIDATES):
+        gx = (2.0 * random.uniform(seed, random.MOTION_STREAM, counter + 2 * i) - 1.0) * wide
+        gy = (2.0 * random.uniform(seed, random.MOTION_STREAM, counter + 2 * i + 1) - 1.0) * deep
+        mark[at.GOAL_X], mark[at.GOAL_Y] = gx, gy
+        if math.hypot(gx - x, gy - y) >= LEAST_WALK:
+            free, _, _ = clearance(gx, gy, k, scene)
+            if free >= radius + ROOM:
+                break
+    way = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)
+    mark[at.UNTIL] = step + (2.0 * way / mark[at.SPEED] + PATIENCE) / period
+
+
+@kernel(allocates=True)
+def walk(marks, k, scene, first, speeds, row, seed, counter, step, period):  # type: ignore[no-untyped-def]
+    """Returns the next velocity of walker k and updates its goal in its row of marks.
+
+    Args:
+        marks: (K, F) of this world, columns as in `separation_kernels`.
+        scene, first, speeds: see `separation_kernels`.
+        row: (P,) the walker's plan.
+        seed, counter: of the random draws; it takes fewer than 64.
+        step: periods since the reset.
+        period: [s].
+
+    Returns:
+        vx, vy in `map` [m/s].
+    """
+    bodies, walls, _, distances = scene
+    mark, x, y = marks[k], bodies[k, 0], bodies[k, 1]
+    away = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)
+    if step >= mark[at.UNTIL] or away < ARRIVED:
+        _new_goal(mark, k, scene, seed, counter + 4, step, period)
+        away = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)
+    ex, ey = 0.0, 0.0
+    if away > 0.0:
+        ex, ey = (mark[at.GOAL_X] - x) / away, (mark[at.GOAL_Y] - y) / away
+    ax, ay = _from_bodies(k, ex, ey, bodies, marks, first, speeds, row)
+    bx, by = _from_walls(x, y, bodies[k, 5], walls, distances, row)
+    ax += bx + (mark[at.SPEED] * ex - mark[at.VX]) / row[at.RELAXATION]
+    ay += by + (mark[at.SPEED] * ey - mark[at.VY]) / row[at.RELAXATION]
+    if row[at.FLUCTUATION] > 0.0:
+        ax += row[at.FLUCTUATION] * random.normal(seed, random.MOTION_STREAM, counter // 2)
+        ay += row[at.FLUCTUATION] * random.normal(seed, random.MOTION_STREAM, counter // 2 + 1)
+    size = math.hypot(ax, ay)
+    share = period * min(1.0, STRONGEST / size) if size > 0.0 else 0.0
+    vx, vy = mark[at.VX] + share * ax, mark[at.VY] + share * ay
+    fast = math.hypot(vx, vy)
+    if fast > row[at.SPEED_HIGH]:
+        vx, vy = vx * row[at.SPEED_HIGH] / fast, vy * row[at.SPEED_HIGH] / fast
+    return vx, vy

@@ -1,0 +1,187 @@
+"""Figures of what the package computes, taken down once: a change of the house must keep them.
+
+Each digest runs a part of the package on fixed seeds and keeps a few projections of all that came
+out on fixed random signs, so that one number that changes shows. `python test/digests/digests.py
+NAME...` takes them down anew, for a change that is meant to change them.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TEST = Path(__file__).resolve().parents[1]
+FILE = Path(__file__).with_name("digests.json")
+ROBOTS = ("ackermann", "differential", "mecanum")
+WORLDS = ("arena", "clutter", "crowd", "room")
+PROJECTIONS = 3
+Found = dict[str, list[float]]
+
+
+def projected(values: Any) -> list[float]:
+    """How many numbers, and sums of them over random signs, in which each has its own part."""
+    array = np.asarray(values, np.float64).ravel()
+    array = np.nan_to_num(array, nan=1e6, posinf=1e7, neginf=-1e7)
+    rng = np.random.default_rng(len(array))
+    weights = rng.uniform(0.5, 1.5, (PROJECTIONS, len(array)))
+    signs = rng.choice([-1.0, 1.0], weights.shape)
+    return [float(len(array)), *((weights * signs) @ array).tolist()]
+
+
+def worlds() -> Found:
+    """Bits of N worlds: the vector env of each robot and world, with and without randomisation."""
+    from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+
+    found = {}
+    for robot in ROBOTS:
+        for world in WORLDS:
+            random = "strong" if world == "clutter" else None
+            env = BridgeVectorEnv(6, robot, world, randomisation=random, max_episode_steps=40)
+            seen, _ = env.reset(seed=5)
+            rng, rows = np.random.default_rng(1), [seen.copy()]
+            for _ in range(80):
+                action = rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
+                seen, reward, ended, cut, _ = env.step(action)
+                rows += [seen.copy(), reward, ended, cut, env.simulator.data.pose.copy()]
+            env.close()
+            found[f"{robot} {world}"] = projected(np.concatenate([np.ravel(row) for row in rows]))
+    return found
+
+
+def single() -> Found:
+    """The single env with the estimator of the nodes."""
+    from nics_drl_bridge.env.bridge_env import BridgeEnv
+
+    found = {}
+    for robot in ROBOTS:
+        env = BridgeEnv(backend="sim", model=robot, world="arena", estimator=True)
+        seen, info = env.reset(seed=3)
+        rng, rows = np.random.default_rng(2), [seen]
+        for _ in range(60):
+            action = rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
+            seen, reward, ended, cut, info = env.step(action)
+            rows += [seen, reward, info["pose"]]
+            if ended or cut:
+                seen, info = env.reset()
+        env.close()
+        found[robot] = projected(np.concatenate([np.ravel(row) for row in rows]))
+    return found
+
+
+def table_1() -> Found:
+    """What Table I fits: coefficients, terms kept and errors of the textbook robots."""
+    import table1_kinematics as table
+
+    from nics_drl_bridge.identify.fit import fit
+
+    found = {}
+    for name in ROBOTS:
+        robot = table.subject(name)
+        model = fit(table.drive(robot, 0), robot.spec).model
+        rmse = np.concatenate(table.errors(model, robot, 1))
+        found[name] = projected(np.concatenate([model.coefficients.ravel(), rmse]))
+    return found
+
+
+def table_2() -> Found:
+    """Errors of the baked scans of Table II, and the scans themselves."""
+    import table2_lidar as table
+
+    found = {}
+    for name, shapes in table.SCENES.items():
+        baked = table.bake(table.SPEC, shapes, table.DENSITY)
+        drawn = table.batches(shapes, 64)
+        exact = [table.scan(baked, "exact", batch) for batch in drawn]
+        fast = [table.scan(baked, "baked", batch) for batch in drawn]
+        found[name] = projected(np.concatenate([np.ravel(each) for each in (*exact, *fast)]))
+        found[f"{name} errors"] = [float(each) for each in table.errors(fast, exact)]
+    return found
+
+
+def identified() -> Found:
+    """Models, calibrations and noise identified from recordings with known defects."""
+    from identify.drives import drive
+
+    from nics_drl_bridge.identify.identify import identify
+    from nics_drl_bridge.robot.spec import load_robot
+
+    found = {}
+    for name, disturbed in {
+        "clean": {},
+        "late and noisy": {"latency": 0.08, "noise": (0.002, 0.004), "seed": 1},
+        "turned": {"rotation": 0.1, "lever": (0.05, -0.02), "noise": (0.001, 0.002), "seed": 2},
+        "bursts": {"burst": 0.1, "pose_clock_ahead": 3.0, "noise": (0.001, 0.002), "seed": 3},
+        "poses only": {"measured_state": False, "latency": 0.05, "seed": 4},
+    }.items():
+        for robot in ROBOTS:
+            spec = load_robot(robot)
+            if robot != "ackermann" and "measured_state" in disturbed:
+                continue  # its wheels follow no single command
+            given = {key: value for key, value in disturbed.items() if key != "lever"}
+            if robot == "ackermann":
+                given = disturbed
+            result = identify(drive(spec, **given), spec)
+            calibration = result.calibration.to_dict()
+            numbers = numbers_of(calibration)
+            found[f"{robot} {name}"] = projected([*result.model.coefficients.ravel(), *numbers])
+    return found
+
+
+def numbers_of(data: Any) -> list[float]:
+    """Every number in nested data, by the order of the keys."""
+    if isinstance(data, dict):
+        return [number for key in sorted(data) for number in numbers_of(data[key])]
+    if isinstance(data, list | tuple):
+        return [number for each in data for number in numbers_of(each)]
+    return [float(data)] if isinstance(data, int | float) else []
+
+
+def gate() -> Found:
+    """What the gate decides about adversaries, moment by moment, with its shipped shield."""
+    from measuring import shield_in_process
+    from measuring.adversaries import ADVERSARIES
+    from measuring.shield_places import Job, Place
+
+    found = {}
+    for index, robot in enumerate(ROBOTS):
+        place = Place(robot, ("crowd", "clutter", "arena")[index])
+        config = shield_in_process.config_of(place, {})
+        decisions: list[float] = []
+        for seed, kind in enumerate(ADVERSARIES):
+            shield_in_process.drive(place, config, [Job(kind, seed)], decisions_into(decisions))
+        found[robot] = projected(decisions)
+    return found
+
+
+def decisions_into(kept: list[float]) -> Callable[[Any, float], None]:
+    """Keeps what each decision says: the twist, the rule that stopped it, and the latch."""
+
+    def keep(decision: Any, now: float) -> None:
+        cause = decision.cause
+        rule = "" if cause is None else cause.rule
+        kept.extend([*decision.twist, float(sum(rule.encode()))])
+
+    return keep
+
+
+DIGESTS: dict[str, Callable[[], Found]] = {
+    each.__name__: each for each in (worlds, single, table_1, table_2, identified, gate)
+}
+
+
+def main() -> None:
+    """Takes digests down anew: those that are named, or all."""
+    sys.path[:0] = [str(TEST), str(TEST.parent / "benchmarks")]
+    kept = json.loads(FILE.read_text()) if FILE.exists() else {}
+    for name in sys.argv[1:] or DIGESTS:
+        kept[name] = DIGESTS[name]()
+    FILE.write_text(json.dumps(kept, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,194 @@
+from __future__ import annotations
+
+import os
+import re
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags", reason="needs the extra 'bags'")
+
+import bags
+
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.extras.bags.info import bag_info
+from nics_drl_bridge.extras.bags.salvage import salvage, salvaged
+from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.recording.bag_file import opened
+from nics_drl_bridge.recording.messages import Offer
+from nics_drl_bridge.recording.write import bag_sink, write_bag
+from nics_drl_bridge.robot.spec import load_robot
+
+CAR = load_robot("ackermann")
+STORAGES = ("mcap", "sqlite3")
+
+
+def storage_file(bag):
+    (file,) = (p for p in bag.iterdir() if p.name != "metadata.yaml")
+    return file
+
+
+def held(bag):
+    """All messages of a bag."""
+    with opened(bag) as whole:
+        return {topic: whole.serialized(topic) for topic in whole.types}
+
+
+@pytest.fixture
+def sealed(tmp_path):
+    """A bag with checksums."""
+    drive = textbook.record(CAR, np.random.default_rng(0), duration=20.0)
+    write_bag(drive, tmp_path / "sealed", CAR)
+    return tmp_path / "sealed"
+
+
+def test_a_whole_bag_is_saved_whole(sealed, tmp_path):
+    kept = salvage(sealed, tmp_path / "kept")
+    assert kept.lost == 0
+    assert held(tmp_path / "kept") == held(sealed)
+    assert "0 of" in kept.lines()[0]
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.8])
+def test_what_is_in_front_of_a_cut_is_saved_and_the_rest_is_counted(tmp_path, storage, share):
+    bag = bags.write(tmp_path / "bag", bags.drive(), storage)
+    before, file = held(bag), storage_file(bag)
+    data = file.read_bytes()
+    file.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(RecordingError, match="nics bag salvage"):
+        bag_info(bag)
+    kept = salvage(bag, tmp_path / "kept")
+    after = held(tmp_path / "kept")
+    assert all(set(rows) <= set(before[topic]) for topic, rows in after.items())
+    found = sum(map(len, after.values()))
+    assert found > 0
+    assert kept.lost == 1800 - found > 0
+    assert f"{kept.lost} of 1800 are lost" in kept.lines()[0]
+
+
+def test_a_flipped_bit_costs_the_chunk_that_it_is_in(sealed, tmp_path):
+    before, file = held(sealed), storage_file(sealed)
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(data)
+    with pytest.raises(RecordingError, match="damaged at byte"):
+        bag_info(sealed)
+    kept = salvage(sealed, tmp_path / "kept")
+    after = held(tmp_path / "kept")
+    assert all(set(rows) <= set(before[topic]) for topic, rows in after.items())
+    assert kept.lost is not None
+    assert 0 < kept.lost < 0.5 * sum(map(len, before.values()))
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_any_flipped_bit_of_a_sealed_file_is_found(sealed, seed):
+    file = storage_file(sealed)
+    data = bytearray(file.read_bytes())
+    rng = np.random.default_rng(seed)
+    data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
+    file.write_bytes(data)
+    with pytest.raises(RecordingError):
+        bag_info(sealed)
+
+
+def test_lost_metadata_do_not_lose_the_bag(sealed, tmp_path):
+    before = held(sealed)
+    (sealed / "metadata.yaml").write_bytes(b"\xff")
+    salvage(sealed, tmp_path / "kept")
+    assert held(tmp_path / "kept") == before
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_of_a_killed_recorder_all_that_was_flushed_is_saved(tmp_path, storage):
+    """A process that is killed leaves the hidden folder as it is."""
+    message = bags.STORE.serialize_cdr(bags.twist(1.0, 0.0, 0.0), bags.kinds.TWIST)
+    writing = bag_sink(tmp_path / "drive", storage)
+    sink = writing.__enter__()
+    sink.add_topic("/cmd_vel", bags.kinds.TWIST, [Offer(depth=1)])
+    for k in range(50):
+        sink.write("/cmd_vel", bags.ns(0.1 * k), bytes(message))
+        if k == 39:
+            sink.flush()
+    (left,) = tmp_path.glob(".drive.*")
+    kept = salvage(left, tmp_path / "kept")
+    assert len(held(tmp_path / "kept")["/cmd_vel"]) == kept.kept["/cmd_vel"] >= 40
+    assert kept.lost is None
+    assert "nothing in the bag tells" in kept.lines()[0]
+    writing.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
+    assert not (tmp_path / "drive").exists()
+    assert not list(tmp_path.glob(".drive.*"))
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_what_publishers_offer_is_kept(tmp_path, storage):
+    offers = (Offer(depth=1, transient_local=True), Offer(depth=7, reliable=False))
+    message = bags.STORE.serialize_cdr(bags.twist(1.0, 0.0, 0.0), bags.kinds.TWIST)
+    with bag_sink(tmp_path / "bag", storage) as sink:
+        sink.add_topic("/cmd_vel", bags.kinds.TWIST, offers)
+        sink.write("/cmd_vel", bags.ns(0.0), bytes(message))
+    with opened(tmp_path / "bag") as bag:
+        assert bag.offers("/cmd_vel") == offers
+
+
+def test_a_type_that_nobody_knows_is_written_with_its_text(tmp_path):
+    texts = {"my_msgs/msg/Own": "int32 x\nmy_msgs/Part part", "my_msgs/msg/Part": "float64 y"}
+    data = b"\x00\x01\x00\x00\x01\x00\x00\x00\x00\x00\x00\x00" + b"\x00" * 8
+    with bag_sink(tmp_path / "bag") as sink:
+        sink.add_topic("/own", "my_msgs/msg/Own", texts=texts)
+        sink.write("/own", bags.ns(0.0), data)
+    assert b"float64 y" in storage_file(tmp_path / "bag").read_bytes()
+    assert held(tmp_path / "bag") == {"/own": [(bags.ns(0.0), data)]}
+
+
+def test_a_bag_of_nothing_intact_is_refused(tmp_path):
+    (tmp_path / "drive.mcap").write_bytes(b"\x89MCAP0\r\n")
+    with pytest.raises(RecordingError, match="no message that is intact"):
+        salvage(tmp_path / "drive.mcap", tmp_path / "kept")
+    assert not (tmp_path / "kept").exists()
+
+
+def test_nothing_is_salvaged_unless_asked_for(sealed):
+    with salvaged(sealed, wanted=False) as (path, lines):
+        assert (path, lines) == (sealed, ())
+    with salvaged(sealed, wanted=True) as (path, lines):
+        assert held(path) == held(sealed)
+        assert lines
+
+
+def test_info_tells_rates_gaps_and_clocks(tmp_path):
+    poses = [row for row in bags.poses(offset=100.0) if not 10.0 < row[0] < 12.0]
+    bag = bags.write(tmp_path / "bag", {"/cmd_vel": bags.commands(), "/pose": poses})
+    told = {topic.topic: topic for topic in bag_info(bag).topics}
+    command, pose = told["/cmd_vel"], told["/pose"]
+    assert command.rate_hz == pytest.approx(10.0)
+    assert (command.clock, command.gaps) == ("no header", 0)
+    assert pose.rate_hz == pytest.approx(50.0)
+    assert (pose.clock, pose.gaps) == ("another", 1)
+    assert pose.longest_gap_s == pytest.approx(2.0, abs=0.05)
+    assert pose.delay_s == pytest.approx(-99.998)
+    assert bag_info(bag).messages == len(bags.commands()) + len(poses)
+
+
+def test_stamps_of_several_clocks_are_told(tmp_path):
+    poses = [(t, bags.pose_stamped(t + 50.0 * (t > 15.0), 0.0, 0.0, 0.0)) for t in bags.times()]
+    bag = bags.write(tmp_path / "bag", {"/pose": poses})
+    (pose,) = bag_info(bag).topics
+    assert pose.clock == "several"
+
+
+def test_sentences_of_damage_name_the_place(sealed):
+    file = storage_file(sealed)
+    data = bytearray(file.read_bytes())
+    data[100] ^= 1
+    file.write_bytes(data)
+    with pytest.raises(RecordingError) as caught:
+        bag_info(sealed)
+    assert re.search(r"sealed\.mcap is damaged at byte \d+", str(caught.value))
+
+
+def test_metadata_that_are_a_pipe_are_not_waited_for(sealed, tmp_path):
+    (sealed / "metadata.yaml").unlink()
+    os.mkfifo(sealed / "metadata.yaml")
+    assert salvage(sealed, tmp_path / "kept").lost == 0
+    assert held(tmp_path / "kept") == held(sealed)

@@ -1,0 +1,178 @@
+from __future__ import annotations
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+
+from gate.rig import TICK_S, Rig, config
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.gate.black_box import (
+    FORMAT,
+    BlackBox,
+    Entry,
+    from_plain,
+    replay,
+    to_plain,
+    write,
+)
+from nics_drl_bridge.gate.inputs import EStop
+from nics_drl_bridge.gate.state import ShieldConfig
+from nics_drl_bridge.interface import NS_PER_S
+
+
+class Recorded(Rig):
+    """A rig whose black box sees all."""
+
+    def __init__(self, given, kept_s):
+        super().__init__(given)
+        self.box = BlackBox(given, kept_s)
+
+    def give(self, event, now=None):
+        before = self.state
+        decision = super().give(event, now)
+        self.box.note(Entry(self.now if now is None else now, event, before, decision))
+        return decision
+
+
+def stopped(path, kept_s=30.0):
+    shield = ShieldConfig(0.2, 1.0, 0.05, 0.02, 0.15, 0.2)
+    rig = Recorded(config(shield=shield), kept_s).drive()
+    rig.command([np.nan, 1.0, -0.0])
+    rig.run(0.3)
+    rig.now += TICK_S
+    rig.scan(stamp_ns=rig.stamp + 5 * NS_PER_S)
+    write(rig.config, rig.box.copy(), path)
+    return rig
+
+
+def test_a_stop_replays_to_the_same_decisions_bit_for_bit(tmp_path):
+    rig = stopped(tmp_path / "stop.jsonl")
+    again = replay(tmp_path / "stop.jsonl")
+    assert again.differing == ()
+    assert len(again.entries) == len(rig.box.copy())
+    assert again.entries[-1].decision.cause.rule == "stamps_jumped"
+    for held, read in zip(rig.box.copy(), again.entries, strict=True):
+        assert held.decision.twist.tobytes() == read.decision.twist.tobytes()
+        assert (held.now, type(held.given)) == (read.now, type(read.given))
+
+
+def test_the_story_of_a_replay_names_each_stop_and_when_it_was(tmp_path):
+    stopped(tmp_path / "stop.jsonl")
+    story = replay(tmp_path / "stop.jsonl").story
+    assert "stopped by disarmed" in story[0]
+    assert story[-2].startswith("  +0.000 s  stopped by stamps_jumped: topic=scan")
+    assert any("stopped by command_malformed: topic=cmd_vel_raw" in line for line in story)
+    assert story[-1].endswith("all decided the same again")
+
+
+def test_it_replays_from_the_middle_once_the_oldest_is_forgotten(tmp_path):
+    rig = stopped(tmp_path / "stop.jsonl", kept_s=0.5)
+    again = replay(tmp_path / "stop.jsonl")
+    assert again.entries[-1].now - again.entries[0].now <= 0.5
+    assert again.entries[0].before.armed
+    assert again.differing == ()
+    assert rig.box.copy()[0].now == again.entries[0].now
+
+
+def test_another_decision_than_the_recorded_one_is_found(tmp_path):
+    path = tmp_path / "stop.jsonl"
+    stopped(path)
+    lines = path.read_text(encoding="utf-8").splitlines()
+    last = json.loads(lines[-2])
+    last["decision"]["granted"] = True
+    text = "\n".join([*lines[:-2], json.dumps(last), ""])
+    seal = {"sha256": hashlib.sha256(text.encode()).hexdigest()}
+    path.write_text(f"{text}{json.dumps(seal)}\n", encoding="utf-8")
+    assert replay(path).differing == (len(lines) - 3,)
+
+
+def test_every_flipped_bit_is_refused(tmp_path):
+    path = tmp_path / "stop.jsonl"
+    stopped(path)
+    data, rng = path.read_bytes(), np.random.default_rng(0)
+    for _ in range(100):
+        damaged = bytearray(data)
+        damaged[rng.integers(len(data))] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged)
+        with pytest.raises(ConfigError, match=r"stop\.jsonl"):
+            replay(path)
+
+
+def test_records_of_the_gate_become_plain_data_and_back(tmp_path):
+    rig = stopped(tmp_path / "stop.jsonl")
+    text = json.dumps(to_plain(rig.state))
+    assert json.dumps(to_plain(from_plain(json.loads(text)))) == text
+    assert from_plain(to_plain(EStop(True))) == EStop(True)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "is no black box"),
+        ("{}", "is no black box"),
+        ("{", "is no JSON"),
+        (f'{{"format": "{FORMAT}"}}', "is damaged"),
+        (f'{{"format": "{FORMAT}", "config": {{"kind": "Spy"}}}}', "is damaged"),
+    ],
+)
+def test_a_file_that_is_no_black_box_is_one_sentence(tmp_path, text, sentence):
+    path = tmp_path / "stop.jsonl"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=sentence):
+        replay(path)
+
+
+def sealed(lines) -> str:
+    text = "".join(line if isinstance(line, str) else json.dumps(line) + "\n" for line in lines)
+    return text + json.dumps({"sha256": hashlib.sha256(text.encode()).hexdigest()}) + "\n"
+
+
+def huge(**changes):
+    return {"kind": "array", "type": "<f8", "shape": [10**15], "data": ""} | changes
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"given": huge()},
+        {"given": huge(type="|O", shape=[1], data="AAAAAAAAAAA=")},
+        {"given": huge(type=f"<U{2**29}")},
+        {"given": {"kind": "Limits"}},
+        {"given": 3},
+        {"given": None},
+        {"now": "x"},
+        {"now": None},
+        {"now": 1e308},
+        {"decision": {"kind": "EStop", "pressed": True}},
+        {"decision": []},
+        {},
+    ],
+    ids=str,
+)
+def test_a_record_that_is_none_of_the_gate_is_one_sentence(tmp_path, change):
+    """Its checksum is right: whoever writes the file can write that too."""
+    path = tmp_path / "stop.jsonl"
+    stopped(path)
+    head, *lines = [json.loads(line) for line in path.read_text().splitlines()[:-1]]
+    if change:
+        lines[1] |= change
+    else:
+        head["config"] = head["state"]
+    path.write_text(sealed([head, *lines]))
+    with pytest.raises(ConfigError, match="can't be replayed") as told:
+        replay(path)
+    assert len(str(told.value)) < 400
+
+
+def test_very_many_records_or_brackets_are_refused_at_once(tmp_path):
+    path = tmp_path / "stop.jsonl"
+    for text, words in (("[" * 3_000_000, "holds 3000000 values"), ("[" * 5000, "no JSON")):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=words):
+            replay(path)
+    with path.open("wb") as file:
+        file.truncate(2**33)
+    with pytest.raises(ConfigError, match="is larger than 64 MB"):
+        replay(path)

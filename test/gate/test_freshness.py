@@ -1,0 +1,158 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gate.rig import PERIOD_S, TICK_S, Rig, config, driving
+from nics_drl_bridge.gate.inputs import Reset
+from nics_drl_bridge.interface import NS_PER_S
+
+
+class Stamped(Rig):
+    """A rig whose stamps go by a clock of their own.
+
+    Attributes:
+        pace: seconds of that clock per second.
+        delay_s: by which data come late.
+    """
+
+    pace, delay_s = 1.0, 0.0
+
+    def send(self, without=""):
+        self.stamp += round((self.pace - 1.0) * PERIOD_S * NS_PER_S)
+        before = self.stamp
+        self.stamp -= round(self.delay_s * NS_PER_S)
+        super().send(without)
+        self.stamp = before + round(PERIOD_S * NS_PER_S)
+
+
+def driven(pace=1.0, **changes):
+    rig = Stamped(config(**changes)).drive()
+    rig.pace = pace
+    return rig
+
+
+@pytest.mark.parametrize("step_s", [0.35, 0.2, 0.05, 0.01])
+def test_stamps_that_run_ahead_of_time_latch_a_stop(step_s):
+    rig = driven(pace=1.0 + step_s / PERIOD_S)
+    ahead = (rig.pace - 1.0) * rig.until_stopped(20.0)
+    assert rig.rule == "stamps_jumped"
+    assert ahead <= 0.1 + step_s + 0.02
+    rig.pace = 1.0
+    rig.run(2.0)
+    assert not rig.moves
+
+
+@pytest.mark.parametrize("topic", ["scan", "odom"])
+def test_stamps_of_one_topic_that_run_ahead_are_named(topic):
+    rig, lead = driving(), [0.0]
+    send = getattr(rig, topic)
+
+    def ahead():
+        lead[0] += 0.35
+        return send(stamp_ns=rig.stamp + round(lead[0] * NS_PER_S))
+
+    setattr(rig, topic, ahead)
+    assert rig.until_stopped(0.4) <= 0.4
+    assert (rig.rule, rig.state.latched.topic) == ("stamps_jumped", topic)
+
+
+@pytest.mark.parametrize("pace", [0.9, 0.5, 0.99])
+def test_data_whose_stamps_fall_behind_get_older_and_stop_the_robot_for_good(pace):
+    rig = driven(pace)
+    began, known = rig.now, len(rig.published)
+    rig.run(0.4 / (1.0 - pace) + 1.0)
+    last = max(time for time, twist in rig.published[known:] if twist.any())
+    assert (1.0 - pace - 1e-3) * (last - began) <= 0.36
+    assert rig.rule in ("scan_silent", "scan_behind_old", "odom_silent")
+
+
+@pytest.mark.parametrize("pace", [1.0 + 5e-4, 1.0 - 5e-4])
+def test_clocks_that_drift_as_real_ones_do_are_followed(pace):
+    rig = driven(pace)
+    for _ in range(30):
+        rig.run(10.0)
+        assert rig.decision.cause is None
+    assert rig.state.scans.late[-1] < 1e-3
+
+
+def test_a_delay_that_comes_and_stays_is_not_taken_for_the_new_normal():
+    rig = driven()
+    rig.delay_s = 0.4
+    rig.run(1.0)
+    known = len(rig.published)
+    rig.run(10.0)
+    assert not any(twist.any() for _, twist in rig.published[known:])
+    rig.delay_s = 0.0
+    assert rig.run(0.5).cause is None
+
+
+def test_jitter_does_not_stop_the_robot():
+    rng, rig = np.random.default_rng(0), driven()
+    for _ in range(300):
+        rig.delay_s = float(rng.uniform(0.0, 0.08))
+        assert rig.run(PERIOD_S).cause is None
+
+
+def test_after_a_reset_the_present_is_the_normal_again():
+    rig = driven()
+    rig.delay_s = 0.4
+    rig.run(1.0)
+    rig.speed = 0.0
+    assert rig.give(Reset()).granted
+    rig.run(1.5)
+    assert rig.arm().granted
+    rig.run(0.5)
+    assert rig.moves
+
+
+def test_a_simulator_that_falls_behind_real_time_goes_on_after_a_while():
+    rig = driven(simulated=True)
+    rig.stamp -= round(0.45 * NS_PER_S)
+    rig.until_stopped(1.0)
+    rig.run(3.0)
+    assert rig.moves
+
+
+def test_a_simulator_that_runs_ahead_is_stopped_all_the_same():
+    rig = driven(pace=1.5, simulated=True)
+    rig.until_stopped(1.0)
+    assert rig.rule == "stamps_jumped"
+
+
+@pytest.mark.parametrize("pace", [2.0, 1.5, 0.6])
+def test_stamps_of_another_pace_are_named_at_arming_and_let_pass_if_they_are_declared(pace):
+    named = Stamped(config(rate_tolerance=0.9))
+    named.pace = pace
+    named.run(2.0)
+    assert "clocks_agree: the stamps of scan run away" in named.arm().answer
+    declared = Stamped(config(rate_tolerance=0.9, clock_rate=pace))
+    declared.pace = pace
+    declared.drive(2.0)
+
+
+def test_a_stop_of_a_second_ago_does_not_hide_a_gap():
+    rig = Rig()
+    rig.run(1.2)
+    rig.run(0.4, without="scan")
+    rig.run(0.9)
+    assert "scan_fresh" in rig.arm().answer
+    rig.run(0.4)
+    assert rig.arm().granted
+
+
+@pytest.mark.parametrize("hertz", [200.0, 1000.0])
+def test_odometry_of_any_rate_lets_the_gate_be_armed(hertz):
+    rig = Rig(config(odom_rate=hertz))
+    step = 1.0 / hertz
+    for k in range(round(1.5 * hertz)):
+        rig.now += step
+        rig.odom(stamp_ns=rig.stamp + round(k * step * NS_PER_S))
+        if k % round(hertz * TICK_S) == 0:
+            rig.tick()
+        if k % round(hertz * PERIOD_S) == 0:
+            rig.scan(stamp_ns=rig.stamp + round(k * step * NS_PER_S))
+            rig.send("scan odom command")
+            rig.stamp -= round(PERIOD_S * NS_PER_S)
+    assert rig.arm().granted, rig.decision.answer
+    assert len(rig.state.odometries.marks) < 40

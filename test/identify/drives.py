@@ -1,0 +1,80 @@
+"""Drives of textbook robots, disturbed in known ways."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.robot.spec import RobotSpec
+
+TICKS_PER_METRE = 70.0
+TRACK = 0.16
+
+
+def drive(
+    spec: RobotSpec,
+    seed: int = 0,
+    duration: float = 40.0,
+    latency: float = 0.0,
+    pose_clock_ahead: float = 0.0,
+    rotation: float = 0.0,
+    lever: tuple[float, float] = (0.0, 0.0),
+    noise: tuple[float, float] = (0.0, 0.0),
+    burst: float = 0.0,
+    measured_state: bool = True,
+) -> Recording:
+    """A random drive.
+
+    Args:
+        spec: the robot.
+        seed: of commands and noise.
+        duration: [s].
+        latency: from a command's stamp to its effect [s].
+        pose_clock_ahead: what the pose's clock shows more than the commands' [s].
+        rotation: heading of base_link less that of the tracked body [rad].
+        lever: the tracked point seen from base_link [m].
+        noise: of position [m] and heading [rad].
+        burst: period of the bursts in which poses arrive [s]; 0 for none.
+        measured_state: whether the state is in the recording.
+    """
+    rng = np.random.default_rng(seed)
+    clean = record(spec, rng, duration)
+    tracked = geometry.compose(clean.pose.values, np.array([*lever, -rotation]))
+    tracked = tracked + rng.normal(0.0, 1.0, tracked.shape) * np.array([*noise[:1], *noise])
+    t = clean.pose.t
+    arrival = t if burst == 0.0 else in_bursts(t, burst)
+    clock = "mocap" if pose_clock_ahead != 0.0 else "robot"
+    return Recording(
+        command=replace(clean.command, t=t - latency),
+        pose=Stream(arrival + pose_clock_ahead, tracked, clock),
+        state=clean.state if measured_state else None,
+        source="disturbed drive",
+    )
+
+
+def in_bursts(t: np.ndarray, period: float) -> np.ndarray:
+    """Arrival stamps of samples that are handed over every `period`, 0.1 ms apart or less."""
+    polled = np.ceil(t / period - 1e-6) * period
+    return polled + 1e-3 * (t - (polled - period))
+
+
+def with_wheels(recording: Recording, truth: Recording, swapped: bool) -> Recording:
+    """Adds wheel encoders of a car, counts per tick, on the robot's clock."""
+    state = truth.state
+    assert state is not None
+    speed, turn = state.values[:, 0], state.values[:, 0] * np.tan(state.values[:, 1]) / 0.2
+    left = np.round(TICKS_PER_METRE * (speed - turn * TRACK / 2.0))
+    right = np.round(TICKS_PER_METRE * (speed + turn * TRACK / 2.0))
+    both = np.stack([right, left] if swapped else [left, right], axis=1)
+    return replace(recording, wheels=Stream(state.t[::2], both[::2], "robot"))
+
+
+def without(recording: Recording, start: float, end: float) -> Recording:
+    """Loses the poses between two times."""
+    pose = recording.pose
+    keep = (pose.t < start) | (pose.t > end)
+    return replace(recording, pose=replace(pose, t=pose.t[keep], values=pose.values[keep]))

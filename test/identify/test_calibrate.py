@@ -1,0 +1,174 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from identify.drives import drive, with_wheels, without
+from nics_drl_bridge.errors import ModelError, RecordingError
+from nics_drl_bridge.identify.align import align
+from nics_drl_bridge.identify.calibrate import calibrate
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.recording.recording import samples_on_one_clock
+from nics_drl_bridge.robot.spec import load_robot
+
+
+@pytest.mark.parametrize("name", ["ackermann", "differential", "mecanum"])
+def test_a_textbook_recording_needs_no_correction_and_is_taken_digit_by_digit(name):
+    spec = load_robot(name)
+    recording = drive(spec, duration=30.0)
+    calibration = calibrate(recording, spec)
+    assert calibration.is_exact
+    samples = align(recording, calibration, spec)
+    r = recording
+    plain = samples_on_one_clock(r.pose.t, r.pose.values, r.state.values, r.command.values)
+    for field in ("t", "q", "x", "dq"):
+        assert np.array_equal(getattr(samples, field), getattr(plain, field))
+
+
+@pytest.mark.parametrize("name", ["ackermann", "differential", "mecanum"])
+def test_latency_is_found_from_the_measured_state(name):
+    spec = load_robot(name)
+    found = calibrate(drive(spec, latency=0.083), spec)
+    assert found.command_latency_s == pytest.approx(0.083, abs=1e-3)
+    assert found.clock_offset_s == 0.0
+
+
+@pytest.mark.parametrize("name", ["ackermann", "differential"])
+@pytest.mark.parametrize(("ahead", "rotation"), [(0.31, 2.5), (-1.7, -1.48)])
+def test_clock_offset_rotation_lever_arm_and_noise_are_found_together(name, ahead, rotation):
+    spec = load_robot(name)
+    recording = drive(
+        spec,
+        latency=0.06,
+        pose_clock_ahead=ahead,
+        rotation=rotation,
+        lever=(0.05, 0.0),
+        noise=(0.001, 0.002),
+    )
+    found = calibrate(recording, spec)
+    assert found.clock_offset_s == pytest.approx(-ahead, abs=4e-3)
+    assert found.command_latency_s == pytest.approx(0.06, abs=2e-3)
+    assert found.rotation_rad == pytest.approx(rotation, abs=0.01)
+    assert found.lever_arm_m[0] == pytest.approx(0.05, abs=3e-3)
+    assert found.position_noise_m == pytest.approx(0.001, rel=0.1)
+    assert found.heading_noise_rad == pytest.approx(0.002, rel=0.1)
+    assert abs(found.clock_offset_s + ahead) < 5 * found.uncertainty["clock_offset_s"] + 1e-3
+
+
+def test_offset_is_found_between_clocks_that_share_no_epoch(differential):
+    recording = drive(differential, pose_clock_ahead=1.7e9)
+    assert calibrate(recording, differential).clock_offset_s == pytest.approx(-1.7e9, abs=0.01)
+
+
+def test_the_lever_arm_along_y_is_found_where_the_speed_is_measured(car):
+    found = calibrate(drive(car, lever=(0.05, -0.03), noise=(5e-4, 1e-3)), car)
+    assert found.lever_arm_m == pytest.approx((0.05, -0.03), abs=3e-3)
+
+
+def test_the_lever_arm_along_y_of_a_differential_robot_is_said_to_be_unknown(differential):
+    found = calibrate(drive(differential, lever=(0.05, -0.03)), differential)
+    assert found.lever_arm_m[1] == 0.0
+    assert any("along y could not be learnt" in note for note in found.notes)
+
+
+def test_a_robot_that_moves_sideways_shows_both_parts_of_the_lever_arm(mecanum):
+    recording = drive(
+        mecanum, latency=0.05, rotation=-0.5, lever=(0.03, 0.04), noise=(0.001, 0.002)
+    )
+    found = calibrate(recording, mecanum)
+    assert found.rotation_rad == pytest.approx(-0.5, abs=0.01)
+    assert found.lever_arm_m == pytest.approx((0.03, 0.04), abs=3e-3)
+
+
+def test_bursts_do_not_spoil_offset_and_mounting(differential):
+    recording = drive(
+        differential, burst=0.1, pose_clock_ahead=0.4, rotation=1.0, lever=(-0.05, 0.0)
+    )
+    found = calibrate(recording, differential)
+    assert found.burst_period_s == pytest.approx(0.1, abs=1e-3)
+    assert found.clock_offset_s == pytest.approx(-0.4, abs=3e-3)
+    assert found.rotation_rad == pytest.approx(1.0, abs=5e-3)
+    assert any("bursts" in note for note in found.notes)
+
+
+def test_gaps_of_the_pose_do_not_spoil_the_calibration(car):
+    recording = drive(car, latency=0.06, rotation=0.4, noise=(5e-4, 1e-3))
+    for start in (5.0, 11.3, 20.2):
+        recording = without(recording, start, start + 0.4)
+    found = calibrate(recording, car)
+    assert found.rotation_rad == pytest.approx(0.4, abs=0.01)
+    samples = align(recording, found, car)
+    assert not ((samples.t > 11.32) & (samples.t < 11.68)).any()
+
+
+def test_lags_and_latency_of_a_state_that_was_not_measured_are_found(car):
+    recording = drive(car, latency=0.06, noise=(5e-4, 1e-3), measured_state=False)
+    found = calibrate(recording, car)
+    assert found.command_latency_s == pytest.approx(0.06, abs=5e-3)
+    speed, steering = found.responses
+    assert speed.lag_s == pytest.approx(0.1, abs=5e-3)
+    assert speed.gain == pytest.approx(1.0, abs=0.01)
+    assert steering.lag_s == pytest.approx(0.1, abs=0.01)
+
+
+def test_without_wheels_offset_and_latency_are_said_to_be_one_sum(car):
+    recording = drive(
+        car, latency=0.06, pose_clock_ahead=0.4, noise=(5e-4, 1e-3), measured_state=False
+    )
+    found = calibrate(recording, car)
+    assert found.command_latency_s == 0.0
+    assert found.clock_offset_s == pytest.approx(-0.46, abs=5e-3)
+    assert any("Only the sum" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("swapped", [True, False])
+def test_wheels_tell_latency_from_clock_offset_and_whether_they_are_swapped(car, swapped):
+    truth = drive(car)
+    recording = drive(
+        car, latency=0.06, pose_clock_ahead=0.4, noise=(5e-4, 1e-3), measured_state=False
+    )
+    found = calibrate(with_wheels(recording, truth, swapped), car)
+    assert found.command_latency_s == pytest.approx(0.06, abs=0.015)
+    assert found.clock_offset_s == pytest.approx(-0.4, abs=0.015)
+    assert found.wheels_swapped is swapped
+    assert any("interchanged" in note for note in found.notes) is swapped
+
+
+def test_a_robot_whose_state_follows_nothing_must_have_it_measured(differential):
+    recording = drive(differential, measured_state=False)
+    with pytest.raises(RecordingError, match="has no measured state, and 'left_wheel'"):
+        calibrate(recording, differential)
+
+
+def test_a_recording_of_another_robot_is_refused(car, mecanum):
+    with pytest.raises(RecordingError, match="check that the recording is of this robot"):
+        calibrate(drive(car, duration=5.0), mecanum)
+
+
+def test_streams_that_do_not_overlap_are_refused(car):
+    recording = drive(car, duration=20.0)
+    moved = replace(recording.command, t=recording.command.t + 500.0)
+    with pytest.raises(RecordingError, match="of one drive"):
+        align(replace(recording, command=moved, state=None), Calibration(), car)
+
+
+def test_a_calibration_survives_plain_data(car):
+    found = calibrate(drive(car, latency=0.05, duration=20.0, measured_state=False), car)
+    assert Calibration.from_dict(found.to_dict()) == found
+
+
+def test_damaged_plain_data_names_the_key():
+    data = Calibration().to_dict()
+    del data["rotation_rad"]
+    with pytest.raises(ModelError, match="rotation_rad"):
+        Calibration.from_dict(data)
+
+
+def test_poses_of_tracked_body_and_base_link_convert_both_ways():
+    calibration = Calibration(rotation_rad=-1.2, lever_arm_m=(0.05, 0.02))
+    base = np.random.default_rng(0).uniform(-3.0, 3.0, (20, 3))
+    tracked = calibration.to_tracked(base)
+    assert np.allclose(calibration.to_base(tracked), base, atol=1e-12)
+    assert np.allclose(np.hypot(*(tracked - base)[:, :2].T), np.hypot(0.05, 0.02))

@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from identify.drives import drive
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.open_loop import predict, windows
+from nics_drl_bridge.identify.windows import course_of, relative_ends, tracked_ends, tracked_slopes
+
+MOUNTING = Calibration(rotation_rad=0.4, lever_arm_m=(0.1, -0.05))
+STEP = 1e-6
+
+
+@pytest.fixture(scope="module", params=[1.0, 0.333])
+def courses(request):
+    """Model, drive, windows and their course; of some a step ends within the last window."""
+    spec = builtin_model("mecanum").robot
+    model, recording = builtin_model("mecanum").kinematics, drive(spec, duration=20.0)
+    chosen = windows(recording, MOUNTING, 0.0, 20.0, 1.0, 1.0)
+    chosen = replace(chosen, end_t=chosen.start_t + request.param * 2.0)
+    return model, recording, spec, chosen, course_of(model, MOUNTING, recording, spec, chosen)
+
+
+def test_a_course_ends_where_the_prediction_does(courses):
+    model, recording, spec, chosen, course = courses
+    ends = tracked_ends(course, MOUNTING, relative_ends(course, model)[0])
+    expected = predict(model, MOUNTING, recording, spec, chosen)
+    assert ends == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_derivatives_are_those_of_finite_differences(courses):
+    model, _, _, _, course = courses
+    model = replace(model, coefficients=model.coefficients * 1.03)
+    free = model.coefficients != 0.0
+    free[3:] = False
+    free[1, int(np.flatnonzero(~free[1])[0])] = True  # a term that is zero may move too
+    ends, moved = relative_ends(course, model, free)
+    slope = tracked_slopes(course, MOUNTING, ends, moved)
+    for p, (d, k) in enumerate(np.argwhere(free)):
+        sides = []
+        for sign in (-1.0, 1.0):
+            coefficients = model.coefficients.copy()
+            coefficients[d, k] += sign * STEP
+            changed = replace(model, coefficients=coefficients)
+            sides.append(tracked_ends(course, MOUNTING, relative_ends(course, changed, free)[0]))
+        difference = sides[1] - sides[0]
+        difference[:, 2] = (difference[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
+        assert slope[:, :, p] == pytest.approx(difference / (2.0 * STEP), rel=1e-3, abs=2e-3)

@@ -1,0 +1,38 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge.identify.excitation import coverage
+from nics_drl_bridge.recording.recording import Stream
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.robot.spec import load_robot
+
+CAR = load_robot("ackermann")
+DRIVE = record(CAR, np.random.default_rng(0), duration=60.0)
+
+
+def with_commands(speed, steering):
+    t = np.arange(len(speed)) * 0.1
+    return replace(DRIVE, command=Stream(t, np.stack([speed, steering], axis=1)))
+
+
+def test_a_drive_at_random_covers_its_commands():
+    for each, variable in zip(coverage(DRIVE, CAR), CAR.command, strict=True):
+        assert each.share > 0.9
+        assert each.own > 0.9
+        assert each.fault == ""
+        assert each.line().startswith(f"{variable.name}: moved from ")
+
+
+def test_what_never_moved_or_moved_together_is_named():
+    wave = np.sin(np.arange(600) * 0.3)
+    still, moved = coverage(with_commands(np.full(600, 0.5), 0.4 * wave), CAR)
+    assert still.line() == "speed_command: never moved"
+    assert moved.fault == ""
+    assert moved.share == pytest.approx(0.8, abs=0.01)
+    both = coverage(with_commands(0.5 + 0.5 * wave, 0.4 * wave), CAR)
+    assert [each.fault for each in both] == ["moved only together with others"] * 2
+    assert max(each.own for each in both) < 1e-6

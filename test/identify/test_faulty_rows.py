@@ -1,0 +1,159 @@
+"""Outliers and missing rows: the model must be that of the same drive without them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from identify.drives import drive
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.identify.align import align
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.fit import fit
+from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.repair import repair
+from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
+from nics_drl_bridge.robot.spec import load_robot
+
+ROBOTS = ("ackermann", "differential", "mecanum")
+
+
+def some(recording: Recording, keep: dict[str, np.ndarray]) -> Recording:
+    """Rows of streams that are kept."""
+    streams = {
+        name: replace(stream, t=stream.t[keep[name]], values=stream.values[keep[name]])
+        for name, stream in recording.streams.items()
+    }
+    return replace(recording, **streams)
+
+
+def with_jumps(recording: Recording, share: float = 0.05, seed: int = 0) -> Recording:
+    """Jumps of the pose by half a metre and a radian, of the state by its range."""
+    rng = np.random.default_rng(seed)
+    for name, size in (("pose", np.array([0.5, 0.5, 1.0])), ("state", None)):
+        stream = getattr(recording, name)
+        size = np.ptp(stream.values, axis=0) if size is None else size
+        bad = rng.random(len(stream.t)) < share
+        values = stream.values.copy()
+        values[bad] += rng.normal(size=(bad.sum(), len(size))) * size
+        recording = replace(recording, **{name: replace(stream, values=values)})
+    return recording
+
+
+def same_motion(a, b, share: float) -> None:
+    """The rates of two models differ by less than a share of their size, at clean samples."""
+    rates, others = a.model.rates(b.samples.x), b.model.rates(b.samples.x)
+    apart = np.sqrt(((rates - others) ** 2).mean(axis=0))
+    assert (apart <= share * np.maximum(np.sqrt((others**2).mean(axis=0)), 1e-2)).all(), apart
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("noise", [(0.0, 0.0), (5e-4, 1e-3), (2e-3, 5e-3)])
+def test_a_recording_without_faults_is_not_touched(name, noise):
+    spec = load_robot(name)
+    recording = drive(spec, duration=20.0, noise=noise)
+    repaired = repair(recording, spec)
+    assert repaired.notes == ()
+    assert repaired.recording is recording
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_an_exact_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
+    spec = load_robot(name)
+    plain = drive(spec, duration=40.0)
+    clean, faulty = identify(plain, spec), identify(with_jumps(plain), spec)
+    assert any("jump away" in note for note in faulty.notes)
+    same_motion(faulty, clean, 0.02)
+    assert faulty.held_out.mean_position_error_m < clean.held_out.mean_position_error_m + 0.01
+
+
+@pytest.mark.parametrize("name", ["ackermann", "differential"])
+def test_a_noisy_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
+    spec = load_robot(name)
+    plain = drive(spec, noise=(5e-4, 1e-3), rotation=0.3)
+    clean, faulty = identify(plain, spec), identify(with_jumps(plain), spec)
+    same_motion(faulty, clean, 0.05)
+    assert faulty.held_out.mean_position_error_m < clean.held_out.mean_position_error_m + 0.02
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("apart", [False, True])
+def test_an_exact_fit_survives_ten_per_cent_of_the_rows_missing(name, apart):
+    """Either whole rows are missing, or each stream misses rows of its own."""
+    spec, rng = load_robot(name), np.random.default_rng(1)
+    plain = drive(spec, duration=40.0)
+    count = len(plain.pose.t)
+    rows = rng.random(count) > 0.1
+    keep = {n: rng.random(count) > 0.1 if apart else rows for n in plain.streams}
+    for kept in keep.values():
+        kept[1000:1030] = False
+    clean, gappy = identify(plain, spec), identify(some(plain, keep), spec)
+    assert gappy.calibration.is_exact
+    same_motion(gappy, clean, 0.02)
+    assert gappy.fit.rmse == pytest.approx(clean.fit.rmse, rel=0.3, abs=1e-6)
+
+
+def test_a_noisy_fit_survives_both(differential):
+    rng = np.random.default_rng(2)
+    plain = drive(differential, noise=(5e-4, 1e-3), latency=0.05)
+    keep = {n: rng.random(len(s.t)) > 0.1 for n, s in plain.streams.items()}
+    keep["command"][:] = True
+    clean = identify(plain, differential)
+    faulty = identify(some(with_jumps(plain), keep), differential)
+    same_motion(faulty, clean, 0.03)
+    assert faulty.calibration.command_latency_s == pytest.approx(0.05, abs=3e-3)
+
+
+def test_a_gap_is_no_step():
+    t = np.array([0.0, 0.1, 0.2, 0.5, 0.6, 0.6, 0.7])
+    pose = np.stack([t, 0.0 * t, 0.0 * t], axis=1)
+    samples = samples_on_one_clock(t, pose, t[:, None], np.zeros((7, 1)))
+    assert samples.t == pytest.approx([0.0, 0.1, 0.5, 0.6])
+    assert samples.dt == pytest.approx(0.1)
+    assert np.allclose(samples.dq, [1.0, 0.0, 0.0, 1.0])
+
+
+def test_steps_of_unequal_length_have_their_own():
+    t = np.cumsum(np.array([0.1, 0.11, 0.09, 0.1, 0.12, 0.08, 0.1, 0.1]))
+    pose = np.stack([2.0 * t, 0.0 * t, 0.0 * t], axis=1)
+    samples = samples_on_one_clock(t, pose, t[:, None], np.zeros((8, 1)))
+    assert np.allclose(samples.dq[:, 0], 2.0)
+    assert np.allclose(samples.dq[:, 3], 1.0)
+
+
+def test_rows_of_samples_that_jump_are_left_out_of_the_fit(car):
+    samples = align(drive(car, noise=(0.0, 0.0)), Calibration(), car)
+    rng = np.random.default_rng(3)
+    bad = rng.random(len(samples.t)) < 0.05
+    dq, x = samples.dq.copy(), samples.x.copy()
+    dq[bad] += rng.normal(size=(bad.sum(), 5)) * 30.0 * samples.dq.std(axis=0)
+    x[bad[::-1], 0] += 40.0
+    clean = fit(samples, car)
+    faulty = fit(Samples(samples.t, samples.q, x, dq, samples.dt), car)
+    terms, others = faulty.model.to_dict()["terms"], clean.model.to_dict()["terms"]
+    for dof in ("vx", "d_speed", "d_steering"):
+        assert terms[dof] == pytest.approx(others[dof], rel=1e-5)
+    assert terms["wz"]["speed*steering"] == pytest.approx(others["wz"]["speed*steering"], rel=0.05)
+    assert 0.02 < faulty.outliers[0] < 0.12
+    assert clean.outliers == pytest.approx(0.0)
+
+
+def test_a_stream_that_is_mixed_of_two_is_refused(car):
+    recording = drive(car, duration=20.0)
+    values = recording.pose.values.copy()
+    values[::5, :2] += 0.5
+    with pytest.raises(RecordingError, match="two sources that are mixed"):
+        identify(replace(recording, pose=replace(recording.pose, values=values)), car)
+
+
+def test_noise_of_the_measured_state_does_not_bend_its_lag(differential):
+    plain = drive(differential, noise=(5e-4, 1e-3))
+    noise = np.random.default_rng(0).normal(size=plain.state.values.shape) * 0.2
+    state = replace(plain.state, values=plain.state.values + noise)
+    model = identify(replace(plain, state=state), differential).model
+    value = model.to_dict()["terms"]["d_left_wheel"]["left_wheel"]
+    error = model.named_errors["d_left_wheel"]["left_wheel"]
+    assert error < 0.2
+    assert abs(value - (np.exp(-0.1) - 1.0) / 0.01) < 3.0 * error

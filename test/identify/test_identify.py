@@ -1,0 +1,187 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from identify.drives import drive
+from nics_drl_bridge.errors import FitError, RecordingError
+from nics_drl_bridge.identify import identify as module
+from nics_drl_bridge.identify.assume import assume_textbook
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.fit import fit
+from nics_drl_bridge.identify.identify import cut, identify
+from nics_drl_bridge.identify.open_loop import open_loop_error, predict, windows
+from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
+from nics_drl_bridge.robot.spec import RobotSpec
+
+
+def term(model, dof: str, name: str) -> float:
+    return model.to_dict()["terms"][dof].get(name, 0.0)
+
+
+def constant_steering(car: RobotSpec, angle: float) -> tuple[RobotSpec, Recording]:
+    """A drive with the steering held, the state not measured, and the spec to read it with."""
+    data = car.model_dump()
+    speed, steering = data["command"]
+    held = {**steering, "min": angle - 1e-9, "max": angle + 1e-9}
+    locked = {**data, "command": [speed, held]}
+    recording = drive(RobotSpec.model_validate(locked), noise=(5e-4, 1e-3), measured_state=False)
+    values = recording.command.values.copy()
+    values[:, 1] = angle
+    return car, replace(recording, command=replace(recording.command, values=values))
+
+
+def test_the_kernel_moves_robots_exactly_as_the_model_does(car):
+    model = identify(drive(car, duration=20.0), car).model
+    rng = np.random.default_rng(1)
+    pose, state = rng.normal(size=(4, 3)), rng.normal(size=(4, 2)) * 0.3
+    command = rng.uniform(-0.5, 0.5, (4, 30, 2))
+    poses, states = np.empty((4, 31, 3)), np.empty((4, 31, 2))
+    poses[:, 0], states[:, 0] = pose, state
+    rollout(poses, states, command, term_arrays(model), SERIES, model.dt)
+    for n in range(30):
+        pose, state = model.step(pose, state, command[:, n])
+    assert np.allclose(poses[:, -1, :2], pose[:, :2], atol=1e-12)
+    assert np.allclose(np.exp(1j * poses[:, -1, 2]), np.exp(1j * pose[:, 2]), atol=1e-12)
+    assert np.allclose(states[:, -1], state, atol=1e-12)
+
+
+def test_an_exact_recording_is_fitted_to_nine_digits_and_not_refined(differential):
+    found = identify(drive(differential, duration=45.0), differential)
+    assert np.delete(found.fit.rmse, 1).max() < 1e-8
+    assert found.fit.rmse[1] < 1e-4  # sideways the robot hardly moves, and gets no terms
+    assert found.model is found.fit.model
+    assert found.held_out is not None
+    assert found.held_out.mean_position_error_m < 1e-4
+
+
+def test_the_held_out_part_is_not_used_for_the_model(car):
+    recording = drive(car, noise=(5e-4, 1e-3), measured_state=False)
+    spoiled = recording.pose.values.copy()
+    spoiled[recording.pose.t > 26.7] += 5.0
+    other = replace(recording, pose=replace(recording.pose, values=spoiled))
+    a, b = identify(recording, car), identify(other, car)
+    assert np.array_equal(a.model.coefficients, b.model.coefficients)
+    assert a.calibration == b.calibration
+
+
+def test_a_prediction_knows_no_pose_after_its_start(car):
+    recording = drive(car, noise=(5e-4, 1e-3), measured_state=False)
+    found = identify(recording, car)
+    chosen = windows(recording, found.calibration, 30.0, 36.0, 5.0, 0.1)
+    values = recording.pose.values.copy()
+    values[recording.pose.t > chosen.start_t[-1]] = 7.0
+    blind = replace(recording, pose=replace(recording.pose, values=values))
+    seen = predict(found.model, found.calibration, recording, car, chosen)
+    assert np.array_equal(seen, predict(found.model, found.calibration, blind, car, chosen))
+
+
+def test_a_noisy_drive_in_bursts_without_state_still_gives_the_textbook_terms(car):
+    recording = drive(
+        car,
+        latency=0.06,
+        pose_clock_ahead=0.4,
+        rotation=-1.2,
+        lever=(0.05, 0.02),
+        noise=(5e-4, 1e-3),
+        burst=0.1,
+        measured_state=False,
+    )
+    found = identify(recording, car)
+    assert term(found.model, "vx", "speed") == 1.0
+    assert term(found.model, "wz", "speed*steering") == pytest.approx(5.2, abs=0.3)
+    assert found.model.terms_kept <= 8
+    assert found.held_out is not None
+    assert found.held_out.mean_position_error_m < 0.05
+
+
+def test_a_noisy_drive_with_measured_wheels_gives_the_textbook_terms(differential):
+    recording = drive(
+        differential, latency=0.08, rotation=2.5, lever=(-0.05, 0.0), noise=(0.001, 0.002)
+    )
+    found = identify(recording, differential)
+    for wheel, sign in (("left_wheel", -1.0), ("right_wheel", 1.0)):
+        assert term(found.model, "vx", wheel) == pytest.approx(0.025, rel=0.02)
+        assert term(found.model, "wz", wheel) == pytest.approx(sign * 0.25, rel=0.02)
+    assert found.model.terms_kept == 10
+
+
+def test_a_short_drive_says_that_it_was_not_tried(car):
+    found = identify(drive(car, duration=9.0), car)
+    assert found.held_out is None
+    assert any("too short for a prediction over 5 s" in note for note in found.notes)
+
+
+def test_steering_that_never_moved_has_no_terms_and_a_sentence(car):
+    spec, recording = constant_steering(car, -0.4)
+    found = identify(recording, spec)
+    used = found.model.powers[:, [1, 3]]
+    assert (used == 0).all()
+    assert found.fit.unmoved == ("steering", "steering_command")
+    assert any("drive with steering_command changing" in note for note in found.notes)
+    assert found.model.assumed == ()
+
+
+def test_on_request_the_textbook_completes_what_was_measured_at_a_constant(car):
+    spec, recording = constant_steering(car, -0.4)
+    plain, completed = identify(recording, spec), identify(recording, spec, assume=True)
+    learnt = term(plain.model, "wz", "speed")
+    assert term(completed.model, "wz", "speed*steering") == pytest.approx(learnt / -0.4)
+    assert ("wz", "speed*steering") in completed.model.assumed
+    assert term(completed.model, "d_steering", "steering_command") > 0.0
+    assert any(note.startswith("Assumed, not learnt: wz") for note in completed.notes)
+
+
+def test_at_the_same_steering_the_completed_model_moves_like_the_learnt_one(car):
+    spec, recording = constant_steering(car, -0.4)
+    plain, completed = identify(recording, spec).model, identify(recording, spec, assume=True).model
+    x = np.array([0.3, -0.4, 0.5, -0.4])
+    assert np.allclose(plain.rates(x), completed.rates(x), atol=1e-9)
+
+
+def test_at_zero_steering_the_parameters_of_the_spec_are_assumed(car):
+    spec, recording = constant_steering(car, 0.0)
+    found = identify(recording, spec, assume=True)
+    assert term(found.model, "wz", "speed*steering") == pytest.approx(1.0 / 0.2, rel=1e-3)
+    assert any("from the parameters" in note for note in found.notes)
+
+
+def test_nothing_is_assumed_where_everything_moved(car):
+    recording = drive(car, duration=20.0)
+    model = fit(module.align(recording, Calibration(), car), car).model
+    completed, notes = assume_textbook(model, car, ())
+    assert notes == ()
+    assert completed.equations() == model.equations()
+
+
+def test_a_drive_in_which_no_command_changes_is_refused(car):
+    recording = drive(car, duration=20.0, measured_state=False)
+    still = np.full_like(recording.command.values, 0.1)
+    with pytest.raises(FitError, match="no command ever changed"):
+        identify(replace(recording, command=replace(recording.command, values=still)), car)
+
+
+@pytest.mark.parametrize("until", [0.0, -3.0])
+def test_a_training_part_must_have_a_length(car, until):
+    with pytest.raises(RecordingError, match="use more than 0"):
+        cut(drive(car, duration=5.0), until)
+
+
+def test_a_part_without_a_window_is_refused(car):
+    recording = drive(car, duration=20.0)
+    model = identify(recording, car).model
+    with pytest.raises(RecordingError, match="hold no window of 5 s"):
+        open_loop_error(model, Calibration(), recording, car, 17.0, 20.0)
+
+
+@pytest.mark.parametrize("name", ["mecanum", "differential"])
+def test_a_wheel_that_always_follows_from_the_others_is_named(name, request):
+    spec = request.getfixturevalue(name)
+    notes = " ".join(identify(drive(spec, duration=20.0), spec).notes)
+    # Four wheels that roll without slip have three speeds to choose.
+    told = "rear_right_wheel always followed from the other variables" in notes
+    assert told == (name == "mecanum")
+    assert "left_wheel always followed" not in notes

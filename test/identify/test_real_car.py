@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from identify.drives import without
+from nics_drl_bridge.errors import FitError
+from nics_drl_bridge.identify.calibrate import calibrate
+from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.open_loop import open_loop_error
+from nics_drl_bridge.recording.readers import read_recording
+
+BENCHMARK = Path(__file__).resolve().parents[2] / "benchmarks" / "real_robot.py"
+
+
+@pytest.fixture(scope="module")
+def found(real_drives, car):
+    return identify(read_recording(real_drives / "random_drive_45s"), car, assume=True)
+
+
+def test_its_recordings_show_bursts_offset_rotation_and_swapped_wheels(real_drives, car):
+    calibration = calibrate(read_recording(real_drives / "random_drive_45s"), car)
+    assert calibration.burst_period_s == pytest.approx(0.1, abs=0.005)
+    assert 0.15 < calibration.clock_offset_s < 0.35
+    assert 0.03 < calibration.command_latency_s < 0.15
+    assert calibration.rotation_rad == pytest.approx(-1.48, abs=0.01)
+    assert calibration.wheels_swapped is True
+    assert any("lies on the robot could not be learnt" in note for note in calibration.notes)
+    assert any("steering_command never changed" in note for note in calibration.notes)
+
+
+@pytest.mark.parametrize("until", [10.0, 20.0, 30.0, 38.0])
+def test_its_model_predicts_five_seconds_of_unseen_drive_to_three_centimetres(
+    real_drives, car, until
+):
+    recording = read_recording(real_drives / "random_drive_45s")
+    held_out = identify(recording, car, train_until=until).held_out
+    assert held_out is not None
+    assert held_out.windows > 15
+    assert held_out.mean_path_m > 1.0
+    assert held_out.mean_position_error_m < 0.03
+
+
+@pytest.mark.parametrize("name", ["constant_drive_51s", "constant_drive_214s"])
+def test_its_model_predicts_other_drives_too(real_drives, car, found, name):
+    other = read_recording(real_drives / name)
+    end = float(other.pose.t[-1])
+    result = open_loop_error(found.model, found.calibration, other, car, 2.0, end)
+    assert result.mean_position_error_m < 0.03
+
+
+def test_its_model_is_short_and_steers_by_assumption_only(found):
+    terms = found.model.to_dict()["terms"]
+    assert terms["vx"] == {"speed": 1.0}
+    assert list(terms["wz"]) == ["speed*steering"]
+    assert terms["wz"]["speed*steering"] * -0.5 == pytest.approx(-2.31, abs=0.05)
+    assert set(found.model.assumed) == {
+        ("wz", "speed*steering"),
+        ("d_steering", "steering"),
+        ("d_steering", "steering_command"),
+    }
+
+
+def test_a_drive_of_constant_command_is_refused(real_drives, car):
+    with pytest.raises(FitError, match="no command ever changed"):
+        identify(read_recording(real_drives / "constant_drive_51s"), car)
+
+
+def test_the_benchmark_prints_one_json_object(real_drives):
+    run = subprocess.run(
+        [sys.executable, BENCHMARK, "--json", "--train-until", "25"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    result = json.loads(run.stdout)
+    assert result["horizon_s"] == 5.0
+    assert result["mean_position_error_m"] < 0.05
+    assert {"mean_heading_error_rad", "mean_path_m"} <= set(result)
+
+
+@pytest.mark.parametrize("ahead", [7.0, -7.0, 1.7e9])
+def test_its_errors_do_not_depend_on_what_the_motion_capture_calls_zero(real_drives, car, ahead):
+    recording = read_recording(real_drives / "random_drive_45s")
+    pose = replace(recording.pose, t=recording.pose.t + ahead)
+    held_out = identify(replace(recording, pose=pose), car).held_out
+    assert held_out is not None
+    assert held_out.mean_position_error_m < 0.03
+
+
+def test_gaps_and_a_start_in_the_middle_do_not_spoil_its_model(real_drives, car):
+    recording = read_recording(real_drives / "random_drive_45s")
+    for gap in (12.0, 15.5, 19.0, 26.0, 33.0):
+        recording = without(recording, gap, gap + 0.4)
+    held_out = identify(without(recording, 0.0, 6.0), car).held_out
+    assert held_out is not None
+    assert held_out.mean_position_error_m < 0.03

@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from identify.drives import in_bursts
+from nics_drl_bridge.identify.repair import find_bursts, newest, spread
+
+
+def test_uniform_stamps_are_not_bursts_and_stay_as_they_are():
+    t = np.arange(1000) * 0.01
+    assert find_bursts(t) is None
+    assert spread(t, None) is t
+
+
+def test_uniform_stamps_with_a_few_gaps_are_not_bursts():
+    t = np.arange(1000) * 0.01
+    assert find_bursts(t[(t < 3.0) | (t > 3.4)]) is None
+
+
+@pytest.mark.parametrize("size", [2, 5, 10])
+def test_samples_of_bursts_get_back_their_times(size):
+    t = np.arange(1, 1001) * 0.1 / size
+    arrival = in_bursts(t, 0.1)
+    bursts = find_bursts(arrival)
+    assert bursts is not None
+    assert bursts.period_s == pytest.approx(0.1, abs=1e-4)
+    assert np.abs(spread(arrival, bursts) - t).max() < 1e-3
+
+
+def test_the_newest_of_each_burst_is_dated_at_its_arrival():
+    arrival = in_bursts(np.arange(1, 201) * 0.02, 0.1)
+    bursts = find_bursts(arrival)
+    chosen = newest(arrival, bursts)
+    assert len(chosen) == 40
+    assert np.abs(spread(arrival, bursts)[chosen] - np.arange(1, 41) * 0.1).max() < 1e-3
+
+
+def test_after_a_gap_a_burst_fills_one_period_only():
+    t = np.arange(1, 201) * 0.02
+    t = t[(t <= 1.0) | (t > 1.4)]
+    arrival = in_bursts(t, 0.1)
+    assert np.abs(spread(arrival, find_bursts(arrival)) - t).max() < 1e-3

@@ -1,0 +1,186 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from nics_drl_bridge.config import dump_yaml, parse_yaml
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.identify.dof import parse_alpha
+from nics_drl_bridge.identify.excitation import commands_together
+from nics_drl_bridge.identify.fit import fit
+from nics_drl_bridge.identify.statistics import (
+    clustered_errors,
+    condition,
+    correlation_reach,
+    cross_validated,
+    knee,
+    standard_errors,
+)
+from nics_drl_bridge.recording.recording import Samples
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.robot.taylor import TaylorModel
+
+RATE = 9.5163
+KNOWN = {
+    "ackermann": {
+        "vx": {"speed": 1.0},
+        "wz": {"speed*steering": 5.0},
+        "d_speed": {"speed": -RATE, "speed_command": RATE},
+        "d_steering": {"steering": -RATE, "steering_command": RATE},
+    },
+    "differential": {
+        "vx": {"left_wheel": 0.025, "right_wheel": 0.025},
+        "wz": {"left_wheel": -0.25, "right_wheel": 0.25},
+        "d_left_wheel": {"left_wheel": -RATE, "forward_command": 190.3, "turn_command": -19.03},
+        "d_right_wheel": {"right_wheel": -RATE, "forward_command": 190.3, "turn_command": 19.03},
+    },
+    "mecanum": {
+        "vx": {"front_left_wheel": 0.025, "front_right_wheel": 0.025},
+        "vy": {"front_left_wheel": -0.025, "rear_left_wheel": 0.025},
+        "wz": {"front_right_wheel": 0.125, "rear_left_wheel": -0.125},
+    },
+}
+
+
+def noisy_samples(spec, seed, alike=0.9, size=0.05):
+    """Samples whose rates are known polynomials, with noise like that of smoothed poses."""
+    rng = np.random.default_rng(seed)
+    drive = record(spec, rng, duration=30.0, dt=0.02)
+    x = np.concatenate([drive.state.values, drive.command.values], axis=1)
+    dq = np.zeros((len(x), len(spec.dof_names)))
+    for dof, row in KNOWN[spec.name].items():
+        powers = np.array([taylor.parse_term(term, spec.variable_names) for term in row])
+        d = spec.dof_names.index(dof)
+        dq[:, d] = taylor.evaluate(x, powers) @ np.array(list(row.values()))
+    noise = lfilter([1.0], [1.0, -alike], rng.normal(size=dq.shape), axis=0)
+    noise *= 0.5 + np.linspace(0.0, 1.0, len(x))[:, None]
+    dq += size * dq.std(axis=0) * noise / np.maximum(noise.std(axis=0), 1e-9)
+    return Samples(drive.pose.t, np.zeros_like(dq), x, dq, 0.02)
+
+
+@pytest.mark.parametrize("name", sorted(KNOWN))
+def test_known_coefficients_lie_within_three_standard_errors(name):
+    spec, inside, short = load_robot(name), [], []
+    for seed in range(40):
+        result = fit(noisy_samples(spec, seed), spec, order=1, noisy=True)
+        terms, errors = result.model.to_dict()["terms"], result.model.named_errors
+        for dof, row in KNOWN[name].items():
+            if dof == "wz" and name == "ackermann":
+                continue
+            for term, value in row.items():
+                off = abs(terms[dof].get(term, 0.0) - value) / errors[dof].get(term, 1e-12)
+                inside.append(off < 3.0)
+                short.append(off < 1.0)
+    assert np.mean(inside) > 0.95
+    assert 0.4 < np.mean(short) < 0.95  # nor are they wide for nothing
+
+
+def test_the_known_product_of_a_car_lies_within_three_standard_errors():
+    spec, inside = load_robot("ackermann"), []
+    for seed in range(30):
+        model = fit(noisy_samples(spec, seed), spec, noisy=True, alpha=0.9).model
+        value = model.to_dict()["terms"]["wz"]["speed*steering"]
+        inside.append(abs(value - 5.0) < 3.0 * model.named_errors["wz"]["speed*steering"])
+    assert np.mean(inside) > 0.9
+
+
+def test_errors_of_white_noise_are_the_textbooks():
+    rng = np.random.default_rng(0)
+    chi = rng.normal(size=(5000, 3)) * [1.0, 10.0, 0.1]
+    residual = rng.normal(size=5000) * 0.3
+    plain = 0.3 * np.sqrt(np.diag(np.linalg.inv(chi.T @ chi)))
+    assert standard_errors(chi, residual) == pytest.approx(plain, rel=0.15)
+    blocks = np.arange(5000) // 50
+    assert clustered_errors(chi, residual, blocks) == pytest.approx(plain, rel=0.25)
+
+
+def test_errors_grow_with_residuals_that_resemble_their_neighbours():
+    rng = np.random.default_rng(1)
+    chi = lfilter([1.0], [1.0, -0.95], rng.normal(size=(4000, 1)), axis=0)
+    residual = lfilter([1.0], [1.0, -0.95], rng.normal(size=4000))
+    plain = residual.std() * np.sqrt(1.0 / (chi.T @ chi)[0, 0])
+    assert standard_errors(chi, residual)[0] > 3.0 * plain
+    assert correlation_reach(residual) > 40
+
+
+def test_the_condition_number_does_not_depend_on_units():
+    chi = np.random.default_rng(2).normal(size=(500, 4))
+    assert condition(chi * [1.0, 1e3, 1e-3, 1.0]) == pytest.approx(condition(chi))
+    assert condition(np.zeros((10, 0))) == 1.0
+
+
+def test_the_knee_is_where_further_terms_gain_nothing():
+    none = np.zeros(5)
+    assert knee(np.array([1.0, 0.5, 0.1, 0.0999, 0.0998]), none) == 2
+    assert knee(np.array([1.0, 0.5, 0.1, 0.05, 0.049]), none + 0.06) == 2
+    assert knee(np.array([1.0, 1.1, 1e-9, 1e-9, 2e-9]), none) == 2
+
+
+def test_cross_validation_is_that_of_separate_fits():
+    rng = np.random.default_rng(3)
+    chi, target = rng.normal(size=(100, 3)), rng.normal(size=100)
+    squares = cross_validated(chi, target)
+    for block, rows in enumerate(np.array_split(np.arange(100), 5)):
+        others = np.setdiff1d(np.arange(100), rows)
+        for n in range(4):
+            beta = np.linalg.lstsq(chi[others, :n], target[others], rcond=None)[0]
+            rest = target[rows] - chi[rows, :n] @ beta
+            assert squares[block, n] == pytest.approx((rest**2).mean())
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_auto_keeps_what_is_worth_it_at_every_order(order):
+    spec = load_robot("differential")
+    result = fit(noisy_samples(spec, 1), spec, order=order, alpha="auto", noisy=True)
+    terms = result.model.to_dict()["terms"]
+    assert set(terms["vx"]) == {"left_wheel", "right_wheel"}
+    assert set(terms["wz"]) == {"left_wheel", "right_wheel"}
+    for curve in result.curves:
+        assert curve.alpha[-1] == pytest.approx(1.0)
+        assert len(curve.error) == len(curve.terms) + 1
+        assert curve.error[curve.kept] <= curve.error[0]
+
+
+def test_a_fourth_order_shows_the_cube_of_a_cars_steering():
+    spec = load_robot("ackermann")
+    drive = record(spec, np.random.default_rng(4), duration=30.0)
+    x = np.concatenate([drive.state.values, drive.command.values], axis=1)
+    dq = np.zeros((len(x), 5))
+    dq[:, 2] = x[:, 0] * np.tan(x[:, 1]) / 0.2
+    samples = Samples(drive.pose.t, np.zeros_like(dq), x, dq, 0.01)
+    rmse = [fit(samples, spec, order=order, alpha=1.0).rmse[2] for order in (2, 4)]
+    assert rmse[1] < 0.1 * rmse[0]
+
+
+def test_errors_and_quality_survive_yaml():
+    spec = load_robot("differential")
+    model = fit(noisy_samples(spec, 2), spec, noisy=True).model
+    data = model.to_dict()
+    assert set(data["standard_errors"]["vx"]) == set(data["terms"]["vx"])
+    back = TaylorModel.from_dict(parse_yaml(dump_yaml(data), "model.yaml"))
+    assert np.array_equal(back.std_errors, model.std_errors)
+    assert back.to_dict() == data
+
+
+def test_commands_that_move_apart_are_not_together():
+    spec = load_robot("differential")
+    samples = noisy_samples(spec, 5)
+    assert commands_together(samples, spec) == ()
+    x = samples.x.copy()
+    x[:, 3] = -1.5 * x[:, 2]
+    joined = Samples(samples.t, samples.q, x, samples.dq, samples.dt)
+    assert commands_together(joined, spec) == ("forward_command", "turn_command")
+
+
+@pytest.mark.parametrize("text", ["1.5", "-0.1", "nan", "automatic", ""])
+def test_an_alpha_that_is_none_is_refused(text):
+    with pytest.raises(ConfigError, match="a number from 0 to 1, or auto"):
+        parse_alpha(text)
+
+
+def test_alpha_is_read_as_written():
+    assert parse_alpha("auto") == "auto"
+    assert parse_alpha("0.9") == 0.9

@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from identify.drives import drive
+from nics_drl_bridge import geometry
+from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.open_loop import open_loop_error
+from nics_drl_bridge.identify.usefulness import is_useless, why_useless
+from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.robot.spec import RobotSpec
+
+
+def coarse(spec: RobotSpec, every: int, duration: float = 60.0) -> Recording:
+    """A drive of which one pose and state in so many, 10 ms apart, is recorded."""
+    fine = record(spec, np.random.default_rng(0), duration, dt=0.01)
+    pose, state = (
+        replace(stream, t=stream.t[::every], values=stream.values[::every])
+        for stream in (fine.pose, fine.state)
+    )
+    return replace(
+        fine, command=replace(fine.command, t=fine.command.t + 0.003), pose=pose, state=state
+    )
+
+
+def held_up(recording: Recording, start: float, end: float) -> Recording:
+    """The robot stands between two times, whatever it is told, and then drives on from there."""
+    t, pose, state = recording.pose.t, recording.pose.values.copy(), recording.state.values.copy()
+    first, after = np.searchsorted(t, (start, end))
+    pose[after:] = geometry.compose(pose[first], geometry.between(pose[after], pose[after:]))
+    pose[first:after], state[first:after] = pose[first], 0.0
+    return replace(
+        recording,
+        pose=replace(recording.pose, values=pose),
+        state=replace(recording.state, values=state),
+    )
+
+
+def verdict_on(recording: Recording, spec: RobotSpec) -> str:
+    return why_useless(identify(recording, spec, alpha="auto"), spec)
+
+
+@pytest.mark.parametrize(
+    ("error", "standing", "path", "radius", "useless"),
+    [
+        (231.0, 0.8, 2.08, 0.2, True),
+        (0.007, 0.8, 2.08, 0.2, False),
+        (0.99, 2.0, 2.5, 0.2, False),  # half of 2 m is left
+        (1.01, 2.0, 2.5, 0.2, True),
+        (2.0, 2.0, 2.5, 0.2, True),  # the model stands still too
+        (0.9, 0.1, 4.0, 0.2, False),  # in circles: a quarter of the path is 1 m
+        (1.1, 0.1, 4.0, 0.2, True),
+        (0.19, 0.0, 0.0, 0.2, False),  # on the spot
+        (0.21, 0.0, 0.0, 0.2, True),
+        (float("nan"), 2.0, 2.5, 0.2, True),
+        (float("inf"), 2.0, 2.5, 0.2, True),
+    ],
+)
+def test_a_model_is_useless_if_standing_still_is_hardly_worse(
+    error, standing, path, radius, useless
+):
+    assert is_useless(error, standing, path, radius) == useless
+
+
+def test_standing_still_is_off_by_the_way_from_start_to_end(car):
+    recording = drive(car, duration=20.0)
+    along = 0.2 * recording.pose.t
+    straight = np.stack([3.0 + 0.6 * along, 0.8 * along, 0.0 * along], axis=1)
+    found = identify(recording, car)
+    moved = replace(recording, pose=replace(recording.pose, values=straight))
+    result = open_loop_error(found.model, found.calibration, moved, car, 0.0, 20.0)
+    assert result.median_displacement_m == pytest.approx(1.0)
+    assert result.mean_path_m == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("name", ["car", "differential", "mecanum"])
+def test_rows_too_far_apart_are_named(name, request):
+    spec = request.getfixturevalue(name)
+    sentence = verdict_on(coarse(spec, every=30), spec)
+    start = f"textbook {spec.name}: the fitted model is of no use: on unseen data its predictions "
+    assert sentence.startswith(start)
+    assert any(f"; {v.name} changes by " in sentence for v in spec.state)
+    assert sentence.endswith("between rows that are 0.3 s apart, so record at a higher rate.")
+
+
+@pytest.mark.parametrize("name", ["car", "differential", "mecanum"])
+def test_a_good_drive_gives_a_useful_model(name, request):
+    spec = request.getfixturevalue(name)
+    for every in (1, 5):
+        assert verdict_on(coarse(spec, every), spec) == ""
+
+
+def test_a_drive_too_short_to_try_the_model_is_not_judged(car):
+    assert verdict_on(drive(car, duration=9.0), car) == ""
+
+
+def test_a_robot_held_up_is_not_put_down_to_the_rate(differential):
+    free = record(differential, np.random.default_rng(0), 60.0, dt=0.01)
+    sentence = verdict_on(held_up(free, 20.0, 30.0), differential)
+    assert "make sure that nothing held the robot up" in sentence
+    assert "rows 0.01 s apart" in sentence
+    assert "higher rate" not in sentence
+
+
+def test_a_pose_that_jumps_once_for_good_does_not_condemn_the_model(car):
+    recording = record(car, np.random.default_rng(0), 60.0)
+    values = recording.pose.values.copy()
+    values[recording.pose.t > recording.pose.t[0] + 50.0, 0] += 20.0
+    jumped = replace(recording, pose=replace(recording.pose, values=values))
+    assert identify(jumped, car, alpha="auto").held_out.mean_position_error_m > 1.0
+    assert verdict_on(jumped, car) == ""
+
+
+class StraightFirst:
+    """Draws commands of a car that turns only in the last third of a drive."""
+
+    def uniform(self, low, high, size):
+        held = np.random.default_rng(0).uniform(low, high, size)
+        held[: 2 * len(held) // 3 + 1, 1] = 0.0
+        return held
+
+
+def test_what_the_textbook_fills_in_is_judged_with_it(car):
+    recording = record(car, StraightFirst(), 90.0)
+    filled = identify(recording, car, alpha="auto", assume=True)
+    assert filled.fit.unmoved
+    assert why_useless(filled, car) == ""
+    sentence = verdict_on(recording, car)
+    assert "steering" in sentence
+    assert "never moved in its first 60 s" in sentence
+
+
+def test_a_model_of_too_few_terms_is_not_put_down_to_the_recording(car):
+    found = identify(record(car, np.random.default_rng(0), 60.0), car, alpha=0.5)
+    sentence = why_useless(found, car)
+    assert sentence.endswith("it may lack terms, so leave the order at 2 and alpha at `auto`.")
+
+
+@pytest.mark.parametrize("name", ["car", "mecanum"])
+def test_a_model_that_predicts_nothing_is_told_of_in_one_sentence(name, request):
+    spec = request.getfixturevalue(name)
+    recording = coarse(spec, every=30)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = identify(recording, spec)
+        sentence = why_useless(found, spec)
+    assert "is of no use: on unseen data its predictions end" in sentence
+    assert any("of their path away" in note and "do not train" in note for note in found.notes)
+    ran_away = replace(found.held_out, mean_position_error_m=np.inf)
+    sentence = why_useless(replace(found, held_out=ran_away), spec)
+    assert "its predictions have run away after 5 s" in sentence

@@ -1,0 +1,272 @@
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from contextlib import closing, contextmanager, suppress
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("rosbags", reason="needs the extra 'bags'")
+
+import bags
+
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.robot.spec import load_robot
+
+CAR = load_robot("ackermann")
+STORAGES = ("mcap", "sqlite3")
+ONE_SENTENCE = 420  # characters; longer is a dump
+SEEDS = 40
+
+
+def refused(path) -> str:
+    """The one sentence with which a bag is refused; it begins with the place."""
+    with pytest.raises(RecordingError) as caught:
+        read_recording(path, CAR)
+    sentence = str(caught.value)
+    assert sentence.startswith(str(path))
+    assert "\n" not in sentence
+    assert sentence.endswith(".")
+    assert len(sentence) - len(str(path)) < ONE_SENTENCE
+    return sentence.removeprefix(str(path))
+
+
+def storage_file(bag):
+    (file,) = (p for p in bag.iterdir() if p.name != "metadata.yaml")
+    return file
+
+
+@contextmanager
+def metadata(bag):
+    """The content of metadata.yaml, to be changed."""
+    file = bag / "metadata.yaml"
+    data = yaml.safe_load(file.read_text(encoding="utf-8"))
+    yield data["rosbag2_bagfile_information"]
+    file.write_text(yaml.safe_dump(data), encoding="utf-8")
+
+
+def same(one, other) -> bool:
+    return all(
+        np.array_equal(stream.values, other.streams[name].values)
+        and np.array_equal(stream.t, other.streams[name].t)
+        for name, stream in one.streams.items()
+    )
+
+
+@pytest.fixture(scope="module", params=STORAGES)
+def pristine(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pristine")
+    return bags.write(folder / "bag", bags.drive(), storage=request.param)
+
+
+@pytest.fixture
+def bag(pristine, tmp_path):
+    return shutil.copytree(pristine, tmp_path / "bag")
+
+
+def test_the_folder_its_file_and_the_file_alone_give_the_same_drive(bag, tmp_path):
+    whole = read_recording(bag, CAR)
+    assert same(whole, read_recording(storage_file(bag), CAR))
+    (tmp_path / "alone").mkdir()
+    alone = shutil.copy(storage_file(bag), tmp_path / "alone")
+    assert same(whole, read_recording(alone, CAR))
+    assert same(whole, read_recording(tmp_path / "alone", CAR))
+
+
+@pytest.mark.parametrize(
+    ("storage", "compression"),
+    [("mcap", "file"), ("mcap", "message"), ("mcap", "storage"),
+     ("sqlite3", "file"), ("sqlite3", "message")],
+)  # fmt: skip
+def test_a_compressed_bag_gives_the_same_drive(tmp_path, storage, compression):
+    plain = bags.write(tmp_path / "plain", bags.drive(), storage)
+    small = bags.write(tmp_path / "small", bags.drive(), storage, compression)
+    assert storage_file(small).stat().st_size != storage_file(plain).stat().st_size
+    assert same(read_recording(plain, CAR), read_recording(small, CAR))
+    assert same(read_recording(plain, CAR), read_recording(storage_file(small), CAR))
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_compressed_file_without_its_folder_is_refused(tmp_path, storage):
+    bag = bags.write(tmp_path / "bag", bags.drive(), storage, "file")
+    (bag / "metadata.yaml").unlink()
+    assert "unpack it with `zstd -d`" in refused(storage_file(bag))
+
+
+@pytest.mark.parametrize("version", [8, 9])
+def test_the_metadata_of_each_version_is_read(tmp_path, version):
+    bag = bags.write(tmp_path / "bag", bags.drive(), version=version)
+    assert len(read_recording(bag, CAR).command.t) == len(bags.commands())
+
+
+@pytest.mark.parametrize("version", [4, 5, 6, 7])
+def test_the_metadata_of_older_distributions_is_read(bag, version):
+    with metadata(bag) as told:
+        told["version"] = version
+        for key, since in (("files", 5), ("custom_data", 6), ("ros_distro", 8)):
+            if version < since:
+                told.pop(key, None)
+        for topic in told["topics_with_message_count"]:
+            topic["topic_metadata"]["offered_qos_profiles"] = ""
+            if version < 7:
+                topic["topic_metadata"].pop("type_description_hash")
+    assert len(read_recording(bag, CAR).command.t) == len(bags.commands())
+
+
+def test_metadata_of_the_future_are_refused(bag):
+    with metadata(bag) as told:
+        told["version"] = 99
+    assert "99" in refused(bag)
+
+
+def test_a_bag_in_several_files_is_read_whole(tmp_path):
+    bag = bags.write(tmp_path / "bag", bags.drive())
+    later = bags.write(tmp_path / "later", bags.drive(delay=bags.DURATION_S))
+    shutil.copy(storage_file(later), bag / "bag_1.mcap")
+    with metadata(bag) as told:
+        told["relative_file_paths"].append("bag_1.mcap")
+        told["duration"]["nanoseconds"] += bags.ns(bags.DURATION_S) - bags.ns(0.0)
+        told["message_count"] *= 2
+        for topic in told["topics_with_message_count"]:
+            topic["message_count"] *= 2
+    assert len(read_recording(bag, CAR).command.t) == 2 * len(bags.commands())
+    assert len(read_recording(bag / "bag.mcap", CAR).command.t) == len(bags.commands())
+    (bag / "metadata.yaml").unlink()
+    assert "holds 2 bag files and no metadata.yaml" in refused(bag)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.7, 0.99])
+@pytest.mark.parametrize("alone", [False, True])
+def test_a_cut_file_is_refused(bag, share, alone):
+    file = storage_file(bag)
+    data = file.read_bytes()
+    file.write_bytes(data[: int(share * len(data))])
+    if alone:
+        (bag / "metadata.yaml").unlink()
+    refused(file if alone else bag)
+
+
+@pytest.mark.parametrize("seed", range(SEEDS))
+def test_flipped_bytes_never_lose_messages_or_end_in_a_traceback(bag, seed):
+    """A number may be another one, which no checksum of a bag tells; but none goes missing."""
+    rng = np.random.default_rng(seed)
+    file = storage_file(bag)
+    data = np.frombuffer(file.read_bytes(), dtype=np.uint8).copy()
+    data[rng.integers(len(data), size=3)] ^= np.uint8(1 << rng.integers(8))
+    file.write_bytes(data.tobytes())
+    with suppress(RecordingError):
+        read = read_recording(bag, CAR)
+        assert len(read.command.t) == len(bags.commands())
+        assert len(read.pose.t) == len(bags.poses())
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (
+            "DELETE FROM messages WHERE id % 50 = 0",
+            "its summary speaks of 1800 messages, its files hold 1764",
+        ),
+        (
+            "UPDATE messages SET timestamp = timestamp + 3600000000000 WHERE id = 77",
+            "outside of the time span",
+        ),
+        (
+            "UPDATE messages SET data = x'0001' WHERE id = 8",
+            "topic '/cmd_vel': message 7 can't be decoded as geometry_msgs/msg/Twist",
+        ),
+    ],
+    ids=["missing", "out_of_time", "garbled"],
+)
+def test_messages_that_do_not_fit_the_bags_summary_are_refused(tmp_path, damage, said):
+    bag = bags.write(tmp_path / "bag", bags.drive(), "sqlite3")
+    with closing(sqlite3.connect(storage_file(bag))) as base, base:
+        base.execute(damage)
+    assert said in refused(bag)
+
+
+@pytest.mark.parametrize("sign", ["?", "#", "%20"])
+def test_a_path_that_sqlite_can_not_open_is_no_damage(pristine, tmp_path, sign):
+    bag = shutil.copytree(pristine, tmp_path / f"drive{sign}1")
+    if storage_file(bag).suffix == ".mcap":
+        assert len(read_recording(bag, CAR).command.t) == len(bags.commands())
+    else:
+        assert "rename the folder" in refused(bag)
+
+
+def test_a_summary_that_contradicts_itself_is_refused(bag):
+    with metadata(bag) as told:
+        told["message_count"] += 1
+    assert "add up to" in refused(bag)
+
+
+@pytest.mark.parametrize("text", ["", "a: [", "just: this\n", "\x00"])
+def test_damaged_metadata_is_refused(bag, text):
+    (bag / "metadata.yaml").write_text(text, encoding="utf-8")
+    assert "ros2 bag reindex" in refused(bag)
+
+
+def test_a_database_that_was_not_closed_is_refused(tmp_path):
+    bag = bags.write(tmp_path / "bag", bags.drive(), "sqlite3")
+    file = storage_file(bag)
+    file.with_name(f"{file.name}-wal").write_bytes(b"the rest of the drive")
+    assert "was not closed" in refused(bag)
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_bag_without_messages_is_refused(tmp_path, storage):
+    kinds = {"/cmd_vel": bags.kinds.TWIST, "/pose": bags.kinds.POSE}
+    topics = {"/cmd_vel": [], "/pose": []}
+    bag = bags.write(tmp_path / "bag", topics, storage, kinds_of=kinds)
+    assert "holds no messages" in refused(bag)
+
+
+def test_a_bag_of_ros_1_comes_with_the_way_to_convert_it(tmp_path):
+    (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\n")
+    assert "rosbags-convert" in refused(tmp_path / "drive.bag")
+
+
+def renamed(told, k, name):
+    told["topics_with_message_count"][k]["topic_metadata"]["name"] = name
+
+
+@pytest.mark.parametrize("name", [None, "", 7])
+@pytest.mark.parametrize("k", [0, 1])
+def test_a_summary_that_lost_the_name_of_a_topic_is_refused(bag, k, name):
+    with metadata(bag) as told:
+        renamed(told, k, name)
+    assert "lost the name of a topic" in refused(bag)
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_topic_that_only_the_summary_or_only_the_file_has_is_refused(tmp_path, storage):
+    """Also one that the drive is not read from."""
+    topics = bags.drive() | {"/extra": [(0.0, bags.twist(0.0, 0.0, 0.0))]}
+    bag = bags.write(tmp_path / "bag", topics, storage)
+    with metadata(bag) as told:
+        names = [one["topic_metadata"]["name"] for one in told["topics_with_message_count"]]
+        renamed(told, names.index("/extra"), "/other")
+    assert "topic '/extra' of type" in refused(bag)
+
+
+def test_messages_that_the_summary_gives_to_another_topic_are_refused(bag):
+    with metadata(bag) as told:
+        one, other = told["topics_with_message_count"][:2]
+        one["message_count"] -= 3
+        other["message_count"] += 3
+    assert "messages in its files" in refused(bag)
+
+
+BOMB = "k0: &k0 {x: 1}\n" + "".join(
+    f"k{i}: &k{i} {{<<: [{', '.join([f'*k{i - 1}'] * 9)}]}}\n" for i in range(1, 9)
+)
+
+
+@pytest.mark.parametrize("text", [BOMB, "a: !!python/name:os.system x\n", "a: !!timestamp x\n"])
+def test_a_summary_that_grows_or_wants_objects_made_is_refused(bag, text):
+    file = bag / "metadata.yaml"
+    file.write_text(file.read_text(encoding="utf-8") + text, encoding="utf-8")
+    assert "can't be read as a bag" in refused(bag)

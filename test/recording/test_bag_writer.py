@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags", reason="needs the extra 'bags'")
+
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.recording.topic_roles import TopicRoles
+from nics_drl_bridge.recording.write import write_bag
+from nics_drl_bridge.robot.spec import load_robot
+
+CAR = load_robot("ackermann")
+
+
+def stream(width: int, clock: str = "robot", start: float = 3.0) -> Stream:
+    t = start + np.arange(200) * 0.05
+    return Stream(t, 0.1 * np.sin(t[:, None] * np.arange(1, width + 1)), clock)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_every_stream_comes_back(tmp_path, storage):
+    drive = Recording(stream(2), stream(3, "mocap", 40.0), stream(2), None, stream(3))
+    write_bag(drive, tmp_path / "bag", CAR, storage)
+    back = read_recording(tmp_path / "bag", CAR)
+    assert set(back.streams) == {"command", "pose", "state", "imu"}
+    for name, one in drive.streams.items():
+        other = back.streams[name]
+        assert np.allclose(other.values, one.values)
+        assert np.allclose(np.diff(other.t), np.diff(one.t))
+    assert back.command.clock == back.state.clock == back.imu.clock != back.pose.clock
+
+
+def test_wheel_speeds_come_back(tmp_path):
+    drive = Recording(stream(2), stream(3), wheels=stream(2))
+    write_bag(drive, tmp_path / "bag", CAR)
+    back = read_recording(tmp_path / "bag", CAR).wheels
+    assert back is not None
+    assert np.allclose(back.values, drive.wheels.values)
+
+
+def test_odometry_beside_a_pose_comes_back(tmp_path):
+    drive = Recording(stream(2), stream(3), odometry=stream(3, start=3.01))
+    write_bag(drive, tmp_path / "bag", CAR)
+    back = read_recording(tmp_path / "bag", CAR, TopicRoles(odom="/odom"))
+    assert np.allclose(back.pose.values, drive.pose.values)
+    assert np.allclose(back.odometry.values, drive.odometry.values)
+    assert back.odometry.t[0] - back.pose.t[0] == pytest.approx(0.01)
+    assert back.pose.clock == back.odometry.clock == back.command.clock
+
+
+def test_a_folder_that_is_there_is_left_alone(tmp_path):
+    (tmp_path / "bag").mkdir()
+    with pytest.raises(RecordingError, match="is there already"):
+        write_bag(Recording(stream(2), stream(3)), tmp_path / "bag", CAR)
+    assert os.listdir(tmp_path / "bag") == []
+
+
+def test_a_bag_that_could_not_be_finished_leaves_nothing(tmp_path):
+    with pytest.raises(ValueError, match="unpack"):
+        write_bag(Recording(stream(2), stream(1)), tmp_path / "bag", CAR)
+    assert os.listdir(tmp_path) == []

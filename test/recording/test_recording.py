@@ -1,0 +1,200 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.npz import npz_bytes
+from nics_drl_bridge.recording.recording import (
+    FORMAT,
+    Recording,
+    Stream,
+    check,
+    load_recording,
+    samples_on_one_clock,
+    save_recording,
+)
+from nics_drl_bridge.robot.spec import load_robot
+
+
+@pytest.fixture
+def recording():
+    t = np.arange(50) * 0.02
+    rng = np.random.default_rng(0)
+    pose = np.stack([t, np.sin(t), geometry.wrap_angle(3.0 + t)], axis=1)
+    return Recording(
+        Stream(t + 0.1, rng.normal(size=(50, 2)), "robot"),
+        Stream(t, pose, "mocap"),
+        Stream(t, rng.normal(size=(50, 2)), "robot"),
+        Stream(t[::2], rng.normal(size=(25, 2)), "robot"),
+        source="here",
+    )
+
+
+@pytest.fixture(scope="module")
+def car():
+    return load_robot("ackermann")
+
+
+def spoilt(recording, name, row, value):
+    stream = getattr(recording, name)
+    values = stream.values.copy()
+    values[row, 0] = value
+    return replace(recording, **{name: replace(stream, values=values)})
+
+
+def test_the_rates_of_samples_are_the_twist_of_the_exact_arc():
+    rng = np.random.default_rng(1)
+    dt, twists = 0.05, rng.normal(size=(40, 3)) * [1.0, 1.0, 20.0]
+    poses = [np.array([1.0, 2.0, 3.0])]
+    for twist in twists:
+        poses.append(geometry.compose(poses[-1], geometry.exp(twist * dt)))
+    t, state = np.arange(41) * dt, rng.normal(size=(41, 1))
+    command = rng.normal(size=(41, 2))
+    samples = samples_on_one_clock(t, np.array(poses), state, command)
+    assert samples.dt == pytest.approx(dt)
+    assert np.allclose(samples.dq[:, :3], twists, atol=1e-9)
+    assert np.allclose(samples.dq[:, 3:], np.diff(state, axis=0) / dt)
+    assert np.array_equal(samples.x, np.concatenate([state, command], axis=1)[:-1])
+    assert np.array_equal(samples.q[:, 3:], state[:-1])
+    assert np.array_equal(samples.t, t[:-1])
+
+
+def test_chosen_rows_stay_together():
+    t = np.arange(6) * 0.1
+    samples = samples_on_one_clock(t, np.zeros((6, 3)), t[:, None], np.zeros((6, 1)))
+    few = samples.rows(samples.t > 0.25)
+    assert np.allclose(few.t, [0.3, 0.4])
+    assert np.allclose(few.x[:, 0], few.t)
+    assert len(few.q) == len(few.dq) == 2
+
+
+def test_a_good_recording_passes(recording, car):
+    assert check(recording, car) is recording
+    assert set(recording.streams) == {"command", "pose", "state", "wheels"}
+    assert set(replace(recording, state=None, wheels=None).streams) == {"command", "pose"}
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", ["command", "pose", "state", "wheels"])
+def test_what_is_no_number_is_refused_with_stream_and_row(recording, car, name, value):
+    with pytest.raises(RecordingError, match=f"here: {name}: row 7 holds NaN or inf"):
+        check(spoilt(recording, name, 7, value), car)
+
+
+def test_a_stamp_that_is_no_number_is_refused(recording, car):
+    t = recording.pose.t.copy()
+    t[3] = np.nan
+    with pytest.raises(RecordingError, match="pose: row 3 holds NaN"):
+        check(replace(recording, pose=replace(recording.pose, t=t)), car)
+
+
+def test_time_that_runs_backwards_is_refused_with_its_row(recording, car):
+    t = recording.command.t.copy()
+    t[[10, 11]] = t[[11, 10]]
+    with pytest.raises(RecordingError, match="command: time runs backwards at row 11"):
+        check(replace(recording, command=replace(recording.command, t=t)), car)
+
+
+def test_equal_stamps_are_allowed(recording, car):
+    t = recording.pose.t.copy()
+    t[5] = t[4]
+    check(replace(recording, pose=replace(recording.pose, t=t)), car)
+
+
+def test_a_recording_of_another_robot_is_refused(recording):
+    with pytest.raises(RecordingError, match=r"command: has the shape \(50, 2\) where \(50, 3\)"):
+        check(recording, load_robot("mecanum"))
+
+
+def test_a_recording_of_one_sample_is_refused(recording, car):
+    short = Stream(recording.pose.t[:1], recording.pose.values[:1])
+    with pytest.raises(RecordingError, match="pose: has 1 samples"):
+        check(replace(recording, pose=short), car)
+
+
+def test_headings_in_degrees_are_refused(recording, car):
+    values = recording.pose.values.copy()
+    values[:, 2] = np.arange(50) * 4.0 % 360.0  # 4 degrees a sample
+    with pytest.raises(RecordingError, match="it must be in radians"):
+        check(replace(recording, pose=replace(recording.pose, values=values)), car)
+
+
+def test_a_saved_recording_reads_back_to_the_same_bits(recording, tmp_path):
+    path = tmp_path / "drive.npz"
+    save_recording(recording, path)
+    back = load_recording(path)
+    assert back.source == str(path)
+    assert set(back.streams) == set(recording.streams)
+    for name, stream in recording.streams.items():
+        assert np.array_equal(back.streams[name].t, stream.t)
+        assert np.array_equal(back.streams[name].values, stream.values)
+        assert back.streams[name].clock == stream.clock
+    content = path.read_bytes()
+    save_recording(replace(back, source="here"), path)
+    assert path.read_bytes() == content
+
+
+def test_another_format_is_named(tmp_path):
+    meta = {"format": "other/1", "source": "", "clocks": {}}
+    path = tmp_path / "a.npz"
+    path.write_bytes(npz_bytes({"meta": np.array(json.dumps(meta))}))
+    with pytest.raises(RecordingError, match="format 'other/1' is not"):
+        load_recording(path)
+
+
+@pytest.mark.parametrize(
+    "meta",
+    [
+        {"format": FORMAT},
+        {"format": FORMAT, "clocks": {"command": "robot"}},
+        {"format": FORMAT, "clocks": {"nonsense": "robot"}},
+        {"format": FORMAT, "clocks": ["command"]},
+        [1, 2],
+        None,
+    ],
+)
+def test_a_file_that_lacks_a_part_is_refused(tmp_path, meta):
+    path = tmp_path / "a.npz"
+    arrays = {"meta": np.array(json.dumps(meta)), "command": np.zeros((2, 2))}
+    path.write_bytes(npz_bytes({**arrays, "command_t": np.zeros(2)}))
+    with pytest.raises(RecordingError, match="is not a recording of this package"):
+        load_recording(path)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(RecordingError, match=r"nowhere.npz: no such file"):
+        load_recording(tmp_path / "nowhere.npz")
+
+
+def test_a_recording_is_never_unpickled(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, meta=np.array([{"format": FORMAT}], dtype=object))
+    with pytest.raises(RecordingError, match=r"can't be read as \.npz"):
+        load_recording(path)
+
+
+def test_a_damaged_file_is_refused_or_reads_as_it_was(recording, tmp_path):
+    path = tmp_path / "drive.npz"
+    save_recording(recording, path)
+    content = path.read_bytes()
+    rng = np.random.default_rng(2)
+    refused = 0
+    for trial in range(300):
+        damaged = bytearray(content)
+        if trial < 50:
+            damaged = damaged[: rng.integers(len(content))]
+        else:
+            damaged[rng.integers(len(content))] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged)
+        try:
+            back = load_recording(path)
+        except RecordingError:
+            refused += 1
+        else:
+            assert np.array_equal(back.pose.values, recording.pose.values)
+    assert refused > 200

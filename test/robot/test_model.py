@@ -1,0 +1,112 @@
+from __future__ import annotations
+
+from copy import deepcopy
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.config import dump_yaml, parse_yaml
+from nics_drl_bridge.errors import ModelError
+from nics_drl_bridge.robot.taylor import TaylorModel
+
+
+@pytest.fixture
+def model():
+    """vx = 2 s, vy = 0, wz = -s c, ds = -3 s + 3 c."""
+    return TaylorModel(
+        variables=("s", "c"),
+        dofs=("vx", "vy", "wz", "d_s"),
+        dof_units=("m/s", "m/s", "rad/s", "m/s/s"),
+        powers=np.array([[1, 0], [0, 1], [1, 1]]),
+        coefficients=np.array([[2.0, 0, 0], [0, 0, 0], [0, 0, -1.0], [-3.0, 3.0, 0]]),
+        dt=0.1,
+        low=np.array([-1.0, -2.0]),
+        high=np.array([1.0, 2.0]),
+        assumed=(("wz", "s*c"),),
+    )
+
+
+def test_rates_are_the_coefficients_times_the_terms(model):
+    assert np.allclose(model.rates([0.5, 2.0]), [1.0, 0.0, -1.0, 4.5])
+    assert model.rates(np.ones((3, 4, 2))).shape == (3, 4, 4)
+
+
+def test_a_step_follows_the_arc_and_adds_to_the_state(model):
+    pose, state = model.step([1.0, 2.0, 0.5], [0.5], [2.0])
+    expected = geometry.compose([1.0, 2.0, 0.5], geometry.exp([0.1, 0.0, -0.1]))
+    assert np.allclose(pose, expected)
+    assert np.allclose(state, [0.95])
+
+
+def test_sizes_are_counted(model):
+    assert model.state_size == 1
+    assert model.terms_kept == 4
+
+
+def test_the_equations_read_as_formulas_with_units(model):
+    assert model.equations() == [
+        "vx = 2*s  [m/s]",
+        "vy = 0  [m/s]",
+        "wz = -1*s*c (assumed)  [rad/s]",
+        "d_s = -3*s + 3*c  [m/s/s]",
+    ]
+
+
+def test_a_model_reads_back_from_yaml_to_the_same_bits(model):
+    rng = np.random.default_rng(0)
+    odd = rng.normal(size=(4, 3)) * 10.0 ** rng.uniform(-12, 12, (4, 3))
+    model = TaylorModel(**{**vars(model), "coefficients": odd, "dt": 0.1 / 3.0})
+    back = TaylorModel.from_dict(parse_yaml(dump_yaml(model.to_dict()), "model.yaml"))
+    assert back.to_dict() == model.to_dict()
+    for name, value in vars(model).items():
+        assert np.array_equal(getattr(back, name), value), name
+
+
+def broken(model, path, value):
+    data = deepcopy(model.to_dict())
+    *folders, last = path
+    inner = data
+    for folder in folders:
+        inner = inner[folder]
+    if value is KeyError:
+        del inner[last]
+    else:
+        inner[last] = value
+    return data
+
+
+@pytest.mark.parametrize("key", ["dt", "units", "terms", "valid", "assumed"])
+def test_a_missing_key_is_named(model, key):
+    with pytest.raises(ModelError, match=f"kinematics: '{key}' is missing or wrong"):
+        TaylorModel.from_dict(broken(model, [key], KeyError))
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (["dt"], "fast"),
+        (["dt"], 0.0),
+        (["dt"], -0.1),
+        (["dt"], float("nan")),
+        (["dt"], float("inf")),
+        (["terms"], [1, 2]),
+        (["terms", "vx"], None),
+        (["terms", "vx", "s"], "much"),
+        (["terms", "vx", "s"], float("nan")),
+        (["terms", "vx", "ghost"], 1.0),
+        (["terms", "vx", "s^-1"], 1.0),
+        (["units", "wz"], KeyError),
+        (["valid", "s"], [0.0]),
+        (["valid", "s"], [0.0, 1.0, 2.0]),
+        (["valid", "s"], "wide"),
+        (["valid"], {"s": [0.0], "c": [1.0]}),
+        (["valid"], {"s": 0.0, "c": 1.0}),
+        (["valid"], 3),
+        (["assumed"], [["wz"]]),
+        (["assumed"], 3),
+    ],
+)
+def test_what_is_wrong_is_one_sentence(model, path, value):
+    with pytest.raises(ModelError, match=r"^kinematics: [^\n]*generate the model anew\.$"):
+        TaylorModel.from_dict(broken(model, path, value))

@@ -1,0 +1,153 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from identify.drives import drive
+from robots import field
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.config import dump_yaml, parse_yaml
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import builtin_model, load_model, save_model
+from nics_drl_bridge.identify.drift import measure_noise
+from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.robot.noise import MEASURED, Level, Noise
+from nics_drl_bridge.sim.simulator import FastSimulator
+
+ODOMETRY = 0.03, 0.05  # m/s, rad/s
+DRIFT = 0.02, 0.03  # m/sqrt(s), rad/sqrt(s)
+TOLERANCE = 0.2
+
+
+def measured(std: float, unit: str) -> Level:
+    return Level(std=std, unit=unit, source=MEASURED)
+
+
+NOISE = Noise(
+    odom_linear=measured(ODOMETRY[0], "m/s"),
+    odom_angular=measured(ODOMETRY[1], "rad/s"),
+    position_drift=measured(DRIFT[0], "m/sqrt(s)"),
+    heading_drift=measured(DRIFT[1], "rad/sqrt(s)"),
+)
+
+
+def drifting(spec, seed: int, duration: float = 150.0) -> Recording:
+    """A textbook drive that drifts, with noisy odometry."""
+    rng = np.random.default_rng(seed)
+    clean = record(spec, rng, duration)
+    pose, dt = clean.pose.values, float(clean.pose.t[1] - clean.pose.t[0])
+    step = geometry.between(pose[:-1], pose[1:])
+    push = rng.normal(size=step.shape) * np.sqrt(dt) * np.array([DRIFT[0], *DRIFT])
+    path = [pose[0]]
+    for relative in geometry.compose(step, push):
+        path.append(geometry.compose(path[-1], relative))
+    twist = geometry.log(step) / dt
+    twist += rng.normal(size=twist.shape) * np.array([ODOMETRY[0], *ODOMETRY])
+    return replace(
+        clean,
+        pose=replace(clean.pose, values=np.array(path)),
+        odometry=Stream(clean.pose.t[:-1] + dt / 2.0, twist),
+    )
+
+
+def driven(model, seconds: float, seed: int) -> Recording:
+    """A drive of the simulator of a model, recorded a hundred times a second."""
+    fast = replace(model, control_period=model.kinematics.dt)
+    simulator, dt = FastSimulator(fast, field(400.0)), fast.control_period
+    rng, spec = np.random.default_rng(seed), model.robot
+    simulator.reset([seed], starts=np.zeros((1, 1, 3)))
+    rows: dict[str, list[np.ndarray]] = {"pose": [], "state": [], "command": [], "odometry": []}
+    for n in range(round(seconds / dt)):
+        if n % round(0.5 / dt) == 0:
+            command = rng.uniform(spec.command_low, spec.command_high)
+        for name, values in (("pose", simulator.data.pose), ("state", simulator.data.state)):
+            rows[name].append(values[0, 0].copy())
+        rows["command"].append(command)
+        simulator.step(command[None, None])
+        rows["odometry"].append(simulator.data.twist[0, 0].copy())
+    t = dt * np.arange(len(rows["pose"]))
+    streams = {name: Stream(t, np.array(values)) for name, values in rows.items()}
+    streams["odometry"] = replace(streams["odometry"], t=t + dt)
+    return Recording(**streams, source="simulator")
+
+
+def levels(noise: Noise) -> np.ndarray:
+    return np.array([*noise.odometry, noise.position_drift.std, noise.heading_drift.std])
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_drive_of_known_noise_gives_it_back_and_so_does_its_simulator(differential, seed):
+    found = identify(drifting(differential, seed), differential)
+    known = np.array([*ODOMETRY, *DRIFT])
+    assert levels(found.noise) == pytest.approx(known, rel=TOLERANCE)
+    model = replace(builtin_model("differential"), kinematics=found.model, noise=found.noise)
+    again = identify(driven(model, 150.0, seed), differential)
+    assert levels(again.noise) == pytest.approx(levels(found.noise), rel=TOLERANCE)
+
+
+def test_the_uncertainty_of_a_level_covers_its_error(differential):
+    found = [identify(drifting(differential, seed, 90.0), differential) for seed in range(3)]
+    for name, known in (("position_drift", DRIFT[0]), ("heading_drift", DRIFT[1])):
+        found_levels = [getattr(f.noise, name) for f in found]
+        away = [(level.std - known) / level.uncertainty for level in found_levels]
+        assert np.abs(away).max() < 4.0
+        assert all(0.0 < level.uncertainty < 0.3 * known for level in found_levels)
+
+
+def test_noise_of_the_pose_is_no_drift_of_the_robot(differential):
+    found = identify(drive(differential, duration=90.0, noise=(0.005, 0.01)), differential).noise
+    assert found.pose_position.std == pytest.approx(0.005, rel=TOLERANCE)
+    assert found.pose_heading.std == pytest.approx(0.01, rel=TOLERANCE)
+    assert found.position_drift.std < 0.003
+    assert found.heading_drift.std < 0.009
+
+
+def test_the_drift_of_a_model_that_runs_away_is_assumed(car):
+    recording = drive(car, noise=(5e-4, 1e-3), measured_state=False)
+    found = identify(recording, car)
+    coefficients = found.model.coefficients.copy()
+    coefficients[3:] *= -20.0
+    unstable = replace(found.model, coefficients=coefficients)
+    with np.errstate(all="ignore"):
+        noise = measure_noise(recording, found.calibration, unstable, found.samples, car)
+    assert found.noise.position_drift.measured
+    assert noise.position_drift == Noise().position_drift
+    assert not noise.heading_drift.measured
+
+
+def test_without_odometry_its_noise_is_assumed_and_the_report_says_so(differential):
+    found = identify(record(differential, np.random.default_rng(0), 30.0), differential)
+    assert not found.noise.odom_linear.measured
+    assert found.noise.odometry == Noise().odometry
+    lines = found.noise.sentences()
+    assert sum(line.endswith("assumed") for line in lines) == 2
+
+
+def test_an_assumed_drift_is_expected_but_not_simulated(car):
+    noise = Noise()
+    assert (noise.drift(car) > 0.0).all()
+    assert not noise.simulated_drift(car).any()
+    assert NOISE.simulated_drift(car)[:3] == pytest.approx([DRIFT[0], *DRIFT])
+
+
+def test_the_levels_are_saved_with_unit_and_source(tmp_path):
+    model = replace(builtin_model("differential"), noise=NOISE)
+    save_model(model, tmp_path / "model")
+    text = (tmp_path / "model" / "model.yaml").read_text()
+    row = parse_yaml(text, "model")["noise"]["odom_linear"]
+    assert (row["std"], row["unit"], row["source"]) == (ODOMETRY[0], "m/s", "measured")
+    assert load_model(tmp_path / "model").noise == NOISE
+
+
+def test_a_level_in_another_unit_is_refused(tmp_path):
+    save_model(builtin_model("differential"), tmp_path / "model")
+    path = tmp_path / "model" / "model.yaml"
+    data = parse_yaml(path.read_text(), "model")
+    data["noise"]["odom_angular"]["unit"] = "deg/s"
+    path.write_text(dump_yaml(data))
+    with pytest.raises(ConfigError, match="odom_angular must be in rad/s"):
+        load_model(tmp_path / "model")

@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge.lidar.spec import load_lidar
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
+from nics_drl_bridge.robot.urdf import urdf_of
+
+ROOT = Path(__file__).resolve().parents[2]
+ROBOTS = ("ackermann", "differential", "mecanum")
+
+
+def joints(text: str) -> dict[str, ElementTree.Element]:
+    return {joint.attrib["name"]: joint for joint in ElementTree.fromstring(text).iter("joint")}
+
+
+def place(text: str, link: str) -> np.ndarray:
+    """x, y, z of a link in base_link, where no joint is turned."""
+    at = np.zeros(3)
+    parents = {j.find("child").attrib["link"]: j for j in joints(text).values()}
+    while link in parents:
+        at += [float(word) for word in parents[link].find("origin").attrib["xyz"].split()]
+        link = parents[link].find("parent").attrib["link"]
+    assert link == "base_link"
+    return at
+
+
+def wheels(text: str) -> dict[str, float]:
+    """Links of wheels and their radii."""
+    links = ElementTree.fromstring(text).iter("link")
+    return {
+        link.attrib["name"]: float(link.find("visual/geometry/cylinder").attrib["radius"])
+        for link in links
+        if link.attrib["name"].endswith("_wheel_link")
+    }
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_shipped_files_are_those_of_the_shipped_robots(name: str) -> None:
+    lidar = load_lidar("paper")
+    file = ROOT / "urdf" / f"{name}.urdf"
+    assert file.read_text(encoding="utf-8") == urdf_of(load_robot(name), lidar.mount, lidar.frame)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_it_is_one_tree_below_base_link(name: str) -> None:
+    text = urdf_of(load_robot(name))
+    root = ElementTree.fromstring(text)
+    links = [link.attrib["name"] for link in root.iter("link")]
+    children = [joint.find("child").attrib["link"] for joint in root.iter("joint")]
+    assert len(set(links)) == len(links)
+    assert sorted([*children, "base_link"]) == sorted(links)
+    assert {"base_link", "laser"} <= set(links)
+    materials = {one.attrib["name"] for one in root.findall("material")}
+    assert {one.attrib["name"] for one in root.iter("material")} == materials
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_wheels_stand_on_the_ground_and_move_as_joint_states_says(name: str) -> None:
+    spec = load_robot(name)
+    text = urdf_of(spec)
+    assert wheels(text)
+    for link, radius in wheels(text).items():
+        assert place(text, link)[2] == pytest.approx(radius)
+    movable = {key for key, joint in joints(text).items() if joint.attrib["type"] != "fixed"}
+    mimics = {key for key, joint in joints(text).items() if joint.find("mimic") is not None}
+    assert movable - mimics <= {variable.name for variable in spec.state}
+    turning = [j for j in joints(text).values() if j.attrib["type"] == "continuous"]
+    assert all(joint.find("axis").attrib["xyz"] == "0 1 0" for joint in turning)
+
+
+def test_a_differential_robot_has_its_track_and_its_left_wheel_at_positive_y() -> None:
+    text = urdf_of(load_robot("differential"))
+    assert place(text, "left_wheel_link") == pytest.approx([0.0, 0.1, 0.05])
+    assert place(text, "right_wheel_link") == pytest.approx([0.0, -0.1, 0.05])
+
+
+def test_a_mecanum_robot_has_four_wheels_in_the_order_of_its_state() -> None:
+    text = urdf_of(load_robot("mecanum"))
+    assert place(text, "front_left_wheel_link") == pytest.approx([0.1, 0.1, 0.05])
+    assert place(text, "rear_right_wheel_link") == pytest.approx([-0.1, -0.1, 0.05])
+    assert set(wheels(text).values()) == {0.05}
+
+
+def test_a_car_has_its_wheelbase_and_steers_within_its_limits() -> None:
+    spec = load_robot("ackermann")
+    text = urdf_of(spec)
+    gap = place(text, "front_left_wheel_link") - place(text, "rear_left_wheel_link")
+    assert gap == pytest.approx([spec.parameters["wheelbase"], 0.0, 0.0])
+    limit = joints(text)["steering"].find("limit").attrib
+    assert (float(limit["lower"]), float(limit["upper"])) == (-0.5, 0.5)
+
+
+def test_the_laser_stands_at_its_mount() -> None:
+    text = urdf_of(load_robot("differential"), (0.1, -0.02, 1.5), "front_laser", "car")
+    origin = joints(text)["laser_mount"].find("origin").attrib
+    assert (origin["xyz"], origin["rpy"]) == ("0.1 -0.02 0", "0 0 1.5")
+    assert joints(text)["laser_mount"].find("child").attrib["link"] == "front_laser"
+    assert joints(text)["laser_mount"].find("parent").attrib["link"] == "car"
+
+
+def test_a_robot_without_textbook_kinematics_has_a_body_and_a_laser() -> None:
+    data = load_robot("differential").model_dump() | {"textbook": None}
+    text = urdf_of(RobotSpec(**data))
+    assert not wheels(text)
+    assert set(joints(text)) == {"laser_mount"}
