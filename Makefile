@@ -144,7 +144,7 @@ $(JAZZY)/.ready: $(DESCRIBED_BY)
 # RLlib holds Gymnasium at a version of its own.
 RAY := .venv-ray
 RAY_EXTRAS := deploy,distributed,test,train
-RAY_TESTS := test/extras/ray/test_train_ray.py test/policy/test_train_vec_env.py
+RAY_TESTS := test/extras/ray/test_engine.py test/policy/test_train_vec_env.py
 
 test-ray: $(RAY)/.ready ## training on a Ray cluster of two nodes on this machine, in .venv-ray
 	$(CLEAN_ENV) $(RAY)/bin/python -m pytest $(RAY_TESTS) $(PYTEST_ARGS)

@@ -1,4 +1,4 @@
-"""Is every rule of the gate tested? Each is taken out in turn, and test/safety has to fail.
+"""Is every rule of the gate tested? Each is taken out in turn, and test/gate has to fail.
 
 A rule is a row of one of the gate's tables: stops, refusals, checks before arming, what shapes a
 motion, and what the shield takes for an obstacle. Each run is a process of its own.
@@ -21,7 +21,7 @@ CONTROLS = {
 }
 LEAST_RULES = 30
 """There are more; a run that found fewer has lost a table."""
-TESTS, OTHER_TEST = "test/safety", "test/safety/test_settings.py"
+TESTS, OTHER_TEST = "test/gate", "test/gate/test_settings.py"
 ROOT = Path(__file__).resolve().parents[1]
 TABLES = {
     "stop": (gate, "STOPS", lambda rule: rule.judge.__name__),

@@ -63,7 +63,7 @@ def test_it_tells_its_version_and_its_commands(tmp_path):
     assert nics("--version", cwd=tmp_path).stdout == f"{__version__}\n"
     told = nics("--help", cwd=tmp_path)
     assert told.returncode == 0
-    assert {"generate", "bake", "replay", "demo"} <= set(told.stdout.split())
+    assert {"generate", "bag", "replay", "demo"} <= set(told.stdout.split())
 
 
 def test_an_unknown_command_or_option_is_refused(tmp_path):

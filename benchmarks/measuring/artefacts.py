@@ -260,7 +260,7 @@ def unchecked() -> Any:
     """Takes every checksum out while it is entered: they fit whatever they are held against."""
     fits = contextlib.ExitStack()
     for place in (
-        "npz.is_sealed", "npz._check_seal", "kinematics.recording.is_sealed",
+        "npz.is_sealed", "npz._check_seal", "recording.recording.is_sealed",
         "policy.onnx_graph.check_seal", "policy.contract._check_unchanged",
         "policy.train_checkpoint.check_sealed",
     ):  # fmt: skip

@@ -112,7 +112,7 @@ def test_a_rule_that_is_taken_out_is_missed_by_a_test(monkeypatch):
         gate_rules.take_out("stop/nothing")
 
 
-ONE_RULE = ("--tests", "test/safety/test_arming.py", "--rule", "arming/one_publisher")
+ONE_RULE = ("--tests", "test/gate/test_arming.py", "--rule", "arming/one_publisher")
 
 
 @pytest.mark.timeout(300)

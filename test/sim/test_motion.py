@@ -15,7 +15,6 @@ from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.sim import obstacle_kernels as kernels
 from nics_drl_bridge.sim import separation_kernels as at
 from nics_drl_bridge.sim.obstacles import (
-    MARK,
     NO_DISTANCES,
     Motion,
     Patrol,
@@ -24,6 +23,7 @@ from nics_drl_bridge.sim.obstacles import (
     distance_arrays,
     plan_arrays,
 )
+from nics_drl_bridge.sim.separation_kernels import MARK
 
 WANDER, WALKER = Wander(speed=(0.3, 0.8)), Pedestrian()
 SQUARE = Patrol(waypoints=((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)), speed=0.7)
