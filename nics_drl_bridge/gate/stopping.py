@@ -65,7 +65,7 @@ def shield_config(
         range_max=lidar.range_max,
         range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
     )
-    source = f"measured, by {path}" if told is not None else "derived from model and limits"
+    source = f"by {path}" if told is not None else "derived from model and limits"
     if given:
         source += f", but {', '.join(sorted(given))} by parameter"
     told_s = ", ".join(f"{name} {value:g}" for name, value in values.model_dump().items())
