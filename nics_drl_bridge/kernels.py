@@ -148,7 +148,7 @@ class _Wait(event.Listener):  # type: ignore[misc]
                 seconds = left * spent / max(self._done, 1)
                 sys.stderr.write(
                     f"nics_drl_bridge: compiling up to {left} kernels, once on this machine: about "
-                    f"{seconds:.0f} s; `nics warmup` does it ahead\n"
+                    f"{seconds:.0f} s\n"
                 )
 
     def on_end(self, event: event.Event) -> None:
