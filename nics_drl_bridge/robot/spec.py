@@ -169,6 +169,11 @@ class RobotSpec(Schema):
         """Units of dQ/dt."""
         return (*POSE_UNITS, *(f"{v.unit}/s" for v in self.state))
 
+    @property
+    def moves_sideways(self) -> bool:
+        """True if a command moves the robot along its lateral axis."""
+        return any(c.cmd_vel == "linear.y" for c in self.command)
+
     @cached_property
     def command_low(self) -> NDArray[np.float64]:
         """Least command (C,)."""
