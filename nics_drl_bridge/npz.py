@@ -72,7 +72,7 @@ def npz_bytes(arrays: Mapping[str, NDArray[Any]], packed: bool = True) -> bytes:
 
 
 def is_sealed(data: bytes) -> bool:
-    """Whether an `.npz` file's content ends with a seal.
+    """True if the content of an `.npz` file ends with a seal.
 
     Raises:
         ValueError: with one that does not fit the rest.
