@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from identify.drives import drive
 from robots import field
 
+from identify.drives import drive
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import dump_yaml, parse_yaml
 from nics_drl_bridge.errors import ConfigError
