@@ -1,9 +1,4 @@
-"""Recovery of the intact messages of a damaged bag, with a count of the lost ones.
-
-Recovery of the intact messages of a damaged MCAP file.
-
-Recovery of the intact rows of a damaged SQLite file of a bag.
-"""
+"""Recovery of the intact messages of a damaged bag, with a count of the lost ones."""
 
 from __future__ import annotations
 
@@ -17,36 +12,35 @@ from dataclasses import dataclass, field
 from mmap import mmap
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 from zlib import crc32
+
+from mcap.opcode import Opcode
+from mcap.records import Chunk, Message, Statistics
 
 from nics_drl_bridge.config import parse_yaml, read_text
 from nics_drl_bridge.errors import BridgeError, RecordingError
 from nics_drl_bridge.recording.bag_file import COMPRESSED, DATABASE, METADATA, is_storage
 from nics_drl_bridge.recording.mcap import (
-    CHUNK,
     COMPRESSIONS,
     INSIDE,
     MAGIC,
-    MESSAGE,
     PREFIX,
-    STATISTICS,
     DamageError,
-    McapMessage,
     McapSummary,
     Record,
-    chunk_of,
-    inner_records,
     mapped,
     records,
-    unpack,
+    unpacked,
 )
 from nics_drl_bridge.recording.messages import typestore
+from nics_drl_bridge.recording.packing import unpack
 from nics_drl_bridge.recording.write import Storage, bag_sink
 
 ZSTD = b"\x28\xb5\x2f\xfd"
 """First bytes of an individually compressed message; a plain ROS message begins with 0."""
 LATEST_NS = 1 << 62
+CHUNK_OP = bytes([Opcode.CHUNK])
 
 
 @dataclass(frozen=True)
@@ -176,11 +170,11 @@ def _read(file: Path, found: _Found) -> None:
     told, messages, promised = intact(file)
     names = {key: channel.topic for key, channel in told.channels.items()}
     for channel in told.channels.values():
-        schema = told.schemas.get(channel.schema)
+        schema = told.schemas.get(channel.schema_id)
         if schema is not None:
             found.kinds[channel.topic] = schema.name
-            found.definitions[schema.name] = schema.text
-    found.messages += [(names[m.channel], m.time_ns, m.data) for m in messages]
+            found.definitions[schema.name] = str(schema.data, "utf-8", "replace")
+    found.messages += [(names[m.channel_id], m.log_time, bytes(m.data)) for m in messages]
     found.told = found.told and bool(promised)
     for key, count in promised.items():
         found.promised[names.get(key, f"unknown channel {key}")] += count
@@ -194,18 +188,12 @@ def _decodable(found: _Found) -> Iterator[tuple[str, int, bytes]]:
         if kind is None or not 0 <= ns < LATEST_NS:
             continue
         try:
-            plain = _unpacked(data)
+            plain = unpack(data, "zstd") if data.startswith(ZSTD) else data
             if kind in store.fielddefs:
                 store.deserialize_cdr(plain, kind)
         except Exception:  # noqa: BLE001, S112 - the decoder can raise anything on damaged bytes
             continue
         yield topic, ns, plain
-
-
-def _unpacked(data: bytes) -> bytes:
-    if not data.startswith(ZSTD):
-        return data
-    return unpack(data, "zstd")
 
 
 def _promised(path: Path) -> dict[str, int] | None:
@@ -219,119 +207,96 @@ def _promised(path: Path) -> dict[str, int] | None:
         return None
 
 
-CHUNK_OP = bytes([CHUNK])
-
-
-class Intact(NamedTuple):
-    """Intact contents of a file.
-
-    Attributes:
-        told: its schemas and channels.
-        messages: the intact messages.
-        promised: messages per channel, by the file's statistics; empty if it has none.
-    """
-
-    told: McapSummary
-    messages: list[McapMessage]
-    promised: dict[int, int]
-
-
-def intact(path: Path) -> Intact:
-    """Returns all intact messages.
+def intact(path: Path) -> tuple[McapSummary, list[Message], dict[int, int]]:
+    """Reads all intact messages of an MCAP file.
 
     A chunk with a checksum is kept as a whole or not at all; a chunk without one is kept up to its
     damage. After damage the file is searched for the next chunk.
+
+    Returns:
+        The file's schemas and channels, its intact messages, and the number of messages of each
+        channel by its statistics; that is empty if it has none.
     """
-    if path.stat().st_size <= len(MAGIC):
-        return Intact(McapSummary(), [], {})
-    data = mapped(path)
     told, promised, waiting = McapSummary(), {}, []
-    place: int | None = len(MAGIC)
-    while place is not None and place < len(data):
+    data = mapped(path) if path.stat().st_size else memoryview(b"")
+    place = len(MAGIC)
+    while place < len(data):
+        whole = False
         try:
-            record = next(iter(records(data, place, len(data))))
-            if record.op == CHUNK:
+            record = next(records(data, place))
+            whole, end = isinstance(record.content, Chunk), record.end
+            if whole:
                 waiting += _inside(record)
-            elif record.op in INSIDE:
+            elif isinstance(record.content, INSIDE):
                 waiting.append(record)
-            elif record.op == STATISTICS:
-                promised = _promised_by_footer(record)
-        except (DamageError, struct.error):
+            elif isinstance(record.content, Statistics):
+                promised = record.content.channel_message_counts
+        except DamageError as damage:
             waiting += _cut_chunk(data, place)
-            place = _next_chunk(data, place + 1, len(data))
-            continue
-        # The length of a record other than a chunk may be damaged: it must not swallow a chunk.
-        swallowed = None if record.op == CHUNK else _next_chunk(data, place + 1, record.end)
-        place = record.end if swallowed is None else swallowed
-    return Intact(told, _messages(told, waiting), promised)
+            end = damage.end or len(data)
+        # The length of anything but a whole chunk may be damaged: it must not swallow a chunk.
+        place = end if whole else _next_chunk(data, place + 1, end)
+    return told, _messages(told, waiting), promised
 
 
 def _inside(record: Record) -> list[Record]:
-    """Returns the records of a chunk before its first damage."""
-    chunk = chunk_of(record)
-    return _until_damage(inner_records(record), chunk.start_ns, chunk.end_ns)
+    """Returns the intact records of a chunk."""
+    with suppress(DamageError):
+        chunk = record.content
+        span = chunk.message_start_time, chunk.message_end_time
+        return list(_until_damage(unpacked(record), span))
+    return []
 
 
 def _cut_chunk(data: memoryview, place: int) -> list[Record]:
     """Returns the records of a plain chunk that is cut off or whose length is wrong."""
     start = place + PREFIX + 40
-    if data[place] != CHUNK or start >= len(data):
+    if data[place] != Opcode.CHUNK or start >= len(data):
         return []
     first, last, size, crc, letters = struct.unpack_from("<QQQII", data, place + PREFIX)
-    if letters:
-        return []  # compressed
-    content = data[start : min(start + size, len(data))]
-    if len(content) == size and crc and crc32(content) != crc:
+    content = data[start : start + size]
+    compressed = letters > 0
+    if compressed or (len(content) == size and crc and crc32(content) != crc):
         return []
-    return _until_damage(records(content, 0, len(content)), first, last)
+    return list(_until_damage(content, (first, last)))
 
 
-def _until_damage(inner: Iterator[Record], first_ns: int, last_ns: int) -> list[Record]:
-    """Returns records before the first damage; messages only within the chunk's time span."""
-    found: list[Record] = []
-    while True:
+def _until_damage(data: memoryview, span_ns: tuple[int, int]) -> Iterator[Record]:
+    """Yields records up to the first wrong length; messages only within the chunk's time span."""
+    place: int | None = 0
+    while place is not None:
         try:
-            each = next(inner, None)
-        except DamageError:
-            return found
-        if each is None or each.op not in INSIDE:
-            return found
-        if each.op == MESSAGE and len(each.content) >= 14:
-            (time_ns,) = struct.unpack_from("<Q", each.content, 6)
-            if not first_ns <= time_ns <= last_ns:
-                continue
-        found.append(each)
+            for record in records(data, place):
+                if not isinstance(record.content, INSIDE):
+                    return
+                time = getattr(record.content, "log_time", span_ns[0])
+                if span_ns[0] <= time <= span_ns[1]:
+                    yield record
+            return
+        except DamageError as damage:
+            place = damage.end
 
 
-def _messages(told: McapSummary, waiting: list[Record]) -> list[McapMessage]:
+def _messages(told: McapSummary, waiting: list[Record]) -> list[Message]:
     """Returns messages, after reading all channels: some may be in the summary only."""
     messages = []
-    for record in sorted(waiting, key=lambda each: each.op == MESSAGE):
-        try:
+    for record in sorted(waiting, key=lambda each: isinstance(each.content, Message)):
+        with suppress(DamageError):
             message = told.see(record)
-        except (DamageError, struct.error):
-            continue
-        if message is not None:
-            messages.append(message)
+            if message is not None:
+                messages.append(message)
     return messages
 
 
-def _promised_by_footer(record: Record) -> dict[int, int]:
-    (size,) = struct.unpack_from("<I", record.content, 42)
-    return dict(struct.iter_unpack("<HQ", record.content[46 : 46 + size // 10 * 10]))
-
-
-def _next_chunk(data: memoryview, start: int, end: int) -> int | None:
-    """Returns the offset of the next record with the consistent lengths of a chunk, or None."""
+def _next_chunk(data: memoryview, start: int, end: int) -> int:
+    """Returns the offset of the next record with the consistent lengths of a chunk, or the end."""
     file = data.obj
     if not isinstance(file, mmap):
-        return None
+        return end
     place = file.find(CHUNK_OP, start, end)
-    while place >= 0:
-        if _looks_like_chunk(data, place):
-            return place
+    while place >= 0 and not _looks_like_chunk(data, place):
         place = file.find(CHUNK_OP, place + 1, end)
-    return None
+    return place if place >= 0 else end
 
 
 def _looks_like_chunk(data: memoryview, place: int) -> bool:
