@@ -133,20 +133,13 @@ def offers_of(profiles: Sequence[Qos]) -> tuple[Offer, ...]:
 
 def profile_of(offer: Offer) -> Qos:
     """Converts an offer to a profile of rosbags; the other policies keep their defaults."""
-    from rosbags.interfaces import (
-        Qos,
-        QosDurability,
-        QosHistory,
-        QosLiveliness,
-        QosReliability,
-        QosTime,
-    )
+    from rosbags import interfaces as rosbags
 
-    forever = QosTime(9223372036, 854775807)
-    return Qos(
-        QosHistory.KEEP_LAST,
-        offer.depth,
-        QosReliability.RELIABLE if offer.reliable else QosReliability.BEST_EFFORT,
-        QosDurability.TRANSIENT_LOCAL if offer.transient_local else QosDurability.VOLATILE,
-        forever, forever, QosLiveliness.AUTOMATIC, forever, False,
+    forever = rosbags.QosTime(9223372036, 854775807)
+    reliability, durability = rosbags.QosReliability, rosbags.QosDurability
+    return rosbags.Qos(
+        rosbags.QosHistory.KEEP_LAST, offer.depth,
+        reliability.RELIABLE if offer.reliable else reliability.BEST_EFFORT,
+        durability.TRANSIENT_LOCAL if offer.transient_local else durability.VOLATILE,
+        forever, forever, rosbags.QosLiveliness.AUTOMATIC, forever, False,
     )  # fmt: skip

@@ -50,8 +50,8 @@ def record(
         order = BagOrder(
             out, tuple(topics or ()), everything, namespace, duration, kind, use_sim_time
         )
-        recorded = record_bag(order, lambda line: typer.echo(line, err=True))
-        for topic, count in sorted(recorded.counts.items()):
+        counts = record_bag(order, lambda line: typer.echo(line, err=True))
+        for topic, count in sorted(counts.items()):
             typer.echo(f"{topic}: {count} messages")
         typer.echo(f"bag written to {out}")
 

@@ -15,12 +15,12 @@ from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from nics_drl_bridge.errors import BackendError, RecordingError, nearest
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.message_types import message_type
+from nics_drl_bridge.nodes.qos import profile_of
 from nics_drl_bridge.nodes.runner import DELIVERY_S, open_context
 from nics_drl_bridge.recording.bag_file import BagFile, opened
 from nics_drl_bridge.recording.messages import Offer
@@ -89,7 +89,12 @@ class _Player:
         space = self._order.namespace.strip("/")
         shared = topic in (CLOCK, "/tf", "/tf_static")
         name = topic if shared or not space else f"/{space}{topic}"
-        self._publishers[topic] = self._node.create_publisher(found, name, _quality(offers))
+        best = Offer(  # matches any subscriber of one of the publishers
+            max((offer.depth for offer in offers), default=QUEUE),
+            not offers or any(offer.reliable for offer in offers),
+            any(offer.transient_local for offer in offers),
+        )
+        self._publishers[topic] = self._node.create_publisher(found, name, profile_of(best))
         return True
 
     def ready(self) -> None:
@@ -228,15 +233,3 @@ def _in_order(messages: Mapping[str, list[tuple[int, bytes]]]) -> Iterator[Timed
         for place, (topic, some) in enumerate(sorted(messages.items()))
     ]
     return heapq.merge(*each, key=lambda one: one[:2])
-
-
-def _quality(offers: tuple[Offer, ...]) -> QoSProfile:
-    """Returns the best that the publishers offered, to match any subscriber of one of them."""
-    reliable = not offers or any(offer.reliable for offer in offers)
-    kept = any(offer.transient_local for offer in offers)
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=max((offer.depth for offer in offers), default=QUEUE),
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
-    )
