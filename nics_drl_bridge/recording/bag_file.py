@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
     from rosbags.rosbag2 import Reader
 
-METADATA = "metadata.yaml"
+METADATA, ABOUT = "metadata.yaml", "rosbag2_bagfile_information"
 DATABASE = ".db3"
 SUFFIXES = (".mcap", DATABASE)
 COMPRESSED = (".zst", ".zstd")
@@ -138,21 +138,24 @@ def _place(path: Path) -> Path:
     return file
 
 
-def _listed(folder: Path) -> list[Path]:
-    """Returns the uncompressed files that a bag's metadata list.
-
-    The metadata are read within the limits of `strict_yaml`, which rosbags lacks.
+def metadata_of(folder: Path) -> dict[str, Any]:
+    """Returns a bag's metadata, read within the limits of `strict_yaml`, which rosbags lacks.
 
     Raises:
-        ValueError: they are not YAML or exceed the limits, or a file would unpack to too much.
+        ValueError: they are not YAML, exceed the limits, or lack the part that rosbag2 writes.
     """
     try:
-        data = parse_yaml(read_text(folder / METADATA), METADATA)
+        about = parse_yaml(read_text(folder / METADATA), METADATA).get(ABOUT)
     except BridgeError as error:
         raise ValueError(str(error)) from None
-    about = data.get("rosbag2_bagfile_information")
     if not isinstance(about, dict):
-        return []
+        raise ValueError(f"{METADATA}: lacks {ABOUT}")
+    return about
+
+
+def _listed(folder: Path) -> list[Path]:
+    """Returns the uncompressed files of a bag; the others must not unpack to too much."""
+    about = metadata_of(folder)
     if str(about.get("compression_mode", "")).lower() == "file":
         for packed in sorted(folder.iterdir()):
             if packed.suffix in COMPRESSED:
@@ -197,11 +200,9 @@ def _check_summary(path: Path, reader: Reader) -> None:
     held = sum(storage.metadata.message_count for storage in _storages(reader))
     if held != counted:
         raise _damaged(path, f"its summary speaks of {counted} messages, its files hold {held}")
-    if reader.message_count != counted:
+    if (whole := reader.message_count) != counted:
         raise _damaged(
-            path,
-            f"its summary speaks of {reader.message_count} messages, those of its topics add up "
-            f"to {counted}",
+            path, f"its summary speaks of {whole} messages, its topics add up to {counted}"
         )
     if counted == 0:
         raise RecordingError(f"{path}: holds no messages; record a drive of 20 s or more.")
@@ -288,26 +289,18 @@ class BagFile:
         connections = self._connections[topic]
         raw = [(c.msgtype, ns, data) for c, ns, data in self._reader.messages(connections)]
         promised = sum(connection.msgcount for connection in connections)
-        if len(raw) != promised:
-            raise _damaged(
-                self.place,
-                f"topic {topic!r} has {len(raw)} messages where the bag's summary promises "
-                f"{promised}",
-            )
         first, last = self.span_ns
+        if len(raw) != promised:
+            what = f"topic {topic!r} has {len(raw)} messages, by the bag's summary {promised}"
+            raise _damaged(self.place, what)
         if any(not first <= ns <= last for _, ns, _ in raw):
-            raise _damaged(
-                self.place,
-                f"topic {topic!r} has messages outside of the time span that the bag's summary "
-                "gives",
-            )
+            what = f"topic {topic!r} has messages outside of the time span of the bag's summary"
+            raise _damaged(self.place, what)
         return raw
 
     def _decoded(self, topic: str, k: int, kind: str, data: bytes) -> Any:
         try:
             return self._store.deserialize_cdr(data, kind)
         except Exception as error:  # noqa: BLE001 - the decoder can raise anything on damaged bytes
-            raise _damaged(
-                self.place,
-                f"topic {topic!r}: message {k} can't be decoded as {kind} ({_reason(error)})",
-            ) from None
+            what = f"topic {topic!r}: message {k} can't be decoded as {kind} ({_reason(error)})"
+            raise _damaged(self.place, what) from None

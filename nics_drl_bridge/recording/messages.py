@@ -24,8 +24,6 @@ ACKERMANN_DEFINITION = (
     "float32 acceleration\nfloat32 jerk\n"
 )
 ACKERMANN_STAMPED_DEFINITION = "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
-
-
 LIBRARIES = ("rosbags", "mcap")
 
 

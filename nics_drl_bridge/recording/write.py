@@ -92,7 +92,7 @@ def write_bag(
         storage: format of the file in the folder.
 
     Raises:
-        RecordingError: the folder exists already, or rosbags is not installed.
+        RecordingError: the folder exists already, or a library is not installed.
     """
     with bag_sink(path, storage) as sink:
         messages = _Messages(store := sink.store)
@@ -155,21 +155,18 @@ class _Messages:
         stamp = self._new("builtin_interfaces/Time", stamp_ns // NS_PER_S, stamp_ns % NS_PER_S)
         return self._new("std_msgs/Header", stamp, FRAMES[0])
 
-    def _vector(self, x: float, y: float, z: float) -> Any:
+    def _vector(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Any:
         return self._new("geometry_msgs/Vector3", x, y, z)
 
     def twist(self, row: Array) -> Any:
         x, y, w = (float(value) for value in row)
-        return self._new("geometry_msgs/Twist", self._vector(x, y, 0.0), self._vector(0.0, 0.0, w))
+        return self._new("geometry_msgs/Twist", self._vector(x, y), self._vector(z=w))
 
     def _pose(self, row: Array) -> Any:
         x, y, heading = (float(value) for value in row)
-        position = self._new("geometry_msgs/Point", x, y, 0.0)
-        half = heading / 2.0
-        turned = (0.0, 0.0, float(np.sin(half)), float(np.cos(half)))
-        return self._new(
-            "geometry_msgs/Pose", position, self._new("geometry_msgs/Quaternion", *turned)
-        )
+        z, w = float(np.sin(heading / 2.0)), float(np.cos(heading / 2.0))
+        turned = self._new("geometry_msgs/Quaternion", 0.0, 0.0, z, w)
+        return self._new("geometry_msgs/Pose", self._new("geometry_msgs/Point", x, y, 0.0), turned)
 
     def pose_stamped(self, header: Any, row: Array) -> Any:
         return self._new("geometry_msgs/PoseStamped", header, self._pose(row))
@@ -179,9 +176,7 @@ class _Messages:
 
     def speeds(self, header: Any, row: Array) -> Any:
         """Makes an odometry message of which only the twist was recorded."""
-        unknown = np.zeros(36)
-        unknown[0] = -1.0
-        return self._odometry(header, np.zeros(3), row, unknown)
+        return self._odometry(header, np.zeros(3), row, np.append(-1.0, np.zeros(35)))
 
     def _odometry(self, header: Any, pose: Array, twist: Array, pose_covariance: Array) -> Any:
         where = self._new("geometry_msgs/PoseWithCovariance", self._pose(pose), pose_covariance)
@@ -193,12 +188,11 @@ class _Messages:
 
     def imu(self, header: Any, row: Array) -> Any:
         ax, ay, w = (float(value) for value in row)
-        unknown = np.full(9, -1.0)
+        level, unknown = self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0), np.full(9, -1.0)
+        rates, pulls, measured = self._vector(z=w), self._vector(ax, ay), np.zeros(9)
         return self._new(
-            "sensor_msgs/Imu", header,
-            self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0), unknown,
-            self._vector(0.0, 0.0, w), np.zeros(9), self._vector(ax, ay, 0.0), np.zeros(9),
-        )  # fmt: skip
+            "sensor_msgs/Imu", header, level, unknown, rates, measured, pulls, measured
+        )
 
 
 Storage = Literal["mcap", "sqlite3"]
@@ -266,12 +260,12 @@ class BagSink:
     def flush(self) -> None:
         """Flushes written messages to the file, so that a crash of this process can't lose them."""
         storage: Any = self._writer.storage
-        if not hasattr(storage, "close_chunk"):
+        if hasattr(storage, "close_chunk"):
+            if storage.chunk.msgs:
+                storage.close_chunk()
+            storage.bio.flush()
+        else:
             storage.conn.commit()
-            return
-        if storage.chunk.msgs:
-            storage.close_chunk()
-        storage.bio.flush()
 
 
 @contextmanager

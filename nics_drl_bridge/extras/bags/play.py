@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import heapq
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -200,7 +199,7 @@ def play_bag(order: PlayOrder, say: Callable[[str], None]) -> int:
         played = {t: m for t, m in messages.items() if player.offer(t, kinds[t], offers[t])}
         for topic in sorted(kinds.keys() - played.keys()):
             say(f"left out: {topic} is of {kinds[topic]}, whose package is not installed.")
-        timed = list(_in_order(played))
+        timed = _in_order(played)
         if not timed:
             raise RecordingError(f"{order.bag}: holds nothing that can be played here.")
         player.ready()
@@ -226,10 +225,8 @@ def _wanted(bag: BagFile, order: PlayOrder) -> list[str]:
     ]
 
 
-def _in_order(messages: Mapping[str, list[tuple[int, bytes]]]) -> Iterator[Timed]:
+def _in_order(messages: Mapping[str, list[tuple[int, bytes]]]) -> list[Timed]:
     """Returns all messages in the order of receipt, at equal times in that of their topics."""
-    each = [
-        [(ns, place, topic, data) for ns, data in sorted(some, key=lambda one: one[0])]
-        for place, (topic, some) in enumerate(sorted(messages.items()))
-    ]
-    return heapq.merge(*each, key=lambda one: one[:2])
+    ranked = enumerate(sorted(messages.items()))
+    timed = [(ns, rank, topic, data) for rank, (topic, some) in ranked for ns, data in some]
+    return sorted(timed, key=lambda one: one[:2])

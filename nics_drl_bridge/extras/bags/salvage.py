@@ -18,9 +18,8 @@ from zlib import crc32
 from mcap.opcode import Opcode
 from mcap.records import Chunk, Message, Statistics
 
-from nics_drl_bridge.config import parse_yaml, read_text
-from nics_drl_bridge.errors import BridgeError, RecordingError
-from nics_drl_bridge.recording.bag_file import COMPRESSED, DATABASE, METADATA, is_storage
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.recording.bag_file import COMPRESSED, DATABASE, is_storage, metadata_of
 from nics_drl_bridge.recording.mcap import (
     COMPRESSIONS,
     INSIDE,
@@ -133,11 +132,8 @@ def salvage(path: str | Path, out: str | Path, storage: Storage = "mcap") -> Sal
 
 
 @contextmanager
-def salvaged(path: Path, wanted: bool) -> Iterator[tuple[Path, tuple[str, ...]]]:
-    """Yields the bag itself; or, if wanted, its intact part and the lines to report."""
-    if not wanted:
-        yield path, ()
-        return
+def salvaged(path: Path) -> Iterator[tuple[Path, tuple[str, ...]]]:
+    """Yields the intact part of a bag and the lines to report."""
     with TemporaryDirectory() as folder:
         out = Path(folder) / "salvaged"
         lines = salvage(path, out).lines()
@@ -185,12 +181,11 @@ def _decodable(found: _Found) -> Iterator[tuple[str, int, bytes]]:
 
 def _promised(path: Path) -> dict[str, int] | None:
     """Returns the messages per topic by the bag's metadata; None if it can't be read."""
-    file = (path if path.is_dir() else path.parent) / METADATA
     try:
-        data: Any = parse_yaml(read_text(file), str(file))
-        topics = data["rosbag2_bagfile_information"]["topics_with_message_count"]
+        about = metadata_of(path if path.is_dir() else path.parent)
+        topics = about["topics_with_message_count"]
         return {t["topic_metadata"]["name"]: int(t["message_count"]) for t in topics}
-    except (BridgeError, OSError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, KeyError):
         return None
 
 
