@@ -13,12 +13,13 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from nics_drl_bridge.config import no_device, parse_yaml, read_text
 from nics_drl_bridge.errors import LONGEST_NAME, BridgeError, RecordingError, shortened
 from nics_drl_bridge.recording.messages import Offer, check_libraries, offers_of, typestore
-from nics_drl_bridge.recording.packing import check_message, check_packed
+from nics_drl_bridge.recording.packing import check_message, unpack_file
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -79,12 +80,10 @@ def opened(path: str | Path) -> Iterator[BagFile]:
         _check_name(place)
         for file in (place, *(place.iterdir() if place.is_dir() else ())):
             no_device(file)
-        plain = _listed(place) if place.is_dir() else [place]
-        for file in plain:  # before rosbags opens it, which unpacks chunks of any size
-            _check_storage(path, file)
+        with TemporaryDirectory() as room:  # before rosbags, which unpacks chunks of any size
+            for file in _listed(place, Path(room)) if place.is_dir() else [place]:
+                _check_storage(path, file)
         with Reader(place) as reader:
-            for file in {Path(str(storage.path)) for storage in _storages(reader)} - {*plain}:
-                _check_storage(path, file)  # it was compressed as a whole
             _check_summary(path, reader)
             _check_topics(path, reader)
             yield BagFile(reader, str(path))
@@ -153,15 +152,14 @@ def metadata_of(folder: Path) -> dict[str, Any]:
     return about
 
 
-def _listed(folder: Path) -> list[Path]:
-    """Returns the uncompressed files of a bag; the others must not unpack to too much."""
+def _listed(folder: Path, room: Path) -> list[Path]:
+    """Returns the files of a bag; those compressed as a whole are unpacked to another folder."""
     about = metadata_of(folder)
-    if str(about.get("compression_mode", "")).lower() == "file":
-        for packed in sorted(folder.iterdir()):
-            if packed.suffix in COMPRESSED:
-                check_packed(packed)
-    files = [folder / Path(str(name)).name for name in about.get("relative_file_paths") or ()]
-    return [file for file in files if file.suffix in SUFFIXES and file.is_file()]
+    listed = [folder / Path(str(name)).name for name in about.get("relative_file_paths") or ()]
+    files = [file for file in listed if file.is_file()]
+    if str(about.get("compression_mode", "")).lower() != "file":
+        return files
+    return [unpack_file(file, room / file.stem) for file in files]
 
 
 def _storages(reader: Reader) -> list[Any]:

@@ -45,15 +45,16 @@ def unpack(data: bytes, compression: str, most: int = MOST_UNPACKED) -> bytes:
     return plain
 
 
-def check_packed(path: Path) -> None:
-    """Raises ValueError for a file that would decompress to far more than its length."""
+def unpack_file(path: Path, out: Path) -> Path:
+    """Decompresses a file. Raises ValueError if it becomes far larger than it was."""
     most = max(MOST_UNPACKED, MOST_PACKED_SHARE * path.stat().st_size)
     length = 0
-    with _zstd().open(path, "rb") as file:
+    with _zstd().open(path, "rb") as file, out.open("wb") as plain:
         while part := file.read(_PART):
-            length += len(part)
+            length += plain.write(part)
             if length > most:
                 raise ValueError(f"{path.name} unpacks to more than {MOST_PACKED_SHARE} times")
+    return out
 
 
 def check_message(data: bytes) -> None:

@@ -4,6 +4,7 @@ import struct
 import zlib
 
 import pytest
+import yaml
 
 pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 pytest.importorskip("mcap", reason="needs the extra 'bags'")
@@ -117,6 +118,18 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(tmp_p
         path.write_bytes(data)
         with pytest.raises(RecordingError, match="more than 1048576 bytes"), opened(path):
             pass
+        bag = packed_as_a_whole(tmp_path / "bag", data)
+        with pytest.raises(RecordingError, match="more than 1048576 bytes"), opened(bag):
+            pass
+
+
+def packed_as_a_whole(folder, data):
+    folder.mkdir(exist_ok=True)
+    (folder / "drive.mcap.zstd").write_bytes(packing._zstd().compress(data))
+    about = {"compression_mode": "FILE", "relative_file_paths": ["drive.mcap.zstd"]}
+    text = yaml.safe_dump({"rosbag2_bagfile_information": about})
+    (folder / "metadata.yaml").write_text(text, encoding="utf-8")
+    return folder
 
 
 def test_a_chunk_that_says_that_it_is_terabytes_is_refused(tmp_path):
