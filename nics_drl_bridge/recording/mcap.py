@@ -16,7 +16,7 @@ from zlib import crc32
 
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, DataEnd, Footer, Message, Schema
+from mcap.records import Channel, Chunk, DataEnd, Footer, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader
 
 from nics_drl_bridge.recording.packing import unpack
@@ -87,7 +87,8 @@ def records(data: memoryview, place: int = 0) -> Iterator[Record]:
     while place < len(data):
         start = place + PREFIX
         op, size = struct.unpack_from("<BQ", data, place) if start <= len(data) else (0, start)
-        end, content = start + size, None
+        end = start + size
+        content: McapRecord | None = None
         if end > len(data):
             raise DamageError(place, "a record is cut off")
         if not Opcode.HEADER <= op <= Opcode.DATA_END and op < PRIVATE:

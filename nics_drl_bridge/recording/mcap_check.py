@@ -102,7 +102,8 @@ def _in_data(walk: _Walk, record: Record, data: memoryview) -> None:
 
 def _in_chunk(walk: _Walk, record: Record) -> None:
     """Walks through a chunk and keeps its messages for the index records that follow it."""
-    walk.places, times = {}, []
+    walk.places = {}
+    times: list[int] = []
     for inner in records(unpacked(record)):
         if not isinstance(inner.content, INSIDE):
             kind = type(inner.content).__name__
