@@ -168,7 +168,8 @@ def _storages(reader: Reader) -> list[Any]:
 
 
 def _check_storage(path: Path, file: Path) -> None:
-    from nics_drl_bridge.recording.mcap_check import DamageError, check_mcap
+    from nics_drl_bridge.recording.mcap import DamageError
+    from nics_drl_bridge.recording.mcap_check import check_mcap
 
     if file.suffix == DATABASE:
         _check_database(path, file)

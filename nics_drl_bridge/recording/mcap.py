@@ -78,7 +78,7 @@ def records(data: memoryview, place: int = 0) -> Iterator[Record]:
     """Yields the records from an offset on, until the end of the data or a footer.
 
     Raises:
-        DamageError: a record is truncated, of an unknown kind, or not as long as its fields.
+        DamageError: a record is truncated, of an unknown kind, or shorter than its fields.
     """
     stream = _View(data, place)
     source = cast("IO[bytes]", stream)
@@ -101,7 +101,7 @@ def records(data: memoryview, place: int = 0) -> Iterator[Record]:
             except EndOfFile:
                 stream.place = len(data) + 1
             if stream.place != end:
-                raise DamageError(place, "a record is longer or shorter than its fields", end)
+                raise DamageError(place, "a record is shorter than its fields", end)
         yield Record(place, end, content)
         if isinstance(content, Footer):
             return

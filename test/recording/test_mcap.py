@@ -80,21 +80,21 @@ def test_a_file_that_is_cut_off_anywhere_is_refused(tmp_path, form):
     [
         (framed(1, struct.pack("<I4sI", 4, b"ros2", 0)), None),
         (framed(0x90, b"of another program"), None),
-        (framed(1, struct.pack("<I4sII", 4, b"ros2", 0, 0)), "longer or shorter"),
-        (framed(1, struct.pack("<I4sI", 4, b"ros2", 9)), "longer or shorter"),
-        (framed(1, struct.pack("<I4sI", 2**32 - 1, b"ros2", 9)), "longer or shorter"),
+        (framed(1, struct.pack("<I4sII", 4, b"ros2", 0, 0)), None),  # the format may grow
+        (framed(1, struct.pack("<I4sI", 4, b"ros2", 9)), "shorter than"),
+        (framed(1, struct.pack("<I4sI", 2**32 - 1, b"ros2", 9)), "shorter than"),
         (framed(1, struct.pack("<I4sI", 4, b"\xff\xff\xff\xff", 0)), "not UTF-8"),
         (framed(5, bytes(22)), None),
-        (framed(5, bytes(21)), "longer or shorter"),
-        (framed(5, bytes(17)), "longer or shorter"),
-        (framed(6, bytes(24) + struct.pack("<IIQ", 0, 0, 2**64 - 1)), "longer or shorter"),
+        (framed(5, bytes(21)), "shorter than"),
+        (framed(5, bytes(17)), "shorter than"),
+        (framed(6, bytes(24) + struct.pack("<IIQ", 0, 0, 2**64 - 1)), "shorter than"),
         (framed(0x10, b""), "no record of kind 16"),
         (framed(1, bytes(8))[:-1], "cut off"),
         (b"\x01\x00", "cut off"),
         (struct.pack("<BQ", 1, 2**64 - 1), "cut off"),
     ],
 )
-def test_a_record_has_to_be_as_long_as_its_fields(record, said):
+def test_a_record_that_is_shorter_than_its_fields_is_refused(record, said):
     """Also the last one, and whatever follows."""
     good = framed(15, bytes(4))
     for data in (good + record, good + record + bytes(40) * (said != "cut off")):
