@@ -263,7 +263,7 @@ def test_a_backend_that_does_not_take_what_it_is_told_is_named():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(extensions, "known", lambda group: {"mine": Point})
         BridgeEnv("mine", direct_model(), field()).reset(seed=0)
-        with pytest.raises(ConfigError, match="backend 'mine': .*'randomisation'; look at its"):
+        with pytest.raises(ConfigError, match=r"'mine': got an unexpected .*'randomisation'; look"):
             BridgeEnv("mine", direct_model(), field(), randomisation="mild")
 
 

@@ -122,7 +122,7 @@ def test_a_car_turns_by_its_own_wheelbase(changes):
 
 def test_a_car_of_unknown_wheelbase_is_refused_and_none_assumed():
     unknown = car(parameters={}, textbook=None)
-    with pytest.raises(ConfigError, match="'ackermann' steers, and its wheelbase is not known; add"):
+    with pytest.raises(ConfigError, match="'ackermann' steers, and its wheelbase is not known"):
         make_policy("dynamic_window", Navigation(unknown, lidar()))
 
 

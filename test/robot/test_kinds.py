@@ -154,6 +154,10 @@ def test_an_unknown_kind_is_refused_with_all_that_there_are():
     assert str(caught.value) == f"tank.yaml: key 'textbook': must be one of {known}, not 'tank'."
 
 
+def textbook_and_drawing(robot):
+    return textbook(robot), urdf_of(robot)
+
+
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_parameter_that_is_missing_is_named(name):
     robot = load_robot(name)
@@ -161,5 +165,4 @@ def test_a_parameter_that_is_missing_is_named(name):
         left = {key: value for key, value in robot.parameters.items() if key != parameter}
         spoilt = robot.model_copy(update={"parameters": left})
         with pytest.raises(ConfigError, match=f"need the parameter '{parameter}'; add it under"):
-            textbook(spoilt)
-            urdf_of(spoilt)
+            textbook_and_drawing(spoilt)
