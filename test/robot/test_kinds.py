@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from robots import lidar
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.config import validate
@@ -86,16 +87,16 @@ def test_a_front_wheel_across_turns_a_tricycle_about_its_rear_axle():
 def model():
     """The tricycle, generated from a drive of its own."""
     robot = load_robot(NEW)
-    return generate(record(robot, np.random.default_rng(0)), robot).model
+    return generate(record(robot, np.random.default_rng(0)), robot, lidar(), ())[0]
 
 
 def test_it_records_and_its_model_moves_as_it_does(model):
     robot = model.robot
     drive = record(robot, np.random.default_rng(1), duration=20.0)
     x = np.concatenate([drive.state.values, drive.command.values], axis=1)
-    twist = textbook(robot).twist(drive.state.values)
-    assert model.kinematics.rates(x)[:, :3] == pytest.approx(twist, abs=0.12)
-    assert not model.kinematics.rates(x)[:, 1].any()
+    twist, found = textbook(robot).twist(drive.state.values), model.kinematics.rates(x)[:, :3]
+    off, size = (np.sqrt((each**2).mean(axis=0)) for each in (found - twist, twist))
+    assert (off <= 0.1 * size).all()  # cosine and sine of the steering, to the second order
 
 
 @pytest.mark.parametrize("options", [{}, {"actions": "discrete"}])
