@@ -33,7 +33,7 @@ def load(group: str, name: str) -> Any:
     """An extension by its name.
 
     Args:
-        group: `backends`, `commands`, `engines`, `nodes` or `salvage`.
+        group: `backends`, `commands`, `engines`, `kinds`, `nodes` or `salvage`.
         name: as it is registered.
 
     Raises:

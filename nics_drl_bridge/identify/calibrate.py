@@ -137,7 +137,7 @@ def _expected(
 def _mounting(
     recording: Recording, spec: RobotSpec, twists: TwistIntervals, timing: TimingEstimate
 ) -> Mounting | None:
-    if any(c.cmd_vel == "linear.y" for c in spec.command):
+    if spec.moves_sideways:
         return jackknifed(
             recording,
             twists,

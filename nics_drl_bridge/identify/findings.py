@@ -111,7 +111,7 @@ def _about_mounting(calibration: Calibration, found: Findings, spec: RobotSpec) 
     elif c.lever_arm_m != (0.0, 0.0):
         x, y = c.lever_arm_m
         notes.append(f"The tracked point lies at x {x:.4f} m, y {y:.4f} m of base_link.")
-    lateral = any(command.cmd_vel == "linear.y" for command in spec.command)
+    lateral = spec.moves_sideways
     if not np.isnan(mounting.lever_sigma[0]) and np.isnan(mounting.lever_sigma[1]) and not lateral:
         notes.append(
             "The tracked point's place along y could not be learnt, since no speed was known "

@@ -205,7 +205,7 @@ def _by_definition(
     `base_link` of a robot without a lateral command is the point without lateral motion.
     """
     coefficients = model.coefficients.copy()
-    if all(command.cmd_vel != "linear.y" for command in spec.command):
+    if not spec.moves_sideways:
         coefficients[1] = 0.0
     responses = list(calibration.responses)
     speeds = [i for i, v in enumerate(spec.state) if v.unit == "m/s"]

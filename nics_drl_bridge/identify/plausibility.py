@@ -64,7 +64,7 @@ def check_axes(recording: Recording, spec: RobotSpec) -> None:
     if len(t) < MIN_DIRECTIONS or np.ptp(np.unwrap(pose[:, 2])) < MIN_TURN:
         return
     other = pose * np.array([1.0, 1.0, -1.0])
-    if all(c.cmd_vel != "linear.y" for c in spec.command):
+    if not spec.moves_sideways:
         as_given, mirrored = _steadiness(pose), _steadiness(other)
     elif recording.state is not None and recording.state.clock == recording.pose.clock:
         as_given, mirrored = (_explained(t, p, recording.state) for p in (pose, other))
@@ -111,10 +111,10 @@ def _explained(t: Array, pose: Array, state: Stream) -> float:
 def mirror_note(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
     """Returns a sentence if the robot turns right when commanded to turn left."""
     for i, command in enumerate(spec.command, start=len(spec.state)):
-        if command.cmd_vel != "angular.z":
+        if not command.turns:
             continue
         turn, wanted = samples.dq[:, 2], samples.x[:, i]
-        if command.unit == "rad":
+        if command.steers:
             wanted = wanted * np.sign(samples.dq[:, 0])
         if min(turn.std(), wanted.std()) > 1e-3 and np.corrcoef(turn, wanted)[0, 1] < MIRRORED:
             return (

@@ -222,7 +222,7 @@ def may_turn(calibration: Calibration, spec: RobotSpec) -> bool:
     It is defined by the direction in which a robot can't move. An omnidirectional robot can be
     described equally well in any other frame, with other coefficients.
     """
-    everywhere = any(command.cmd_vel == "linear.y" for command in spec.command)
+    everywhere = spec.moves_sideways
     return "rotation_rad" in calibration.uncertainty and not calibration.is_exact and not everywhere
 
 

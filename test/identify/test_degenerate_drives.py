@@ -13,8 +13,8 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.recording.recording import Recording, Stream
-from nics_drl_bridge.recording.textbook import textbook
 from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
+from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import load_robot
 
 FINE = 10

@@ -7,8 +7,9 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.fit import fit, prune
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
-from nics_drl_bridge.recording.textbook import integrate, record, textbook
+from nics_drl_bridge.recording.textbook import integrate, record
 from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 PAIR = RobotSpec.model_validate(
