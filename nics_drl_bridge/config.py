@@ -59,10 +59,9 @@ def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> Schema
 def _taken_for_numbers(given: Any, found: Any, place: str = "") -> Iterator[tuple[str, Any]]:
     """Yields strings and booleans that pydantic coerced to numbers: `true` is no length."""
     pairs: list[tuple[Any, Any, Any]] = []
-    if isinstance(found, BaseModel) and isinstance(given, dict):
-        pairs = [(k, v, getattr(found, k)) for k, v in given.items() if hasattr(found, str(k))]
-    elif isinstance(found, dict) and isinstance(given, dict):
-        pairs = [(key, value, found[key]) for key, value in given.items() if key in found]
+    if isinstance(given, dict):
+        parts = found if isinstance(found, dict) else getattr(found, "__dict__", {})
+        pairs = [(key, value, parts[key]) for key, value in given.items() if key in parts]
     elif isinstance(found, (tuple, list)) and isinstance(given, (tuple, list)):
         pairs = [(k, *both) for k, both in enumerate(zip(given, found, strict=False))]
     elif isinstance(given, (str, bool)) and type(found) in (int, float):
@@ -71,6 +70,8 @@ def _taken_for_numbers(given: Any, found: Any, place: str = "") -> Iterator[tupl
         yield from _taken_for_numbers(value, made, f"{place}.{key}")
 
 
+_UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
+"""Errors of pydantic about an unknown key, of a model and of a dataclass."""
 _SHORT = reprlib.Repr()
 """Shortens a wrong value: one made of YAML aliases may not fit into memory in full."""
 _SHORT.maxstring = _SHORT.maxother = 80
@@ -78,9 +79,9 @@ _SHORT.maxstring = _SHORT.maxother = 80
 
 def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
     details = error.errors(include_url=False)
-    first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
+    first = next((d for d in details if d["type"] in _UNKNOWN), details[0])
     key = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden":
+    if first["type"] in _UNKNOWN:
         known = _fields_at(schema, first["loc"][:-1])
         hint = nearest(str(first["loc"][-1]), known) if known else "remove it"
         return f"unknown key {key!r}; {hint}"
