@@ -8,8 +8,9 @@ from __future__ import annotations
 import re
 import reprlib
 from collections.abc import Iterator
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -105,25 +106,33 @@ def _fields_at(schema: type[BaseModel], location: tuple[int | str, ...]) -> list
     In a union of models, the location names the `kind` of the one that is present.
     """
     current: Any = schema
-    candidates: list[type[BaseModel]] = []
+    candidates: list[type] = []
     for part in location:
-        fields = getattr(current, "model_fields", {})
+        fields = _annotations_of(current)
         if part in fields:
-            candidates = _inner_models(fields[part].annotation)
+            candidates = _inner_models(fields[part])
             current = candidates[0] if candidates else None
         else:
             kinds = [c for c in candidates if _kind_of(c) == part]
             current = kinds[0] if kinds else current
-    return list(getattr(current, "model_fields", {}))
+    return list(_annotations_of(current))
 
 
-def _kind_of(model: type[BaseModel]) -> Any:
-    kind = model.model_fields.get("kind")
+def _annotations_of(model: Any) -> dict[Any, Any]:
+    """Types of the fields of a model or dataclass; empty for any other type."""
+    if is_dataclass(model):
+        return dict(get_type_hints(model))
+    fields: dict[str, Any] = getattr(model, "model_fields", {})
+    return {name: field.annotation for name, field in fields.items()}
+
+
+def _kind_of(model: type) -> Any:
+    kind = getattr(model, "model_fields", {}).get("kind")
     return None if kind is None else kind.default
 
 
-def _inner_models(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+def _inner_models(annotation: Any) -> list[type]:
+    if _annotations_of(annotation):
         return [annotation]
     return [
         model

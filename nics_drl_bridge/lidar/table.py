@@ -317,7 +317,7 @@ def _mapped(path: Path) -> NDArray[Any]:
         with np.errstate(over="raise"):  # of a shape whose size is no number
             array = np.load(path, mmap_mode="c", allow_pickle=False)
         if not isinstance(array, np.memmap):
-            raise ValueError("it is an archive")
-    except Exception as error:  # noqa: BLE001 - a false header breaks numpy in any way
-        raise ModelError(f"{path}: is no array ({error}); generate the model anew.") from None
+            raise TypeError("an archive of arrays")
+    except Exception:  # noqa: BLE001 - a false header breaks numpy in any way
+        raise ModelError(f"{path}: is no array of numbers; generate the model anew.") from None
     return np.asarray(array)
