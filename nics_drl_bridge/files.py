@@ -219,9 +219,10 @@ def read_file(path: Path) -> bytes:
 
 def write_sums(folder: Path) -> None:
     """Writes the SHA-256 of every file in a folder and below to its `SHA256SUMS`."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    lines = [_line_of(folder, path.relative_to(folder).as_posix()) for path in files]
-    write_parts(folder / SUMS, lines)
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / SUMS)
+    write_parts(
+        folder / SUMS, [_line_of(folder, path.relative_to(folder).as_posix()) for path in files]
+    )
 
 
 def check_sums(folder: Path, names: Sequence[str], editable: str = "") -> None:

@@ -155,7 +155,7 @@ def test_the_table_of_another_model_is_refused(saved, tmp_path):
         load_model(saved)
 
 
-def test_who_edits_a_model_is_told_to_remove_its_line(saved):
+def test_an_edited_model_is_read_once_its_line_is_removed(saved):
     path = saved / MODEL_FILE
     path.write_text(path.read_text().replace("control_period: 0.1", "control_period: 0.2"))
     with pytest.raises(ModelError, match=r"model\.yaml: .* if you changed it yourself, remove its"):

@@ -306,7 +306,6 @@ def _table(rng: Rng, place: Path) -> Attempt:
         _zip({"rows": bytes(size % 10**7)}),
     )  # fmt: skip
     (place / f"{name}.npy").write_bytes(ways[way])
-    (place / SUMS).unlink()
     write_sums(place)
     return Attempt("model", f"table, way {way}, {name}, {size}", lambda: LidarTable.load(place))
 
