@@ -59,7 +59,7 @@ def generate(
     with one_sentence():
         from nics_drl_bridge.generator import check_place, save_model
         from nics_drl_bridge.generator import generate as generate_model
-        from nics_drl_bridge.identify.dof import parse_alpha
+        from nics_drl_bridge.identify.fit import parse_alpha
         from nics_drl_bridge.lidar.spec import load_lidar
         from nics_drl_bridge.recording.readers import read_recording
         from nics_drl_bridge.recording.topic_roles import topic_roles

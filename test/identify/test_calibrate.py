@@ -10,8 +10,9 @@ from pydantic import TypeAdapter
 from identify.drives import drive, with_wheels, without
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.align import align
-from nics_drl_bridge.identify.calibrate import calibrate
 from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.identify import calibrate
 from nics_drl_bridge.recording.recording import samples_on_one_clock
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -22,7 +23,7 @@ def test_a_textbook_recording_needs_no_correction_and_is_taken_digit_by_digit(na
     recording = drive(spec, duration=30.0)
     calibration = calibrate(recording, spec)
     assert calibration.is_exact
-    samples = align(recording, calibration, spec)
+    samples = align(Drive(recording, spec), calibration)
     r = recording
     plain = samples_on_one_clock(r.pose.t, r.pose.values, r.state.values, r.command.values)
     for field in ("t", "q", "x", "dq"):
@@ -101,7 +102,7 @@ def test_gaps_of_the_pose_do_not_spoil_the_calibration(car):
         recording = without(recording, start, start + 0.4)
     found = calibrate(recording, car)
     assert found.rotation_rad == pytest.approx(0.4, abs=0.01)
-    samples = align(recording, found, car)
+    samples = align(Drive(recording, car), found)
     assert not ((samples.t > 11.32) & (samples.t < 11.68)).any()
 
 
@@ -153,7 +154,7 @@ def test_streams_that_do_not_overlap_are_refused(car):
     recording = drive(car, duration=20.0)
     moved = replace(recording.command, t=recording.command.t + 500.0)
     with pytest.raises(RecordingError, match="of one drive"):
-        align(replace(recording, command=moved, state=None), Calibration(), car)
+        align(Drive(replace(recording, command=moved, state=None), car), Calibration())
 
 
 def test_a_calibration_survives_plain_data(car):

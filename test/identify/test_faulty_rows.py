@@ -11,9 +11,10 @@ from identify.drives import drive
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.align import align
 from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.repair import repair
+from nics_drl_bridge.identify.repair import repaired
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -53,10 +54,10 @@ def same_motion(a, b, share: float) -> None:
 @pytest.mark.parametrize("noise", [(0.0, 0.0), (5e-4, 1e-3), (2e-3, 5e-3)])
 def test_a_recording_without_faults_is_not_touched(name, noise):
     spec = load_robot(name)
-    recording = drive(spec, duration=20.0, noise=noise)
-    repaired = repair(recording, spec)
-    assert repaired.notes == ()
-    assert repaired.recording is recording
+    whole = Drive(drive(spec, duration=20.0, noise=noise), spec)
+    found, notes = repaired(whole)
+    assert notes == ()
+    assert found is whole
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -124,7 +125,7 @@ def test_steps_of_unequal_length_have_their_own():
 
 
 def test_rows_of_samples_that_jump_are_left_out_of_the_fit(car):
-    samples = align(drive(car, noise=(0.0, 0.0)), Calibration(), car)
+    samples = align(Drive(drive(car, noise=(0.0, 0.0)), car), Calibration())
     rng = np.random.default_rng(3)
     bad = rng.random(len(samples.t)) < 0.05
     dq, x = samples.dq.copy(), samples.x.copy()
