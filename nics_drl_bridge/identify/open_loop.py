@@ -269,8 +269,8 @@ def relative_ends(
     used = (model.coefficients != 0.0) | asked
     used[3:] = False
     dofs, places = np.nonzero(used)
-    _, _, factors, count = term_arrays(replace(model, coefficients=used.astype(np.float64)))
-    terms = dofs.astype(np.int64), model.coefficients[dofs, places], factors, count
+    terms = term_arrays(replace(model, coefficients=used.astype(np.float64)))
+    terms = terms._replace(coefficient=model.coefficients[dofs, places])
     moving = np.flatnonzero(asked[dofs, places]).astype(np.int64)
     ends = np.zeros((len(course.steps), 3))
     moved = np.zeros((len(course.steps), 3, len(moving)))
