@@ -112,7 +112,7 @@ def _jumps_of_pose(drive: Drive) -> NDArray[np.bool_]:
     span = np.zeros(len(t))
     span[NEIGHBOURS:] = t[NEIGHBOURS:] - t[:-NEIGHBOURS]
     span[:-NEIGHBOURS] = np.maximum(span[:-NEIGHBOURS], t[NEIGHBOURS:] - t[:-NEIGHBOURS])
-    speeds = [abs(v) for c in spec.command if c.cmd_vel != "angular.z" for v in (c.min, c.max)]
+    speeds = [abs(v) for c in spec.command if not c.turns for v in (c.min, c.max)]
     reach = np.maximum(REACH * max(speeds, default=0.0) * span, 1e-6)
     out = [_stands_out(pose.values[:, i], reach) for i in (0, 1)]
     turns = np.maximum(HEADING_REACH, reach / max(spec.footprint_radius, 1e-3) / 2.0)

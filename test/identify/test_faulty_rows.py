@@ -133,7 +133,7 @@ def test_rows_of_samples_that_jump_are_left_out_of_the_fit(car):
     x[bad[::-1], 0] += 40.0
     clean = fit(samples, car)
     faulty = fit(Samples(samples.t, samples.q, x, dq, samples.dt), car)
-    terms, others = faulty.model.to_dict()["terms"], clean.model.to_dict()["terms"]
+    terms, others = faulty.model.named.terms, clean.model.named.terms
     for dof in ("vx", "d_speed", "d_steering"):
         assert terms[dof] == pytest.approx(others[dof], rel=1e-5)
     assert terms["wz"]["speed*steering"] == pytest.approx(others["wz"]["speed*steering"], rel=0.05)
@@ -154,7 +154,7 @@ def test_noise_of_the_measured_state_does_not_bend_its_lag(differential):
     noise = np.random.default_rng(0).normal(size=plain.state.values.shape) * 0.2
     state = replace(plain.state, values=plain.state.values + noise)
     model = identify(replace(plain, state=state), differential).model
-    value = model.to_dict()["terms"]["d_left_wheel"]["left_wheel"]
+    value = model.named.terms["d_left_wheel"]["left_wheel"]
     error = model.named_errors["d_left_wheel"]["left_wheel"]
     assert error < 0.2
     assert abs(value - (np.exp(-0.1) - 1.0) / 0.01) < 3.0 * error

@@ -20,7 +20,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 
 def term(model, dof: str, name: str) -> float:
-    return model.to_dict()["terms"][dof].get(name, 0.0)
+    return model.named.terms[dof].get(name, 0.0)
 
 
 def constant_steering(car: RobotSpec, angle: float) -> tuple[RobotSpec, Recording]:

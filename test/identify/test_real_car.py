@@ -55,7 +55,7 @@ def test_its_model_predicts_other_drives_too(real_drives, car, found, name):
 
 
 def test_its_model_is_short_and_steers_by_assumption_only(found):
-    terms = found.model.to_dict()["terms"]
+    terms = found.model.named.terms
     assert terms["vx"] == {"speed": 1.0}
     assert list(terms["wz"]) == ["speed*steering"]
     assert terms["wz"]["speed*steering"] * -0.5 == pytest.approx(-2.31, abs=0.05)
