@@ -143,10 +143,10 @@ def _list(names: tuple[str, ...] | list[str]) -> str:
 def mirror_note(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
     """Returns a sentence if the robot turns right when commanded to turn left."""
     for i, command in enumerate(spec.command, start=len(spec.state)):
-        if command.cmd_vel != "angular.z":
+        if not command.turns:
             continue
         turn, wanted = samples.dq[:, 2], samples.x[:, i]
-        if command.unit == "rad":
+        if command.steers:
             wanted = wanted * np.sign(samples.dq[:, 0])
         if min(turn.std(), wanted.std()) > 1e-3 and np.corrcoef(turn, wanted)[0, 1] < MIRRORED:
             return (
