@@ -10,6 +10,7 @@ from identify.drives import drive
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import dump_yaml, parse_yaml
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import SUMS
 from nics_drl_bridge.generator import builtin_model, load_model, save_model
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.noise import motion_noise
@@ -149,5 +150,8 @@ def test_a_level_in_another_unit_is_refused(tmp_path):
     data = parse_yaml(path.read_text(), "model")
     data["noise"]["odom_angular"]["unit"] = "deg/s"
     path.write_text(dump_yaml(data))
+    sums = path.with_name(SUMS)
+    lines = sums.read_text().splitlines(keepends=True)
+    sums.write_text("".join(line for line in lines if "model.yaml" not in line))
     with pytest.raises(ConfigError, match="odom_angular must be in rad/s"):
         load_model(tmp_path / "model")
