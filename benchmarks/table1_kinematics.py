@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.recording.recording import Samples
-from nics_drl_bridge.recording.textbook import textbook
 from nics_drl_bridge.robot import kernels
+from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import CommandVariable, RobotSpec, load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
 

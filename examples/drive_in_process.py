@@ -6,7 +6,7 @@ import nics_drl_bridge  # noqa: F401 - makes the environments known
 from nics_drl_bridge.policy.policies import make_policy
 
 env = gymnasium.make("NicsBridge/Navigation-v0", backend="sim", model="ackermann", world="arena")
-policy = make_policy("go_to_goal", env.unwrapped.task)
+policy = make_policy("dynamic_window", env.unwrapped.task)
 
 observation, info = env.reset(seed=0)
 ended = False

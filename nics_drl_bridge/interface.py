@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypedDict, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -61,6 +61,25 @@ class Start:
     pose: NDArray[np.float64]
 
 
+class BackendFacts(TypedDict, total=False):
+    """Facts that a backend alone knows; those that it does not know are left out.
+
+    Attributes:
+        true_pose: (3,) x [m], y [m], heading [rad] in `map` now; (M, 3) of a team.
+        true_collision: True once the robot has touched something; (M,) of a team.
+        bodies: (K, 7) the obstacles where they are now, see `sim.scenes.Scene`.
+        randomisation: name -> value that was drawn for the episode, where any was.
+        scenes: gives the scenes of episodes for their seeds (n,), where these are not those of the
+            world alone.
+    """
+
+    true_pose: NDArray[np.float64]
+    true_collision: bool | NDArray[np.bool_]
+    bodies: NDArray[np.float64]
+    randomisation: dict[str, Any]
+    scenes: Callable[[ArrayLike], Any]
+
+
 @runtime_checkable
 class Backend(Protocol):
     """Access to a robot: a simulator in process, or whatever is behind ROS 2 topics."""
@@ -79,6 +98,10 @@ class Backend(Protocol):
             The view at the end of the period, and facts for `info` (stamps, sequence
             numbers, and the true pose where a simulator knows it).
         """
+        ...
+
+    def facts(self) -> BackendFacts:
+        """Returns what this backend alone knows at present; it may be called at any time."""
         ...
 
     def halt(self) -> None:

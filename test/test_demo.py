@@ -18,7 +18,7 @@ from domains import claimed_domain
 
 DEADLINE_S = 300.0
 LAST_LINE = r"demo: in process ([0-2])/2, over DDS ([0-2])/2, report (.+/report\.html)"
-READY_MADE = ("--policy", "go_to_goal")
+READY_MADE = ("--policy", "dynamic_window")
 DEVIATION = r"<td>([0-9.e+-]+)</td></tr>"
 
 
@@ -185,7 +185,7 @@ def wait_for(condition, what):
 
 @pytest.mark.parametrize("words", [("--recording", "drive"), ("--robot", "ackerman"),
                                    ("--world", "areena"), ("--out", "file"),
-                                   ("--policy", "go_to_gaol")])  # fmt: skip
+                                   ("--policy", "dynamic_widow")])  # fmt: skip
 def test_bad_input_ends_it_with_code_2_and_one_sentence(tmp_path, words):
     (tmp_path / "drive").mkdir()
     (tmp_path / "drive" / "cmd.csv").write_text("0.5,nan,0.0\n", encoding="utf-8")

@@ -34,11 +34,11 @@ def nics(*words, cwd, domain_id=0):
 @needs_nodes
 def test_the_same_episodes_are_driven_in_three_worlds(tmp_path):
     with claimed_domain() as domain_id:
-        words = ("evaluate", "go_to_goal", "--model", "differential", "--episodes", 2)
+        words = ("evaluate", "dynamic_window", "--model", "differential", "--episodes", 2)
         done = nics(*words, "--out", "out", cwd=tmp_path, domain_id=domain_id)
     assert done.returncode == 0, done.stderr
     told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
-    places = told["policies"]["go_to_goal"]
+    places = told["policies"]["dynamic_window"]
     assert list(places) == ["fast", "dds", "mujoco_dds"]
     for figures in places.values():
         assert [one["seed"] for one in figures["each"]] == [1_000_000, 1_000_001]
@@ -48,13 +48,13 @@ def test_the_same_episodes_are_driven_in_three_worlds(tmp_path):
     assert dds["greatest_deviation"] < 1e-6  # the same numbers, by way of messages
     assert 0.001 < mujoco["greatest_deviation"] < 1.0  # another machine, the same road
     assert [one["goal"] for one in fast["each"]] == [one["goal"] for one in mujoco["each"]]
-    picture = tmp_path / "out" / "trajectories_go_to_goal.png"
+    picture = tmp_path / "out" / "trajectories_dynamic_window.png"
     assert picture.read_bytes().startswith(PNG)
-    assert "go_to_goal: success in process " in done.stdout.splitlines()[-2]
+    assert "dynamic_window: success in process " in done.stdout.splitlines()[-2]
 
 
 def test_several_policies_drive_the_same_episodes_in_one_table(tmp_path):
-    words = ("evaluate", "go_to_goal", "random", "--in", "fast", "--episodes", 3, "--seed", 7)
+    words = ("evaluate", "dynamic_window", "random", "--in", "fast", "--episodes", 3, "--seed", 7)
     done = nics(*words, "--model", "ackermann", "--out", "out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
@@ -62,7 +62,7 @@ def test_several_policies_drive_the_same_episodes_in_one_table(tmp_path):
     assert [each["goal"] for each in one] == [each["goal"] for each in other]
     assert [each["path"][0] for each in one] == [each["path"][0] for each in other]
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "evaluation.json", "trajectories_go_to_goal.png", "trajectories_random.png",
+        "evaluation.json", "trajectories_dynamic_window.png", "trajectories_random.png",
     }  # fmt: skip
 
 
@@ -78,16 +78,16 @@ def test_a_shipped_policy_brings_its_own_robot(tmp_path):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("go_to_gaol",), "go_to_goal"),
-        (("go_to_goal", "--in", "gazebo"), "--in 'gazebo'"),
-        (("go_to_goal", "--world", "areena", "--in", "fast"), "arena"),
+        (("dynamic_widow",), "dynamic_window"),
+        (("dynamic_window", "--in", "gazebo"), "--in 'gazebo'"),
+        (("dynamic_window", "--world", "areena", "--in", "fast"), "arena"),
         (("nowhere.onnx",), "nowhere.onnx"),
-        (("go_to_goal", "--hardware"), "--backend dds"),
-        (("go_to_goal", "--backend", "sim"), "--backend 'sim'"),
-        (("go_to_goal", "--goal", "there"), "--goal 'there'"),
-        (("go_to_goal", "--shadow", "nothing"), "nothing"),
-        (("go_to_goal", "--backend", "dds", "--hardware", "--in", "dds"), "--in"),
-        (("go_to_goal", "random", "--backend", "dds", "--hardware"), "one policy at a time"),
+        (("dynamic_window", "--hardware"), "--backend dds"),
+        (("dynamic_window", "--backend", "sim"), "--backend 'sim'"),
+        (("dynamic_window", "--goal", "there"), "--goal 'there'"),
+        (("dynamic_window", "--shadow", "nothing"), "nothing"),
+        (("dynamic_window", "--backend", "dds", "--hardware", "--in", "dds"), "--in"),
+        (("dynamic_window", "random", "--backend", "dds", "--hardware"), "one policy at a time"),
     ],
 )
 def test_bad_input_ends_it_with_one_sentence(tmp_path, words, said):
@@ -117,7 +117,7 @@ def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monke
     # What a busy machine does to rates and ages would be a finding; that is tested elsewhere.
     monkeypatch.setattr(vehicle, "examine", lambda facts, expected: [])
     order = vehicle.VehicleOrder(
-        "go_to_goal", tmp_path / "out", "differential", "empty", start="present", arm=True,
+        "dynamic_window", tmp_path / "out", "differential", "empty", start="present", arm=True,
         stale_after_s=DEADLINE_S,
     )  # fmt: skip
     with claimed_domain() as domain_id:
@@ -139,14 +139,14 @@ def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monke
     assert list(driven.path[0]) == list(beside.path[0])
     assert list(driven.goal) == list(beside.goal)
     told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
-    assert list(told["policies"]["go_to_goal"]) == ["vehicle", "fast"]
+    assert list(told["policies"]["dynamic_window"]) == ["vehicle", "fast"]
 
 
 @pytest.mark.ros
 @needs_nodes
 def test_a_vehicle_that_does_not_fit_its_model_is_not_driven(tmp_path):
     with claimed_domain() as domain_id:  # nobody is there
-        words = ("evaluate", "go_to_goal", "--backend", "dds", "--hardware", "--yes")
+        words = ("evaluate", "dynamic_window", "--backend", "dds", "--hardware", "--yes")
         done = nics(*words, "--out", "out", cwd=tmp_path, domain_id=domain_id)
     assert done.returncode == 2
     assert "the vehicle is not driven: " in done.stderr.splitlines()[-1]

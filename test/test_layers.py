@@ -19,7 +19,7 @@ PACKAGE = "nics_drl_bridge"
 LAYERS = (
     ("errors", "geometry", "interface", "kernels"),
     ("extensions", "random_kernels", "seeds", "strict_yaml"),
-    ("config", "files", "npz", "threads"),
+    ("config", "files", "threads"),
     ("robot",),
     ("recording",),
     ("identify",),
@@ -63,6 +63,7 @@ HOMES = {
     "pettingzoo": ("env/pettingzoo_env.py",),
     "ray": ("extras/ray/*",),
     "rosbags": ("recording/*", "extras/bags/*"),
+    "mcap": ("recording/*", "extras/bags/*"),
     "threadpoolctl": ("threads.py",),
 }
 

@@ -204,7 +204,7 @@ BASELINES = Table(
             for at in (f"circles/{robot}/{policy}"
                        for robot in ("differential", "ackermann", "mecanum"))
         ))
-        for policy in ("dynamic_window", "go_to_goal", "straight", "random")
+        for policy in ("dynamic_window", "straight", "random")
     ),
 )  # fmt: skip
 TRAINING = Table(

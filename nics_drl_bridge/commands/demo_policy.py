@@ -28,7 +28,7 @@ from nics_drl_bridge.sim.world import load_world
 
 SETTINGS, SEED = "demo", 0
 NEEDED = ("torch", "stable_baselines3", "tensorboard", "onnx", "onnxruntime")
-BASELINE = "go_to_goal"
+BASELINE = "dynamic_window"
 LINES = 10
 """Number of progress reports of a training."""
 

@@ -18,7 +18,7 @@ def evaluate(
         typer.Argument(
             metavar="POLICY...",
             help="Policy files, shipped policies (differential), or baselines (dynamic_window, "
-            "go_to_goal, straight, random).",
+            "straight, random).",
         ),
     ],
     model: Annotated[

@@ -31,12 +31,11 @@ def discrete_commands(robot: RobotSpec) -> Array:
     A robot whose commands do not name fields of `cmd_vel` gets a stop, and each command alone at
     its maximum and its minimum.
     """
-    fields = [command.cmd_vel for command in robot.command]
-    if None in fields:
-        each = np.eye(len(fields), dtype=np.int64)
+    if any(command.cmd_vel is None for command in robot.command):
+        each = np.eye(len(robot.command), dtype=np.int64)
         signs = np.concatenate([0 * each[:1], each, -each])
     else:
-        drives = (*DRIVES, *SIDEWAYS) if "linear.y" in fields else DRIVES
+        drives = (*DRIVES, *SIDEWAYS) if robot.moves_sideways else DRIVES
         signs = robot.from_cmd_vel(np.array(drives))
     limits = np.where(signs > 0, robot.command_high, robot.command_low)
     commands: Array = np.where(signs == 0, still(robot), limits)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.env.actions import check_action, check_command, still, team_space
 from nics_drl_bridge.env.guard import check_options, check_reset, halts_on_error
 from nics_drl_bridge.env.registry import make_task
-from nics_drl_bridge.env.sim_backend import SimBackend, halting, make_backend
+from nics_drl_bridge.env.sim_backend import completed, make_backend
 from nics_drl_bridge.env.task import Episodes, Memory, Task, give, override
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
@@ -84,8 +84,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     ## Arguments
 
     Args:
-        backend: `sim`, `dds`, or your own object, see `interface.Backend`; one without `halt` is
-            halted by a step with the command nearest to zero.
+        backend: `sim`, `dds`, or your own object, see `interface.Backend`; it may lack `halt` and
+            `facts`, see `env.sim_backend.CompletedBackend`.
         model: a SimulatorModel, its folder, or the name of a shipped robot.
         world: a World, its YAML file, or the name of a shipped one.
         task: a name, `path/to/file.py:ClassName`, a class, or a Task; see `env.registry.make_task`.
@@ -94,7 +94,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             task. Without it, the default of `sim`, pose and twist are those of odometry and
             bit-identical to the vector env. With it, one robot in process and one over `dds`,
             which always has it, give the same numbers.
-        backend_options: passed to the backend, see `SimBackend` and `DdsBackend`.
+        backend_options: passed to a backend by name, see `SimBackend` and `DdsBackend`; so are
+            `estimator`, `randomisation` and the number of robots if they are given.
         randomisation: quantities drawn in each episode: the name of a shipped one, a YAML file, or
             a Randomisation; the drawn values are in `info["randomisation"]` of a reset.
         render_mode: `rgb_array`, `human` or None.
@@ -132,7 +133,6 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self.scene: Scene | None = None
         self.ended: NDArray[np.bool_] = np.zeros(self.robots, np.bool_)
         self._view: RobotView | None = None  # always a batch of one, as tasks expect
-        self._true_pose: Array = np.zeros((self.robots, 3))
         self._shape = (1, self.robots, self.task.observation_space.shape[0])
         self._each = (1, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
@@ -140,25 +140,12 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._seed, self._episode, self._rehearsed = 0, -1, False
         self._picture: Any = None
         if isinstance(backend, str):
-            options = dict(backend_options or {})
-            options |= self._backend_arguments(backend, estimator, randomisation)
-            self._backend = make_backend(backend, self.model, self.world, **options)
-        else:
-            self._backend = halting(backend, self._row(self._rest))
-
-    def _backend_arguments(
-        self, backend: str, estimator: bool | None, randomisation: str | Randomisation | None
-    ) -> dict[str, Any]:
-        """Arguments of a backend known by name, in addition to the user's options."""
-        if backend != "sim":
-            if estimator is False or randomisation is not None:
-                raise ConfigError(
-                    f"backend {backend!r} always estimates and is never randomised; leave out "
-                    "`estimator` and `randomisation`."
-                )
-            return {} if self.robots == 1 else {"robots": self.robots}
-        chosen = {"estimator": bool(estimator), "robots": self.robots}
-        return chosen if randomisation is None else {**chosen, "randomisation": randomisation}
+            robots = self.robots if self.robots > 1 else None
+            asked = {"estimator": estimator, "robots": robots, "randomisation": randomisation}
+            options = {name: value for name, value in asked.items() if value is not None}
+            options = {**(backend_options or {}), **options}
+            backend = make_backend(backend, self.model, self.world, **options)
+        self._backend: Backend = completed(backend, self._row(self._rest))
 
     @halts_on_error
     def reset(
@@ -188,13 +175,14 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         override(memory, options)
         self._view = self._lifted(self._backend.reset(Start(episode, self._row(starts))))
         self.memory = memory
-        self.ended, self._true_pose = np.zeros(self.robots, np.bool_), starts
-        facts = {
+        self.ended = np.zeros(self.robots, np.bool_)
+        facts: dict[str, Any] = {
             "episode_seed": episode,
             "start": self._row(starts),
             "bodies": self.scene.bodies.copy(),
-            **self._drawn(),
         }
+        if drawn := self._backend.facts().get("randomisation"):
+            facts["randomisation"] = drawn
         observation = self.task.observation(self._view, self.memory)[0]
         if self.render_mode == "human":
             self.render()
@@ -205,7 +193,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
         A task may compile code for seconds, while a robot with a command would drive on.
         """
-        if self._rehearsed or isinstance(self._backend, SimBackend):
+        if self._rehearsed:
             return
         still = np.zeros((1, self.robots, 3))
         free = np.full((1, self.robots, self.model.lidar.beams), np.inf, np.float32)
@@ -215,16 +203,11 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._rehearsed = True
 
     def _scene_of(self, episode: int) -> Scene:
-        if isinstance(self._backend, SimBackend):
-            return self._backend.simulator.scenes([episode])[0]
-        return sample_scene(self.world, self.model.robot.footprint_radius, episode, self.robots)
-
-    def _drawn(self) -> dict[str, Any]:
-        """Values that the randomisation drew for this episode, for `info`."""
-        drawn = self._backend.simulator.drawn if isinstance(self._backend, SimBackend) else {}
-        values = {name: values[0] for name, values in drawn.items()}
-        named = {name: self._fact(value) if value.ndim else value for name, value in values.items()}
-        return {"randomisation": named} if named else {}
+        draw = self._backend.facts().get("scenes")
+        if draw is None:
+            return sample_scene(self.world, self.model.robot.footprint_radius, episode, self.robots)
+        scene: Scene = draw([episode])[0]
+        return scene
 
     @halts_on_error
     def step(
@@ -275,7 +258,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if waiting:
             terms = {name: np.where(self.ended, 0.0, term) for name, term in terms.items()}
         self.ended = (self.ended & waiting) | outcome.ended[0]
-        self._view, self._true_pose = view, facts.get("true_pose", seen.pose)
+        self._view = view
         for name, values in outcome.info.items():
             facts[name] = self._fact(values[0])
         return out[0], terms, self._info(view, facts)
@@ -325,10 +308,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             self._picture = drawing.WorldPicture(
                 self.model, self.world, self.render_mode, RENDER_FPS
             )
-        poses = np.reshape(self._true_pose, (self.robots, 3))
-        bodies = self.scene.bodies
-        if isinstance(self._backend, SimBackend):
-            bodies = self._backend.simulator.obstacles[0]
+        facts = self._backend.facts()
+        poses = np.reshape(facts.get("true_pose", self._view.pose), (self.robots, 3))
+        bodies = facts.get("bodies", self.scene.bodies)
         return self._picture.draw(poses, self._view.ranges[0], bodies, self.memory)
 
     @halts_on_error

@@ -5,6 +5,8 @@ Backends of an env: those known by name, and user-defined ones.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,14 @@ from numpy.typing import NDArray
 from nics_drl_bridge import extensions
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, Backend, RobotView, Start, stacked
+from nics_drl_bridge.interface import (
+    NS_PER_S,
+    Backend,
+    BackendFacts,
+    RobotView,
+    Start,
+    stacked,
+)
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -75,14 +84,34 @@ class SimBackend:
             middleware.command(self._now_ns, one)
         self.simulator.step(commands[None])
         self._now_ns += self._period_ns
-        view = self._measure()
-        collided = data.collided[self._row]
-        facts = {
-            "stamp_ns": self._now_ns,
-            "true_pose": data.pose[self._row].copy(),
+        return self._measure(), {"stamp_ns": self._now_ns, **self._truth()}
+
+    def facts(self) -> BackendFacts:
+        """Returns the truth, the obstacles and the draws; see `interface.Backend`."""
+        simulator = self.simulator
+        known: BackendFacts = {
+            **self._truth(), "bodies": simulator.obstacles[0], "scenes": simulator.scenes,
+        }  # fmt: skip
+        if simulator.drawn:
+            known["randomisation"] = {
+                name: self._of_episode(draws) for name, draws in simulator.drawn.items()
+            }
+        return known
+
+    def _truth(self) -> BackendFacts:
+        data, row = self.simulator.data, self._row
+        collided = data.collided[row]
+        return {
+            "true_pose": data.pose[row].copy(),
             "true_collision": bool(collided) if collided.ndim == 0 else collided.astype(np.bool_),
         }
-        return view, facts
+
+    def _of_episode(self, draws: NDArray[Any]) -> Any:
+        """Returns a draw of the scene (1,), or of its robots (1, M), as it is for `info`."""
+        if draws.ndim == 1:
+            return draws[0]
+        drawn = draws[self._row]
+        return drawn.item() if drawn.ndim == 0 else drawn.copy()
 
     def _measure(self) -> RobotView:
         data, now, row = self.simulator.data, self._now_ns, self._row
@@ -108,8 +137,11 @@ class SimBackend:
 NEEDED = ("reset", "step", "close")
 
 
-class HaltedByStep:
-    """Wraps a backend without `halt`, which becomes a step with the command nearest to zero.
+class CompletedBackend:
+    """Wraps a user-defined backend that lacks `halt` or `facts`.
+
+    Instead of `halt` it gets a step with the command nearest to zero; its facts are those of its
+    last step.
 
     Args:
         backend: with `reset`, `step` and `close`.
@@ -118,10 +150,12 @@ class HaltedByStep:
 
     def __init__(self, backend: Any, still: NDArray[np.float64]) -> None:
         self._backend, self._still = backend, still
-        self._told = False
+        self._halt, self._facts = method_of(backend, "halt"), method_of(backend, "facts")
+        self._told, self._known = False, BackendFacts()
 
     def reset(self, start: Start) -> RobotView:
         """Calls the backend's."""
+        self._known = {}
         view: RobotView = self._backend.reset(start)
         return view
 
@@ -129,13 +163,22 @@ class HaltedByStep:
         """Calls the backend's."""
         self._told = True
         told: tuple[RobotView, dict[str, Any]] = self._backend.step(command)
+        if "true_pose" in told[1]:
+            self._known = {"true_pose": told[1]["true_pose"]}
         return told
 
     def halt(self) -> None:
-        """Steps once with the command nearest to zero, if there was a step since the last halt."""
-        if self._told:
+        """Calls the backend's, or steps at a standstill if there was a step since the last halt."""
+        if self._halt is not None:
+            self._halt()
+        elif self._told:
             self._backend.step(self._still.copy())
             self._told = False
+
+    def facts(self) -> BackendFacts:
+        """Calls the backend's, or returns the true pose of the last step if that told it."""
+        known: BackendFacts = self._known if self._facts is None else self._facts()
+        return known
 
     def close(self) -> None:
         """Closes the backend, which sends a zero command itself."""
@@ -143,28 +186,38 @@ class HaltedByStep:
         self._told = False
 
 
-def halting(backend: Any, still: NDArray[np.float64]) -> Backend:
-    """Returns a user-defined backend as one that can be halted.
+def method_of(backend: Any, name: str) -> Callable[..., Any] | None:
+    """Returns a method of a user-defined backend; None if it has none of that name."""
+    method = getattr(backend, name, None)
+    return method if callable(method) else None
+
+
+def completed(backend: Any, still: NDArray[np.float64]) -> Backend:
+    """Returns a backend as one with all methods; see `CompletedBackend`.
 
     Raises:
         ConfigError: it is not a backend.
     """
     if isinstance(backend, Backend):
         return backend
-    missing = [name for name in NEEDED if not callable(getattr(backend, name, None))]
+    missing = [name for name in NEEDED if method_of(backend, name) is None]
     if missing:
         raise ConfigError(
             f"backend of type {type(backend).__name__}: has no {', no '.join(missing)}; see "
             "interface.Backend."
         )
-    return HaltedByStep(backend, still)
+    return CompletedBackend(backend, still)
 
 
-def make_backend(name: str, model: SimulatorModel, world: World, **options: Any) -> Backend:
-    """A backend by the name under which it is registered, see `extensions`.
+def make_backend(name: str, model: SimulatorModel, world: World, **options: Any) -> Any:
+    """Makes a backend by the name under which it is registered, see `extensions`.
 
     Raises:
-        ConfigError: unknown name, or its library is missing.
+        ConfigError: unknown name, its library is missing, or it has no such option.
     """
-    made: Backend = extensions.load("backends", name)(model, world, **options)
-    return made
+    make = extensions.load("backends", name)
+    try:
+        signature(make).bind(model, world, **options)
+    except TypeError as error:
+        raise ConfigError(f"backend {name!r}: {error}; look at its arguments.") from None
+    return make(model, world, **options)

@@ -109,7 +109,7 @@ def wheelbase(robot: RobotSpec) -> float:
                 f"robot {robot.name!r}: the shield knows commands in m/s, rad/s and rad, and "
                 f"{variable.name!r} is in {variable.unit!r}; without it, set `shield: false`."
             )
-    if all(variable.unit != ANGLE for variable in robot.command):
+    if not robot.steers:
         return 0.0
     if not robot.parameters.get("wheelbase", 0.0) > 0.0:
         raise ConfigError(

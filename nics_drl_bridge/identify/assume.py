@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.recording.textbook import Textbook, textbook
-from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.kinds import Textbook, textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -39,7 +36,8 @@ def assume_textbook(
         ConfigError: the spec names no textbook kinematics.
     """
     book = textbook(spec)
-    rows = _rows(model)
+    named = model.named
+    rows = {dof: dict(terms) for dof, terms in named.terms.items()}
     point = dict(zip(model.variables, (model.low + model.high) / 2.0, strict=True))
     assumed: list[tuple[str, str]] = list(model.assumed)
     notes: list[str] = []
@@ -48,32 +46,8 @@ def assume_textbook(
             notes += _twist_of_state(rows, assumed, spec, book, i, point)
     if any(variable.name in unmoved for variable in (*spec.state, *spec.command)):
         notes += _rates_of_state(rows, assumed, model, spec, book, unmoved, point)
-    return _model(replace(model, assumed=tuple(assumed)), rows), tuple(notes)
-
-
-def _rows(model: TaylorModel) -> dict[str, dict[str, float]]:
-    """Returns the kept terms of each degree of freedom, by name."""
-    return {
-        dof: {
-            taylor.term_name(model.powers[k], model.variables): float(model.coefficients[d, k])
-            for k in np.flatnonzero(model.coefficients[d])
-        }
-        for d, dof in enumerate(model.dofs)
-    }
-
-
-def _model(model: TaylorModel, rows: dict[str, dict[str, float]]) -> TaylorModel:
-    names = sorted({name for row in rows.values() for name in row})
-    parsed = {name: taylor.parse_term(name, model.variables) for name in names}
-    names.sort(key=lambda name: taylor.canonical(parsed[name]))
-    powers = np.array([parsed[name] for name in names], dtype=np.int64)
-    coefficients = np.array([[rows[dof].get(n, 0.0) for n in names] for dof in model.dofs])
-    completed = replace(
-        model,
-        powers=powers.reshape(len(names), len(model.variables)),
-        coefficients=coefficients.reshape(len(model.dofs), len(names)),
-    )
-    return completed.with_errors(model.named_errors)
+    completed = named.model_copy(update={"terms": rows, "assumed": tuple(assumed)})
+    return completed.model(), tuple(notes)
 
 
 def _twist_of_state(

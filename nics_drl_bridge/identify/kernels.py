@@ -30,9 +30,8 @@ def _sinc(half):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True, inline=True)
-def _follow_derivatives(now, values, dof, free, arc, along_x, along_y, dt):  # type: ignore[no-untyped-def]
+def _follow_derivatives(now, values, dof, free, dx, dy, turn, along_x, along_y, dt):  # type: ignore[no-untyped-def]
     """Propagates the derivatives (3, P) of a pose along one arc: (dx, dy, turn)."""
-    dx, dy, turn = arc
     for p in range(now.shape[1]):
         value, d = values[free[p]], dof[free[p]]
         lean = now[2, p]
@@ -98,7 +97,7 @@ def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-un
             c, s = math.cos(heading + turn / 2.0), math.sin(heading + turn / 2.0)
             along = dt * sinc
             dx, dy = along * (c * vx - s * vy), along * (s * vx + c * vy)
-            _follow_derivatives(now, values, dof, free, (dx, dy, turn), along * c, along * s, dt)
+            _follow_derivatives(now, values, dof, free, dx, dy, turn, along * c, along * s, dt)
             px, py, heading = px + dx, py + dy, heading + turn
         if share[w] > 0.0:
             a, b = 1.0 - share[w], share[w]

@@ -5,16 +5,16 @@ FleetBackend: several robots of one simulator behind ROS 2 topics, each in its n
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import Backend, RobotView, Start, stacked
+from nics_drl_bridge.interface import Backend, BackendFacts, RobotView, Start, stacked
 from nics_drl_bridge.nodes.dds_backend import DdsBackend
 from nics_drl_bridge.nodes.device_parameters import default_namespaces
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
@@ -24,7 +24,13 @@ MODES = {"lockstep": DdsBackend, "realtime": RealtimeBackend}
 
 
 def dds_backend(
-    model: SimulatorModel, world: World, mode: str = "lockstep", robots: int = 1, **options: Any
+    model: SimulatorModel,
+    world: World,
+    mode: str = "lockstep",
+    robots: int = 1,
+    estimator: bool = True,
+    randomisation: None = None,
+    **options: Any,
 ) -> Backend:
     """Returns the backend of a robot behind ROS 2 topics, or of a team in lock-step.
 
@@ -37,12 +43,20 @@ def dds_backend(
             vehicle, see `RealtimeBackend`.
         robots: number of robots; their `namespaces` are robot1, robot2, ... unless given as an
             option.
+        estimator: must be True.
+        randomisation: must be None.
         options: of the chosen class.
 
     Raises:
-        ConfigError: there is no such mode, or not for a team.
+        ConfigError: there is no such mode, or not for a team; or it should not estimate, or
+            randomise.
         BackendError: no peer is there.
     """
+    if not estimator or randomisation is not None:
+        raise ConfigError(
+            "backend 'dds' always estimates and is never randomised; leave out `estimator` and "
+            "`randomisation`."
+        )
     if mode not in MODES:
         raise ConfigError(f"backend_options: there is no mode {mode!r}; {nearest(mode, MODES)}")
     if robots > 1:
@@ -120,6 +134,10 @@ class FleetBackend:
             views, facts = zip(*(robot.receive() for robot in self._robots), strict=True)
         return stacked(views), together(facts)
 
+    def facts(self) -> BackendFacts:
+        """Returns what is known of all robots, stacked."""
+        return cast("BackendFacts", together([robot.facts() for robot in self._robots]))
+
     @contextmanager
     def _zero_after_an_error(self) -> Iterator[None]:
         try:
@@ -141,7 +159,7 @@ class FleetBackend:
                 each.callback(robot.close)
 
 
-def together(facts: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def together(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Merges the facts of M robots: equal values stay as they are, others become (M, ...)."""
     return {
         name: value

@@ -21,7 +21,7 @@ from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.errors import BackendError, StaleDataError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, RobotView, Start
+from nics_drl_bridge.interface import NS_PER_S, BackendFacts, RobotView, Start
 from nics_drl_bridge.lidar.spec import from_device
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
@@ -168,6 +168,7 @@ class DdsBackend:
         self._period_ns = round(model.control_period * NS_PER_S)
         self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *((TRUTH,) if truth else ()))
         self._now_ns, self._mail = 0, _Mailbox(self._topics, _worker(self._middleware))
+        self._known: BackendFacts = {}
         self._link = Link(namespace, domain_id)
         types = {SCAN: LaserScan, ODOM: Odometry, TRUTH: Odometry}
         for topic in self._topics:
@@ -267,6 +268,7 @@ class DdsBackend:
         }
         if TRUTH in self._topics:
             facts["true_pose"] = _read(TRUTH, wire.odometry_of, messages[TRUTH][0])[0]
+            self._known = {"true_pose": facts["true_pose"]}
         return self._middleware.view(now), facts
 
     def _await(self, stamp_ns: int) -> dict[str, tuple[bytes, int]]:
@@ -283,6 +285,10 @@ class DdsBackend:
                 if left_s <= AGAIN_S:
                     raise StaleDataError(error.topic, error.age_s, self.timeout_s) from None
                 self._episodes.repeat()
+
+    def facts(self) -> BackendFacts:
+        """Returns the newest true pose, if it was asked for."""
+        return self._known
 
     def halt(self) -> None:
         """Publishes a zero command; the episode is over."""

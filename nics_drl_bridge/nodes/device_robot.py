@@ -174,8 +174,7 @@ class CommandInlet:
             kind, f"{namespace}cmd_vel", hear, quality, raw=not stamped
         ).topic_name
         self._warned: set[str] = set()
-        self._steering = steering_of(robot)
-        if self._steering is not None:
+        if robot.steers:
             self._listen_to_ackermann(f"{namespace}ackermann_cmd", quality)
 
     def _listen_to_ackermann(self, topic: str, quality: QoSProfile) -> None:
@@ -203,12 +202,8 @@ class CommandInlet:
             self._obey((twist.linear.x, twist.linear.y, twist.angular.z))
 
     def _on_ackermann(self, message: Any) -> None:
-        command = np.empty(2)
-        command[list(self._steering or ())] = message.drive.speed, message.drive.steering_angle
-        if not np.isfinite(command).all():
-            self._complain("NaN or inf ignored")
-        elif self._is_fresh(message.header.stamp):
-            self._take(command)
+        if self._is_fresh(message.header.stamp):
+            self._obey((message.drive.speed, 0.0, message.drive.steering_angle))
 
     def _is_fresh(self, stamp: Any) -> bool:
         stamp_ns = conversions.stamp_from_ros(stamp)
@@ -235,12 +230,6 @@ class CommandInlet:
                 f"{self._topic}: {who} publishes {kind}, but {self._kind} is expected here, so "
                 f"that its commands are not heard; let it publish that, or set {switch}."
             )
-
-
-def steering_of(robot: RobotSpec) -> tuple[int, int] | None:
-    """Returns the indices of speed [m/s] and steering angle [rad]; None for other commands."""
-    units = [variable.unit for variable in robot.command]
-    return (units.index("m/s"), units.index("rad")) if sorted(units) == ["m/s", "rad"] else None
 
 
 class Outbox:

@@ -51,7 +51,7 @@ class PolicyNode(ManagedNode):
         declare_model_name(self)
         declare_sensors(self)
         about = "A policy file (*.onnx), or the name of a shipped one or of a baseline."
-        declare(self, "policy", "go_to_goal", about, read_only=True)
+        declare(self, "policy", "dynamic_window", about, read_only=True)
         declare(self, "base_frame", "base_link", "Frame id of the robot.")
         about = "x, y in map [m]; NaN waits for goal_pose."
         declare(self, "goal", [float("nan")] * 2, about, read_only=True)

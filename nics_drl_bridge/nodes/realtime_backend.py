@@ -18,7 +18,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.config import Schema, validate
 from nics_drl_bridge.errors import BackendError, StaleDataError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, RobotView, Start
+from nics_drl_bridge.interface import NS_PER_S, BackendFacts, RobotView, Start
 from nics_drl_bridge.middleware.measurement import SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes.link import Link
@@ -234,6 +234,10 @@ class RealtimeBackend:
             facts = data_facts(self._topics.middleware, time.monotonic_ns())
             view, stamp_ns = self._topics.view(), self._topics.newest_ns
         return view, {"stamp_ns": stamp_ns, "deadline_misses": self._misses, **facts}
+
+    def facts(self) -> BackendFacts:
+        """Returns nothing: topics tell all that is known."""
+        return {}
 
     def halt(self) -> None:
         """Publishes a zero command."""

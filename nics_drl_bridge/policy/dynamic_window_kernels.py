@@ -3,42 +3,94 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 
+Array = NDArray[np.float64]
+
+
+class ScanRays(NamedTuple):
+    """Rays of a scan.
+
+    Attributes:
+        directions: (P, 2) unit vectors in `base_link`.
+        origin: (2,) in `base_link` [m].
+        range_max: range that a share of 1 stands for [m].
+    """
+
+    directions: Array
+    origin: Array
+    range_max: float
+
+
+class LookAhead(NamedTuple):
+    """Parameters of the roll-outs of a robot.
+
+    Attributes:
+        reach: (3,) greatest change of a twist in one period.
+        radius: of the footprint with its margin [m].
+        period: time step [s].
+        steps: number of time steps.
+        rest: time to come to rest [s].
+    """
+
+    reach: Array
+    radius: float
+    period: float
+    steps: int
+    rest: float
+
+
+class TwistWeights(NamedTuple):
+    """Weights of the cost of a twist.
+
+    Attributes:
+        gap: to the goal [1/m].
+        aim: of the heading at the goal.
+        clearance: of the nearest thing on the way.
+        time: until a contact.
+    """
+
+    gap: float
+    aim: float
+    clearance: float
+    time: float
+
 
 @kernel(allocates=True)
-def choose_all(out, scans, goals, twists, candidates, sight, body, weights):  # type: ignore[no-untyped-def]
+def choose_all(out, scans, goals, twists, candidates, rays, ahead, weights):  # type: ignore[no-untyped-def]
     """Writes for N robots the index of the candidate that `choose` returns into out (N,)."""
     hits = np.empty((scans.shape[1], 2))
     for n in range(out.shape[0]):
-        count = hits_of(hits, scans[n], sight)
-        out[n] = choose(hits[:count], goals[n], twists[n], candidates, body, weights)
+        count = hits_of(hits, scans[n], rays)
+        out[n] = choose(hits[:count], goals[n], twists[n], candidates, ahead, weights)
 
 
 @kernel(allocates=True)
-def hits_of(hits, shares, sight):  # type: ignore[no-untyped-def]
+def hits_of(hits, shares, rays):  # type: ignore[no-untyped-def]
     """Writes the end points of a scan into hits (P, 2) [m] in `base_link`; returns their number.
 
     Args:
         hits: result.
         shares: (P,) of the maximum range; 1 is free.
-        sight: directions (P, 2), origin (2,) [m] and range_max [m].
+        rays: `ScanRays`.
     """
-    directions, origin, range_max = sight
     count = 0
     for p in range(shares.shape[0]):
         if shares[p] < 1.0:
-            hits[count, 0] = origin[0] + shares[p] * range_max * directions[p, 0]
-            hits[count, 1] = origin[1] + shares[p] * range_max * directions[p, 1]
+            share = shares[p] * rays.range_max
+            hits[count, 0] = rays.origin[0] + share * rays.directions[p, 0]
+            hits[count, 1] = rays.origin[1] + share * rays.directions[p, 1]
             count += 1
     return count
 
 
 @kernel(allocates=True)
-def choose(hits, goal, twist, candidates, body, weights):  # type: ignore[no-untyped-def]
+def choose(hits, goal, twist, candidates, ahead, weights):  # type: ignore[no-untyped-def]
     """Returns the index of the cheapest candidate, preferring those within the window.
 
     Args:
@@ -46,17 +98,15 @@ def choose(hits, goal, twist, candidates, body, weights):  # type: ignore[no-unt
         goal: (2,) in `base_link` [m].
         twist: (3,) present twist of the robot.
         candidates: (K, 3) twists to choose from.
-        body: reach (3,) of a twist in one period, radius with margin [m], time step [s] and number
-            of steps of the look-ahead, time to come to rest [s].
-        weights: (4,) of gap, aim, clearance and time until a contact.
+        ahead: `LookAhead`.
+        weights: `TwistWeights`.
     """
-    reach = body[0]
     best, least = 0, math.inf
     for k in range(candidates.shape[0]):
         far = False
         for i in range(3):
-            far |= abs(candidates[k, i] - twist[i]) > reach[i]
-        cost = cost_of(hits, goal, candidates[k], body, weights)
+            far |= abs(candidates[k, i] - twist[i]) > ahead.reach[i]
+        cost = cost_of(hits, goal, candidates[k], ahead, weights)
         cost += 1e6 if far else 0.0
         if cost < least:
             best, least = k, cost
@@ -64,13 +114,13 @@ def choose(hits, goal, twist, candidates, body, weights):  # type: ignore[no-unt
 
 
 @kernel(allocates=True)
-def cost_of(hits, goal, aimed, body, weights):  # type: ignore[no-untyped-def]
+def cost_of(hits, goal, aimed, ahead, weights):  # type: ignore[no-untyped-def]
     """Cost of holding a twist (3,), which is inadmissible if it hits before it can be stopped."""
-    _, radius, period, steps, rest = body
+    period, steps = ahead.period, ahead.steps
     x, y, heading = 0.0, 0.0, 0.0
     gap, clearance, free = math.hypot(goal[0], goal[1]), math.inf, steps
     now = nearest_hit(hits, 0.0, 0.0)
-    limit = min(radius, 0.98 * now)  # already nearer than that: only away
+    limit = min(ahead.radius, 0.98 * now)  # already nearer than that: only away
     for step in range(steps):
         middle = heading + 0.5 * aimed[2] * period
         x += (aimed[0] * math.cos(middle) - aimed[1] * math.sin(middle)) * period
@@ -80,17 +130,17 @@ def cost_of(hits, goal, aimed, body, weights):  # type: ignore[no-untyped-def]
         if room < limit:
             free = step
             break
-        clearance = min(clearance, room - radius)
+        clearance = min(clearance, room - ahead.radius)
         gap = min(gap, math.hypot(goal[0] - x, goal[1] - y))
         if gap < 0.15:
             break  # anything behind the goal does not matter
     turn = math.atan2(goal[1] - y, goal[0] - x) - heading
     turn = abs((turn + math.pi) % (2.0 * math.pi) - math.pi) / math.pi
-    cost = weights[0] * gap + weights[1] * turn * min(gap, 1.0)
-    cost += weights[2] * (1.0 - min(max(clearance, 0.0), 0.4) / 0.4)
-    cost += weights[3] * (1.0 - free / steps)
+    cost = weights.gap * gap + weights.aim * turn * min(gap, 1.0)
+    cost += weights.clearance * (1.0 - min(max(clearance, 0.0), 0.4) / 0.4)
+    cost += weights.time * (1.0 - free / steps)
     moves = abs(aimed[0]) + abs(aimed[1]) > 1e-9
-    return cost + (1e3 if moves and free * period < rest else 0.0)
+    return cost + (1e3 if moves and free * period < ahead.rest else 0.0)
 
 
 @kernel(allocates=True)

@@ -17,8 +17,7 @@ from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.policy.dynamic_window import DynamicWindow
-from nics_drl_bridge.policy.go_to_goal import GoToGoal
+from nics_drl_bridge.policy.planners import DynamicWindow
 
 FULL_TURN_RAD = 0.8
 """Bearing of the goal from which a robot turns as fast as it can."""
@@ -41,13 +40,9 @@ class StraightToGoal:
         robot, first = self.task.robot, self.task.scan_parts + 1
         cosine, sine = np.moveaxis(observation[..., first : first + 2].astype(float), -1, 0)
         turn = np.clip(np.arctan2(sine, cosine) / FULL_TURN_RAD, -1.0, 1.0)
-        steers = any(one.cmd_vel == "angular.z" and one.unit == "rad" for one in robot.command)
-        ahead = np.maximum(cosine, CREEP if steers else 0.0)
-        shares = {"linear.x": ahead, "angular.z": turn}
-        wanted = np.zeros((*cosine.shape, len(robot.command)))
-        for i, one in enumerate(robot.command):
-            if one.cmd_vel in shares:
-                wanted[..., i] = shares[one.cmd_vel] * one.max
+        ahead = np.maximum(cosine, CREEP if robot.steers else 0.0)
+        shares = np.stack([ahead, np.zeros_like(ahead), turn], axis=-1)
+        wanted = robot.from_cmd_vel(shares) * robot.command_high
         low, high = robot.command_low, robot.command_high
         return np.clip(2.0 * (wanted - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
 
@@ -83,7 +78,6 @@ class Policy(Protocol):
 
 POLICIES: dict[str, Callable[[Navigation], Policy]] = {
     "dynamic_window": DynamicWindow,
-    "go_to_goal": GoToGoal,
     "random": RandomActions,
     "straight": StraightToGoal,
 }

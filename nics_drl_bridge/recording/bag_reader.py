@@ -92,7 +92,7 @@ def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
     """Reads the commands (T, C) of the robot."""
     if bag.types[topic] in (topic_roles.ACKERMANN, topic_roles.ACKERMANN_STAMPED):
         for variable in spec.command:
-            if variable.cmd_vel == "angular.z" and variable.unit != "rad":
+            if variable.turns and not variable.steers:
                 raise RecordingError(
                     f"{bag.place}: topic {topic!r} holds steering angles [rad], but "
                     f"{variable.name!r} of robot {spec.name!r} is in {variable.unit}; choose the "

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.recording.joints import POSITION_UNITS
-from nics_drl_bridge.recording.textbook import textbook
+from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
@@ -89,7 +89,7 @@ class Exploration:
         fastest = np.hypot(*spec.to_cmd_vel(np.maximum(-self.low, self.high))[:2])
         self._outermost = bound - spec.footprint_radius
         self.keep_within = self._outermost - MARGIN_M - REACTION_S * float(fastest)
-        turning = np.array([c.cmd_vel == "angular.z" for c in spec.command])
+        turning = np.array([c.turns for c in spec.command])
         self._ways = self._ways_back(np.where(turning, TURNING, TURNING_SPEED))
         self._emergency = self._ways_back(np.where(turning, 1.0, TURNING_SPEED))
 
@@ -308,9 +308,6 @@ class Pattern:
         )
 
 
-TWIST_UNITS = {"linear.x": "m/s", "linear.y": "m/s", "angular.z": "rad/s"}
-
-
 @dataclass(frozen=True)
 class ExpectedMotion:
     """Expected motion of a robot.
@@ -362,7 +359,7 @@ def expected_motion(spec: RobotSpec) -> ExpectedMotion:
             lambda state, _: book.twist(state),
         )
     for command in spec.command:
-        if command.cmd_vel is None or TWIST_UNITS[command.cmd_vel] != command.unit:
+        if not command.is_twist:
             raise ConfigError(
                 f"robot {spec.name!r}: where {command.name!r} in {command.unit} leads can't be "
                 "predicted; add `textbook:` and its `parameters:` to the robot's YAML file."

@@ -13,9 +13,11 @@ from pydantic import Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.robot.registry import find_kind, kind_names
 
 CmdVelField = Literal["linear.x", "linear.y", "angular.z"]
 CMD_VEL_FIELDS: tuple[CmdVelField, ...] = ("linear.x", "linear.y", "angular.z")
+TWIST_UNITS = dict(zip(CMD_VEL_FIELDS, ("m/s", "m/s", "rad/s"), strict=True))
 UNITS = ("m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1")
 """SI units of a state or a command; 1 for a ratio or a count."""
 LARGEST = 1e3
@@ -72,6 +74,26 @@ class CommandVariable(Variable):
 
     cmd_vel: CmdVelField | None = None
 
+    @property
+    def turns(self) -> bool:
+        """True for a turn rate, and for a steering angle."""
+        return self.cmd_vel == "angular.z"
+
+    @property
+    def steers(self) -> bool:
+        """True for a steering angle: how fast it turns the robot depends on the speed."""
+        return self.turns and self.unit == "rad"
+
+    @property
+    def is_sideways(self) -> bool:
+        """True for a speed to the left."""
+        return self.cmd_vel == "linear.y"
+
+    @property
+    def is_twist(self) -> bool:
+        """True for a component of the body twist."""
+        return self.cmd_vel is not None and TWIST_UNITS[self.cmd_vel] == self.unit
+
 
 class RobotSpec(Schema):
     """Definition of a robot.
@@ -79,9 +101,9 @@ class RobotSpec(Schema):
     Attributes:
         name: user-visible name.
         description: one sentence.
-        textbook: the textbook kinematics for its synthetic recordings, whose structure may also
-            be assumed for motion that a drive did not show.
-        parameters: of the textbook kinematics [m, s], see `recording.textbook`.
+        textbook: its kind, see `robot.kinds`: the textbook kinematics for its synthetic recordings,
+            whose structure may also be assumed for motion that a drive did not show.
+        parameters: of the textbook kinematics [m, s], see the module of that kind.
         footprint_radius: radius of the circular footprint around `base_link` [m]; optional with a
             `footprint`, which it then circumscribes.
         footprint: corners of a polygonal footprint instead, in `base_link` [m], in either
@@ -92,7 +114,7 @@ class RobotSpec(Schema):
 
     name: str
     description: str = ""
-    textbook: Literal["ackermann", "differential", "mecanum"] | None = None
+    textbook: str | None = None
     parameters: dict[str, float] = Field(default_factory=dict)
     footprint_radius: float = Field(ge=1e-3, le=LARGEST)
     footprint: tuple[tuple[float, float], ...] | None = Field(
@@ -100,6 +122,13 @@ class RobotSpec(Schema):
     )
     state: tuple[StateVariable, ...] = Field(default=(), max_length=MOST_VARIABLES)
     command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MOST_VARIABLES)
+
+    @field_validator("textbook")
+    @classmethod
+    def _known(cls, textbook: str | None) -> str | None:
+        if textbook is not None and find_kind(textbook) is None:
+            raise ValueError(f"must be one of {', '.join(kind_names())}")
+        return textbook
 
     @model_validator(mode="before")
     @classmethod
@@ -169,6 +198,31 @@ class RobotSpec(Schema):
         """Units of dQ/dt."""
         return (*POSE_UNITS, *(f"{v.unit}/s" for v in self.state))
 
+    @property
+    def steers(self) -> bool:
+        """True if a steering angle is commanded."""
+        return any(command.steers for command in self.command)
+
+    @property
+    def moves_sideways(self) -> bool:
+        """True if a sideways speed is commanded."""
+        return any(command.is_sideways for command in self.command)
+
+    @property
+    def wheelbase(self) -> float:
+        """Distance between the axles of a robot that steers [m].
+
+        Raises:
+            ConfigError: it is not known.
+        """
+        wheelbase = self.parameters.get("wheelbase", 0.0)
+        if not wheelbase > 0.0:
+            raise ConfigError(
+                f"robot {self.name!r} steers, and its wheelbase is not known; add `wheelbase:` [m] "
+                "to the `parameters:` of its YAML file."
+            )
+        return wheelbase
+
     @cached_property
     def command_low(self) -> NDArray[np.float64]:
         """Least command (C,)."""
@@ -232,13 +286,3 @@ def load_robot(name: str | Path) -> RobotSpec:
         ConfigError: unknown name or wrong key, with the nearest valid one.
     """
     return load_yaml(find_config(name, "robots"), RobotSpec)
-
-
-def require_textbook(spec: RobotSpec) -> str:
-    """Returns the name of the robot's textbook kinematics. Raises ConfigError if it has none."""
-    if spec.textbook is None:
-        raise ConfigError(
-            f"robot {spec.name!r} names no textbook kinematics; add `textbook:` to its YAML file "
-            "or give a recording."
-        )
-    return spec.textbook

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from xml.etree import ElementTree
 
+from nics_drl_bridge.robot.kinds import Drawing, Pivot, Wheel, drawing
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Element = ElementTree.Element
-Parameters = dict[str, float]
 Place = tuple[float, float, float]
 
 COLOURS = {"body": "0.2 0.4 0.7 1", "wheel": "0.1 0.1 0.1 1", "laser": "0.7 0.1 0.1 1"}
@@ -42,63 +41,47 @@ def urdf_of(
     if spec.textbook is None:
         _visual_cylinder(link, "body", spec.footprint_radius, BODY_HEIGHT, BODY_HEIGHT)
     else:
-        _WHEELS[spec.textbook](robot, link, spec)
+        _draw(robot, link, drawing(spec))
     _visual_cylinder(_add(robot, "link", name=laser), "laser", LASER_RADIUS, LASER_HEIGHT, 0.07)
     _joint(robot, "laser_mount", "fixed", (base, laser), (*mount[:2], 0.0), yaw=mount[2])
     ElementTree.indent(robot)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(robot, encoding="unicode")}\n'
 
 
-def car_wheels(parameters: Parameters) -> tuple[float, float]:
-    """Returns `track` and `wheel_radius` of a car [m]; by default shares of its wheelbase."""
-    wheelbase = parameters["wheelbase"]
-    return (
-        parameters.get("track", 0.8 * wheelbase),
-        parameters.get("wheel_radius", 0.18 * wheelbase),
-    )
+def _draw(robot: Element, link: Element, looks: Drawing) -> None:
+    x, height = looks.centre
+    if isinstance(looks.body, tuple):
+        _visual_box(link, looks.body, (x, height))
+    else:
+        _visual_cylinder(link, "body", looks.body, BODY_HEIGHT, height)
+    for wheel in looks.wheels:
+        _wheel(robot, link.attrib["name"], wheel)
 
 
-def _car(robot: Element, base: Element, spec: RobotSpec) -> None:
-    wheelbase = spec.parameters["wheelbase"]
-    track, radius = car_wheels(spec.parameters)
-    _visual_box(base, (1.3 * wheelbase, 0.7 * track), (0.45 * wheelbase, radius))
-    steering = next(variable for variable in spec.state if variable.unit == "rad")
-    name = base.attrib["name"]
-    for side, y in (("left", 0.5 * track), ("right", -0.5 * track)):
-        _wheel(robot, (name, f"rear_{side}_wheel"), (0.0, y, radius), radius, "fixed")
-        knuckle = f"{side}_knuckle"
-        _add(robot, "link", name=knuckle)
-        which = steering.name if side == "left" else f"{steering.name}_right"
-        joint = _joint(robot, which, "revolute", (name, knuckle), (wheelbase, y, radius))
-        _add(joint, "axis", xyz="0 0 1")
-        limits = {"lower": f"{steering.min:g}", "upper": f"{steering.max:g}"}
-        _add(joint, "limit", **limits, effort="1", velocity="10")
-        if side == "right":
-            _add(joint, "mimic", joint=steering.name)
-        _wheel(robot, (knuckle, f"front_{side}_wheel"), (0.0, 0.0, 0.0), radius, "fixed")
+def _wheel(robot: Element, base: str, wheel: Wheel) -> None:
+    """Adds a wheel; one that turns turns forwards about y, a steered one's pivot about z."""
+    parent, place = base, (*wheel.place, wheel.radius)
+    if wheel.pivot is not None:
+        _pivot(robot, base, wheel.pivot, place)
+        parent, place = wheel.pivot.link, (0.0, 0.0, 0.0)
+    name, kind = wheel.name, "continuous" if wheel.turns else "fixed"
+    joint = _joint(robot, name, kind, (parent, f"{name}_link"), place)
+    if wheel.turns:
+        _add(joint, "axis", xyz="0 1 0")
+    visual = _add(_add(robot, "link", name=f"{name}_link"), "visual")
+    _cylinder(visual, wheel.radius, 0.4 * wheel.radius, (0.0, 0.0, 0.0), roll=0.5 * math.pi)
+    _add(visual, "material", name="wheel")
 
 
-def _differential(robot: Element, base: Element, spec: RobotSpec) -> None:
-    track, radius = spec.parameters["track"], spec.parameters["wheel_radius"]
-    _visual_cylinder(base, "body", 0.4 * track, BODY_HEIGHT, radius)
-    for variable, y in zip(spec.state, (0.5 * track, -0.5 * track), strict=True):
-        _wheel(robot, (base.attrib["name"], variable.name), (0.0, y, radius), radius)
-
-
-def _mecanum(robot: Element, base: Element, spec: RobotSpec) -> None:
-    p = spec.parameters
-    length, width, radius = p["half_length"], p["half_width"], p["wheel_radius"]
-    _visual_box(base, (2.0 * length + radius, 1.4 * width), (0.0, radius))
-    places = ((length, width), (length, -width), (-length, width), (-length, -width))
-    for variable, place in zip(spec.state, places, strict=True):
-        _wheel(robot, (base.attrib["name"], variable.name), (*place, radius), radius)
-
-
-_WHEELS: dict[str, Callable[[Element, Element, RobotSpec], None]] = {
-    "ackermann": _car,
-    "differential": _differential,
-    "mecanum": _mecanum,
-}
+def _pivot(robot: Element, base: str, pivot: Pivot, place: Place) -> None:
+    angle = pivot.angle
+    _add(robot, "link", name=pivot.link)
+    joint = _joint(robot, pivot.joint, "revolute", (base, pivot.link), place)
+    _add(joint, "axis", xyz="0 0 1")
+    limits = {"lower": f"{angle.min:g}", "upper": f"{angle.max:g}"}
+    _add(joint, "limit", **limits, effort="1", velocity="10")
+    if pivot.joint != angle.name:
+        _add(joint, "mimic", joint=angle.name)
 
 
 def _add(parent: Element, tag: str, **attributes: str) -> Element:
@@ -117,19 +100,6 @@ def _joint(
     _add(joint, "parent", link=links[0])
     _add(joint, "child", link=links[1])
     return joint
-
-
-def _wheel(
-    robot: Element, links: tuple[str, str], place: Place, radius: float, kind: str = "continuous"
-) -> None:
-    """Adds a wheel whose joint turns forwards about y and has the name of the wheel."""
-    name = links[1]
-    joint = _joint(robot, name, kind, (links[0], f"{name}_link"), place)
-    if kind == "continuous":
-        _add(joint, "axis", xyz="0 1 0")
-    visual = _add(_add(robot, "link", name=f"{name}_link"), "visual")
-    _cylinder(visual, radius, 0.4 * radius, (0.0, 0.0, 0.0), roll=0.5 * math.pi)
-    _add(visual, "material", name="wheel")
 
 
 def _cylinder(parent: Element, radius: float, length: float, at: Place, roll: float = 0.0) -> None:

@@ -40,7 +40,7 @@ def test_without_the_extra_a_robot_without_a_shipped_policy_gets_a_baseline(
     (tmp_path / "mine.yaml").write_text(dump_yaml(robot))
     model = builtin_model(str(tmp_path / "mine.yaml"))
     learned = learn(DemoPlan(tmp_path, str(tmp_path / "mine.yaml")), model, lambda _: None)
-    assert learned.policy == "go_to_goal"
+    assert learned.policy == "dynamic_window"
 
 
 def test_a_named_policy_is_taken_and_a_misspelt_one_refused(tmp_path):

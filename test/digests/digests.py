@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -126,8 +127,7 @@ def identified() -> Found:
             if robot == "ackermann":
                 given = disturbed
             result = identify(drive(spec, **given), spec)
-            calibration = result.calibration.to_dict()
-            numbers = numbers_of(calibration)
+            numbers = numbers_of(asdict(result.calibration))
             found[f"{robot} {name}"] = projected([*result.model.coefficients.ravel(), *numbers])
     return found
 

@@ -8,6 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from robots import direct_model, field
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS, NAVIGATION, register_envs
@@ -198,7 +199,7 @@ class Recorder:
         self.closed += 1
 
 
-def test_any_object_with_reset_step_and_close_is_a_backend_that_a_still_command_halts():
+def test_any_backendwith_reset_step_and_close_is_a_backend_that_a_still_command_halts():
     backend = Recorder()
     env = BridgeEnv(backend, model=direct_model(), world=field())
     env.reset(seed=0)
@@ -217,12 +218,53 @@ def test_a_backend_with_a_halt_of_its_own_is_halted_by_it():
             self.halts += 1
 
     backend = Halting()
-    assert isinstance(backend, Backend)
     assert isinstance(SimBackend(direct_model(), field()), Backend)
     env = BridgeEnv(backend, model=direct_model(), world=field())
     env.reset(seed=0)
     env.halt()
     assert (backend.halts, backend.commands) == (1, [])
+
+
+def test_facts_of_a_backend_of_ones_own_are_those_of_its_last_step_unless_it_has_some():
+    class Knowing(Recorder):
+        def facts(self):
+            return self.inner.facts()
+
+    for backend, knows in ((Recorder(), False), (Knowing(), True)):
+        env = BridgeEnv(backend, model=direct_model(), world=field())
+        env.reset(seed=0)
+        info = env.step(np.array([1.0, -1.0, 0.0], np.float32))[4]
+        facts = env._backend.facts()
+        assert np.array_equal(facts["true_pose"], info["true_pose"])
+        assert ("bodies" in facts) == knows
+
+
+def test_a_randomised_backend_gives_the_same_episode_as_an_backendas_by_its_name():
+    model, world, strong = direct_model(), field(count=4), "strong"
+    backend = SimBackend(model, world, randomisation=strong)
+    given = (
+        BridgeEnv("sim", model, world, randomisation=strong),
+        BridgeEnv(backend, model, world),
+    )
+    infos = [env.reset(seed=3)[1] for env in given]
+    assert infos[0]["randomisation"]
+    for name, value in infos[0].items():
+        assert np.all(value == infos[1][name]), name
+    assert np.array_equal(infos[0]["bodies"], backend.facts()["bodies"])
+    assert np.array_equal(infos[0]["start"], backend.facts()["true_pose"])
+
+
+def test_a_backend_that_does_not_take_what_it_is_told_is_named():
+    class Point:
+        @staticmethod
+        def load():
+            return lambda model, world: Recorder()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(extensions, "known", lambda group: {"mine": Point})
+        BridgeEnv("mine", direct_model(), field()).reset(seed=0)
+        with pytest.raises(ConfigError, match=r"'mine': got an unexpected .*'randomisation'; look"):
+            BridgeEnv("mine", direct_model(), field(), randomisation="mild")
 
 
 def test_what_is_no_backend_is_refused_with_what_it_lacks():
@@ -287,11 +329,6 @@ def test_the_pose_is_that_of_odometry_unless_an_estimator_is_asked_for():
         assert np.array_equal(infos[-1]["pose"], odometry) == (env is plain)
         paths.append([info["true_pose"] for info in infos])
     assert np.array_equal(*paths)
-
-
-def test_what_the_topics_need_is_refused_where_there_are_none():
-    with pytest.raises(ConfigError, match="'dds' always estimates and is never randomised"):
-        BridgeEnv("dds", direct_model(), field(), estimator=False)
 
 
 @pytest.mark.parametrize(

@@ -79,7 +79,7 @@ def test_a_robot_that_touched_something_leaves_and_stands_still_as_an_obstacle()
     for _ in range(5):
         _, rewards, *_ = parallel.step({"robot_1": rest})
         assert set(rewards) == {"robot_1"}
-        poses.append(parallel.env._true_pose[0].copy())
+        poses.append(parallel.env._backend.facts()["true_pose"][0])
     assert np.abs(np.diff(poses, axis=0)).max() == 0.0
 
 

@@ -7,8 +7,9 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.fit import fit, prune
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
-from nics_drl_bridge.recording.textbook import integrate, record, textbook
+from nics_drl_bridge.recording.textbook import integrate, record
 from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 PAIR = RobotSpec.model_validate(
@@ -44,13 +45,13 @@ def aligned(drive: Recording) -> Samples:
 
 
 def term(model, dof, name):
-    return model.to_dict()["terms"][dof].get(name, 0.0)
+    return model.named.terms[dof].get(name, 0.0)
 
 
 def test_a_polynomial_of_second_order_is_found_with_its_own_terms_only():
     x = random_x()
     result = fit(samples_of(x, rates_of(x)), PAIR, alpha=1.0)
-    terms = result.model.to_dict()["terms"]
+    terms = result.model.named.terms
     assert {dof: set(named) for dof, named in terms.items()} == {
         "vx": {"a", "a*b"},
         "vy": {"1", "b^2"},

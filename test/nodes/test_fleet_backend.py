@@ -32,6 +32,12 @@ def test_a_team_over_dds_sees_what_a_team_in_process_sees(launch, model, domain_
         there.close()
 
 
+@pytest.mark.parametrize("wish", [{"estimator": False}, {"randomisation": "mild"}])
+def test_what_topics_can_not_give_is_refused(model, wish):
+    with pytest.raises(ConfigError, match="'dds' always estimates and is never randomised"):
+        BridgeEnv("dds", model, **wish)
+
+
 @pytest.mark.parametrize("options", [{"mode": "realtime"}, {"namespaces": ["a"]}])
 def test_a_team_is_driven_in_lockstep_in_a_namespace_each(model, options):
     with pytest.raises(ConfigError, match="a team of 2 robots is driven in mode 'lockstep'"):

@@ -75,10 +75,10 @@ def test_what_a_node_reads_when_it_is_configured_can_be_changed_before_only(mana
     assert "'goal'" in late.reason
     assert "cleanup" in late.reason
     assert lead(managed, "policy_node", "cleanup")
-    assert managed.set_parameters("policy_node", policy="go_to_goall").successful
+    assert managed.set_parameters("policy_node", policy="dynamic_windowl").successful
     assert not lead(managed, "policy_node", "configure")
     assert state(managed, "policy_node") == "unconfigured"
-    assert managed.set_parameters("policy_node", policy="go_to_goal").successful
+    assert managed.set_parameters("policy_node", policy="dynamic_window").successful
     assert lead(managed, "policy_node", "configure")
     assert lead(managed, "policy_node", "activate")
 

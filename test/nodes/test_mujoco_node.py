@@ -66,7 +66,7 @@ def test_whole_episodes_over_topics_reach_the_goal_as_in_this_process(node, robo
     here = gymnasium.wrappers.TimeLimit(
         BridgeEnv(MujocoBackend(model, world), **arguments), MAX_EPISODE_STEPS
     )
-    policy = make_policy("go_to_goal", there.unwrapped.task)
+    policy = make_policy("dynamic_window", there.unwrapped.task)
     try:
         over_topics = drive_all(there, policy, SEEDS)
     finally:

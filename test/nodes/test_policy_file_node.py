@@ -185,7 +185,7 @@ def test_scans_that_cannot_fill_its_sectors_are_refused_in_one_sentence_once(dri
     ("parameters", "words"),
     [
         ({"policy": "none.onnx"}, "none.onnx: field 'file'"),
-        ({"policy": "go_to_gaol"}, "did you mean 'go_to_goal'"),
+        ({"policy": "dynamic_widow"}, "did you mean 'dynamic_window'"),
         ({"rate": -1.0}, "rate -1.0"),
     ],
 )

@@ -97,11 +97,11 @@ def test_leaving_the_block_ends_a_node_that_runs_and_one_that_hangs(
 
 
 def test_a_node_that_ended_by_itself_is_named_with_its_code_and_log(tmp_path, domain_id, meet):
-    with NodeProcess("policy_node", tmp_path, {"policy": "go_to_gaol"}, domain_id) as node:
+    with NodeProcess("policy_node", tmp_path, {"policy": "dynamic_widow"}, domain_id) as node:
         meet(domain_id).until(lambda: node._process.poll() is not None, "its end")
         expected = (
-            "policy_node ended with code 2: unknown policy 'go_to_gaol'; did you mean "
-            f"'go_to_goal'? (its log is {node.log})."
+            "policy_node ended with code 2: unknown policy 'dynamic_widow'; did you mean "
+            f"'dynamic_window'? (its log is {node.log})."
         )
         with pytest.raises(BackendError, match=f"^{re.escape(expected)}$"):
             node.check()

@@ -176,7 +176,7 @@ def test_a_policy_that_raises_leaves_a_zero_command_behind(robot, domain_id, err
             assert process.returncode == 2
             assert "Traceback" not in said
             name = error.partition("(")[0]
-            told = [line for line in said.splitlines() if f"'go_to_goal' raised {name}" in line]
+            told = [line for line in said.splitlines() if f"'dynamic_window' raised {name}" in line]
             assert len(told) == 1
             assert "the robot is stopped" in told[0]
     finally:

@@ -67,8 +67,8 @@ def test_make_policy_opens_a_file_and_checks_it_against_the_task(file):
     assert policy.act(np.zeros(SECTORS + 6, np.float32)).shape == (3,)
     with pytest.raises(PolicyError, match=r"field 'scan\.?"):
         make_policy(str(file), make_task("navigation", model, {"scan": 36}), model)
-    with pytest.raises(ConfigError, match="did you mean 'go_to_goal'"):
-        make_policy("go_to_gaol", task, model)
+    with pytest.raises(ConfigError, match="did you mean 'dynamic_window'"):
+        make_policy("dynamic_widow", task, model)
 
 
 def test_an_observation_of_another_size_is_refused(file):

@@ -63,14 +63,14 @@ def driven_by(name):
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """The goal of a drive of go_to_goal, and its bag."""
-    goal, topics = driven_by("go_to_goal")
+    """The goal of a drive of dynamic_window, and its bag."""
+    goal, topics = driven_by("dynamic_window")
     return goal, bags.write(tmp_path_factory.mktemp("drive") / "bag", topics), len(topics["/scan"])
 
 
 def test_a_policy_in_the_shadow_of_its_own_drive_commands_what_was_driven(recorded):
     goal, bag, count = recorded
-    made = shadow(bag, MODEL, "go_to_goal", {}, goal)
+    made = shadow(bag, MODEL, "dynamic_window", {}, goal)
     assert len(made.time) == count
     assert np.abs(made.policy - made.driven).max() < 1e-4
     assert np.abs(made.driven).max() > 0.1
@@ -86,7 +86,7 @@ def test_another_policy_differs(recorded):
 
 def test_without_a_goal_it_is_where_the_robot_was_later(recorded):
     _, bag, _ = recorded
-    made = shadow(bag, MODEL, "go_to_goal", {}, ahead_s=2.0)
+    made = shadow(bag, MODEL, "dynamic_window", {}, ahead_s=2.0)
     ahead = round(2.0 / PERIOD)
     assert made.goal[0] == pytest.approx(made.pose[ahead, :2], abs=1e-6)
 
@@ -125,7 +125,7 @@ def test_what_can_not_be_compared_is_told(recorded, topics, goal, ahead, words):
         bag = bags.write(bag.parent / "standing", driven_standing())
         goal = (0.0, 0.0)
     with pytest.raises((RecordingError, ConfigError), match=words):
-        shadow(bag, MODEL, "go_to_goal", topics, goal, ahead)
+        shadow(bag, MODEL, "dynamic_window", topics, goal, ahead)
 
 
 def driven_standing():
@@ -143,12 +143,12 @@ def test_a_bag_without_commands_is_refused(tmp_path):
     del topics["/cmd_vel"]
     bag = bags.write(tmp_path / "bag", topics)
     with pytest.raises(RecordingError, match="has no cmd_vel"):
-        shadow(bag, MODEL, "go_to_goal", {})
+        shadow(bag, MODEL, "dynamic_window", {})
 
 
 def test_the_command_writes_a_table_a_picture_and_json(recorded, tmp_path):
     goal, bag, count = recorded
-    words = ["evaluate", "go_to_goal", "--shadow", str(bag), "--model", "ackermann"]
+    words = ["evaluate", "dynamic_window", "--shadow", str(bag), "--model", "ackermann"]
     words += [f"--goal={goal[0]},{goal[1]}", "--out", str(tmp_path / "out")]
     done = subprocess.run(
         [sys.executable, "-m", "nics_drl_bridge.commands.cli", *words],
@@ -156,6 +156,6 @@ def test_the_command_writes_a_table_a_picture_and_json(recorded, tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert f"compared at {count} times" in done.stdout
-    told = json.loads((tmp_path / "out" / "shadow_go_to_goal.json").read_text(encoding="utf-8"))
+    told = json.loads((tmp_path / "out" / "shadow_dynamic_window.json").read_text(encoding="utf-8"))
     assert told["commands"]["speed_command"]["greatest"] < 1e-4
-    assert (tmp_path / "out" / "shadow_go_to_goal.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "out" / "shadow_dynamic_window.png").read_bytes().startswith(b"\x89PNG")

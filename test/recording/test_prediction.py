@@ -6,7 +6,8 @@ from robots import DIRECT
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.recording.excite import expected_motion
-from nics_drl_bridge.recording.textbook import integrate, textbook
+from nics_drl_bridge.recording.textbook import integrate
+from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import load_robot
 
 PERIOD_S = 0.05

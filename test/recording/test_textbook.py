@@ -6,7 +6,8 @@ from scipy.integrate import solve_ivp
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.recording.textbook import integrate, record, textbook
+from nics_drl_bridge.recording.textbook import integrate, record
+from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import load_robot
 
 ROBOTS = ("ackermann", "differential", "mecanum")

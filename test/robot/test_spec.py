@@ -5,7 +5,8 @@ import pytest
 
 from nics_drl_bridge.config import validate
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.robot.spec import RobotSpec, load_robot, require_textbook
+from nics_drl_bridge.robot.kinds import require_textbook
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 ROBOTS = ("ackermann", "differential", "mecanum")
 

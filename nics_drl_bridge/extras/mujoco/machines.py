@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.extras.mujoco import machine
 from nics_drl_bridge.extras.mujoco.machine import Machine, Motor, Physics
-from nics_drl_bridge.robot.spec import RobotSpec, require_textbook
-from nics_drl_bridge.robot.urdf import car_wheels
+from nics_drl_bridge.robot.ackermann import track_and_radius
+from nics_drl_bridge.robot.kinds import require_textbook
+from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 Parameters = dict[str, float]
@@ -32,9 +33,15 @@ def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
     Ackermann robot are used if the spec has them.
 
     Raises:
-        ConfigError: the spec names no textbook kinematics, or lacks a parameter.
+        ConfigError: the spec names no textbook kinematics or a kind without a machine, or lacks a
+            parameter.
     """
     kind = require_textbook(spec)
+    if kind not in _BUILDERS:
+        raise ConfigError(
+            f"robot {spec.name!r}: MuJoCo has no machine of the kind {kind!r}; take one of "
+            f"{', '.join(_BUILDERS)}, or the fast simulator."
+        )
     try:
         return _BUILDERS[kind](spec.parameters, greatest_step(spec), physics or Physics())
     except KeyError as error:
@@ -46,7 +53,7 @@ def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
 
 def greatest_step(spec: RobotSpec) -> float:
     """Maximum step of a speed that commands within their limits can request [m/s]."""
-    return max(c.max - c.min for c in spec.command if c.cmd_vel != "angular.z")
+    return max(c.max - c.min for c in spec.command if not c.turns)
 
 
 def ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
@@ -56,7 +63,7 @@ def ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
     tendon that averages their speeds, which shares its torque as a differential does.
     """
     wheelbase = p["wheelbase"]
-    track, radius = car_wheels(p)
+    track, radius = track_and_radius(p)
     total = physics.mass + 4 * physics.wheel_mass
     engine = machine.motor(
         (total + 2 * physics.wheel_mass) * radius**2, p["speed_lag"], radius, step, physics

@@ -18,7 +18,7 @@ from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.extras.mujoco.machine import Machine, Physics, load_mujoco
 from nics_drl_bridge.extras.mujoco.machines import build_machine
 from nics_drl_bridge.recording.recording import Recording, Stream
-from nics_drl_bridge.recording.textbook import textbook
+from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from nics_drl_bridge.extras.mujoco.machine import Physics, load_mujoco
 from nics_drl_bridge.extras.mujoco.machines import build_machine, roller_size
 from nics_drl_bridge.extras.mujoco.rig import MujocoRobot, Reading, record
 from nics_drl_bridge.recording.recording import check
-from nics_drl_bridge.recording.textbook import textbook
+from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 NAMES = ("ackermann", "differential", "mecanum")

@@ -1,4 +1,4 @@
-"""A dynamic-window planner: the best twist for the next moments."""
+"""Planners, policies that need no training: a dynamic window, the best twist for a moment."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
+from nics_drl_bridge.robot.kinds import steady_twist
 
 Array = NDArray[np.float64]
-DEFAULT_WHEELBASE = 0.2
-LAGS = ("speed_lag", "steering_lag", "wheel_lag")
 
 
 @dataclass(frozen=True)
@@ -25,7 +24,8 @@ class DynamicWindow:
     Tries the twists that the commands allow and that the robot can reach from its present one in a
     period; each is held for the look-ahead. A twist with a contact before the robot could stop is
     inadmissible; the best of the others in distance, aim, clearance and time to contact is chosen.
-    It plans no path: behind a long wall it stays.
+    It plans no path: behind a long wall it stays. Which twist a command leads to follows from the
+    robot's kind and parameters.
 
     Attributes:
         task: defines observations and actions.
@@ -33,6 +33,9 @@ class DynamicWindow:
         period: between commands [s].
         steps: of the look-ahead, each a period and a half long.
         weights: of gap to the goal [1/m], aim, clearance, and time until a contact.
+
+    Raises:
+        ConfigError: it is not known where the robot's commands lead, see `steady_twist`.
     """
 
     task: Navigation
@@ -40,6 +43,9 @@ class DynamicWindow:
     period: float = 0.1
     steps: int = 10
     weights: tuple[float, float, float, float] = (1.0, 0.6, 0.3, 1.5)
+
+    def __post_init__(self) -> None:
+        _ = self._twists
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Returns the action (C,) for an observation (O,); or (N, C) for (N, O)."""
@@ -50,25 +56,26 @@ class DynamicWindow:
         kernels.choose_all(
             chosen, np.ascontiguousarray(seen[:, :parts]), goals,
             np.ascontiguousarray(seen[:, parts + 3 : parts + 6]),
-            self._twists, self._sight, self._body, np.array(self.weights),
+            self._twists, self._rays, self._ahead, kernels.TwistWeights(*self.weights),
         )  # fmt: skip
         return self._actions[chosen[0] if observation.ndim == 1 else chosen]
 
     @cached_property
-    def _sight(self) -> tuple[Array, Array, float]:
+    def _rays(self) -> kernels.ScanRays:
         sight = self.task.sight
         directions = np.stack([np.cos(sight.angles), np.sin(sight.angles)], axis=-1)
-        return directions, sight.origin, float(sight.range_max)
+        return kernels.ScanRays(directions, sight.origin, float(sight.range_max))
 
     @cached_property
-    def _body(self) -> tuple[Array, float, float, int, float]:
-        """The kernel's argument `body`."""
+    def _ahead(self) -> kernels.LookAhead:
         robot = self.task.robot
-        lag = max((robot.parameters.get(name, 0.0) for name in LAGS), default=0.0)
+        lags = [value for name, value in robot.parameters.items() if name.endswith("_lag")]
+        lag = max(lags, default=0.0)
         share = 1.0 - math.exp(-self.period / lag) if lag > 0.0 else 1.0
         reach = share * (self._twists.max(axis=0) - self._twists.min(axis=0)) + 1e-6
         radius = robot.footprint_radius + self.margin
-        return reach, radius, 1.5 * self.period, self.steps, 2.0 * self.period + lag
+        rest = 2.0 * self.period + lag
+        return kernels.LookAhead(reach, radius, 1.5 * self.period, self.steps, rest)
 
     @cached_property
     def _commands(self) -> Array:
@@ -90,9 +97,4 @@ class DynamicWindow:
     @cached_property
     def _twists(self) -> Array:
         """(K, 3) body twist of each command."""
-        robot = self.task.robot
-        twists = robot.to_cmd_vel(self._commands)
-        if any(one.cmd_vel == "angular.z" and one.unit == "rad" for one in robot.command):
-            wheelbase = robot.parameters.get("wheelbase", DEFAULT_WHEELBASE)
-            twists[:, 2] = twists[:, 0] * np.tan(twists[:, 2]) / wheelbase
-        return twists
+        return steady_twist(self.task.robot, self._commands)

@@ -1,15 +1,23 @@
+"""The planner, and the baselines beside it."""
+
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from gymnasium.wrappers import TimeLimit
 from robots import lidar
 
+from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.policy.evaluation import drive_all, successes
 from nics_drl_bridge.policy.evaluation_batch import drive_worlds
+from nics_drl_bridge.policy.planners import DynamicWindow
 from nics_drl_bridge.policy.policies import POLICIES, make_policy
-from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.robot.kinds import steady_twist
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 ROBOTS = ("ackermann", "differential", "mecanum")
 
@@ -89,3 +97,36 @@ def test_the_planner_reaches_most_goals_where_straight_ones_collide(robot):
     }
     assert share["dynamic_window"] >= 0.8
     assert share["dynamic_window"] > share["straight"] > share["random"]
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_planner_reaches_every_goal_of_the_empty_world(robot):
+    env = BridgeEnv(model=robot, world="empty")
+    policy = make_policy("dynamic_window", env.task)
+    assert successes(drive_all(TimeLimit(env, 300), policy, range(3))) == 3
+
+
+def car(**changes):
+    return RobotSpec.model_validate(load_robot("ackermann").model_dump() | changes)
+
+
+@pytest.mark.parametrize("changes", [{}, {"textbook": None}])
+def test_a_car_turns_by_its_own_wheelbase(changes):
+    long = car(parameters={"wheelbase": 2.5, "speed_lag": 0.1, "steering_lag": 0.1}, **changes)
+    speed, angle = long.command_high
+    twist = [speed, 0.0, speed * np.tan(angle) / 2.5]
+    assert steady_twist(long, long.command_high) == pytest.approx(twist)
+    planner = DynamicWindow(Navigation(long, lidar()))
+    assert np.abs(planner._twists).max(axis=0) == pytest.approx(np.abs(twist))
+
+
+def test_a_car_of_unknown_wheelbase_is_refused_and_none_assumed():
+    unknown = car(parameters={}, textbook=None)
+    with pytest.raises(ConfigError, match="'ackermann' steers, and its wheelbase is not known"):
+        make_policy("dynamic_window", Navigation(unknown, lidar()))
+
+
+def test_an_unknown_policy_gives_the_nearest():
+    sentence = "unknown policy 'dynamic_widow'; did you mean 'dynamic_window'"
+    with pytest.raises(ConfigError, match=sentence):
+        make_policy("dynamic_widow", task_of("ackermann"))

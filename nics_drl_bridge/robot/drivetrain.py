@@ -1,0 +1,116 @@
+"""Drive trains of which textbook kinematics are made: wheels on a base, and a steered axle.
+
+Commands are identified by their field of `cmd_vel`, speed and steering angle in the state by their
+units. An actuator is of first order (parameters `wheel_lag`, `speed_lag`, `steering_lag` [s]) or
+rate-limited (`wheel_rate`, `speed_rate`, `steering_rate` [its unit/s]).
+
+Siegwart, Nourbakhsh, Scaramuzza: Introduction to Autonomous Mobile Robots, ch. 3; the paper's
+reference for Table I.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.robot.kinds import Textbook
+from nics_drl_bridge.robot.spec import POSE_RATES, CmdVelField, RobotSpec, StateVariable
+
+Array = NDArray[np.float64]
+STEERED: tuple[CmdVelField, ...] = ("linear.x", "angular.z")
+
+
+def steered(spec: RobotSpec, twist: Callable[[Array, Array], Array]) -> Textbook:
+    """Builds the kinematics of a robot that is driven by a speed and a steering angle.
+
+    Its state and its commands are both of these, in any order; its turn rate is, up to the second
+    order, a multiple of their product, and its speed one of the speed.
+
+    Args:
+        spec: the robot.
+        twist: gives the body twist (..., 3) for speeds [m/s] and steering angles [rad] (...).
+    """
+    v, phi = _states(spec, ("m/s", "rad"))
+    command, order = _commands(spec, STEERED), np.argsort([v, phi])
+    names = [spec.state[i].name for i in (v, phi)]
+    lag, rate = _actuators(spec.parameters, ("speed", "steering"))
+    return Textbook(
+        twist=lambda state: twist(state[..., v], state[..., phi]),
+        target=lambda given: given[..., command][..., order],
+        lag=lag[order],
+        rate=rate[order],
+        structure={"vx": (names[0],), "vy": (), "wz": ("*".join(names),)},
+    )
+
+
+def steering_angle(spec: RobotSpec) -> StateVariable:
+    """Returns the state variable of the steering angle of a robot that is `steered`."""
+    return spec.state[_states(spec, ("m/s", "rad"))[1]]
+
+
+def wheeled(
+    spec: RobotSpec,
+    inverse: Array,
+    forward: Array,
+    fields: tuple[CmdVelField, ...],
+    moves: tuple[str, ...],
+) -> Textbook:
+    """Builds the kinematics of a robot whose twist is linear in its wheel speeds.
+
+    Args:
+        spec: the robot; its state is the wheel speeds.
+        inverse: (S, C) wheel speeds per command, in the order of `fields`.
+        forward: (3, S) body twist per wheel speed.
+        fields: of `cmd_vel`.
+        moves: the degrees of freedom that the wheels can move.
+    """
+    if len(spec.state) != len(inverse):
+        raise ConfigError(
+            f"robot {spec.name!r}: the {spec.textbook} kinematics have {len(inverse)} wheels as "
+            f"state, not {len(spec.state)} variables; correct `state:`."
+        )
+    command = _commands(spec, fields)
+    names = tuple(v.name for v in spec.state)
+    lag, rate = _actuators(spec.parameters, ("wheel",) * len(inverse))
+    return Textbook(
+        twist=lambda state: state @ forward.T,
+        target=lambda given: given[..., command] @ inverse.T,
+        lag=lag,
+        rate=rate,
+        structure={dof: names if dof in moves else () for dof in POSE_RATES},
+    )
+
+
+def _commands(spec: RobotSpec, fields: tuple[CmdVelField, ...]) -> list[int]:
+    """Returns the indices of the commands for fields of `cmd_vel`; in order if they name none."""
+    have = [c.cmd_vel for c in spec.command]
+    if not any(have):
+        return list(range(len(have)))
+    missing = [field for field in fields if field not in have]
+    if missing:
+        raise ConfigError(
+            f"robot {spec.name!r}: the {spec.textbook} kinematics need a command with "
+            f"`cmd_vel: {missing[0]}`; add it."
+        )
+    return [have.index(field) for field in fields]
+
+
+def _states(spec: RobotSpec, units: tuple[str, ...]) -> list[int]:
+    """Returns the indices of the state variables with the given units."""
+    have = [v.unit for v in spec.state]
+    if sorted(have) != sorted(units):
+        raise ConfigError(
+            f"robot {spec.name!r}: the {spec.textbook} kinematics need a state in "
+            f"{' and '.join(units)}, not in {', '.join(have) or 'nothing'}; correct `state:`."
+        )
+    return [have.index(unit) for unit in units]
+
+
+def _actuators(p: dict[str, float], parts: tuple[str, ...]) -> tuple[Array, Array]:
+    """Returns time constants and greatest rates (S,) of actuators, by parameter names."""
+    rate = np.array([p.get(f"{part}_rate", np.inf) for part in parts])
+    lag = [p[f"{part}_lag"] if f"{part}_rate" not in p else 1.0 for part in parts]
+    return np.array(lag), rate

@@ -1,0 +1,171 @@
+"""Kinds of robots: textbook kinematics and a drawing for each, found by name, see `registry`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.robot.registry import find_kind, kind_names
+from nics_drl_bridge.robot.spec import RobotSpec, StateVariable
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Textbook:
+    """Textbook kinematics of a robot.
+
+    Attributes:
+        twist: gives the body twist (..., 3) for a state (..., S).
+        target: gives the state (..., S) that a command (..., C) requests.
+        lag: (S,) time constants of first-order actuators [s]; unused for rate-limited ones.
+        rate: (S,) greatest rates of the state of rate-limited actuators [its unit/s]; inf for
+            first-order ones.
+        structure: possible products of state variables in each degree of freedom of the twist, up
+            to the second order.
+    """
+
+    twist: Callable[[Array], Array]
+    target: Callable[[Array], Array]
+    lag: Array
+    rate: Array
+    structure: dict[str, tuple[str, ...]]
+
+    def respond(self, state: Array, goal: Array, t: Array | float) -> Array:
+        """Returns the exact state (..., S) at time t [s] on its way from `state` to `goal`."""
+        gap = state - goal
+        ramp = np.sign(gap) * np.maximum(np.abs(gap) - np.where(self.limited, self.rate, 0) * t, 0)
+        return goal + np.where(self.limited, ramp, gap * np.exp(-t / self.lag))
+
+    @property
+    def limited(self) -> NDArray[np.bool_]:
+        """Mask (S,) of the rate-limited actuators."""
+        return np.isfinite(self.rate)
+
+
+@dataclass(frozen=True)
+class Pivot:
+    """A vertical axis about which a wheel is steered.
+
+    Attributes:
+        link: name of the link that carries the wheel.
+        joint: name of its joint; another one than the variable's follows the variable's joint.
+        angle: state variable of the steering angle [rad].
+    """
+
+    link: str
+    joint: str
+    angle: StateVariable
+
+
+@dataclass(frozen=True)
+class Wheel:
+    """A wheel of a drawing; it stands on the ground.
+
+    Attributes:
+        name: of its joint.
+        place: x, y of its centre in `base_link` [m].
+        radius: [m].
+        turns: True if its joint turns, as the state variable of that name tells.
+        pivot: by which it is steered; None for a wheel that is not.
+    """
+
+    name: str
+    place: tuple[float, float]
+    radius: float
+    turns: bool = False
+    pivot: Pivot | None = None
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Looks of a robot.
+
+    Attributes:
+        body: length and width of a box, or radius of a cylinder [m].
+        centre: x and height of the body's centre above `base_link` [m].
+        wheels: in the order in which they are drawn.
+    """
+
+    body: tuple[float, float] | float
+    centre: tuple[float, float]
+    wheels: tuple[Wheel, ...]
+
+
+@dataclass(frozen=True)
+class RobotKind:
+    """A kind of robot. Both functions raise KeyError for a parameter that the spec lacks.
+
+    Attributes:
+        kinematics: gives the textbook kinematics of a robot.
+        drawing: gives the looks of a robot.
+    """
+
+    kinematics: Callable[[RobotSpec], Textbook]
+    drawing: Callable[[RobotSpec], Drawing]
+
+
+def textbook(spec: RobotSpec) -> Textbook:
+    """Returns the textbook kinematics of a robot, with the parameters of its spec.
+
+    Raises:
+        ConfigError: the spec names none, lacks a parameter, or has other variables.
+    """
+    return _made(spec, _kind_of(spec).kinematics)
+
+
+def drawing(spec: RobotSpec) -> Drawing:
+    """Returns the looks of a robot. Raises ConfigError as `textbook` does."""
+    return _made(spec, _kind_of(spec).drawing)
+
+
+def _kind_of(spec: RobotSpec) -> RobotKind:
+    kind: RobotKind | None = find_kind(require_textbook(spec))
+    if kind is None:
+        raise ConfigError(
+            f"robot {spec.name!r}: `textbook:` must be one of {', '.join(kind_names())}, not "
+            f"{spec.textbook!r}."
+        )
+    return kind
+
+
+def _made(spec: RobotSpec, make: Callable[[RobotSpec], T]) -> T:
+    try:
+        return make(spec)
+    except KeyError as error:
+        raise ConfigError(
+            f"robot {spec.name!r}: the {spec.textbook} kinematics need the parameter {error}; add "
+            "it under `parameters:`."
+        ) from None
+
+
+def require_textbook(spec: RobotSpec) -> str:
+    """Returns the name of a robot's kind. Raises ConfigError if it names none."""
+    if spec.textbook is None:
+        raise ConfigError(
+            f"robot {spec.name!r} names no textbook kinematics; add `textbook:` to its YAML file "
+            "or give a recording."
+        )
+    return spec.textbook
+
+
+def steady_twist(spec: RobotSpec, command: ArrayLike) -> Array:
+    """Returns the body twist (..., 3) to which commands (..., C) lead when they are held.
+
+    Raises:
+        ConfigError: the robot steers, and neither its textbook kinematics nor its wheelbase is
+            known.
+    """
+    if spec.steers and spec.textbook is not None:
+        book = textbook(spec)
+        return book.twist(book.target(np.asarray(command, dtype=np.float64)))
+    twist = spec.to_cmd_vel(command)
+    if spec.steers:
+        twist[..., 2] = twist[..., 0] * np.tan(twist[..., 2]) / spec.wheelbase
+    return twist

@@ -1,0 +1,169 @@
+"""A kind of robot is one file and its YAML; everything else asks the spec for facts."""
+
+from __future__ import annotations
+
+import ast
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from robots import lidar
+
+from nics_drl_bridge import extensions
+from nics_drl_bridge.config import validate
+from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.gate.limits import load_limits
+from nics_drl_bridge.generator import generate
+from nics_drl_bridge.policy.policies import make_policy
+from nics_drl_bridge.recording.textbook import integrate, record
+from nics_drl_bridge.robot.kinds import find_kind, kind_names, steady_twist, textbook
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
+from nics_drl_bridge.robot.urdf import urdf_of
+
+PACKAGE = Path(__file__).resolve().parents[2] / "nics_drl_bridge"
+NEW = "tricycle"
+SHIPPED = ("ackermann", "differential", "mecanum", NEW)
+
+
+def test_the_kinds_are_the_modules_that_define_one():
+    assert kind_names() == sorted(SHIPPED)
+    assert find_kind("spec") is find_kind("a tank") is find_kind("..") is None
+
+
+def test_no_other_file_of_the_package_names_the_newest_kind():
+    naming = {path for path in PACKAGE.rglob("*.py") if NEW in path.read_text(encoding="utf-8")}
+    assert naming == {PACKAGE / "robot" / f"{NEW}.py"}
+
+
+def comparisons(path):
+    """Comparisons with a field of cmd_vel, by line."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Compare):
+            words = {each.value for each in ast.walk(node) if isinstance(each, ast.Constant)}
+            if words & {"linear.x", "linear.y", "angular.z"}:
+                yield f"{path.relative_to(PACKAGE)}:{node.lineno}"
+
+
+def test_nobody_but_the_spec_asks_for_a_field_of_cmd_vel():
+    found = [place for path in sorted(PACKAGE.rglob("*.py")) for place in comparisons(path)]
+    assert found
+    assert all(place.startswith("robot/spec.py:") for place in found), found
+
+
+@pytest.mark.parametrize(
+    ("name", "steers", "moves_sideways", "turns"),
+    [
+        ("ackermann", True, False, [False, True]),
+        ("differential", False, False, [False, True]),
+        ("mecanum", False, True, [False, False, True]),
+        (NEW, True, False, [False, True]),
+    ],
+)
+def test_the_spec_tells_what_its_commands_mean(name, steers, moves_sideways, turns):
+    robot = load_robot(name)
+    assert (robot.steers, robot.moves_sideways) == (steers, moves_sideways)
+    assert [command.turns for command in robot.command] == turns
+    assert all(command.is_twist for command in robot.command) == (not steers)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_held_command_leads_to_its_steady_twist(name):
+    robot = load_robot(name)
+    book, command = textbook(robot), 0.6 * robot.command_high
+    _, state = integrate(book, np.zeros(3), np.zeros(len(robot.state)), command, 5.0)
+    assert steady_twist(robot, command) == pytest.approx(book.twist(state), abs=1e-9)
+
+
+def test_a_front_wheel_across_turns_a_tricycle_about_its_rear_axle():
+    book = textbook(load_robot(NEW))
+    assert book.twist(np.array([0.6, np.pi / 2])) == pytest.approx([0.0, 0.0, 0.6 / 0.3])
+    assert book.twist(np.array([0.6, 0.0])) == pytest.approx([0.6, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def model():
+    """The tricycle, generated from a drive of its own."""
+    robot = load_robot(NEW)
+    return generate(record(robot, np.random.default_rng(0)), robot, lidar(), ())[0]
+
+
+def test_it_records_and_its_model_moves_as_it_does(model):
+    robot = model.robot
+    drive = record(robot, np.random.default_rng(1), duration=20.0)
+    x = np.concatenate([drive.state.values, drive.command.values], axis=1)
+    twist, found = textbook(robot).twist(drive.state.values), model.kinematics.rates(x)[:, :3]
+    off, size = (np.sqrt((each**2).mean(axis=0)) for each in (found - twist, twist))
+    assert (off <= 0.1 * size).all()  # cosine and sine of the steering, to the second order
+
+
+@pytest.mark.parametrize("options", [{}, {"actions": "discrete"}])
+def test_it_drives_in_an_env(model, options):
+    env = BridgeEnv(model=model, world="arena", task_options=options)
+    env.reset(seed=0)
+    for _ in range(20):
+        observation, *_, info = env.step(env.action_space.sample())
+    assert env.observation_space.contains(observation)
+    assert np.isfinite(info["true_pose"]).all()
+
+
+def test_it_reaches_goals_by_the_planner(model):
+    env = BridgeEnv(model=model, world="empty")
+    policy = make_policy("dynamic_window", env.task)
+    for seed in range(3):
+        observation, info, ended = *env.reset(seed=seed), False
+        for _ in range(200):
+            observation, _, ended, _, info = env.step(policy.act(observation))
+            if ended:
+                break
+        assert info["is_success"]
+
+
+def test_it_has_limits_and_is_drawn_on_three_wheels():
+    robot = load_robot(NEW)
+    assert load_limits(NEW, robot).linear.tolist() == [True, False]
+    root = ElementTree.fromstring(urdf_of(robot))
+    wheels = [link.attrib["name"] for link in root.iter("link") if "wheel" in link.attrib["name"]]
+    assert wheels == ["rear_left_wheel_link", "rear_right_wheel_link", "front_wheel_link"]
+    (steering,) = [j for j in root.iter("joint") if j.attrib["type"] == "revolute"]
+    assert steering.attrib["name"] == "steering"
+    assert steering.find("mimic") is None
+
+
+def test_mujoco_says_that_it_has_no_machine_of_it():
+    from nics_drl_bridge.extras.mujoco.machines import build_machine
+
+    with pytest.raises(ConfigError, match="'tricycle': MuJoCo has no machine of the kind 'tricycl"):
+        build_machine(load_robot(NEW))
+
+
+def test_another_package_adds_a_kind_by_an_entry_point(monkeypatch):
+    points = {"tank": EntryPoint("tank", f"nics_drl_bridge.robot.{NEW}:KIND", "")}
+    monkeypatch.setattr(extensions, "known", lambda group: points if group == "kinds" else {})
+    robot = RobotSpec.model_validate(load_robot(NEW).model_dump() | {"textbook": "tank"})
+    assert textbook(robot).twist(np.array([1.0, 0.0])) == pytest.approx([1.0, 0.0, 0.0])
+    assert "tank" in kind_names()
+
+
+def test_an_unknown_kind_is_refused_with_all_that_there_are():
+    data = load_robot(NEW).model_dump() | {"textbook": "tank"}
+    with pytest.raises(ConfigError) as caught:
+        validate(data, RobotSpec, "tank.yaml")
+    known = ", ".join(sorted(SHIPPED))
+    assert str(caught.value) == f"tank.yaml: key 'textbook': must be one of {known}, not 'tank'."
+
+
+def textbook_and_drawing(robot):
+    return textbook(robot), urdf_of(robot)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_parameter_that_is_missing_is_named(name):
+    robot = load_robot(name)
+    for parameter in robot.parameters:
+        left = {key: value for key, value in robot.parameters.items() if key != parameter}
+        spoilt = robot.model_copy(update={"parameters": left})
+        with pytest.raises(ConfigError, match=f"need the parameter '{parameter}'; add it under"):
+            textbook_and_drawing(spoilt)
