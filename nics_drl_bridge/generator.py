@@ -98,7 +98,7 @@ class SimulatorModel:
                 f"{self.robot.name!r} needs {self.robot.dof_names}; generate the model anew."
             )
         substeps = self.control_period / self.kinematics.dt
-        if round(substeps) < 1 or abs(substeps - round(substeps)) > 1e-6:
+        if not 0.5 < substeps < np.inf or abs(substeps - round(substeps)) > 1e-6:
             raise ModelError(
                 f"control_period {self.control_period} s is no multiple of the model's step "
                 f"{self.kinematics.dt} s; change one of them."

@@ -282,7 +282,7 @@ def test_kinematics_of_another_robot_are_refused():
         replace(car, kinematics=mecanum.kinematics)
 
 
-@pytest.mark.parametrize("period", [0.015, 0.001, 0.1001])
+@pytest.mark.parametrize("period", [0.015, 0.001, 0.1001, 1e308])
 def test_a_control_period_that_is_no_multiple_of_the_step_is_refused(period):
     with pytest.raises(ModelError, match="is no multiple of the model's step"):
         replace(direct_model(), control_period=period)

@@ -279,7 +279,8 @@ def accepted(artefact: Artefact, flips: int, rng: np.random.Generator, folder: P
         damaged[int(rng.integers(len(whole)))] ^= 1 << int(rng.integers(8))
         file.write_bytes(damaged)
         try:
-            artefact.version(path)
+            with contextlib.suppress(ValueError):  # read, but as no version that was written
+                artefact.version(path)
             good += 1
         except BridgeError:
             pass
