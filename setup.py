@@ -33,7 +33,7 @@ EXTRAS = {
         f"{wheel}; {ROS_WHEELS_EXIST}"
         for wheel in ("ros-rclpy", "ros-common-interfaces", "ros-rmw-fastrtps-cpp")
     ],
-    "bags": ["rosbags>=0.11,<0.12"],
+    "bags": ["mcap>=1.3,<2", "rosbags>=0.11,<0.12"],
     "mujoco": ["mujoco>=3.3"],
     "multi": ["pettingzoo>=1.25,<1.28"],
     # Before 2.6, torch.load unpickles whatever a file says unless told not to, and its reader of

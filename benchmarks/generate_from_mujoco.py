@@ -21,6 +21,7 @@ from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.extras.mujoco.rig import MujocoRobot, record
+from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.open_loop import open_loop_error
 from nics_drl_bridge.recording.recording import Recording
@@ -46,7 +47,8 @@ ROUNDS = 3
 def errors(found: Identified, drives: list[Recording], spec: RobotSpec) -> dict[str, float]:
     """Mean errors of the predictions on unseen drives, each as long as the others."""
     results = [
-        open_loop_error(found.model, found.calibration, d, spec, 0.0, d.pose.t[-1]) for d in drives
+        open_loop_error(found.model, found.calibration, Drive(d, spec), 0.0, d.pose.t[-1])
+        for d in drives
     ]
     shares = [f.mean_position_error_m / f.mean_path_m for f in results]
     path = float(np.mean([f.mean_path_m for f in results]))

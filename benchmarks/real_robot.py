@@ -18,6 +18,7 @@ import numpy as np
 from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.errors import BridgeError, RecordingError
+from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.open_loop import HORIZON_S, open_loop_error
 from nics_drl_bridge.recording.readers import read_recording
@@ -57,8 +58,9 @@ def under(
         coefficients = np.roll(coefficients, 1, axis=0)
     model = replace(found.model, coefficients=coefficients)
     held_out = open_loop_error(
-        model, found.calibration, recording, robot, found.train_until_s, float(recording.pose.t[-1])
-    )
+        model, found.calibration, Drive(recording, robot), found.train_until_s,
+        float(recording.pose.t[-1]),
+    )  # fmt: skip
     return replace(found, model=model, held_out=held_out)
 
 

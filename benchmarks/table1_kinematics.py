@@ -105,14 +105,14 @@ def rms(values: Array) -> Array:
 
 def batch(model: TaylorModel, dtype: type, robots: int, robot: Subject) -> tuple[Any, ...]:
     """Arguments of `kernels.run` for robots at the origin under random inputs."""
-    dof, coefficient, factors, count = kernels.term_arrays(model)
+    terms = kernels.term_arrays(model)
     rng = np.random.default_rng(3)
     x = np.ones((len(model.variables) + 1, robots), dtype)
     low, high = robot.spec.command_low, robot.spec.command_high
     x[:-1] = rng.uniform(low[:, None], high[:, None], (len(low), robots))
     pose = np.zeros((6, robots), dtype)
     pose[2] = 1.0
-    terms = (dof, coefficient.astype(dtype), factors, count)
+    terms = terms._replace(coefficient=terms.coefficient.astype(dtype))
     dq = np.zeros((len(model.dofs), robots), dtype)
     return pose, x, dq, terms, kernels.SERIES.astype(dtype), dtype(model.dt)
 

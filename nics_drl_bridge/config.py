@@ -8,8 +8,9 @@ from __future__ import annotations
 import re
 import reprlib
 from collections.abc import Iterator
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -59,10 +60,9 @@ def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> Schema
 def _taken_for_numbers(given: Any, found: Any, place: str = "") -> Iterator[tuple[str, Any]]:
     """Yields strings and booleans that pydantic coerced to numbers: `true` is no length."""
     pairs: list[tuple[Any, Any, Any]] = []
-    if isinstance(found, BaseModel) and isinstance(given, dict):
-        pairs = [(k, v, getattr(found, k)) for k, v in given.items() if hasattr(found, str(k))]
-    elif isinstance(found, dict) and isinstance(given, dict):
-        pairs = [(key, value, found[key]) for key, value in given.items() if key in found]
+    if isinstance(given, dict):
+        parts = found if isinstance(found, dict) else getattr(found, "__dict__", {})
+        pairs = [(key, value, parts[key]) for key, value in given.items() if key in parts]
     elif isinstance(found, (tuple, list)) and isinstance(given, (tuple, list)):
         pairs = [(k, *both) for k, both in enumerate(zip(given, found, strict=False))]
     elif isinstance(given, (str, bool)) and type(found) in (int, float):
@@ -71,6 +71,8 @@ def _taken_for_numbers(given: Any, found: Any, place: str = "") -> Iterator[tupl
         yield from _taken_for_numbers(value, made, f"{place}.{key}")
 
 
+_UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
+"""Errors of pydantic about an unknown key, of a model and of a dataclass."""
 _SHORT = reprlib.Repr()
 """Shortens a wrong value: one made of YAML aliases may not fit into memory in full."""
 _SHORT.maxstring = _SHORT.maxother = 80
@@ -78,9 +80,9 @@ _SHORT.maxstring = _SHORT.maxother = 80
 
 def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
     details = error.errors(include_url=False)
-    first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
+    first = next((d for d in details if d["type"] in _UNKNOWN), details[0])
     key = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden":
+    if first["type"] in _UNKNOWN:
         known = _fields_at(schema, first["loc"][:-1])
         hint = nearest(str(first["loc"][-1]), known) if known else "remove it"
         return f"unknown key {key!r}; {hint}"
@@ -104,25 +106,33 @@ def _fields_at(schema: type[BaseModel], location: tuple[int | str, ...]) -> list
     In a union of models, the location names the `kind` of the one that is present.
     """
     current: Any = schema
-    candidates: list[type[BaseModel]] = []
+    candidates: list[type] = []
     for part in location:
-        fields = getattr(current, "model_fields", {})
+        fields = _annotations_of(current)
         if part in fields:
-            candidates = _inner_models(fields[part].annotation)
+            candidates = _inner_models(fields[part])
             current = candidates[0] if candidates else None
         else:
             kinds = [c for c in candidates if _kind_of(c) == part]
             current = kinds[0] if kinds else current
-    return list(getattr(current, "model_fields", {}))
+    return list(_annotations_of(current))
 
 
-def _kind_of(model: type[BaseModel]) -> Any:
-    kind = model.model_fields.get("kind")
+def _annotations_of(model: Any) -> dict[Any, Any]:
+    """Types of the fields of a model or dataclass; empty for any other type."""
+    if is_dataclass(model):
+        return dict(get_type_hints(model))
+    fields: dict[str, Any] = getattr(model, "model_fields", {})
+    return {name: field.annotation for name, field in fields.items()}
+
+
+def _kind_of(model: type) -> Any:
+    kind = getattr(model, "model_fields", {}).get("kind")
     return None if kind is None else kind.default
 
 
-def _inner_models(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+def _inner_models(annotation: Any) -> list[type]:
+    if _annotations_of(annotation):
         return [annotation]
     return [
         model

@@ -12,7 +12,13 @@ from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
 
 PACKAGE = "nics_drl_bridge"
 ROS = ("rclpy", "_msgs", "std_srvs", "builtin_interfaces")
-INSTALL = {"mujoco": "mujoco", "ray": "train,distributed", "rosbags": "bags", "torch": "train"}
+INSTALL = {
+    "mcap": "bags",
+    "mujoco": "mujoco",
+    "ray": "train,distributed",
+    "rosbags": "bags",
+    "torch": "train",
+}
 """Libraries, and the extra of this package that brings each."""
 
 

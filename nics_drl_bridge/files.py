@@ -1,4 +1,7 @@
-"""Atomic writes: a reader finds either the old file or the new one, complete."""
+"""Atomic writes and checksums.
+
+A reader finds either the old file or the new one, complete, and notices any damage to it.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,12 @@ import hashlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import ConfigError, ModelError
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
@@ -163,13 +166,26 @@ def sync_folder(folder: Path) -> None:
         _fsync(file)
 
 
+SUMS = "SHA256SUMS"
+"""Manifest of a folder, which `sha256sum -c SHA256SUMS` checks as well."""
+MOST_BYTES = 256 * 2**20
+"""Greatest size of a file of arrays: a day of driving, or the table of a thousand shapes."""
+_SEAL = b"sha256 "
+_PART = 2**20
+
+
 def sha256(data: bytes) -> str:
     """The SHA-256 of some bytes, in hexadecimal."""
     return hashlib.sha256(data).hexdigest()
 
 
-_SEAL = b"sha256 "
-_PART = 2**20
+def _sha256_of(file: BinaryIO, size: int) -> str:
+    """The SHA-256 of the next `size` bytes of a file, which are never all in memory."""
+    digest = hashlib.sha256()
+    while size > 0 and (part := file.read(min(size, _PART))):
+        digest.update(part)
+        size -= len(part)
+    return digest.hexdigest()
 
 
 def sealed(data: bytes) -> bytes:
@@ -186,12 +202,74 @@ def check_sealed(file: BinaryIO) -> None:
     Raises:
         ValueError: the data have changed, or there is no checksum.
     """
-    left = file.seek(0, os.SEEK_END) - len(_SEAL) - 64
-    digest = hashlib.sha256()
+    size = file.seek(0, os.SEEK_END) - len(_SEAL) - 64
     file.seek(0)
-    while left > 0 and (part := file.read(min(left, _PART))):
-        digest.update(part)
-        left -= len(part)
-    if left or file.read() != _SEAL + digest.hexdigest().encode():
+    digest = _sha256_of(file, size)
+    if file.read() != _SEAL + digest.encode():
         raise ValueError("its checksum is missing or does not fit the rest")
     file.seek(0)
+
+
+def read_file(path: Path) -> bytes:
+    """The content of a file. Raises ValueError if it is larger than any file of arrays."""
+    if path.stat().st_size > MOST_BYTES:
+        raise ValueError(f"it is larger than {MOST_BYTES // 2**20} MB")
+    return path.read_bytes()
+
+
+def write_sums(folder: Path) -> None:
+    """Writes the SHA-256 of every file in a folder and below to its `SHA256SUMS`."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / SUMS)
+    write_parts(
+        folder / SUMS, [_line_of(folder, path.relative_to(folder).as_posix()) for path in files]
+    )
+
+
+def check_sums(folder: Path, names: Sequence[str], editable: str = "") -> None:
+    """Checks files against the `SHA256SUMS` of their folder.
+
+    Args:
+        folder: of a model or a lidar table.
+        names: every file that the manifest lists; other files in the folder are ignored.
+        editable: the name that needs no line, since a user may have removed it to edit the file.
+
+    Raises:
+        ModelError: a file is missing, too large or different from its line, or the manifest does
+            not list exactly these files.
+    """
+    with _opened(folder / SUMS) as file:
+        listed = file.readlines(_PART)
+    expected = {name: _line_of(folder, name) for name in names}
+    for name, line in expected.items():
+        free = name == editable
+        if line in listed or (free and not any(one.endswith(line[64:]) for one in listed)):
+            continue
+        own = f"if you changed it yourself, remove its line from {SUMS}, otherwise " if free else ""
+        raise ModelError(
+            f"{folder / name}: does not match its checksum in {SUMS}; {own}generate the model anew."
+        )
+    for line in listed:
+        if line not in expected.values():
+            raise ModelError(
+                f"{folder / SUMS}: the line {line.decode(errors='replace')!r} is of no file of a "
+                "model; remove it."
+            )
+
+
+def _line_of(folder: Path, name: str) -> bytes:
+    """The line of a file in `SHA256SUMS`."""
+    with _opened(folder / name) as file:
+        return f"{_sha256_of(file, MOST_BYTES)}  {name}\n".encode()
+
+
+def _opened(path: Path) -> BinaryIO:
+    """Opens a file of a model. Raises ModelError for what is missing, no file, or too large."""
+    reason = "missing, or no file"
+    try:
+        if path.is_file():
+            reason = f"larger than {MOST_BYTES // 2**20} MB"
+            if path.stat().st_size <= MOST_BYTES:
+                return path.open("rb")
+    except OSError as error:
+        reason = f"not readable ({error.strerror})"
+    raise ModelError(f"{path}: is {reason}; generate the model anew.")

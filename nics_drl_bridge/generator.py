@@ -3,31 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import Field
 
 from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError, FitError, ModelError
-from nics_drl_bridge.files import check_folder, sha256, whole_folder, write_bytes, write_text
+from nics_drl_bridge.files import (
+    SUMS,
+    check_folder,
+    check_sums,
+    sha256,
+    whole_folder,
+    write_sums,
+    write_text,
+)
 from nics_drl_bridge.identify import fit
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.report import fit_report
-from nics_drl_bridge.identify.usefulness import why_useless
+from nics_drl_bridge.identify.verdict import why_useless
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
-from nics_drl_bridge.lidar.table import LidarTable
+from nics_drl_bridge.lidar.table import TABLE_FILES, LidarTable
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.noise import Latency, Noise
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
-from nics_drl_bridge.robot.taylor import TaylorModel
+from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
 
 __all__ = [
     "Noise",
@@ -40,8 +47,14 @@ __all__ = [
     "save_model",
 ]
 
-FORMAT = "nics_drl_bridge/simulator_model/3"
-MODEL_FILE, TABLE_FILE, REPORT_FILE = "model.yaml", "lidar_table.npz", "report.txt"
+FORMAT = "nics_drl_bridge/simulator_model/4"
+MODEL_FILE, TABLE_FOLDER, REPORT_FILE = "model.yaml", "lidar_table", "report.txt"
+MODEL_FILES = (
+    MODEL_FILE,
+    REPORT_FILE,
+    *(f"{TABLE_FOLDER}/{name}" for name in (SUMS, *TABLE_FILES)),
+)
+"""The files of a model, in addition to its manifest."""
 CONTROL_PERIOD_S = 0.1
 DEFAULT_LIDAR = "paper"
 BUILTIN_SEED = 0
@@ -101,7 +114,6 @@ class SimulatorModel:
     @cached_property
     def text(self) -> str:
         """The content of `model.yaml`."""
-        table = self.table.dump()
         measured = (
             {"latency": self.latency.model_dump(mode="json")} if self.latency.measured else {}
         )
@@ -110,19 +122,18 @@ class SimulatorModel:
                 "format": FORMAT,
                 "control_period": self.control_period,
                 "robot": self.robot.model_dump(mode="json"),
-                "kinematics": self.kinematics.to_dict(),
-                "calibration": self.calibration.to_dict(),
+                "kinematics": self.kinematics.named.model_dump(exclude_none=True),
+                "calibration": asdict(self.calibration),
                 "lidar": self.lidar.model_dump(mode="json"),
                 "noise": self.noise.model_dump(mode="json"),
                 **measured,
-                "lidar_table_sha256": sha256(table),
             }
         )
 
     @property
     def fingerprint(self) -> str:
-        """Identifies the model: the first 16 digits of the SHA-256 of `text`."""
-        return sha256(self.text.encode())[:16]
+        """Identifies the model: 16 digits of the SHA-256 of `text` and of the table's."""
+        return sha256(f"{self.text}{self.table.fingerprint}".encode())[:16]
 
 
 class _File(Schema):
@@ -131,14 +142,11 @@ class _File(Schema):
     format: str
     control_period: float = Field(gt=0.0)
     robot: RobotSpec
-    kinematics: dict[str, Any]
-    calibration: dict[str, Any]
+    kinematics: NamedTaylorModel
+    calibration: Calibration
     lidar: LidarSpec
     noise: Noise
     latency: Latency = Field(default_factory=Latency)
-    lidar_table_sha256: str
-    report_sha256: str
-    sha256: str | None = None
 
 
 def generate(
@@ -232,15 +240,10 @@ def save_model(model: SimulatorModel, folder: str | Path) -> None:
         ConfigError: the folder contains something else.
     """
     with whole_folder(folder, MODEL_FILE) as temporary:
-        text = f"{model.text}report_sha256: {sha256(model.report.encode())}\n"
-        write_text(temporary / MODEL_FILE, f"{text}{_seal(text)}")
-        write_bytes(temporary / TABLE_FILE, model.table.dump())
+        write_text(temporary / MODEL_FILE, model.text)
         write_text(temporary / REPORT_FILE, model.report)
-
-
-def _seal(text: str) -> str:
-    """The last line of `model.yaml`, for the text before it."""
-    return f"sha256: {sha256(text.encode())}\n"
+        model.table.save(temporary / TABLE_FOLDER)
+        write_sums(temporary)
 
 
 def load_model(folder: str | Path) -> SimulatorModel:
@@ -253,37 +256,26 @@ def load_model(folder: str | Path) -> SimulatorModel:
     path = folder / MODEL_FILE
     if not path.is_file():
         raise ModelError(f"{folder}: holds no {MODEL_FILE}; make a model with `nics generate`.")
-    text = read_text(path)
-    data = parse_yaml(text, str(path))
+    inode = folder.stat().st_ino
+    data = parse_yaml(read_text(path), str(path))
     if data.get("format") != FORMAT:
         raise ModelError(
             f"{path}: key 'format' is {data.get('format')!r}, not {FORMAT!r}; generate the model "
             "anew."
         )
+    check_sums(folder, MODEL_FILES, editable=MODEL_FILE)
     file = validate(data, _File, str(path))
+    for key in fields(Calibration):  # its defaults are those of a robot that needs none
+        if key.name not in data["calibration"]:
+            raise ConfigError(f"{path}: the key 'calibration.{key.name}' is missing; add it.")
+    table = LidarTable.load(folder / TABLE_FOLDER, checked=True)
     report = read_text(folder / REPORT_FILE)
-    if sha256(report.encode()) != file.report_sha256:
-        raise ModelError(
-            f"{folder / REPORT_FILE}: does not match its checksum; generate the model anew."
-        )
-    table = LidarTable.load(folder / TABLE_FILE, file.lidar_table_sha256)
+    if folder.stat().st_ino != inode:
+        raise ModelError(f"{folder}: was replaced while it was read; open it again.")
     try:
-        model = SimulatorModel(
-            file.robot,
-            TaylorModel.from_dict(file.kinematics),
-            Calibration.from_dict(file.calibration),
-            file.lidar,
-            table,
-            file.noise,
-            file.control_period,
-            report,
-            file.latency,
-        )
+        return SimulatorModel(
+            file.robot, file.kinematics.model(), file.calibration, file.lidar, table, file.noise,
+            file.control_period, report, file.latency,
+        )  # fmt: skip
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from None
-    if file.sha256 is not None and text != (rest := text[: -len(_seal(""))]) + _seal(rest):
-        raise ModelError(
-            f"{path}: does not match its checksum; generate the model anew. If you changed the "
-            "file yourself, remove its line sha256."
-        )
-    return model

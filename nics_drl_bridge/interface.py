@@ -62,7 +62,7 @@ class Start:
 
 
 class BackendFacts(TypedDict, total=False):
-    """What a backend alone knows; what it does not know, it leaves out.
+    """Facts that a backend alone knows; those that it does not know are left out.
 
     Attributes:
         true_pose: (3,) x [m], y [m], heading [rad] in `map` now; (M, 3) of a team.

@@ -1,12 +1,12 @@
-"""`@kernel`, by which every function of the package is compiled, kept on disk, and kept up to date.
+"""`@kernel`: the one decorator by which functions are compiled, kept on disk, and kept up to date.
 
 numba keeps machine code beside the source and checks the file of the function itself. A kernel
 calls others and uses constants of others, so here the code is kept as long as nothing changed in
 any module of the package that its own module imports, directly or not. This is decided by content:
 an edit, an update and another branch compile what they must, and nothing else.
 
-Whoever waits is told: when compiling takes longer than `PATIENCE_S`, a line on standard error says
-how many kernels are compiled, and about how long that takes.
+When compiling takes longer than `PATIENCE_S`, a line on standard error says how many kernels are
+compiled, and about how long that takes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from typing import Any, overload
 
 import numba
 from numba.core import event
@@ -28,7 +28,6 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 PACKAGE = Path(__file__).parent
 PATIENCE_S = 2.0
-Function = TypeVar("Function", bound=Callable[..., Any])
 KERNELS: list[Any] = []
 """Every kernel that was imported so far, as numba's dispatchers."""
 _IMPORT = re.compile(
@@ -36,20 +35,21 @@ _IMPORT = re.compile(
     rf"|import[ \t]+({PACKAGE.name}[.\w]*))",
     re.MULTILINE,
 )
+_ALIAS = re.compile(r"\bas\s+\w+")
 
 
 @overload
-def kernel(function: Function) -> Function: ...
+def kernel(function: Callable[..., Any]) -> Any: ...
 
 
 @overload
 def kernel(
     *, allocates: bool = ..., contracts: bool = ..., inline: bool = ...
-) -> Callable[[Function], Function]: ...
+) -> Callable[[Callable[..., Any]], Any]: ...
 
 
 def kernel(
-    function: Any = None,
+    function: Callable[..., Any] | None = None,
     *,
     allocates: bool = False,
     contracts: bool = False,
@@ -68,19 +68,21 @@ def kernel(
     Returns:
         numba's dispatcher; without `function`, a decorator.
     """
-    if function is None:
-        return lambda later: kernel(later, allocates=allocates, contracts=contracts, inline=inline)
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
     options |= {} if allocates else {"_nrt": False}
     options |= {"fastmath": {"contract"}} if contracts else {}
     options |= {"forceinline": True} if inline else {}
-    compiled = numba.njit(**options)(function)
-    compiled._cache = _Cache(function)
-    KERNELS.append(compiled)
-    return compiled
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        dispatcher = numba.njit(**options)(function)
+        dispatcher._cache = _Cache(function)
+        KERNELS.append(dispatcher)
+        return dispatcher
+
+    return compiled if function is None else compiled(function)
 
 
-class _Cache(FunctionCache):
+class _Cache(FunctionCache):  # type: ignore[misc]
     """Machine code on disk, stamped with the content of all that it was compiled from."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -121,7 +123,7 @@ def imports_of(file: Path) -> tuple[Path, ...]:
     for origin, names, plain in _IMPORT.findall(_read(file)):
         module = (origin or plain).split(".")[1:]
         found.append(module)
-        found += [[*module, name] for name in re.findall(r"\w+", names)]
+        found += [[*module, name] for name in re.findall(r"\w+", _ALIAS.sub("", names))]
     places = (PACKAGE.joinpath(*parts).with_suffix(".py") for parts in found if parts)
     return tuple(place for place in places if place.is_file())
 

@@ -7,10 +7,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from stale_caches import remove_stale_caches
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGE = ROOT / "nics_drl_bridge"
 
 # rclpy's major version tells the distribution where no ROS 2 is sourced, as with wheels.
 DISTRIBUTIONS = {"3": "humble", "7": "jazzy", "9": "kilted"}
@@ -19,11 +17,6 @@ ASK_ROS = """
 import os, rclpy
 print(os.environ.get("ROS_DISTRO", ""), rclpy.get_rmw_implementation_identifier())
 """
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    if not hasattr(config, "workerinput"):  # once, and not in each worker of pytest-xdist
-        remove_stale_caches(PACKAGE)
 
 
 def pytest_report_header() -> str:

@@ -8,7 +8,8 @@ import numpy as np
 
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.sim import obstacle_kernels as kernels
-from nics_drl_bridge.sim.obstacles import MARK, NO_DISTANCES, plan_arrays
+from nics_drl_bridge.sim.obstacles import NO_DISTANCES, plan_arrays
+from nics_drl_bridge.sim.separation_kernels import MARK
 
 PERIOD = 0.1
 

@@ -37,7 +37,7 @@ OTHERS = {
     "stop.jsonl": replay,
     "topics.yaml": topic_roles,
     "drive.npz": load_recording,
-    "table.npz": LidarTable.load,
+    "lidar_table": LidarTable.load,
 }
 
 

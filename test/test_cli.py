@@ -17,7 +17,7 @@ from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.recording import save_recording
 from nics_drl_bridge.robot.spec import load_robot
 
-MODEL_FILES = {"model.yaml", "lidar_table.npz", "report.txt"}
+MODEL_FILES = {"model.yaml", "lidar_table", "report.txt", "SHA256SUMS"}
 
 
 def nics(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -9,14 +9,18 @@ import time
 import pytest
 
 from nics_drl_bridge import files
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import ConfigError, ModelError
 from nics_drl_bridge.files import (
+    MOST_BYTES,
+    SUMS,
     check_folder,
     check_sealed,
+    check_sums,
     sealed,
     sha256,
     whole_folder,
     write_bytes,
+    write_sums,
     write_text,
 )
 
@@ -278,3 +282,78 @@ def test_any_flipped_bit_of_what_was_sealed_is_noticed():
     for cut in range(len(whole)):
         with pytest.raises(ValueError, match="checksum"):
             check_sealed(io.BytesIO(whole[:cut]))
+
+
+NAMES = ("model.yaml", "sub/deep")
+
+
+@pytest.fixture
+def listed(tmp_path):
+    """A folder with a manifest."""
+    write_text(tmp_path / "model.yaml", "a: 1\n")
+    write_text(tmp_path / "sub" / "deep", "deep")
+    write_sums(tmp_path)
+    return tmp_path
+
+
+def unlisted(folder, name):
+    """Removes the line of a file from the manifest, as a user does."""
+    lines = (folder / SUMS).read_text().splitlines(keepends=True)
+    (folder / SUMS).write_text("".join(line for line in lines if name not in line))
+
+
+def test_a_manifest_is_that_of_sha256sum(listed):
+    check_sums(listed, NAMES)
+    by_tool = subprocess.run(["sha256sum", *NAMES], cwd=listed, capture_output=True, check=True)
+    assert (listed / SUMS).read_bytes() == by_tool.stdout
+    (listed / "notes").write_text("mine")
+    check_sums(listed, NAMES)
+
+
+def test_any_flipped_bit_of_a_manifest_is_noticed(listed):
+    whole = (listed / SUMS).read_bytes()
+    for place in range(8 * len(whole)):
+        flipped = bytearray(whole)
+        flipped[place // 8] ^= 1 << place % 8
+        (listed / SUMS).write_bytes(flipped)
+        with pytest.raises(ModelError, match=str(listed)):
+            check_sums(listed, NAMES, editable="model.yaml")
+
+
+def test_a_changed_file_is_named_and_an_editable_one_may_lose_its_line(listed):
+    (listed / "sub" / "deep").write_text("deeP")
+    with pytest.raises(ModelError, match=r"sub/deep: does not match its checksum in SHA256SUMS; g"):
+        check_sums(listed, NAMES, editable="model.yaml")
+    (listed / "sub" / "deep").write_text("deep")
+    (listed / "model.yaml").write_text("a: 2\n")
+    with pytest.raises(ModelError, match=r"if you changed it yourself, remove its line from SHA"):
+        check_sums(listed, NAMES, editable="model.yaml")
+    unlisted(listed, "model.yaml")
+    check_sums(listed, NAMES, editable="model.yaml")
+    with pytest.raises(ModelError, match=r"model\.yaml: does not match its checksum"):
+        check_sums(listed, NAMES)
+    unlisted(listed, "deep")
+    with pytest.raises(ModelError, match=r"sub/deep: does not match its checksum"):
+        check_sums(listed, NAMES, editable="model.yaml")
+
+
+@pytest.mark.parametrize("name", ["../../../dev/zero", "/etc/passwd", "other"])
+def test_a_manifest_that_lists_other_files_is_refused_without_reading_them(listed, name):
+    with (listed / SUMS).open("a") as manifest:
+        manifest.write(f"{sha256(b'')}  {name}\n")
+    with pytest.raises(ModelError, match="is of no file of a model; remove it"):
+        check_sums(listed, NAMES)
+
+
+@pytest.mark.parametrize("name", [SUMS, "sub/deep"])
+@pytest.mark.parametrize("what", ["missing", "pipe", "large"])
+def test_what_is_no_file_to_read_is_one_sentence(listed, name, what):
+    path = listed / name
+    path.unlink()
+    if what == "pipe":
+        os.mkfifo(path)
+    if what == "large":
+        with path.open("wb") as file:
+            file.truncate(MOST_BYTES + 1)
+    with pytest.raises(ModelError, match=f"{name}: is (missing, or no file|larger than 256 MB);"):
+        check_sums(listed, NAMES)

@@ -1,9 +1,10 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -12,16 +13,17 @@ from robots import circles, direct_model, field
 from nics_drl_bridge import generator
 from nics_drl_bridge.config import dump_yaml, parse_yaml
 from nics_drl_bridge.errors import BridgeError, ConfigError, ModelError
+from nics_drl_bridge.files import SUMS
 from nics_drl_bridge.generator import (
     MODEL_FILE,
-    REPORT_FILE,
-    TABLE_FILE,
+    MODEL_FILES,
+    TABLE_FOLDER,
     builtin_model,
     load_model,
     open_model,
     save_model,
 )
-from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.robot.noise import Delay, Latency, Level
 from nics_drl_bridge.sim.simulator import FastSimulator
 
@@ -36,10 +38,17 @@ def saved(tmp_path):
 
 
 def change(folder, edit):
-    path = folder / MODEL_FILE
+    """Edits a model by hand: its line in the manifest is removed."""
+    path, manifest = folder / MODEL_FILE, folder / SUMS
     data = parse_yaml(path.read_text(), "model")
     edit(data)
     path.write_text(dump_yaml(data))
+    lines = manifest.read_text().splitlines(keepends=True)
+    manifest.write_text("".join(line for line in lines if not line.endswith(f"  {MODEL_FILE}\n")))
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -82,8 +91,15 @@ def test_a_measured_latency_is_kept_and_one_that_nothing_showed_leaves_no_trace(
 
 def test_saving_twice_gives_the_same_bytes(saved, tmp_path):
     save_model(load_model(saved), tmp_path / "again")
-    for name in (MODEL_FILE, TABLE_FILE, REPORT_FILE):
+    for name in (*MODEL_FILES, SUMS):
         assert (saved / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
+    assert len(contents(saved)) == len(MODEL_FILES) + 1
+
+
+def test_sha256sum_checks_a_model(saved):
+    check = ["sha256sum", "--strict", "-c", SUMS]
+    done = subprocess.run(check, cwd=saved, capture_output=True, check=True)
+    assert done.stdout.count(b": OK") == len(MODEL_FILES)
 
 
 def test_the_fingerprint_is_the_same_in_another_process():
@@ -119,18 +135,47 @@ def test_every_part_that_the_simulator_uses_changes_the_fingerprint():
     assert direct_model().fingerprint == model.fingerprint
 
 
-def test_any_flipped_bit_in_the_table_is_refused(saved):
-    path = saved / TABLE_FILE
+@pytest.mark.parametrize("name", [*MODEL_FILES, SUMS])
+def test_any_flipped_bit_is_refused(saved, name):
+    path = saved / name
     content = path.read_bytes()
-    for place in np.random.default_rng(1).integers(len(content), size=20):
+    for place in np.random.default_rng(1).integers(len(content), size=10):
         damaged = bytearray(content)
         damaged[place] ^= 1
         path.write_bytes(damaged)
-        with pytest.raises(ModelError, match="does not match its checksum"):
+        with pytest.raises(BridgeError, match=str(saved)):
             load_model(saved)
 
 
-@pytest.mark.parametrize("name", [MODEL_FILE, TABLE_FILE, REPORT_FILE])
+def test_the_table_of_another_model_is_refused(saved, tmp_path):
+    save_model(builtin_model("mecanum"), tmp_path / "other")
+    shutil.rmtree(saved / TABLE_FOLDER)
+    shutil.copytree(tmp_path / "other" / TABLE_FOLDER, saved / TABLE_FOLDER)
+    with pytest.raises(ModelError, match=r"does not match its checksum in SHA256SUMS"):
+        load_model(saved)
+
+
+def test_an_edited_model_is_read_once_its_line_is_removed(saved):
+    path = saved / MODEL_FILE
+    path.write_text(path.read_text().replace("control_period: 0.1", "control_period: 0.2"))
+    with pytest.raises(ModelError, match=r"model\.yaml: .* if you changed it yourself, remove its"):
+        load_model(saved)
+    change(saved, lambda data: None)
+    assert load_model(saved).control_period == 0.2
+
+
+def test_a_model_that_is_replaced_while_it_is_read_is_refused(saved, monkeypatch):
+    def meanwhile(*given, **named):
+        save_model(builtin_model("mecanum"), saved)
+        check_sums(*given, **named)
+
+    check_sums = generator.check_sums
+    monkeypatch.setattr(generator, "check_sums", meanwhile)
+    with pytest.raises(ModelError, match="was replaced while it was read; open it again"):
+        load_model(saved)
+
+
+@pytest.mark.parametrize("name", [*MODEL_FILES, SUMS])
 def test_a_missing_file_is_named(saved, name):
     (saved / name).unlink()
     with pytest.raises(BridgeError, match=name):
@@ -144,7 +189,6 @@ KEYS = (
     "calibration",
     "lidar",
     "noise",
-    "lidar_table_sha256",
 )
 
 
@@ -159,17 +203,66 @@ def test_a_missing_key_is_one_sentence_with_file_and_key(saved, key):
     ("part", "key"),
     [
         *(("kinematics", key) for key in ("dt", "units", "terms", "valid", "assumed")),
-        *(("calibration", key) for key in Calibration().to_dict()),
+        *(("calibration", key.name) for key in fields(Calibration)),
     ],
 )
 def test_a_missing_key_of_a_part_is_one_sentence(saved, part, key):
     change(saved, lambda data: data[part].pop(key))
-    with pytest.raises(ModelError, match=f"{MODEL_FILE}: {part}: '{key}' is missing") as caught:
+    with pytest.raises(ConfigError, match=f"the key '{part}.{key}' is missing; add") as caught:
         load_model(saved)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("value", ["other/1", None, 7])
+@pytest.mark.parametrize(
+    ("place", "value", "sentence"),
+    [
+        ("calibration.burst_period_s", -1.0, "should be greater than or equal to 0"),
+        ("calibration.burst_period_s", True, "should be a number, not True"),
+        ("calibration.burst_period_s", "0.1", "should be a number, not '0.1'"),
+        ("calibration.rotation_rad", float("nan"), "should be a finite number"),
+        ("calibration.lever_arm_m", [0.0], "lever_arm_m"),
+        ("calibration.notes", 3, "should be a valid tuple"),
+        ("calibration.colour", 3, "unknown key 'calibration.colour'"),
+        ("calibration.responses", [{"state": "speed"}], "the key 'calibration.responses.0."),
+        ("calibration", 3, "key 'calibration'"),
+        ("kinematics.dt", 0.0, "should be greater than 0"),
+        ("kinematics.colour", 3, "unknown key 'kinematics.colour'; valid are"),
+        ("kinematics.terms.vx", {"ghost": 1.0}, "unknown variable 'ghost'; generate"),
+        ("kinematics.units.vx", None, "key 'kinematics.units.vx'"),
+        ("kinematics.quality.colour", 3, "unknown key 'kinematics.quality.colour'"),
+        ("kinematics.quality.samples", "many", "key 'kinematics.quality.samples'"),
+    ],
+)
+def test_a_wrong_value_is_one_sentence_with_file_and_key(saved, place, value, sentence):
+    *parts, last = place.split(".")
+
+    def edit(data):
+        for part in parts:
+            data = data[part]
+        data[last] = value
+
+    change(saved, edit)
+    with pytest.raises(BridgeError, match=f"{MODEL_FILE}: ") as caught:
+        load_model(saved)
+    assert sentence in str(caught.value)
+
+
+def test_a_calibration_and_figures_of_merit_that_are_inf_are_kept(saved, tmp_path):
+    model = load_model(saved)
+    calibration = Calibration(
+        clock_offset_s=0.1, lever_arm_m=(0.1, -0.2), responses=(Response("speed", "speed_c", 0.2),),
+        wheels_swapped=True, wheel_scale=0.1 / 3.0, uncertainty={"clock_offset_s": float("inf")},
+        notes=("one", "two"),
+    )  # fmt: skip
+    quality = replace(model.kinematics.quality, condition={"vx": float("inf")})
+    kinematics = replace(model.kinematics, quality=quality)
+    save_model(replace(model, calibration=calibration, kinematics=kinematics), tmp_path / "new")
+    back = load_model(tmp_path / "new")
+    assert back.calibration == calibration
+    assert back.kinematics.quality == quality
+
+
+@pytest.mark.parametrize("value", ["other/1", "nics_drl_bridge/simulator_model/3", None, 7])
 def test_another_format_is_refused(saved, value):
     change(saved, lambda data: data.update(format=value))
     with pytest.raises(ModelError, match="key 'format' is"):
@@ -203,15 +296,15 @@ def test_the_latency_is_counted_in_steps_of_the_model(latency, delay):
 
 
 def test_a_crash_while_saving_leaves_the_old_model(saved, monkeypatch):
-    before = {path.name: path.read_bytes() for path in saved.iterdir()}
+    before = contents(saved)
 
     def crash(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(generator, "write_bytes", crash)
+    monkeypatch.setattr(generator, "write_sums", crash)
     with pytest.raises(KeyboardInterrupt):
         save_model(builtin_model("mecanum"), saved)
-    assert {path.name: path.read_bytes() for path in saved.iterdir()} == before
+    assert contents(saved) == before
     assert [path.name for path in saved.parent.iterdir()] == ["model"]
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from nics_drl_bridge import kernels
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "nics_drl_bridge"
 
@@ -17,7 +19,7 @@ PACKAGE = "nics_drl_bridge"
 LAYERS = (
     ("errors", "geometry", "interface", "kernels"),
     ("extensions", "random_kernels", "seeds", "strict_yaml"),
-    ("config", "files", "npz", "threads"),
+    ("config", "files", "threads"),
     ("robot",),
     ("recording",),
     ("identify",),
@@ -61,6 +63,7 @@ HOMES = {
     "pettingzoo": ("env/pettingzoo_env.py",),
     "ray": ("extras/ray/*",),
     "rosbags": ("recording/*", "extras/bags/*"),
+    "mcap": ("recording/*", "extras/bags/*"),
     "threadpoolctl": ("threads.py",),
 }
 
@@ -206,6 +209,26 @@ def modules_after(code: str) -> set[str]:
     ask = f"import sys\n{code}\nprint(*{{name.partition('.')[0] for name in sys.modules}})"
     done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True)
     return set(done.stdout.split())
+
+
+LIGHT = {"errors.py", "geometry.py", "interface.py", "robot/taylor.py", "sim/state.py"}
+
+
+def test_kernels_import_kernels_only_so_that_no_other_edit_compiles_them_anew():
+    heavy = {}
+    for path in (ROOT / PACKAGE).rglob("*.py"):
+        if "@kernel" not in path.read_text(encoding="utf-8") or path == Path(kernels.__file__):
+            continue
+        assert path.name.endswith("kernels.py"), path
+        files, left = set(), [path]
+        while left:
+            file = left.pop()
+            if file not in files:
+                files.add(file)
+                left += kernels.imports_of(file)
+        others = {file.relative_to(kernels.PACKAGE).as_posix() for file in files} - LIGHT
+        heavy[path.name] = {name for name in others if not name.endswith("kernels.py")}
+    assert {name: found for name, found in heavy.items() if found} == {}
 
 
 def test_importing_the_package_imports_nothing_heavy():

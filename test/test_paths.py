@@ -10,7 +10,7 @@ from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.gate.black_box import replay
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import (
-    TABLE_FILE,
+    TABLE_FOLDER,
     builtin_model,
     check_place,
     load_model,
@@ -46,7 +46,10 @@ def test_a_model_is_saved_and_opened_at_either(tmp_path, kind):
     check_place(place)
     save_model(model, place)
     assert load_model(place).fingerprint == open_model(place).fingerprint == model.fingerprint
-    assert LidarTable.load(kind(tmp_path / "model" / TABLE_FILE)).density == model.table.density
+    table = LidarTable.load(kind(tmp_path / "model" / TABLE_FOLDER))
+    assert table.fingerprint == model.table.fingerprint
+    table.save(kind(tmp_path / "table"))
+    assert (tmp_path / "table" / "rows.npy").is_file()
 
 
 @KINDS

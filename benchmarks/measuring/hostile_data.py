@@ -19,13 +19,18 @@ from measuring.damaged_bags import samples
 from measuring.gates import Gate, gate_config
 from nics_drl_bridge.config import dump_yaml, parse_yaml
 from nics_drl_bridge.extras.bags.info import bag_info
-from nics_drl_bridge.files import sealed, sha256
+from nics_drl_bridge.files import SUMS, sealed, sha256, write_sums
 from nics_drl_bridge.gate import black_box
 from nics_drl_bridge.gate.inputs import Tick
-from nics_drl_bridge.generator import builtin_model, load_model, save_model
+from nics_drl_bridge.generator import (
+    MODEL_FILE,
+    TABLE_FOLDER,
+    builtin_model,
+    load_model,
+    save_model,
+)
 from nics_drl_bridge.lidar.spec import load_lidar
-from nics_drl_bridge.lidar.table import LidarTable
-from nics_drl_bridge.npz import npz_bytes
+from nics_drl_bridge.lidar.table import ARRAYS, LidarTable
 from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.readers import read_recording
@@ -109,9 +114,7 @@ def _zip(parts: dict[str, bytes]) -> bytes:
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in parts.items():
             archive.writestr(f"{name}.npy", data)
-        archive.comment = b"sha256 " + bytes(64)
-    data = buffer.getvalue()[:-64]
-    return data + sha256(data).encode()
+    return sealed(buffer.getvalue())
 
 
 def _recording(rng: Rng, folder: Path, whole: Whole) -> Attempt:
@@ -142,9 +145,9 @@ def _recording(rng: Rng, folder: Path, whole: Whole) -> Attempt:
     elif way == 6:
         parts["meta"] = _npy_of(np.array("[" * 100_000))
     else:
-        arrays[name] = arrays[name].astype(str(rng.choice(["S8", "c16", "?", "i1"])))
-        path.write_bytes(npz_bytes(arrays))
-        return Attempt("recording", f"{name} of type {arrays[name].dtype}", _read(path), "any")
+        other = arrays[name].astype(str(rng.choice(["S8", "c16", "?", "i1"])))
+        parts[name] = _npy_of(other)
+        told, verdict = f"{name} of type {other.dtype}", "any"
     path.write_bytes(_zip(parts))
     act = nics("generate", path, "--out", folder / "out") if rng.random() < 0.2 else _read(path)
     return Attempt("recording", told, act, verdict)
@@ -272,13 +275,12 @@ def _model(rng: Rng, folder: Path, whole: Whole) -> Attempt:
     shutil.rmtree(place, ignore_errors=True)
     shutil.copytree(whole.model, place)
     if rng.random() < 0.3:
-        table, size = place / "lidar_table.npz", int(10 ** rng.uniform(8, 18))
-        parts = {name: _npy("'<f4'", f"({size},)", b"") for name in ("about", "grid", "rows")}
-        table.write_bytes(_zip(parts))
-        return Attempt("model", f"table of {size}", lambda: LidarTable.load(table))
-    text = (place / "model.yaml").read_text(encoding="utf-8")
+        return _table(rng, place / TABLE_FOLDER)
+    lines = (place / SUMS).read_text(encoding="utf-8").splitlines(keepends=True)
+    listed = [line for line in lines if not line.endswith(f"  {MODEL_FILE}\n")]
+    (place / SUMS).write_text("".join(listed), encoding="utf-8")
+    text = (place / MODEL_FILE).read_text(encoding="utf-8")
     data: Any = parse_yaml(text, "model")
-    del data["sha256"]
     inner: Any = data
     told = []
     while True:
@@ -291,8 +293,21 @@ def _model(rng: Rng, folder: Path, whole: Whole) -> Attempt:
     values = (None, "x" * 3000, -1, 1e308, 10**20, [], {}, [[1.0]], 1e-320, True)
     which = int(rng.integers(len(values)))
     inner[key] = values[which]
-    (place / "model.yaml").write_text(dump_yaml(data), encoding="utf-8")
+    (place / MODEL_FILE).write_text(dump_yaml(data), encoding="utf-8")
     return Attempt("model", f"{'.'.join(told)} is {which}", lambda: load_model(place), "any")
+
+
+def _table(rng: Rng, place: Path) -> Attempt:
+    """A table with one array of a false header, whose checksums are right."""
+    name, way, size = str(rng.choice(ARRAYS)), int(rng.integers(5)), int(10 ** rng.uniform(8, 30))
+    ways = (
+        _npy("'<f4'", f"({size},)", b""), _npy("'<f4'", f"({2**32}, {2**32})", b""),
+        _npy("'|O'", "(3,)", b"cos\nsystem\n(S'true'\ntR."), _npy("'<f4'", "(" * 3000, b""),
+        _zip({"rows": bytes(size % 10**7)}),
+    )  # fmt: skip
+    (place / f"{name}.npy").write_bytes(ways[way])
+    write_sums(place)
+    return Attempt("model", f"table, way {way}, {name}, {size}", lambda: LidarTable.load(place))
 
 
 def _checkpoint(rng: Rng, folder: Path) -> Attempt:

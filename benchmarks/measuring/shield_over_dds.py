@@ -48,7 +48,7 @@ LATCHED = re.compile(r"(?:call ~/reset first: |e_stop_released: )(\w+)")
 
 @dataclass
 class HeldUp:
-    """How well this process kept up with the clock.
+    """How well this process kept up with the clock while robots drove.
 
     Attributes:
         count: how often it was held up.
@@ -253,7 +253,8 @@ def _run(
             continue
         if -ahead > BEHIND_S:
             began, epoch_ns = began - ahead, epoch_ns - round(ahead * NS_PER_S)
-            held_up.add(HeldUp(1, -ahead, 0.0, sum(lane.void() for lane in lanes)))
+            if voided := sum(lane.void() for lane in lanes):  # not while the gates start
+                held_up.add(HeldUp(1, -ahead, 0.0, voided))
         step_ns = epoch_ns + round(step * STEP_S * NS_PER_S)
         for index, lane in enumerate(lanes):
             lane.step(step_ns, speaks=(step + index) % SCAN_STEPS == 0)

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError
 
 EXIT_BAD_INPUT = 2
@@ -77,6 +78,18 @@ def needs_ros(what: str) -> Iterator[None]:
         if (error.name or "").startswith("nics_drl_bridge"):
             raise
         raise ConfigError(f"{what} {MISSING_ROS.format(module=error.name)}") from None
+
+
+@contextmanager
+def intact(recording: Path, salvage: bool) -> Iterator[Path]:
+    """Yields a recording; or, if wanted, the intact part of a bag, after telling what is lost."""
+    if not salvage:
+        yield recording
+        return
+    with extensions.load("salvage", "bag")(recording) as (whole, lines):
+        for line in lines:
+            typer.echo(line, err=True)
+        yield whole
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -5,20 +5,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.console import (
     RobotOption,
     TopicOption,
     TopicsOption,
     WorldOption,
+    intact,
     one_sentence,
 )
 
@@ -61,7 +59,7 @@ def generate(
     with one_sentence():
         from nics_drl_bridge.generator import check_place, save_model
         from nics_drl_bridge.generator import generate as generate_model
-        from nics_drl_bridge.identify.dof import parse_alpha
+        from nics_drl_bridge.identify.fit import parse_alpha
         from nics_drl_bridge.lidar.spec import load_lidar
         from nics_drl_bridge.recording.readers import read_recording
         from nics_drl_bridge.recording.topic_roles import topic_roles
@@ -71,7 +69,7 @@ def generate(
         check_place(out)
         spec, sensor, threshold = load_robot(robot), load_lidar(lidar), parse_alpha(alpha)
         shapes = load_world(world).shapes
-        with _intact(recording, salvage) as whole:
+        with intact(recording, salvage) as whole:
             drive = read_recording(whole, spec, topic_roles(topics, topic or ()))
         drive = replace(drive, source=str(recording))
         model, identified = generate_model(
@@ -85,18 +83,6 @@ def generate(
             write_pictures(spec, identified, out / "pictures")
         typer.echo(model.report.rstrip())
         typer.echo(f"model written to {out}")
-
-
-@contextmanager
-def _intact(recording: Path, salvage: bool) -> Iterator[Path]:
-    """The recording; or what is intact of a damaged bag, if that is wanted."""
-    if not salvage:
-        yield recording
-        return
-    with extensions.load("salvage", "bag")(recording, True) as (whole, lines):
-        for line in lines:
-            typer.echo(line, err=True)
-        yield whole
 
 
 def urdf(

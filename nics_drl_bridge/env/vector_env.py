@@ -145,7 +145,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             "ended": self.ended, "over": self._over, "first": self._first,
             "episode": self._episode, "starts": self._starts, "bodies": self._bodies,
         }  # fmt: skip
-        data = {f"data.{name}": rows for name, rows in vars(self.simulator.data).items()}
+        data = {f"data.{name}": rows for name, rows in self.simulator.data._asdict().items()}
         return {**own, **data, "goals": self.simulator.goals}
 
     def reset(

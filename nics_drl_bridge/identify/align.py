@@ -1,4 +1,4 @@
-"""Alignment of a calibrated recording: all streams on one time axis, at `base_link`."""
+"""Alignment of a calibrated drive: all streams on one time axis, at `base_link`."""
 
 from __future__ import annotations
 
@@ -6,13 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.identify import repair
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.noise import MAX_GAP_S
-from nics_drl_bridge.identify.signals import held, resample, unwrapped
-from nics_drl_bridge.identify.timing import inferred_states
+from nics_drl_bridge.identify.drive import MAX_GAP_S, MIN_STAMPS, Drive
+from nics_drl_bridge.identify.signals import held, inferred_states, resample, unwrapped
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
-from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 
@@ -28,36 +25,28 @@ STATE_GAP = 2.5
 """Rates are unknown between states that are this many median steps apart."""
 
 
-def align(recording: Recording, calibration: Calibration, spec: RobotSpec) -> Samples:
-    """Puts a recording on one time axis.
+def align(drive: Drive, calibration: Calibration) -> Samples:
+    """Puts a drive on one time axis, on the clock of the commands.
 
     A recording that needs no correction is used bit for bit. Otherwise the pose is smoothed by
     local parabolas as far as its noise requires, and rows in gaps of the pose are dropped.
 
-    Args:
-        recording: the drive.
-        calibration: of this drive.
-        spec: the robot.
-
-    Returns:
-        The samples, on the clock of the commands.
-
     Raises:
         RecordingError: the streams do not overlap in time.
     """
+    recording = drive.recording
     if calibration.is_identity and (shared := _shared_stamps(recording)) is not None:
         return samples_on_one_clock(*shared)
     grid = _grid(recording, calibration)
-    bursts = repair.find_bursts(recording.pose.t)
-    t = repair.spread(recording.pose.t, bursts) + calibration.clock_offset_s
+    t = drive.sample_t + calibration.clock_offset_s
     tracked = resample(t, unwrapped(recording.pose.values), grid, _half_width(calibration))
     step = float(grid[1] - grid[0])
     begin = grid - calibration.command_latency_s
     samples = samples_on_one_clock(
         grid,
         calibration.to_base(tracked),
-        states_at(recording, calibration, spec, grid),
-        held(recording.command, spec, begin, begin + step),
+        states_at(drive, calibration, grid),
+        held(recording.command, drive.spec, begin, begin + step),
     )
     known = _outside_gaps(samples.t, t, step)
     if recording.state is not None:
@@ -65,10 +54,9 @@ def align(recording: Recording, calibration: Calibration, spec: RobotSpec) -> Sa
     return samples.rows(known)
 
 
-def states_at(
-    recording: Recording, calibration: Calibration, spec: RobotSpec, grid: Array
-) -> Array:
+def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
     """Returns states (T, S), measured or inferred, at uniform times (T,) on the commands' clock."""
+    recording = drive.recording
     if recording.state is not None:
         columns = recording.state.values.T
         return np.stack([np.interp(grid, recording.state.t, c) for c in columns], axis=1)
@@ -78,7 +66,7 @@ def states_at(
     lead = int(np.ceil(max(0.0, grid[0] - recording.command.t[0]) / step)) + 1
     longer = np.concatenate([grid[0] + step * np.arange(-lead, 0), grid])
     latency = calibration.command_latency_s
-    return gains * inferred_states(recording.command, spec, lags, latency, longer)[lead:]
+    return gains * inferred_states(recording.command, drive.spec, lags, latency, longer)[lead:]
 
 
 def _shared_stamps(recording: Recording) -> tuple[Array, Array, Array, Array] | None:
@@ -124,7 +112,7 @@ def _grid(recording: Recording, calibration: Calibration) -> Array:
     if recording.state is not None:
         first, last = max(first, recording.state.t[0]), min(last, recording.state.t[-1])
     count = int(np.floor((last - first) / step + 1e-6))
-    if count < repair.MIN_STAMPS:
+    if count < MIN_STAMPS:
         raise RecordingError(
             f"{recording.source}: commands and poses overlap for {max(last - first, 0.0):.2f} s "
             "only; check that they are of one drive."

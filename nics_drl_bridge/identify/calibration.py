@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import AllowInfNan, NonNegativeFloat
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import ModelError
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ class Response:
 
     state: str
     command: str
-    lag_s: float
+    lag_s: NonNegativeFloat
     gain: float = 1.0
 
 
@@ -55,13 +55,13 @@ class Calibration:
     rotation_rad: float = 0.0
     lever_arm_m: tuple[float, float] = (0.0, 0.0)
     responses: tuple[Response, ...] = ()
-    burst_period_s: float = 0.0
-    position_noise_m: float = 0.0
-    heading_noise_rad: float = 0.0
+    burst_period_s: NonNegativeFloat = 0.0
+    position_noise_m: NonNegativeFloat = 0.0
+    heading_noise_rad: NonNegativeFloat = 0.0
     wheel_scale: float | None = None
     turn_scale: float | None = None
     wheels_swapped: bool | None = None
-    uncertainty: dict[str, float] = field(default_factory=dict)
+    uncertainty: dict[str, Annotated[float, AllowInfNan()]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     @property
@@ -91,56 +91,3 @@ class Calibration:
     def to_tracked(self, base: ArrayLike) -> Array:
         """Converts poses (..., 3) of `base_link` to poses of the tracked body."""
         return geometry.compose(base, self.mounting)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Returns plain data for YAML."""
-        return {
-            "clock_offset_s": self.clock_offset_s,
-            "command_latency_s": self.command_latency_s,
-            "rotation_rad": self.rotation_rad,
-            "lever_arm_m": list(self.lever_arm_m),
-            "responses": [dict(vars(response)) for response in self.responses],
-            "burst_period_s": self.burst_period_s,
-            "position_noise_m": self.position_noise_m,
-            "heading_noise_rad": self.heading_noise_rad,
-            "wheel_scale": self.wheel_scale,
-            "turn_scale": self.turn_scale,
-            "wheels_swapped": self.wheels_swapped,
-            "uncertainty": dict(self.uncertainty),
-            "notes": list(self.notes),
-        }
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Calibration:
-        """Reads the output of `to_dict`. Raises ModelError with the wrong key."""
-        try:
-            x, y = data["lever_arm_m"]
-            swapped = data["wheels_swapped"]
-            return cls(
-                **{name: float(data[name]) for name in _NUMBERS},
-                wheel_scale=_optional(data["wheel_scale"]),
-                turn_scale=_optional(data["turn_scale"]),
-                lever_arm_m=(float(x), float(y)),
-                responses=tuple(Response(**response) for response in data["responses"]),
-                wheels_swapped=None if swapped is None else bool(swapped),
-                uncertainty={str(k): float(v) for k, v in data["uncertainty"].items()},
-                notes=tuple(str(note) for note in data["notes"]),
-            )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise ModelError(
-                f"calibration: {error!s} is missing or wrong; generate the model anew."
-            ) from None
-
-
-_NUMBERS = (
-    "clock_offset_s",
-    "command_latency_s",
-    "rotation_rad",
-    "burst_period_s",
-    "position_noise_m",
-    "heading_noise_rad",
-)
-
-
-def _optional(value: Any) -> float | None:
-    return None if value is None else float(value)

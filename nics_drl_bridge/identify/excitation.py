@@ -1,11 +1,9 @@
-"""Excitation: inputs that a drive moved, and those that it moved independently of each other.
+"""Excitation: what a drive moved, and moved independently, and so what a fit can learn from it.
 
-Robust regression: detection of outlying rows, such as those that a jump of the pose causes.
-
-Least trimmed squares with concentration steps finds the bulk of the rows (Rousseeuw, Van
-Driessen: Computing LTS regression for large data sets). Rows far from it are dropped and the rest
-is fitted by ordinary least squares: reweighted least squares with weights of 0 and 1. Without
-outliers, the fit is plain least squares.
+Outliers: the rows that it can't. Least trimmed squares with concentration steps finds the bulk
+(Rousseeuw, Van Driessen: Computing LTS regression for large data sets). Rows far from it are
+dropped and the rest is fitted by ordinary least squares: reweighted least squares with weights of
+0 and 1. Without outliers, the fit is plain least squares.
 
 Coverage: the range of motion of each command in a drive, computed before any fit.
 """
@@ -18,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
+from nics_drl_bridge.errors import FitError
+from nics_drl_bridge.identify.signals import GAUSSIAN_MAD, white_noise
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -32,9 +32,33 @@ DEPENDENT = 1e-7
 """A normalised feature whose component orthogonal to those before it is below this is a copy."""
 TOGETHER = 1e-3
 """Commands are linearly dependent if a normalised combination of them is smaller than this."""
-DIFFERENCE = 6
-DIFFERENCE_GAIN = np.sqrt(924.0)  # white noise grows by this in a sixth difference
-GAUSSIAN_MAD = 0.6745
+MIN_SAMPLES_PER_TERM = 5
+NEGLIGIBLE = 1e-3
+"""A velocity component below this share of the other one is modelled as zero."""
+NOISY = 5e-4
+"""A measured state is noisy if its noise exceeds this share of its range."""
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """Excitation of a robot's variables by a drive.
+
+    Attributes:
+        unmoved: variables that the drive never moved, so that no term contains them.
+        together: commands that moved, but were linearly dependent.
+        levels: number of different values of each command, at most 10.
+    """
+
+    unmoved: tuple[str, ...]
+    together: tuple[str, ...]
+    levels: dict[str, int]
+
+
+def excitation_of(samples: Samples, spec: RobotSpec) -> Excitation:
+    """Returns the excitation of the variables by a drive."""
+    return Excitation(
+        unmoved_variables(samples, spec), commands_together(samples, spec), levels(samples, spec)
+    )
 
 
 def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
@@ -51,14 +75,6 @@ def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
         followed = [variable.follows] if variable.follows else [c.name for c in spec.command]
         still[i] |= noise_only[i] and all(named[name] for name in followed)
     return tuple(n for n, s in zip(spec.variable_names, still, strict=True) if s)
-
-
-def white_noise(x: Array) -> Array:
-    """Returns the standard deviation (V,) of white noise on series (T, V), by differences."""
-    rest = np.diff(x, DIFFERENCE, axis=0) / DIFFERENCE_GAIN
-    if len(rest) < DIFFERENCE:
-        return np.zeros(x.shape[1])
-    return np.asarray(np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD)
 
 
 def commands_together(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
@@ -97,6 +113,57 @@ def independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]
     for k in range(chi.shape[1]):
         (independent if k < len(r) and r[k] > DEPENDENT else dependent).append(k)
     return np.array(independent, dtype=np.intp), np.array(dependent, dtype=np.intp)
+
+
+def moved_terms(
+    samples: Samples, powers: NDArray[np.int64], names: tuple[str, ...], unmoved: tuple[str, ...]
+) -> NDArray[np.int64]:
+    """Returns the terms (K, V) of variables that moved; refuses too few samples for them."""
+    still = [names.index(name) for name in unmoved]
+    moved: NDArray[np.int64] = powers[(powers[:, still] == 0).all(axis=1)]
+    if len(samples.t) < MIN_SAMPLES_PER_TERM * len(moved):
+        raise FitError(
+            f"{len(samples.t)} samples are too few for {len(moved)} terms; drive for longer, or "
+            "lower the order."
+        )
+    if len(unmoved) == len(names):
+        raise FitError(
+            "no command ever changed, so nothing can be learnt; vary each over its range."
+        )
+    return moved
+
+
+def terms_through_state(
+    powers: NDArray[np.int64], spec: RobotSpec, unmoved: tuple[str, ...]
+) -> NDArray[np.bool_]:
+    """Selects the terms (K,) allowed in the body twist of a noisy recording."""
+    if not spec.state:
+        return np.ones(len(powers), dtype=np.bool_)
+    allowed = (powers[:, len(spec.state) :] == 0).all(axis=1)
+    if any(v.unit == "m/s" and v.name not in unmoved for v in spec.state):
+        allowed &= powers.sum(axis=1) > 0
+    return np.asarray(allowed)
+
+
+def moving_dofs(dq: Array) -> tuple[int, ...]:
+    """Returns the indices of the dofs that move: of vx and vy the non-negligible, and all others.
+
+    Args:
+        dq: (T, D) rates.
+    """
+    size = np.sqrt((dq**2).mean(axis=0))
+    moves = np.ones(len(size), dtype=np.bool_)
+    moves[:2] = size[:2] > NEGLIGIBLE * size[:2].max()
+    return tuple(map(int, np.flatnonzero(moves)))
+
+
+def states_are_noisy(samples: Samples, spec: RobotSpec) -> bool:
+    """True if the noise of a measured state would bias a fit."""
+    if not spec.state:
+        return False
+    size = len(spec.state)
+    width = np.array([v.max - v.min for v in spec.state])
+    return bool((white_noise(samples.x[:, :size]) > NOISY * width).any())
 
 
 BULK = 0.75
@@ -142,8 +209,9 @@ def inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
     return everything
 
 
-def plausible(x: Array, low: Array, high: Array) -> NDArray[np.bool_]:
-    """Selects the rows (T,) of X (T, V) that are within or close to the variables' limits (V,)."""
+def plausible(x: Array, spec: RobotSpec) -> NDArray[np.bool_]:
+    """Selects the rows (T,) of X (T, V) that are within or close to the variables' limits."""
+    low, high = np.array([[v.min, v.max] for v in (*spec.state, *spec.command)]).T
     margin = BEYOND * (high - low)
     inside = ((x >= low - margin) & (x <= high + margin)).all(axis=1)
     everything = np.ones(len(x), dtype=np.bool_)

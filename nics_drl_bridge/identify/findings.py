@@ -1,61 +1,148 @@
-"""Sentences on the findings of a calibration and on what could not be learnt."""
+"""Findings: all that the stages of an identification have found so far, its result, sentences."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.clocks import TimingEstimate
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.fit import Alpha, Fit, Regression
 from nics_drl_bridge.identify.mounting import Mounting
-from nics_drl_bridge.identify.repair import Bursts
-from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.identify.open_loop import OpenLoop
+from nics_drl_bridge.identify.signals import moved_commands
+from nics_drl_bridge.recording.recording import Recording, Samples
+from nics_drl_bridge.robot.noise import Noise
+from nics_drl_bridge.robot.taylor import TaylorModel
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings for the sentences, in addition to the calibration's values.
+    """Findings of the stages, in their order; None, empty or the default until they have run.
 
     Attributes:
-        bursts: of the pose's stamps.
-        noise_known: True if the pose's noise could be measured.
-        separated: True if clock offset and latency could be separated.
-        clocks_differ: True if pose and commands are on different clocks.
-        lag_sigma: (S,) uncertainty of the lags [s]; NaN for a nominal one.
-        mounting: None if it could not be learnt.
-        unmoved: commands that never changed.
+        training: the part of the drive to learn from; repaired by `repair`.
+        whole: the whole drive; repaired by `repair`.
+        timing: clock offset, latency [s] and lags (S,) [s], of `clocks`; nominal before.
+        repairs: sentences of `repair`.
+        speed: (n,) expected along the direction of travel over the intervals of the training
+            part's twists [m/s], of `mounting`; None too if no state is such a speed.
+        mounting: of `mounting` [m, rad]; None too if it could not be learnt.
+        calibration: of `clocks`, `mounting`, `responses` and `noise`; then of `refine`.
+        noise: of sensors and motion; the pose sensor's of `noise`, the rest of `judge`.
+        samples: of the training part on one time axis, of `fit`.
+        regression: on all features (Eq. 1), of `fit`.
+        linear: the pruned fit (Eq. 2), of `prune`.
+        model: of `prune`; then of `refine` and `complete`.
+        refinement: sentences of `refine`.
+        assumptions: sentences of `complete`.
+        unseen: samples of the part that the fit did not see, of `judge`; None too if too few.
+        held_out: open-loop errors on that part, of `judge`; None too if it is too short.
+        notes: all sentences, of `judge`.
     """
 
-    bursts: Bursts | None
-    noise_known: bool
-    separated: bool
-    clocks_differ: bool
-    lag_sigma: NDArray[np.float64]
-    mounting: Mounting | None
-    unmoved: tuple[str, ...]
+    training: Drive
+    whole: Drive
+    timing: TimingEstimate
+    repairs: tuple[str, ...] = ()
+    speed: NDArray[np.float64] | None = None
+    mounting: Mounting | None = None
+    calibration: Calibration = field(default_factory=Calibration)
+    noise: Noise = field(default_factory=Noise)
+    samples: Samples | None = None
+    regression: Regression | None = None
+    linear: Fit | None = None
+    model: TaylorModel | None = None
+    refinement: tuple[str, ...] = ()
+    assumptions: tuple[str, ...] = ()
+    unseen: Samples | None = None
+    held_out: OpenLoop | None = None
+    notes: tuple[str, ...] = ()
 
 
-def sentences(calibration: Calibration, found: Findings, spec: RobotSpec) -> tuple[str, ...]:
-    """Returns the notes of a calibration."""
+def known(found: T | None, name: str, stage: str) -> T:
+    """Returns a finding that a later stage can't do without.
+
+    Raises:
+        FitError: it is missing; names the stage that finds it.
+    """
+    if found is None:
+        raise FitError(f"{name} is missing; put the stage {stage!r} before those that need it.")
+    return found
+
+
+@dataclass(frozen=True)
+class Identified:
+    """Result of an identification.
+
+    Attributes:
+        drive: the whole drive, repaired.
+        model: the model, refined and, on request, completed by assumption, with standard
+            errors and quality.
+        calibration: of the drive.
+        fit: the linear fit, before refinement.
+        samples: the samples that the fit used.
+        unseen: samples of the part that the fit did not see; None if there are too few.
+        held_out: open-loop errors on that part; None if it was too short.
+        noise: of sensors and motion, each level measured or assumed.
+        findings: of all stages.
+        notes: sentences on findings, on what could not be learnt and on assumptions.
+    """
+
+    drive: Drive
+    model: TaylorModel
+    calibration: Calibration
+    fit: Fit
+    samples: Samples
+    unseen: Samples | None
+    held_out: OpenLoop | None
+    noise: Noise
+    findings: Findings
+    notes: tuple[str, ...]
+
+    @property
+    def recording(self) -> Recording:
+        """The whole recording, repaired."""
+        return self.drive.recording
+
+    @property
+    def train_until_s(self) -> float:
+        """End of the training part, from the drive's first pose [s]."""
+        return self.drive.settings.train_until_s
+
+    @property
+    def alpha(self) -> Alpha:
+        """Threshold of the pruning; `auto` for the knee of the accuracy curve."""
+        return self.drive.settings.alpha
+
+
+def sentences(findings: Findings) -> tuple[str, ...]:
+    """Returns the notes on a calibration."""
     return (
-        *_about_stamps(calibration, found),
-        *_about_clocks(calibration, found, len(spec.command)),
-        *_about_mounting(calibration, found, spec),
-        *_about_responses(calibration, found),
-        *_about_wheels(calibration),
+        *_about_stamps(findings.training),
+        *_about_clocks(findings),
+        *_about_mounting(findings),
+        *_about_responses(findings),
+        *_about_wheels(findings.calibration),
     )
 
 
-def _about_stamps(calibration: Calibration, found: Findings) -> list[str]:
+def _about_stamps(drive: Drive) -> list[str]:
     notes = []
-    if found.bursts is not None:
+    if drive.bursts is not None:
         notes.append(
-            f"The poses arrive in bursts of about {found.bursts.size:.0f} every "
-            f"{found.bursts.period_s:.3f} s: their stamps are arrival times; the samples of a "
+            f"The poses arrive in bursts of about {drive.bursts.size:.0f} every "
+            f"{drive.bursts.period_s:.3f} s: their stamps are arrival times; the samples of a "
             "burst were spread over the time since the one before."
         )
-    if not found.noise_known:
+    if drive.pose_noise is None:
         notes.append(
             "The noise of the pose could not be measured; let the robot stand still for 2 s at the "
             "start."
@@ -63,24 +150,25 @@ def _about_stamps(calibration: Calibration, found: Findings) -> list[str]:
     return notes
 
 
-def _about_clocks(calibration: Calibration, found: Findings, commands: int) -> list[str]:
-    c, sigma = calibration, calibration.uncertainty
+def _about_clocks(found: Findings) -> list[str]:
+    c, sigma, recording = found.calibration, found.calibration.uncertainty, found.training.recording
+    clocks_differ = recording.pose.clock != recording.command.clock
     notes = []
-    if found.clocks_differ and "clock_offset_s" in sigma:
+    if clocks_differ and "clock_offset_s" in sigma:
         notes.append(
             f"Pose and commands are stamped by different clocks: {c.clock_offset_s:.4f} s (+- "
             f"{sigma['clock_offset_s']:.4f} s) added to the pose's stamps gives the commands' "
             "clock."
         )
-    if found.unmoved and len(found.unmoved) == commands:
+    if not moved_commands(recording.command).any():
         notes.append("No command ever changed, so clock offset and latency could not be learnt.")
-    elif not found.separated and found.clocks_differ:
+    elif not found.timing.separated and clocks_differ:
         notes.append(
             "Only the sum of clock offset and command latency can be known, since nothing measured "
             "on the commands' clock follows them; the latency is taken as zero. Record the wheels "
             "or the state to tell them apart."
         )
-    if found.separated and c.command_latency_s > 0.0:
+    if found.timing.separated and c.command_latency_s > 0.0:
         notes.append(
             f"Commands take effect {c.command_latency_s:.4f} s (+- "
             f"{sigma['command_latency_s']:.4f} s) after their stamps."
@@ -88,8 +176,8 @@ def _about_clocks(calibration: Calibration, found: Findings, commands: int) -> l
     return notes
 
 
-def _about_mounting(calibration: Calibration, found: Findings, spec: RobotSpec) -> list[str]:
-    c, mounting, notes = calibration, found.mounting, []
+def _about_mounting(found: Findings) -> list[str]:
+    c, mounting, notes = found.calibration, found.mounting, []
     if mounting is None:
         return [
             "How the tracked body sits on the robot could not be learnt, and is taken to be "
@@ -111,8 +199,8 @@ def _about_mounting(calibration: Calibration, found: Findings, spec: RobotSpec) 
     elif c.lever_arm_m != (0.0, 0.0):
         x, y = c.lever_arm_m
         notes.append(f"The tracked point lies at x {x:.4f} m, y {y:.4f} m of base_link.")
-    lateral = spec.moves_sideways
-    if not np.isnan(mounting.lever_sigma[0]) and np.isnan(mounting.lever_sigma[1]) and not lateral:
+    known_x, known_y = ~np.isnan(mounting.lever_sigma)
+    if known_x and not known_y and not found.training.spec.moves_sideways:
         notes.append(
             "The tracked point's place along y could not be learnt, since no speed was known "
             "apart from the tracked one; it is taken as zero."
@@ -120,10 +208,12 @@ def _about_mounting(calibration: Calibration, found: Findings, spec: RobotSpec) 
     return notes
 
 
-def _about_responses(calibration: Calibration, found: Findings) -> list[str]:
+def _about_responses(found: Findings) -> list[str]:
     notes = []
-    for response, sigma in zip(calibration.responses, found.lag_sigma, strict=True):
-        if response.command in found.unmoved:
+    moved = moved_commands(found.training.recording.command)
+    names = [c.name for c, m in zip(found.training.spec.command, moved, strict=True) if m]
+    for response, sigma in zip(found.calibration.responses, found.timing.lag_sigma, strict=False):
+        if response.command not in names:
             notes.append(
                 f"{response.command} never changed, so how {response.state} follows it could not "
                 f"be learnt; drive with {response.command} changing over its whole range."

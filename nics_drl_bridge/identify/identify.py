@@ -1,8 +1,13 @@
-"""Identification of a model from a recording: calibrate, align, fit, prune, refine and test."""
+"""Identification of a model from a recording: a row of stages over one prepared drive.
+
+Each stage takes the drive, as it was recorded, and the findings so far, and returns the findings
+with its own added. `STAGES` is the whole road from a recording to a model.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,66 +15,179 @@ import numpy as np
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.identify.align import align
 from nics_drl_bridge.identify.assume import assume_textbook
-from nics_drl_bridge.identify.calibrate import examine
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.drift import measure_noise
-from nics_drl_bridge.identify.findings import Findings, sentences
-from nics_drl_bridge.identify.fit import ALPHA, ORDER, Alpha, Fit, fit
-from nics_drl_bridge.identify.open_loop import HORIZON_S, OpenLoop, open_loop_error, windows
-from nics_drl_bridge.identify.plausibility import check_axes, check_units, mirror_note
-from nics_drl_bridge.identify.refine import refine, simplify
-from nics_drl_bridge.identify.repair import repair
-from nics_drl_bridge.identify.timing import SEARCH_S
+from nics_drl_bridge.identify.clocks import SEARCH_S, expected_speed, nominal_timing, timing_of
+from nics_drl_bridge.identify.drive import Drive, Settings
+from nics_drl_bridge.identify.findings import Findings, Identified, known, sentences
+from nics_drl_bridge.identify.fit import ALPHA, ORDER, Alpha, Fit, pruned, regress
+from nics_drl_bridge.identify.mounting import mounted, mounting_of
+from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
+from nics_drl_bridge.identify.refine import refined
+from nics_drl_bridge.identify.repair import check_axes, check_units, repaired
+from nics_drl_bridge.identify.responses import responses_of, with_wheels
 from nics_drl_bridge.identify.verdict import (
     doubts,
-    merged,
+    mirror_note,
     refuse_unexcited,
+    tried,
     unlearnt,
     unseen_samples,
     with_quality,
 )
-from nics_drl_bridge.identify.windows import problem_of
-from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
-from nics_drl_bridge.robot.noise import Noise
+from nics_drl_bridge.recording.recording import Recording, Stream, check
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.threads import one_blas_thread
 
+__all__ = ["STAGES", "Identified", "begun", "calibrate", "cut", "identify", "run"]
+
 TRAIN_SHARE = 2.0 / 3.0
+PRUNED = "the pruned fit"
+
+Stage = Callable[[Drive, Findings], Findings]
 
 
-@dataclass(frozen=True)
-class Identified:
-    """Result of an identification.
+def repair(drive: Drive, findings: Findings) -> Findings:
+    """Refuses other units and reversed axes; drops repeated rows and jumps, clips commands."""
+    check_units(drive)
+    training, repairs = repaired(findings.training)
+    whole, _ = repaired(findings.whole)
+    check_axes(training)
+    check(training.recording, drive.spec)
+    return replace(findings, training=training, whole=whole, repairs=repairs)
 
-    Attributes:
-        model: the model, refined and, on request, completed by assumption, with standard
-            errors and quality.
-        calibration: of the recording.
-        fit: the linear fit, before refinement.
-        samples: the samples that the fit used.
-        unseen: samples of the part that the fit did not see; None if there are too few.
-        recording: the whole drive, repaired.
-        train_until_s: end of the training part, from the drive's first pose [s].
-        held_out: open-loop errors on the rest; None if it was too short.
-        alpha: of the pruning; `auto` for the knee of the accuracy curve.
-        noise: of sensors and motion, each level measured or assumed.
-        findings: of the calibration, for plots.
-        notes: sentences on findings, on what could not be learnt and on assumptions.
-    """
 
-    model: TaylorModel
-    calibration: Calibration
-    fit: Fit
-    samples: Samples
-    unseen: Samples | None
-    recording: Recording
-    train_until_s: float
-    held_out: OpenLoop | None
-    alpha: Alpha
-    noise: Noise
-    findings: Findings
-    notes: tuple[str, ...]
+def clocks(drive: Drive, findings: Findings) -> Findings:
+    """Finds the period of bursts, the offset between clocks, the latency of commands, and lags."""
+    training, timing = findings.training, timing_of(findings.training)
+    calibration = replace(
+        findings.calibration,
+        clock_offset_s=timing.offset,
+        command_latency_s=timing.latency,
+        burst_period_s=training.bursts.period_s if training.bursts else 0.0,
+        uncertainty=timing.sigma,
+    )
+    return replace(findings, timing=timing, calibration=calibration)
+
+
+def mounting(drive: Drive, findings: Findings) -> Findings:
+    """Finds where and how the tracked body is mounted on the robot."""
+    speed = expected_speed(findings.training, findings.timing)
+    found = mounting_of(findings.training, findings.timing, speed)
+    calibration = mounted(findings.calibration, found)
+    return replace(findings, speed=speed, mounting=found, calibration=calibration)
+
+
+def responses(drive: Drive, findings: Findings) -> Findings:
+    """Finds how states that were not measured follow the commands, and the scale of the wheels."""
+    training, calibration = findings.training, findings.calibration
+    found = responses_of(training, calibration, findings.timing, findings.speed)
+    calibration = with_wheels(training, replace(calibration, responses=found))
+    return replace(findings, calibration=calibration)
+
+
+def noise(drive: Drive, findings: Findings) -> Findings:
+    """Measures the noise of the pose: without it, a drive without corrections is an exact one."""
+    position, heading = findings.training.pose_noise or (0.0, 0.0)
+    calibration = replace(
+        findings.calibration, position_noise_m=position, heading_noise_rad=heading
+    )
+    return replace(findings, calibration=calibration, noise=sensor_noise(findings.whole))
+
+
+def fit(drive: Drive, findings: Findings) -> Findings:
+    """Puts the streams on one time axis, and fits all terms by least squares (Eq. 1)."""
+    calibration, spec, settings = findings.calibration, drive.spec, drive.settings
+    if spec.state and drive.recording.state is None:
+        known(calibration.responses or None, "the response of each state", "responses")
+    samples = align(findings.training, calibration)
+    try:
+        regression = regress(samples, spec, settings.order, noisy=not calibration.is_exact)
+    except FitError as error:
+        raise FitError(f"{drive.recording.source}: {error}") from None
+    if settings.strict:
+        refuse_unexcited(regression.excitation, spec)
+    return replace(findings, samples=samples, regression=regression)
+
+
+def prune(drive: Drive, findings: Findings) -> Findings:
+    """Keeps the terms of Eq. 2, and fits them anew."""
+    regression = known(findings.regression, "the fit of all terms", "fit")
+    linear = pruned(regression, drive.spec, drive.settings.alpha)
+    return replace(findings, linear=linear, model=linear.model)
+
+
+def refine(drive: Drive, findings: Findings) -> Findings:
+    """Adjusts model and calibration to predictions over seconds, unless the drive is exact."""
+    linear, _ = _fitted(findings)
+    if findings.calibration.is_exact:
+        return findings
+    model, calibration, note = refined(linear.model, findings.calibration, findings.training)
+    return replace(findings, model=model, calibration=calibration, refinement=(note,))
+
+
+def complete(drive: Drive, findings: Findings) -> Findings:
+    """Completes the model, on request, by the textbook for inputs that never moved."""
+    if not drive.settings.assume:
+        return findings
+    linear, model = _fitted(findings)
+    model, assumptions = assume_textbook(model, drive.spec, linear.unmoved)
+    return replace(findings, model=model, assumptions=assumptions)
+
+
+def judge(drive: Drive, findings: Findings) -> Findings:
+    """Tries the model on unseen data, measures what it leaves unexplained, says what to doubt."""
+    linear, model = _fitted(findings)
+    spec, whole, calibration = drive.spec, findings.whole, findings.calibration
+    samples = align(whole, calibration)
+    unseen = unseen_samples(samples, whole, calibration)
+    held_out, trial = tried(model, calibration, whole)
+    calibration = replace(calibration, notes=sentences(findings))
+    judged = with_quality(model, linear, unseen, held_out, spec)
+    return replace(
+        findings,
+        calibration=calibration,
+        noise=motion_noise(findings.noise, whole, calibration, model, samples),
+        linear=replace(linear, model=judged) if model is linear.model else linear,
+        model=judged,
+        unseen=unseen,
+        held_out=held_out,
+        notes=(
+            *findings.repairs,
+            *calibration.notes,
+            *findings.refinement,
+            *mirror_note(known(findings.samples, "the training part", "fit"), spec),
+            *unlearnt(linear, calibration, spec),
+            *doubts(linear, held_out, calibration.is_exact),
+            *trial,
+            *findings.assumptions,
+        ),
+    )
+
+
+def _fitted(findings: Findings) -> tuple[Fit, TaylorModel]:
+    return known(findings.linear, PRUNED, "prune"), known(findings.model, PRUNED, "prune")
+
+
+STAGES: tuple[Stage, ...] = (
+    repair, clocks, mounting, responses, noise, fit, prune, refine, complete, judge,
+)  # fmt: skip
+"""In order; each builds on what the stages before it found."""
+CALIBRATION: tuple[Stage, ...] = (clocks, mounting, responses, noise)
+
+
+def begun(drive: Drive) -> Findings:
+    """Returns the findings on a drive before the first stage."""
+    training = drive.part(cut(drive.recording, drive.settings.train_until_s))
+    return Findings(training, drive, nominal_timing(training))
+
+
+def run(stages: Sequence[Stage], drive: Drive) -> Findings:
+    """Runs a row of stages over a drive and returns their findings."""
+    findings = begun(drive)
+    for stage in stages:
+        findings = stage(drive, findings)
+    return findings
 
 
 @one_blas_thread
@@ -85,64 +203,35 @@ def identify(
 ) -> Identified:
     """Learns a robot's motion from the first part of a recording and tests it on the rest.
 
-    Args:
-        recording: of a drive in which every command varied. Single samples that jump and
-            repeated rows are dropped first.
-        spec: the robot.
-        order: of the Taylor expansion.
-        alpha: of the pruning (Eq. 2), or `auto`.
-        train_until: end of the training part, from the first pose [s]; after two thirds of the
-            drive when None.
-        assume: completes the model by the textbook for inputs that never moved.
-        strict: refuses a drive that did not move every input independently, instead of
-            returning a model without those inputs.
-
-    Returns:
-        Model, calibration, errors and sentences.
+    Every command must have varied. The first part ends at `train_until`, counted from the first
+    pose [s]; after two thirds of the drive when None. For the other options, see `Settings`.
 
     Raises:
         RecordingError: the recording can't be used for this robot.
         FitError: the drive does not contain enough information to fit a model.
     """
-    check_units(check(recording, spec), spec)
-    duration = float(recording.pose.t[-1] - recording.pose.t[0])
-    until = TRAIN_SHARE * duration if train_until is None else train_until
-    training, whole = repair(cut(recording, until), spec), repair(recording, spec).recording
-    check_axes(training.recording, spec)
-    calibration, findings = examine(training.recording, spec)
-    samples = align(training.recording, calibration, spec)
-    try:
-        linear = fit(samples, spec, order, alpha, noisy=not calibration.is_exact)
-    except FitError as error:
-        raise FitError(f"{recording.source}: {error}") from None
-    if strict:
-        refuse_unexcited(linear, spec)
-    exact = calibration.is_exact
-    model, calibration, notes = _refined(linear.model, calibration, training.recording, spec, until)
-    assumed: tuple[str, ...] = ()
-    if assume:
-        model, assumed = assume_textbook(model, spec, linear.unmoved)
-    held_out, trial = _held_out(model, calibration, whole, spec, until, duration)
-    calibration = replace(calibration, notes=sentences(calibration, findings, spec))
-    notes = (
-        *training.notes,
-        *calibration.notes,
-        *notes,
-        *mirror_note(samples, spec),
-        *unlearnt(linear, calibration, spec),
-        *doubts(linear, held_out, exact),
-        *trial,
-        *assumed,
-    )
-    unseen = unseen_samples(whole, calibration, spec, until)
-    noise = measure_noise(whole, calibration, model, align(whole, calibration, spec), spec)
-    as_fitted = model is linear.model
-    model = with_quality(model, linear, unseen, held_out, spec)
-    linear = replace(linear, model=model) if as_fitted else linear
+    drive = Drive(check(recording, spec), spec)
+    until = TRAIN_SHARE * drive.duration_s if train_until is None else train_until
+    found = run(STAGES, replace(drive, settings=Settings(order, alpha, until, assume, strict)))
+    linear, model = _fitted(found)
     return Identified(
-        model, calibration, linear, samples, unseen, whole, until, held_out, alpha, noise, findings,
-        notes,
+        found.whole, model, found.calibration, linear,
+        known(found.samples, "the training part", "fit"), found.unseen, found.held_out,
+        found.noise, found, found.notes,
     )  # fmt: skip
+
+
+@one_blas_thread
+def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
+    """Estimates the corrections that the streams of a recording need before a fit.
+
+    It is the identity for a recording that needs none.
+
+    Raises:
+        RecordingError: the recording can't be used for this robot.
+    """
+    found = run(CALIBRATION, Drive(check(recording, spec), spec))
+    return replace(found.calibration, notes=sentences(found))
 
 
 def cut(recording: Recording, until: float) -> Recording:
@@ -166,75 +255,3 @@ def cut(recording: Recording, until: float) -> Recording:
     parts: dict[str, Any] = {name: part(stream) for name, stream in recording.streams.items()}
     parts["command"] = part(recording.command, SEARCH_S)
     return replace(recording, **parts)
-
-
-def _refined(
-    model: TaylorModel, calibration: Calibration, training: Recording, spec: RobotSpec, until: float
-) -> tuple[TaylorModel, Calibration, tuple[str, ...]]:
-    """Refines a model of a real recording; the model of an exact recording is unchanged."""
-    if calibration.is_exact:
-        return model, calibration, ()
-    linear = model
-    model, calibration = _by_definition(model.with_errors({}), calibration, spec)
-    problem = problem_of(model, calibration, training, spec, 0.0, until)
-    if problem is None:
-        return merged(model, linear, {}), calibration, (
-            "The training part is too short to refine the model by its errors over seconds; record "
-            "a longer drive.",
-        )  # fmt: skip
-    try:
-        refined = simplify(problem, refine(problem, model, calibration))
-    except np.linalg.LinAlgError:  # the model is unstable: its slopes overflow
-        return merged(model, linear, {}), calibration, (
-            "The predictions of the fitted model run away on the training part, so that it could "
-            "not be refined.",
-        )  # fmt: skip
-    note = (
-        "Coefficients and calibration were refined by the open-loop errors over up to 5 s: "
-        f"{refined.error:.4f} m (root mean square) is left on the training part."
-    )
-    errors = replace(refined.model, std_errors=refined.std_errors).named_errors
-    return merged(refined.model, linear, errors), refined.calibration, (note,)
-
-
-def _by_definition(
-    model: TaylorModel, calibration: Calibration, spec: RobotSpec
-) -> tuple[TaylorModel, Calibration]:
-    """Scales an inferred speed so that vx = 1 speed, and treats lateral motion as noise.
-
-    `base_link` of a robot without a lateral command is the point without lateral motion.
-    """
-    coefficients = model.coefficients.copy()
-    if not spec.moves_sideways:
-        coefficients[1] = 0.0
-    responses = list(calibration.responses)
-    speeds = [i for i, v in enumerate(spec.state) if v.unit == "m/s"]
-    if responses and len(speeds) == 1:
-        i = speeds[0]
-        alone = np.array([v == spec.state[i].name for v in spec.variable_names], dtype=np.int64)
-        scale = float(coefficients[0] @ (model.powers == alone).all(axis=1))
-        if scale > 0.0:
-            coefficients = coefficients / scale ** model.powers[:, i]
-            coefficients[3 + i] *= scale
-            responses[i] = replace(responses[i], gain=responses[i].gain * scale)
-            coefficients[0, (model.powers == alone).all(axis=1)] = 1.0
-    model = replace(model, coefficients=coefficients)
-    return model, replace(calibration, responses=tuple(responses))
-
-
-def _held_out(
-    model: TaylorModel,
-    calibration: Calibration,
-    recording: Recording,
-    spec: RobotSpec,
-    until: float,
-    duration: float,
-) -> tuple[OpenLoop | None, tuple[str, ...]]:
-    chosen = windows(recording, calibration, until, duration, HORIZON_S, 0.1)
-    if len(chosen.start_t) == 0:
-        return None, (
-            f"The last {max(duration - until, 0.0):.1f} s, held out of the fit, are too short for "
-            f"a prediction over {HORIZON_S:g} s: the model was not tried on unseen data; record "
-            "20 s or more.",
-        )  # fmt: skip
-    return open_loop_error(model, calibration, recording, spec, until, duration), ()

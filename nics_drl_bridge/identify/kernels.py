@@ -66,11 +66,12 @@ def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-un
         x: (W, T, V + 1) X during each step, and a last entry of 1.
         steps: (W,) whole steps to the end.
         share: (W,) remaining fraction of one more step.
-        terms: degree of freedom (K,), coefficient (K,), factors (K, order), their number (K,).
+        terms: of the twist, see `robot.kernels.Terms`.
         free: (P,) indices of the free terms.
         dt: length of a step [s].
     """
-    dof, coefficient, factors, count = terms
+    dof, coefficient = terms.dof, terms.coefficient
+    factors, count = terms.factors, terms.degree
     params = moved.shape[2]
     values = np.empty(dof.shape[0])
     now, before = np.zeros((3, params)), np.zeros((3, params))

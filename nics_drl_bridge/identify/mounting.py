@@ -1,11 +1,8 @@
 """Mounting: position and rotation of the tracked body on the robot.
 
-Uncertainty of a mounting by the delete-one-block jackknife.
-
-Efron, Tibshirani: An Introduction to the Bootstrap, ch. 11. It covers what least-squares formulas
-miss: wheel slip that is correlated over seconds, and errors of the regressors themselves.
-
-Wheels: the scale of their speeds, and interchanged left and right wheels.
+The uncertainty on an omnidirectional robot is that of the delete-one-block jackknife (Efron,
+Tibshirani: An Introduction to the Bootstrap, ch. 11). It covers what least-squares formulas miss:
+wheel slip that is correlated over seconds, and errors of the regressors themselves.
 """
 
 from __future__ import annotations
@@ -13,18 +10,22 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import rotate, wrap_angle
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.noise import TwistIntervals
-from nics_drl_bridge.identify.signals import interval_means
+from nics_drl_bridge.identify.clocks import (
+    LONG_STEP,
+    TimingEstimate,
+    expected_states,
+    if_certain,
+)
+from nics_drl_bridge.identify.drive import Drive, TwistIntervals
+from nics_drl_bridge.identify.signals import followed, held
 from nics_drl_bridge.identify.statistics import standard_errors
-from nics_drl_bridge.identify.timing import CERTAIN
-from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.recording.recording import Stream
 
 Array = NDArray[np.float64]
 
@@ -35,6 +36,9 @@ DISTINCT = 4.0
 MIN_SECOND = 0.05
 """It must have at least this share of the size of the first."""
 STILL = 1e-3
+MIN_LENGTH = 1e-4  # m, rad
+REGULAR = 0.8
+BLOCKS = 8
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,54 @@ class Mounting:
     rotation_sigma: float
     lever_sigma: Array
     turns: bool
+
+
+def mounting_of(drive: Drive, timing: TimingEstimate, speed: Array | None) -> Mounting | None:
+    """Estimates the mounting as far as the drive shows it; None if it does not.
+
+    `speed` (n,) is expected along the direction of travel over the intervals of the twists, up to
+    one factor; None if unknown.
+    """
+    spec, twists = drive.spec, drive.twists
+    if spec.moves_sideways:
+        return jackknifed(
+            drive, twists, timing.offset, lambda part, rows: _by_commands(part, rows, timing)
+        )
+    start, end = twists.on_clock(timing.offset)
+    command = held(drive.recording.command, spec, start - timing.latency, end - timing.latency)
+    found = mounting_without_lateral_motion(twists, spec.to_cmd_vel(command)[:, 0])
+    if found is None or speed is None or np.isnan(found.lever_sigma[0]):
+        return found
+    lever_y, sigma = lateral_lever(twists, found.rotation, speed)
+    return replace(
+        found,
+        lever=np.array([found.lever[0], lever_y]),
+        lever_sigma=np.array([found.lever_sigma[0], sigma]),
+    )
+
+
+def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
+    """Adds those parts of a mounting that are significant, and all uncertainties."""
+    if mounting is None:
+        return calibration
+    rotation = if_certain(mounting.rotation, mounting.rotation_sigma, MIN_LENGTH)
+    known = ~np.isnan(mounting.lever_sigma)
+    x, y = (
+        if_certain(float(value), float(sigma), MIN_LENGTH) if k else 0.0
+        for value, sigma, k in zip(mounting.lever, mounting.lever_sigma, known, strict=True)
+    )
+    sigma = {"rotation_rad": mounting.rotation_sigma}
+    sigma |= {
+        f"lever_arm_{axis}_m": float(s)
+        for axis, s, k in zip("xy", mounting.lever_sigma, known, strict=True)
+        if k
+    }
+    return replace(
+        calibration,
+        rotation_rad=rotation,
+        lever_arm_m=(x, y),
+        uncertainty={**calibration.uncertainty, **sigma},
+    )
 
 
 def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> Mounting | None:
@@ -156,17 +208,62 @@ def mounting_by_commands(motion: TwistIntervals, response: Array) -> Mounting | 
     )
 
 
-BLOCKS = 8
-Estimate = Callable[[Recording, TwistIntervals], Mounting | None]
+def _by_commands(drive: Drive, twists: TwistIntervals, timing: TimingEstimate) -> Mounting | None:
+    """Estimates the mounting on an omnidirectional robot from its state, or from its commands."""
+    recording, spec = drive.recording, drive.spec
+    if spec.state:
+        expected = expected_states(drive, twists, timing)
+        command = _as_commands(expected, drive, timing.latency)
+    else:
+        begin = twists.start + timing.offset - timing.latency
+        command = held(recording.command, spec, begin, begin + twists.end - twists.start)
+    return mounting_by_commands(twists, spec.to_cmd_vel(command))
+
+
+def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
+    """Converts states (n, S) to the commands (n, C) that would sustain them."""
+    stream, command, spec = drive.recording.state, drive.recording.command, drive.spec
+    if stream is None:
+        return states[:, np.argsort(followed(spec))]
+    span = np.diff(stream.t)
+    keep = (span > 0.0) & (span < LONG_STEP * np.median(span))
+    keep &= _fresh(command, stream.t[:-1] - latency)
+    rates = np.diff(stream.values, axis=0)[keep] / span[keep, None]
+    before = stream.values[:-1][keep]
+    begin = stream.t - latency
+    u = held(command, spec, begin[:-1][keep], begin[1:][keep])
+    # With more wheels than degrees of freedom, the rest of their speeds is slip, not commands.
+    ways = np.linalg.svd(before, full_matrices=False)[2][: u.shape[1]].T
+    chi = np.concatenate([before @ ways, u, np.ones((len(u), 1))], axis=1)
+    beta = np.linalg.lstsq(chi, rates @ ways, rcond=1e-9)[0]
+    size = ways.shape[1]
+    steady = -np.linalg.pinv(beta[:size].T, rcond=1e-6) @ beta[size:-1].T
+    return np.asarray(states @ ways @ np.linalg.pinv(steady).T)
+
+
+def _fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
+    """Returns a mask of the times (n,) at which the command is known; rows may be missing.
+
+    If commands are recorded irregularly, each is assumed to be held until the next.
+    """
+    span = np.diff(command.t)
+    usual = float(np.median(span)) if len(span) else 0.0
+    if not (span < LONG_STEP * usual).mean() > REGULAR:
+        return np.ones(len(start), dtype=np.bool_)
+    row = np.searchsorted(command.t, start + 1e-9, "right") - 1
+    return np.asarray(np.append(span, 0.0)[np.clip(row, 0, None)] < LONG_STEP * usual)
+
+
+Estimate = Callable[[Drive, TwistIntervals], Mounting | None]
 
 
 def jackknifed(
-    recording: Recording, twists: TwistIntervals, offset: float, estimate: Estimate
+    drive: Drive, twists: TwistIntervals, offset: float, estimate: Estimate
 ) -> Mounting | None:
     """Estimates a mounting, with at least the uncertainty of the delete-one-block jackknife.
 
     Args:
-        recording: the drive.
+        drive: the drive.
         twists: of the tracked body.
         offset: of the pose's clock, as in `Calibration` [s].
         estimate: estimates the mounting from a drive and its twists.
@@ -174,12 +271,12 @@ def jackknifed(
     Returns:
         The mounting from the whole drive; None if it can't be estimated.
     """
-    whole = estimate(recording, twists)
+    whole = estimate(drive, twists)
     if whole is None:
         return None
     edges = np.linspace(twists.start[0], twists.end[-1], BLOCKS + 1)
     parts = [
-        estimate(*_without(recording, twists, offset, begin, end)) for begin, end in pairwise(edges)
+        estimate(*_without(drive, twists, offset, begin, end)) for begin, end in pairwise(edges)
     ]
     found = [part for part in parts if part is not None]
     if len(found) < BLOCKS:
@@ -199,55 +296,14 @@ def _spread(values: Array) -> Array:
 
 
 def _without(
-    recording: Recording, twists: TwistIntervals, offset: float, begin: float, end: float
-) -> tuple[Recording, TwistIntervals]:
+    drive: Drive, twists: TwistIntervals, offset: float, begin: float, end: float
+) -> tuple[Drive, TwistIntervals]:
     """Drops the twists and the measured state between two times of the pose's clock [s]."""
     rows = (twists.end <= begin) | (twists.start >= end)
     kept = TwistIntervals(twists.start[rows], twists.end[rows], twists.twist[rows])
-    state = recording.state
+    state = drive.recording.state
     if state is None:
-        return recording, kept
+        return drive, kept
     outside = (state.t < begin + offset) | (state.t > end + offset)
     cut = replace(state, t=state.t[outside], values=state.values[outside])
-    return replace(recording, state=cut), kept
-
-
-def wheels_swapped(recording: Recording, twists: TwistIntervals, offset: float) -> bool | None:
-    """True if the left wheel is faster in left turns; None if the wheels do not show it."""
-    if recording.wheels is None:
-        return None
-    start, end = twists.start + offset, twists.end + offset
-    wheels = interval_means(recording.wheels.t, recording.wheels.values, start, end)
-    difference, turn = wheels[:, 1] - wheels[:, 0], twists.twist[:, 2]
-    size = float(np.sqrt((difference**2).mean() * (turn**2).mean()))
-    if size <= 0.0:
-        return None
-    agreement = float((difference * turn).mean()) / size
-    return agreement < 0.0 if abs(agreement) > 0.5 else None
-
-
-def wheel_scales(
-    recording: Recording, twists: TwistIntervals, calibration: Calibration
-) -> Calibration:
-    """Adds the scales of the wheel speeds, as far as the drive shows them."""
-    if recording.wheels is None:
-        return calibration
-    start, end = (t + calibration.clock_offset_s for t in (twists.start, twists.end))
-    wheels = interval_means(recording.wheels.t, recording.wheels.values, start, end)
-    c, s = np.cos(calibration.rotation_rad), np.sin(calibration.rotation_rad)
-    turn = twists.twist[:, 2]
-    along = c * twists.twist[:, 0] + s * twists.twist[:, 1] + calibration.lever_arm_m[1] * turn
-    rows = {
-        "wheel_scale": (wheels.mean(axis=1), along),
-        "turn_scale": (wheels[:, 1] - wheels[:, 0], turn),
-    }
-    for name, (units, moved) in rows.items():
-        if not float(units @ units) > 0.0:
-            continue
-        scale = float(units @ moved / (units @ units))
-        sigma = float(standard_errors(units[:, None], moved - scale * units)[0])
-        if abs(scale) > CERTAIN * sigma:
-            known: dict[str, Any] = {name: scale}
-            uncertainty = {**calibration.uncertainty, name: sigma}
-            calibration = replace(calibration, uncertainty=uncertainty, **known)
-    return calibration
+    return drive.part(replace(drive.recording, state=cut)), kept

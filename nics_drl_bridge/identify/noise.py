@@ -1,143 +1,249 @@
-"""Noise of the pose, and body twists over intervals long enough for that noise."""
+"""Measurement of sensor noise, and of the motion that a model leaves unexplained.
+
+The drift is measured over a second: systematic errors of a model grow faster than noise, so over
+a longer horizon the same model seems to drift more. The noise of the odometry is the deviation of
+reported velocities from the motion.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.identify.repair import Bursts, find_bursts
-from nics_drl_bridge.identify.signals import unwrapped
-from nics_drl_bridge.recording.recording import Stream
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive, find_bursts, pose_noise
+from nics_drl_bridge.identify.open_loop import (
+    Windows,
+    course_of,
+    predict,
+    relative_ends,
+    tracked_ends,
+    windows,
+)
+from nics_drl_bridge.identify.signals import white_noise
+from nics_drl_bridge.recording.recording import Samples
+from nics_drl_bridge.robot.noise import ASSUMED_STATE_DRIFT, MEASURED, Level, Noise, assumed
+from nics_drl_bridge.robot.taylor import TaylorModel
 
 Array = NDArray[np.float64]
 
-DIFFERENCE = 6
-DIFFERENCE_GAIN = np.sqrt(924.0)  # white noise grows by this in a sixth difference
-GAUSSIAN_MAD = 0.6745
-UNEVEN = 0.5
-LEAST_WHOLE = 0.1  # share of gap-free stretches from which on only those are used
-NEGLIGIBLE = 1e-6  # m, rad
-REST_SAMPLES = 12
-REST_DRIFT = 3.0  # standard errors; straight motion shows at least 4
-SLOPE_NOISE = 0.05
-MAX_SPAN_S = 0.2
-MAX_GAP_S = 0.25
+HORIZON_S = 1.0
+SPACING_S = 0.25
+GROWTH_S = (0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
+STATE_HORIZON_S = 0.1
+MIN_WINDOWS = 20
+OUTLYING = 10.0
+"""A window whose error is more than this many times the median contains a jump."""
+RUN_AWAY_M = 1e4
+"""A larger error of a prediction over a second is divergence, not drift."""
+BLOCKS = 8
+TINY = 1e-9
+NEGLIGIBLE = 1e-4
+"""A smaller level is rounding: a tenth of a millimetre after a second."""
+WITHIN_SIGMA = 68.27
+"""Percentage of a normal distribution within one standard deviation."""
+MIN_ROWS = 40
 
 
-@dataclass(frozen=True)
-class TwistIntervals:
-    """Twists of the tracked body over intervals.
+def sensor_noise(drive: Drive) -> Noise:
+    """Measures the noise of the pose sensor; its uncertainty comes from blocks of the drive."""
+    pose, whole = drive.recording.pose, drive.pose_noise
+    if whole is None:
+        return Noise()
+    blocks = (
+        replace(pose, t=pose.t[rows], values=pose.values[rows])
+        for rows in np.array_split(np.arange(len(pose.t)), BLOCKS)
+    )
+    parts = [pose_noise(block, find_bursts(block.t)) for block in blocks]
+    known = np.array([part for part in parts if part is not None])
+    spread = known.std(axis=0, ddof=1) / np.sqrt(len(known)) if len(known) > 1 else [None, None]
+    position, heading = (
+        Level(std=std, unit=unit, source=MEASURED, uncertainty=None if u is None else float(u))
+        for std, unit, u in zip(whole, ("m", "rad"), spread, strict=True)
+    )
+    return Noise(pose_position=position, pose_heading=heading)
 
-    Attributes:
-        start, end: (n,) of the intervals, on the pose's clock [s].
-        twist: (n, 3) constant twist whose arc joins the poses at both ends, in the frame of the
-            tracked body.
+
+def motion_noise(
+    sensor: Noise, drive: Drive, calibration: Calibration, model: TaylorModel, samples: Samples
+) -> Noise:
+    """Adds odometry noise and drift to the noise of the pose sensor.
+
+    Each level is marked as measured or assumed.
     """
+    linear, angular = odometry_noise(drive, calibration, model, samples)
+    measured: dict[str, Level | dict[str, Level]] = {
+        "odom_linear": linear,
+        "odom_angular": angular,
+        "state_drift": _state_drift(drive, model, samples),
+    }
+    drift = _pose_drift(sensor, drive, calibration, model)
+    if drift is not None:
+        measured |= {"position_drift": drift[0], "heading_drift": drift[1]}
+    return sensor.model_copy(update=measured)
 
-    start: Array
-    end: Array
-    twist: Array
 
+def level(variances: Array, unit: str) -> Level:
+    """Returns a measured level from squares (n,) in order of time, sensor noise subtracted.
 
-def pose_noise(
-    pose: Array, bursts: Bursts | None, t: Array | None = None
-) -> tuple[float, float] | None:
-    """Returns standard deviations of position [m] and heading [rad] of poses (T, 3) at times (T,).
-
-    They come from sixth differences, in which smooth motion vanishes, over gap-free stretches. In
-    bursts, whose sample times are not known well enough, they come from the stretches in which
-    the robot stood still. None if there are none.
+    The uncertainty is that of the mean over blocks of the drive.
     """
-    pose = unwrapped(pose)
-    if bursts is None:
-        rest = _high_differences(pose, t)
-        if len(rest) < DIFFERENCE:
-            return None
-        sigma = np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD
+    variance = max(float(variances.mean()), 0.0)
+    means = np.array([part.mean() for part in np.array_split(variances, BLOCKS)])
+    spread = float(means.std(ddof=1) / np.sqrt(BLOCKS))
+    std = float(np.sqrt(variance))
+    if std < NEGLIGIBLE:
+        std = 0.0
+    uncertainty = spread / (2.0 * std) if std**2 > spread else float(np.sqrt(max(spread, 0.0)))
+    return Level(std=std, unit=unit, source=MEASURED, uncertainty=uncertainty if std else 0.0)
+
+
+def _pose_drift(
+    sensor: Noise, drive: Drive, calibration: Calibration, model: TaylorModel
+) -> tuple[Level, Level] | None:
+    """Returns the drift of position and heading; None if too short or the model diverges."""
+    chosen = windows(drive, calibration, 0.0, drive.duration_s, HORIZON_S, SPACING_S)
+    if len(chosen.start_t) < MIN_WINDOWS:
+        return None
+    error = geometry.between(_predicted(drive, calibration, model, chosen), chosen.end)
+    size = np.hypot(error[:, 0], error[:, 1])
+    if not (size < RUN_AWAY_M).all():
+        return None
+    inside = size <= OUTLYING * max(float(np.median(size)), TINY)
+    position, _, heading = sensor.pose
+    away = np.sum((chosen.end - chosen.start)[inside, :2] ** 2, axis=1)
+    turn = error[inside, 2] ** 2 - 2.0 * heading**2
+    grown = max(float(turn.mean()), 0.0)
+    # Errors of the initial heading, and heading drift on the way, cause lateral errors.
+    aside = 0.5 * away * (heading**2 + grown / 3.0)
+    shift = 0.5 * size[inside] ** 2 - 2.0 * position**2 - aside
+    return level(shift / HORIZON_S, "m/sqrt(s)"), level(turn / HORIZON_S, "rad/sqrt(s)")
+
+
+def drift_growth(
+    drive: Drive, calibration: Calibration, model: TaylorModel
+) -> tuple[Array, Array, Array] | None:
+    """Returns the growth of prediction errors: horizons [s], position [m], heading [rad], all (n,).
+
+    The errors are root mean squares, of the position per axis. None if the drive is too short.
+    """
+    rows = []
+    for horizon in GROWTH_S:
+        chosen = windows(drive, calibration, 0.0, drive.duration_s, horizon, SPACING_S)
+        if len(chosen.start_t) < MIN_WINDOWS:
+            break
+        ends = _predicted(drive, calibration, model, chosen)
+        error = geometry.between(ends, chosen.end)
+        square = np.mean(error**2, axis=0)
+        rows.append((horizon, np.sqrt(0.5 * (square[0] + square[1])), np.sqrt(square[2])))
+    if not rows:
+        return None
+    horizons, position, heading = np.array(rows).T
+    return horizons, position, heading
+
+
+def _predicted(
+    drive: Drive, calibration: Calibration, model: TaylorModel, chosen: Windows
+) -> Array:
+    """Predicts end poses (W, 3) from the measured state if there is one, else from commands.
+
+    The unexplained part of the state's rates is thus not counted twice.
+    """
+    state = drive.recording.state
+    if state is None:
+        return predict(model, calibration, drive, chosen)
+    course = course_of(model, calibration, drive, chosen)
+    x, begin = course.x.copy(), chosen.start_t + calibration.clock_offset_s
+    t = begin[:, None] + model.dt * np.arange(x.shape[1])
+    for i, column in enumerate(state.values.T):
+        x[:, :, i] = np.interp(t, state.t, column)
+    course = replace(course, x=x)
+    return tracked_ends(course, calibration, relative_ends(course, model)[0])
+
+
+def _state_drift(drive: Drive, model: TaylorModel, samples: Samples) -> dict[str, Level]:
+    """Returns the drift of a measured state; assumed levels for an unmeasured one."""
+    state = drive.recording.state
+    nominal = {
+        v.name: assumed(ASSUMED_STATE_DRIFT * (v.max - v.min), f"{v.unit}/sqrt(s)")
+        for v in drive.spec.state
+    }
+    if state is None:
+        return nominal
+    rest = (samples.dq - model.rates(samples.x))[:, 3:] * samples.dt
+    steps = max(1, round(STATE_HORIZON_S / samples.dt))
+    count = len(rest) // steps
+    next_to = np.append(np.diff(samples.t) < 1.5 * samples.dt, True)[: count * steps]
+    whole = next_to.reshape(count, steps)[:, :-1].all(axis=1)
+    sums = rest[: count * steps].reshape(count, steps, -1)[whole].sum(axis=1)
+    if len(sums) < MIN_WINDOWS:
+        return nominal
+    found, sensor = {}, white_noise(state.values)
+    for i, variable in enumerate(drive.spec.state):
+        usual = OUTLYING * max(float(np.median(np.abs(sums[:, i]))), TINY)
+        kept = sums[np.abs(sums[:, i]) <= usual, i]
+        found[variable.name] = level(
+            (kept**2 - 2.0 * float(sensor[i]) ** 2) / (steps * samples.dt),
+            f"{variable.unit}/sqrt(s)",
+        )
+    return found
+
+
+def odometry_noise(
+    drive: Drive, calibration: Calibration, model: TaylorModel, samples: Samples
+) -> tuple[Level, Level]:
+    """Returns linear and angular noise relative to the twist of the fitted model.
+
+    It comes from the recorded odometry; else from the wheels, if the calibration knows their
+    scale; else it is the assumed noise of `Noise`.
+    """
+    default = Noise()
+    rest = odometry_residual(drive, calibration, model, samples)
+    if rest is None:
+        return default.odom_linear, default.odom_angular
+    linear = max((_level(rest[:, i], "m/s") for i in (0, 1)), key=lambda found: found.std)
+    return linear, _level(rest[:, 2], "rad/s")
+
+
+def odometry_residual(
+    drive: Drive, calibration: Calibration, model: TaylorModel, samples: Samples
+) -> Array | None:
+    """Returns reported minus modelled twist (n, 3); None if there is nothing to compare."""
+    recording, stream = drive.recording, drive.recording.odometry
+    if stream is not None:
+        t, twist = stream.t, stream.values
+        if stream.clock == recording.pose.clock:
+            t = t + calibration.clock_offset_s
+    elif recording.wheels is not None and calibration.wheel_scale is not None:
+        t, wheels = recording.wheels.t, recording.wheels.values
+        twist = np.zeros((len(t), 3))
+        twist[:, 0] = calibration.wheel_scale * wheels.mean(axis=1)
+        twist[:, 2] = (calibration.turn_scale or 0.0) * (wheels[:, 1] - wheels[:, 0])
     else:
-        found = _spread_at_rest(pose)
-        if found is None:
-            return None
-        sigma = found
-    sigma = np.where(sigma < NEGLIGIBLE, 0.0, sigma)
-    return float(np.hypot(sigma[0], sigma[1]) / np.sqrt(2.0)), float(sigma[2])
-
-
-def pose_residual(pose: Stream) -> Array | None:
-    """Returns the noise (n, 3) of poses at its own scale; None for bursts or too few poses."""
-    if find_bursts(pose.t) is not None or len(pose.t) <= 2 * DIFFERENCE:
         return None
-    return _high_differences(unwrapped(pose.values), pose.t)
-
-
-def _high_differences(pose: Array, t: Array | None) -> Array:
-    """Returns sixth differences (n, 3) at the scale of the noise, over gap-free stretches."""
-    rest = np.diff(pose, DIFFERENCE, axis=0) / DIFFERENCE_GAIN
-    if t is None or not len(rest):
-        return np.asarray(rest)
-    span = np.diff(t)
-    even = np.abs(span - np.median(span)) < UNEVEN * np.median(span)
-    whole = np.convolve(even, np.ones(DIFFERENCE), "valid") > DIFFERENCE - 0.5
-    return np.asarray(rest[whole] if whole.mean() > LEAST_WHOLE else rest)
-
-
-def white_noise(values: Array) -> float:
-    """Returns the standard deviation of white noise on an otherwise smooth, even series (T,)."""
-    if len(values) <= 2 * DIFFERENCE:
-        return 0.0
-    rest = np.diff(values, DIFFERENCE) / DIFFERENCE_GAIN
-    return float(np.median(np.abs(rest)) / GAUSSIAN_MAD)
-
-
-def _spread_at_rest(pose: Array) -> Array | None:
-    """Returns the spread (3,) in stretches whose two halves do not differ; None if too few."""
-    count = len(pose) // REST_SAMPLES
-    blocks = pose[: count * REST_SAMPLES].reshape(count, REST_SAMPLES, 3)
-    spread = blocks.std(axis=1, ddof=1)
-    half = REST_SAMPLES // 2
-    drift = np.abs(blocks[:, :half].mean(axis=1) - blocks[:, half:].mean(axis=1))
-    still = (drift < REST_DRIFT * spread / np.sqrt(half)).all(axis=1)
-    still &= (spread < 10.0 * np.maximum(spread.min(axis=0), NEGLIGIBLE)).all(axis=1)
-    if still.sum() < 2:
+    inside = (t >= samples.t[0]) & (t <= samples.t[-1])
+    if inside.sum() < MIN_ROWS:
         return None
-    return np.asarray(np.sqrt((spread[still] ** 2).mean(axis=0)))
+    rates = model.rates(samples.x)[:, :3]
+    # The rates are means from each sample to the next, so they belong to the middle of the step.
+    middle = samples.t + samples.dt / 2.0
+    expected = np.stack([np.interp(t[inside], middle, column) for column in rates.T], axis=1)
+    return np.asarray(twist[inside] - expected)
 
 
-def motion(
-    t: Array, pose: Array, bursts: Bursts | None, noise: tuple[float, float]
-) -> TwistIntervals:
-    """Returns twists of the tracked body over intervals long enough for the noise.
-
-    Args:
-        t: (T,) sample times [s], of each burst only the newest.
-        pose: (T, 3).
-        bursts: of the stream.
-        noise: of position [m] and heading [rad].
-    """
-    stride = 1 if bursts is not None else _stride(t, pose, noise)
-    limit = 1.8 * bursts.period_s if bursts is not None else MAX_GAP_S
-    t, pose = t[::stride], pose[::stride]
-    span = np.diff(t)
-    usable = (span > 0.0) & (span < max(limit, 3.0 * float(np.median(span))))
-    relative = geometry.between(pose[:-1], pose[1:])[usable]
-    return TwistIntervals(
-        t[:-1][usable], t[1:][usable], geometry.log(relative) / span[usable, None]
+def _level(rest: Array, unit: str) -> Level:
+    """Returns a level that is robust against single outliers."""
+    parts = np.array([_sigma(part) for part in np.array_split(rest, BLOCKS)])
+    return Level(
+        std=_sigma(rest),
+        unit=unit,
+        source=MEASURED,
+        uncertainty=float(parts.std(ddof=1) / np.sqrt(BLOCKS)),
     )
 
 
-def _stride(t: Array, pose: Array, noise: tuple[float, float]) -> int:
-    """Returns the number of samples between poses that makes motion stand out of the noise."""
-    dt = float(np.median(np.diff(t)))
-    coarse = max(1, round(MAX_SPAN_S / dt))
-    far = geometry.log(geometry.between(pose[:-coarse:coarse], pose[coarse::coarse])) / (
-        coarse * dt
-    )
-    speed = float(np.sqrt((far[:, :2] ** 2).sum(axis=1).mean())) if len(far) else 0.0
-    turn = float(np.sqrt((far[:, 2] ** 2).mean())) if len(far) else 0.0
-    needed = max(
-        noise[0] / max(SLOPE_NOISE * speed, 1e-9), noise[1] / max(SLOPE_NOISE * turn, 1e-9)
-    )
-    return int(np.clip(np.ceil(np.sqrt(2.0) * needed / dt), 1, coarse))
+def _sigma(rest: Array) -> float:
+    return float(np.percentile(np.abs(rest - np.median(rest)), WITHIN_SIGMA))

@@ -1,22 +1,20 @@
-"""Open-loop prediction: the error of a model after some seconds of commands."""
+"""Open-loop prediction: windows of a drive, and the poses that a model predicts at their ends."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.identify import repair
 from nics_drl_bridge.identify.align import states_at
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.signals import held
-from nics_drl_bridge.identify.timing import followed
-from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.kernels import follow
+from nics_drl_bridge.identify.signals import followed, held
 from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
-from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 Array = NDArray[np.float64]
@@ -74,7 +72,7 @@ class Windows:
 
 
 def windows(
-    recording: Recording,
+    drive: Drive,
     calibration: Calibration,
     start: float,
     stop: float,
@@ -84,19 +82,18 @@ def windows(
     """Selects the windows between two times, counted from the first pose.
 
     Args:
-        recording: the drive.
+        drive: the drive.
         calibration: of this drive.
-        start: start of the part of the drive that contains the windows, from its first pose [s].
+        start: start of the part of the drive that contains the windows [s].
         stop: its end [s].
         horizon: length of a window [s].
         spacing: minimum time between two starts [s].
     """
-    best = repair.newest(recording.pose.t, repair.find_bursts(recording.pose.t))
-    t, pose = recording.pose.t[best], recording.pose.values[best]
-    origin, period = recording.pose.t[0], float(np.median(np.diff(t)))
+    t, pose = drive.dated.t, drive.dated.values
+    origin, period = drive.recording.pose.t[0], float(np.median(np.diff(t)))
     first = origin + start
     if calibration.responses:
-        first = max(first, recording.command.t[0] - calibration.clock_offset_s + SETTLE_S)
+        first = max(first, drive.recording.command.t[0] - calibration.clock_offset_s + SETTLE_S)
     begin = np.flatnonzero((t >= first) & (t + horizon <= origin + stop + period / 2.0))
     begin = begin[_spaced(t[begin], spacing)]
     after = np.clip(np.searchsorted(t, t[begin] + horizon), 1, len(t) - 1)
@@ -118,31 +115,22 @@ def _spaced(t: Array, spacing: float) -> NDArray[np.intp]:
     return np.array(chosen, dtype=np.intp)
 
 
-def predict(
-    model: TaylorModel,
-    calibration: Calibration,
-    recording: Recording,
-    spec: RobotSpec,
-    chosen: Windows,
-) -> Array:
+def predict(model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows) -> Array:
     """Predicts poses (W, 3) of the tracked body at the ends of windows from the commands.
 
     The state at the start is the measured one, or follows from the commands before it.
     """
     base = calibration.to_base(chosen.start)
-    by = _by_one_rollout if recording.state is None else _by_windows
-    relative = by(model, calibration, recording, spec, chosen)
+    by = _by_one_rollout if drive.recording.state is None else _by_windows
+    relative = by(model, calibration, drive, chosen)
     return calibration.to_tracked(geometry.compose(base, relative))
 
 
 def _by_one_rollout(
-    model: TaylorModel,
-    calibration: Calibration,
-    recording: Recording,
-    spec: RobotSpec,
-    chosen: Windows,
+    model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
 ) -> Array:
     """Returns relative poses (W, 3) from one roll-out: an inferred state needs commands only."""
+    recording, spec = drive.recording, drive.spec
     start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
     lead = np.ceil((max(0.0, start.min() - recording.command.t[0]) + 1.0) / model.dt)
     # Whole steps before the first window: windows of regular poses then begin and end on the grid.
@@ -156,12 +144,8 @@ def _by_one_rollout(
     return geometry.between(at[0], at[1])
 
 
-def from_measured_states(
-    model: TaylorModel,
-    calibration: Calibration,
-    recording: Recording,
-    spec: RobotSpec,
-    chosen: Windows,
+def _from_measured_states(
+    model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
 ) -> tuple[Array, Array, Array, NDArray[np.intp], Array]:
     """Rolls each window out from its own measured state.
 
@@ -172,22 +156,18 @@ def from_measured_states(
     start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
     steps = int(np.ceil(float((end - start).max()) / model.dt - 1e-6)) + 1
     begin = start[:, None] + model.dt * np.arange(steps) - calibration.command_latency_s
-    command = held(recording.command, spec, begin, begin + model.dt)
-    poses, states = _roll(model, states_at(recording, calibration, spec, start), command)
+    command = held(drive.recording.command, drive.spec, begin, begin + model.dt)
+    poses, states = _roll(model, states_at(drive, calibration, start), command)
     exact = (end - start) / model.dt
     step = np.floor(exact + 1e-6).astype(np.intp)
     return poses, states, command, step, np.clip(exact - step, 0.0, 1.0)
 
 
 def _by_windows(
-    model: TaylorModel,
-    calibration: Calibration,
-    recording: Recording,
-    spec: RobotSpec,
-    chosen: Windows,
+    model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
 ) -> Array:
     """Returns relative poses (W, 3), each window started from its measured state."""
-    poses, _, _, step, share = from_measured_states(model, calibration, recording, spec, chosen)
+    poses, _, _, step, share = _from_measured_states(model, calibration, drive, chosen)
     row, share = np.arange(len(step)), share[:, None]
     return np.asarray((1.0 - share) * poses[row, step] + share * poses[row, step + 1])
 
@@ -207,36 +187,26 @@ def _roll(model: TaylorModel, state: Array, command: Array) -> tuple[Array, Arra
 def open_loop_error(
     model: TaylorModel,
     calibration: Calibration,
-    recording: Recording,
-    spec: RobotSpec,
+    drive: Drive,
     start: float,
     stop: float,
     horizon: float = HORIZON_S,
 ) -> OpenLoop:
     """Predicts a part of a drive open-loop and compares the end poses.
 
-    Args:
-        model: the model.
-        calibration: of this drive.
-        recording: the drive.
-        spec: the robot.
-        start: start of the part of the drive to use, from its first pose [s].
-        stop: its end [s].
-        horizon: length of each prediction [s].
-
-    Returns:
-        The errors over windows that start every 0.1 s.
+    The part lasts from `start` to `stop`, counted from the first pose [s]. Windows of length
+    `horizon` [s] start every 0.1 s.
 
     Raises:
         RecordingError: the part is too short for a window.
     """
-    chosen = windows(recording, calibration, start, stop, horizon, SPACING_S)
+    chosen = windows(drive, calibration, start, stop, horizon, SPACING_S)
     if len(chosen.start_t) == 0:
         raise RecordingError(
-            f"{recording.source}: the {stop - start:.1f} s from {start:.1f} s on hold no window of "
-            f"{horizon:g} s; record a longer drive or shorten the horizon."
+            f"{drive.recording.source}: the {stop - start:.1f} s from {start:.1f} s on hold no "
+            f"window of {horizon:g} s; record a longer drive or shorten the horizon."
         )
-    error = predict(model, calibration, recording, spec, chosen) - chosen.end
+    error = predict(model, calibration, drive, chosen) - chosen.end
     position = np.hypot(error[:, 0], error[:, 1])
     moved = chosen.end - chosen.start
     return OpenLoop(
@@ -249,3 +219,77 @@ def open_loop_error(
         mean_path_m=float(chosen.path.mean()),
         median_displacement_m=float(np.median(np.hypot(moved[:, 0], moved[:, 1]))),
     )
+
+
+@dataclass(frozen=True)
+class Course:
+    """X over windows, step by step, of a drive whose state was measured.
+
+    State and commands of a window are then known before the twist is: the model of the state's
+    rates stays as fitted. One pass through a window gives the pose at its end and its derivatives
+    by all coefficients of the twist.
+
+    Attributes:
+        chosen: the windows.
+        x: (W, T, V + 1) X during each step, and a last entry of 1.
+        steps: (W,) whole steps to the end of each window.
+        share: (W,) remaining fraction of one more step.
+    """
+
+    chosen: Windows
+    x: Array
+    steps: NDArray[np.intp]
+    share: Array
+
+
+def course_of(
+    model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
+) -> Course:
+    """Returns the course of X over windows, each started from its measured state."""
+    states, command, steps, share = _from_measured_states(model, calibration, drive, chosen)[1:]
+    ones = np.ones((*command.shape[:2], 1))
+    x = np.concatenate([states[:, :-1], command, ones], axis=2)
+    return Course(chosen, np.ascontiguousarray(x), steps, share)
+
+
+def relative_ends(
+    course: Course, model: TaylorModel, free: NDArray[np.bool_] | None = None
+) -> tuple[Array, Array]:
+    """Returns the end poses relative to the starts, and their derivatives by coefficients.
+
+    Args:
+        course: of the windows.
+        model: its body twist is integrated.
+        free: (D, K) coefficients to differentiate by, even where they are zero.
+
+    Returns:
+        (W, 3) with unwrapped headings, and (W, 3, P).
+    """
+    asked = np.zeros(model.coefficients.shape, dtype=np.bool_) if free is None else free
+    used = (model.coefficients != 0.0) | asked
+    used[3:] = False
+    dofs, places = np.nonzero(used)
+    terms = term_arrays(replace(model, coefficients=used.astype(np.float64)))
+    terms = terms._replace(coefficient=model.coefficients[dofs, places])
+    moving = np.flatnonzero(asked[dofs, places]).astype(np.int64)
+    ends = np.zeros((len(course.steps), 3))
+    moved = np.zeros((len(course.steps), 3, len(moving)))
+    follow(ends, moved, course.x, course.steps, course.share, terms, moving, model.dt)
+    return ends, moved
+
+
+def tracked_ends(course: Course, calibration: Calibration, ends: Array) -> Array:
+    """Returns poses (W, 3) of the tracked body after `base_link` moved by `ends` (W, 3)."""
+    base = calibration.to_base(course.chosen.start)
+    return calibration.to_tracked(geometry.compose(base, ends))
+
+
+def tracked_slopes(course: Course, calibration: Calibration, ends: Array, moved: Array) -> Array:
+    """Returns derivatives (W, 3, P) of `tracked_ends`, from those of the relative poses."""
+    heading = calibration.to_base(course.chosen.start)[:, 2]
+    arm = geometry.rotate(np.broadcast_to(calibration.mounting[:2], (len(ends), 2)), ends[:, 2])
+    across = np.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None]
+    inside = moved[:, :2] + across * moved[:, 2:]
+    c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
+    x, y = inside[:, 0], inside[:, 1]
+    return np.stack([c * x - s * y, s * x + c * y, moved[:, 2]], axis=1)

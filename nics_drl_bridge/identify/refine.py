@@ -1,15 +1,13 @@
 """Refinement of a model by its open-loop errors over seconds (the output-error method).
 
 Least squares on rates predicts the next instant; a simulator must predict the next seconds.
-Ljung, System Identification, ch. 7; the paper's kept terms stay, their values change.
-
-Free parameters of a refinement; the others are fixed by definition or by measurement.
-
-Removal of refined terms that hardly improve the prediction.
+Ljung, System Identification, ch. 7; the paper's kept terms stay, their values change. Terms that
+then hardly improve the prediction are removed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,14 +15,20 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.calibration import Calibration, Response
-from nics_drl_bridge.identify.least_squares import minimise, uncertainty
-from nics_drl_bridge.identify.statistics import clustered_errors
-from nics_drl_bridge.identify.windows import (
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.problem import (
     HORIZONS_S,
     Problem,
+    free_coefficients,
+    free_time,
+    lag_is_measured,
+    linear_term,
+    may_turn,
     prediction_errors,
     prediction_slopes,
+    problem_of,
 )
+from nics_drl_bridge.identify.statistics import clustered_errors, minimise, uncertainty
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -35,6 +39,9 @@ LEAST_SCALE = 0.05
 WITHIN = 12.0**-0.5
 """A model uses the values at the start of a step, so a time is uncertain by the standard deviation
 of a uniform distribution over the step."""
+WORTH = 0.1
+"""Terms are removed while the error rises by less than this share in total."""
+Errors = Mapping[str, Mapping[str, float]]
 
 
 @dataclass(frozen=True)
@@ -68,18 +75,89 @@ class _Free:
         return int(self.coefficients.sum())
 
 
-def refine(problem: Problem, model: TaylorModel, calibration: Calibration) -> Refined:
-    """Adjusts coefficients and calibration to the least open-loop error.
+def by_definition(
+    model: TaylorModel, calibration: Calibration, spec: RobotSpec
+) -> tuple[TaylorModel, Calibration]:
+    """Scales an inferred speed so that vx = 1 speed, and treats lateral motion as noise.
 
-    Args:
-        problem: the windows to predict.
-        model: the fitted model; its pruned terms stay pruned.
-        calibration: of the drive.
+    `base_link` of a robot without a lateral command is the point without lateral motion.
     """
+    coefficients = model.coefficients.copy()
+    if not spec.moves_sideways:
+        coefficients[1] = 0.0
+    responses = list(calibration.responses)
+    speeds = [i for i, v in enumerate(spec.state) if v.unit == "m/s"]
+    if responses and len(speeds) == 1:
+        i = speeds[0]
+        alone = np.array([v == spec.state[i].name for v in spec.variable_names], dtype=np.int64)
+        scale = float(coefficients[0] @ (model.powers == alone).all(axis=1))
+        if scale > 0.0:
+            coefficients = coefficients / scale ** model.powers[:, i]
+            coefficients[3 + i] *= scale
+            responses[i] = replace(responses[i], gain=responses[i].gain * scale)
+            coefficients[0, (model.powers == alone).all(axis=1)] = 1.0
+    model = replace(model, coefficients=coefficients)
+    return model, replace(calibration, responses=tuple(responses))
+
+
+def refined(
+    linear: TaylorModel, calibration: Calibration, drive: Drive
+) -> tuple[TaylorModel, Calibration, str]:
+    """Refines a linear fit by its predictions of the training part, and removes terms.
+
+    Returns:
+        Model and calibration, and a sentence on what was done, or why it could not be.
+    """
+    model, calibration = by_definition(linear.with_errors({}), calibration, drive.spec)
+    problem = problem_of(model, calibration, drive)
+    if problem is None:
+        return merged(model, linear, {}), calibration, (
+            "The training part is too short to refine the model by its errors over seconds; record "
+            "a longer drive."
+        )  # fmt: skip
+    try:
+        best = simplify(problem, refine(problem, model, calibration))
+    except np.linalg.LinAlgError:  # the model is unstable: its slopes overflow
+        return merged(model, linear, {}), calibration, (
+            "The predictions of the fitted model run away on the training part, so that it could "
+            "not be refined."
+        )  # fmt: skip
+    errors = replace(best.model, std_errors=best.std_errors).named_errors
+    return merged(best.model, linear, errors), best.calibration, (
+        "Coefficients and calibration were refined by the open-loop errors over up to 5 s: "
+        f"{best.error:.4f} m (root mean square) is left on the training part."
+    )  # fmt: skip
+
+
+def merged(model: TaylorModel, linear: TaylorModel, refined: Errors) -> TaylorModel:
+    """Returns the model with the standard errors of its coefficients.
+
+    Rows that are unchanged from the linear fit keep its errors; a refined coefficient has the
+    larger of both.
+    """
+    first = linear.named_errors
+    own = {dof: row for dof, row in first.items() if _same_row(model, linear, dof)}
+    refined = {
+        dof: {term: max(error, first.get(dof, {}).get(term, 0.0)) for term, error in row.items()}
+        for dof, row in refined.items()
+    }
+    rows = {dof: {**own.get(dof, {}), **refined.get(dof, {})} for dof in model.dofs}
+    return model.with_errors(rows)
+
+
+def _same_row(model: TaylorModel, linear: TaylorModel, dof: str) -> bool:
+    d = model.dofs.index(dof)
+    before = dict(zip(linear.term_names, linear.coefficients[d], strict=True))
+    after = dict(zip(model.term_names, model.coefficients[d], strict=True))
+    return all(before.get(name, 0.0) == value for name, value in after.items())
+
+
+def refine(problem: Problem, model: TaylorModel, calibration: Calibration) -> Refined:
+    """Adjusts coefficients and calibration to the least open-loop error; no term is added."""
     free = _Free(
-        free_coefficients(model, calibration, problem.spec),
+        free_coefficients(model, calibration, problem.drive.spec),
         free_time(calibration),
-        may_turn(calibration, problem.spec),
+        may_turn(calibration, problem.drive.spec),
     )
     theta = _pack(free, model, calibration)
     scale = np.maximum(np.abs(theta), LEAST_SCALE)
@@ -110,8 +188,8 @@ def _coefficient_errors(
     cluster = np.floor((starts - starts.min()) / max(HORIZONS_S)).astype(np.intp)
     errors = np.full(model.coefficients.shape, np.nan)
     errors[free.coefficients] = clustered_errors(jacobian, rest, cluster)[: free.count]
-    for state in problem.spec.state:
-        tied = [linear_term(model, problem.spec, n) for n in (state.name, str(state.follows))]
+    for state in problem.drive.spec.state:
+        tied = [linear_term(model, problem.drive.spec, n) for n in (state.name, str(state.follows))]
         d = model.dofs.index(f"d_{state.name}")
         if None in tied or not free.coefficients[d, tied[0]] or free.coefficients[d, tied[1]]:
             continue
@@ -138,7 +216,7 @@ def _unpack(
     coefficients[free.coefficients] = theta[: free.count]
     for i, response in enumerate(calibration.responses):
         own, command = (
-            linear_term(model, problem.spec, n) for n in (response.state, response.command)
+            linear_term(model, problem.drive.spec, n) for n in (response.state, response.command)
         )
         if own is not None and command is not None and not free.coefficients[3 + i, command]:
             coefficients[3 + i, command] = -response.gain * coefficients[3 + i, own]
@@ -160,7 +238,7 @@ def _unpack(
         calibration,
         **values,  # type: ignore[arg-type]
         uncertainty={**calibration.uncertainty, **spread},
-        responses=tuple(_response(model, problem.spec, r) for r in calibration.responses),
+        responses=tuple(_response(model, problem.drive.spec, r) for r in calibration.responses),
     )
 
 
@@ -180,70 +258,6 @@ def _bounded(error: Array) -> Array:
     return np.asarray(np.clip(finite, -DIVERGED, DIVERGED))
 
 
-def free_coefficients(
-    model: TaylorModel, calibration: Calibration, spec: RobotSpec
-) -> NDArray[np.bool_]:
-    """Selects the free coefficients (D, K): kept, and not fixed by the definition of a state.
-
-    An inferred speed is by definition the speed along the direction of travel, so that
-    vx = 1 speed; its lag is fixed if the wheels showed it.
-    """
-    free = model.coefficients != 0.0
-    if not calibration.responses:
-        free[3:] = False  # the rates of a measured state were fitted to that state itself
-    for i, response in enumerate(calibration.responses):
-        alone = linear_term(model, spec, response.state)
-        if alone is None:
-            continue
-        if model.coefficients[0, alone] == 1.0:
-            free[0, alone] = False
-        else:  # the scale of this state is arbitrary, so its gain is fixed
-            free[3 + i, linear_term(model, spec, response.command)] = False
-        if lag_is_measured(calibration):
-            free[3 + i, alone] = False
-    return np.asarray(free)
-
-
-def lag_is_measured(calibration: Calibration) -> bool:
-    """True if both offset and latency are known: only the wheels' response separates them."""
-    return {"clock_offset_s", "command_latency_s"} <= set(calibration.uncertainty)
-
-
-def linear_term(model: TaylorModel, spec: RobotSpec, name: str) -> int | None:
-    """Returns the column of the term that is one variable alone; None without such a term."""
-    wanted = np.array([v == name for v in spec.variable_names], dtype=np.int64)
-    hits = np.flatnonzero((model.powers == wanted).all(axis=1))
-    return int(hits[0]) if len(hits) else None
-
-
-def may_turn(calibration: Calibration, spec: RobotSpec) -> bool:
-    """True if the rotation is free.
-
-    It is defined by the direction in which a robot can't move. An omnidirectional robot can be
-    described equally well in any other frame, with other coefficients.
-    """
-    everywhere = spec.moves_sideways
-    return "rotation_rad" in calibration.uncertainty and not calibration.is_exact and not everywhere
-
-
-def free_time(calibration: Calibration) -> str | None:
-    """Returns the free time: the clock offset, else the latency; None if neither is free.
-
-    Times estimated from a measured state are fixed.
-    """
-    if not calibration.responses:
-        return None
-    if "clock_offset_s" in calibration.uncertainty:
-        return "clock_offset_s"
-    if calibration.command_latency_s > 0.0:
-        return "command_latency_s"
-    return None
-
-
-WORTH = 0.1
-"""Terms are removed while the error rises by less than this share in total."""
-
-
 def simplify(problem: Problem, refined: Refined) -> Refined:
     """Removes terms of the body twist that hardly improve the prediction of the training part.
 
@@ -251,7 +265,7 @@ def simplify(problem: Problem, refined: Refined) -> Refined:
     """
     best, tried = refined, set[tuple[int, int]]()
     limit = refined.error * (1.0 + WORTH)
-    while (weakest := _weakest(best, problem.spec, tried)) is not None:
+    while (weakest := _weakest(best, problem.drive.spec, tried)) is not None:
         tried.add(weakest)
         coefficients = best.model.coefficients.copy()
         coefficients[weakest] = 0.0

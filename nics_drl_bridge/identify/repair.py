@@ -1,22 +1,24 @@
-"""Repair of a recording: repeated rows, jumps of single samples, commands beyond the limits.
+"""Repair of a drive: repeated rows, jumps of single samples, commands beyond the limits.
 
-Dropped rows leave gaps. A recording without such faults is returned unchanged.
-
-Stamps: conversion of bursts of arrivals to sample times.
+Dropped rows leave gaps. A drive without such faults is returned unchanged. Other units and reversed
+axes, which nothing can repair, are refused.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.geometry import wrap_angle
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.signals import interval_means
+from nics_drl_bridge.identify.statistics import unexplained
 from nics_drl_bridge.recording.recording import Recording, Stream
-from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.spec import RobotSpec, Variable
 
 Array = NDArray[np.float64]
 
@@ -36,27 +38,28 @@ MOST = 0.15
 """Jumps in more than this share of the rows are not faults of single samples."""
 EXCESS = 0.01
 """Commands may exceed their limits by this share of their range."""
+WRONG_UNIT = 5.0
+"""Values this many times the limit are in another unit: degrees are 57, rpm 9.5 times larger."""
+UNIT_PERCENTILE = 75.0
+TRAVEL_SHARE = 0.1
+"""Directions of travel are measured over at least this share of the footprint's radius."""
+MIN_DIRECTIONS = 30
+MIN_TURN = 1.0
+"""A reversed axis does not show in a drive that turned by less than this [rad]."""
+CONSISTENT, INCONSISTENT = 0.9, 0.6
+"""Consistency of the direction of travel in the body frame; 1 is perfect."""
 
 
-@dataclass(frozen=True)
-class Repaired:
-    """A repaired recording.
+def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
+    """Drops repeated rows and jumps, and clips commands to the robot's limits.
 
-    Attributes:
-        recording: without the faults.
-        notes: one sentence per kind of fault.
+    Returns:
+        The drive, and one sentence per kind of fault.
     """
-
-    recording: Recording
-    notes: tuple[str, ...]
-
-
-def repair(recording: Recording, spec: RobotSpec) -> Repaired:
-    """Drops repeated rows and jumps, and clips commands to the robot's limits."""
-    recording, repeated = _without_repetitions(recording)
-    recording, jumps = _without_jumps(recording, spec)
-    recording, beyond = _within_limits(recording, spec)
-    return Repaired(recording, (*repeated, *jumps, *beyond))
+    recording, repeated = _without_repetitions(drive.recording)
+    drive, jumps = _without_jumps(drive.part(recording))
+    recording, beyond = _within_limits(drive.recording, drive.spec)
+    return drive.part(recording), (*repeated, *jumps, *beyond)
 
 
 def _with_rows(recording: Recording, name: str, keep: NDArray[np.bool_]) -> Recording:
@@ -79,10 +82,10 @@ def _without_repetitions(recording: Recording) -> tuple[Recording, list[str]]:
     return recording, notes
 
 
-def _without_jumps(recording: Recording, spec: RobotSpec) -> tuple[Recording, list[str]]:
-    notes = []
-    found = {"pose": _jumps_of_pose(recording.pose, spec)}
-    if recording.state is not None and spec.state:
+def _without_jumps(drive: Drive) -> tuple[Drive, list[str]]:
+    recording, notes = drive.recording, []
+    found = {"pose": _jumps_of_pose(drive)}
+    if recording.state is not None and drive.spec.state:
         found["state"] = _jumps_of_state(recording.state)
     for name, jump in found.items():
         share = float(jump.mean()) if len(jump) else 0.0
@@ -97,14 +100,15 @@ def _without_jumps(recording: Recording, spec: RobotSpec) -> tuple[Recording, li
                 f"{name}: {int(jump.sum())} of {len(jump)} rows ({share:.1%}) jump away from "
                 "their neighbours and back, and were left out as outliers."
             )
-    return recording, notes
+    return drive.part(recording), notes
 
 
-def _jumps_of_pose(pose: Stream, spec: RobotSpec) -> NDArray[np.bool_]:
+def _jumps_of_pose(drive: Drive) -> NDArray[np.bool_]:
     """Selects the poses (T,) that jump in position or heading."""
+    pose, spec = drive.recording.pose, drive.spec
     if len(pose.t) <= 2 * NEIGHBOURS:
         return np.zeros(len(pose.t), dtype=np.bool_)
-    t = spread(pose.t, find_bursts(pose.t))
+    t = drive.sample_t
     span = np.zeros(len(t))
     span[NEIGHBOURS:] = t[NEIGHBOURS:] - t[:-NEIGHBOURS]
     span[:-NEIGHBOURS] = np.maximum(span[:-NEIGHBOURS], t[NEIGHBOURS:] - t[:-NEIGHBOURS])
@@ -147,7 +151,7 @@ def _differences(values: Array, turning: bool) -> tuple[Array, Array]:
     back, ahead = np.zeros((NEIGHBOURS, count)), np.zeros((NEIGHBOURS, count))
     for n in range(1, NEIGHBOURS + 1):
         difference = values[n:] - values[:-n]
-        difference = wrap_angle(difference) if turning else difference
+        difference = geometry.wrap_angle(difference) if turning else difference
         back[n - 1, n:], ahead[n - 1, :-n] = difference, -difference
     return back, ahead
 
@@ -160,7 +164,7 @@ def _within_limits(recording: Recording, spec: RobotSpec) -> tuple[Recording, li
     if not beyond.any():
         return recording, []
     clipped = np.where(beyond, np.clip(values, spec.command_low, spec.command_high), values)
-    if _unexplained(recording, values) < _unexplained(recording, clipped):
+    if _rates_left(recording, values) < _rates_left(recording, clipped):
         return recording, [
             "Commands were beyond the limits in the robot's YAML file, and the robot followed them "
             "there: widen the limits, or the simulator will not go so far."
@@ -174,7 +178,7 @@ def _within_limits(recording: Recording, spec: RobotSpec) -> tuple[Recording, li
     return replace(recording, command=replace(command, values=clipped)), notes
 
 
-def _unexplained(recording: Recording, command: Array) -> float:
+def _rates_left(recording: Recording, command: Array) -> float:
     """Returns the share of the state's rates that commands (T, C) leave unexplained.
 
     0 without a measured state.
@@ -192,61 +196,80 @@ def _unexplained(recording: Recording, command: Array) -> float:
     return float(((rest / np.maximum(rates.std(axis=0), 1e-9)) ** 2).mean())
 
 
-MIN_STAMPS = 20
-BURSTY = 5.0
-"""In bursts the mean interval is more than this many times the 30th percentile."""
-WITHIN_BURST = 0.25
-"""Stamps less than this share of the period apart belong to one burst."""
+def check_units(drive: Drive) -> None:
+    """Refuses states and commands that only another unit can explain.
 
-
-@dataclass(frozen=True)
-class Bursts:
-    """Bursts of arrivals.
-
-    Attributes:
-        period_s: usual time between two bursts [s].
-        size: usual number of samples per burst.
-        of: (T,) index of the burst of each sample.
-        newest: (K,) index of the last sample of each burst, the freshest on arrival.
+    Raises:
+        RecordingError: a variable is too large; with its value and its limit.
     """
-
-    period_s: float
-    size: float
-    of: NDArray[np.intp]
-    newest: NDArray[np.intp]
-
-
-def find_bursts(t: Array) -> Bursts | None:
-    """Finds bursts in stamps (T,) [s]; None if the samples arrive one by one."""
-    if len(t) < MIN_STAMPS:
-        return None
-    gaps = np.diff(t)
-    if gaps.mean() <= BURSTY * np.percentile(gaps, 30):
-        return None
-    period = float(np.median(gaps[gaps > gaps.mean()]))
-    starts = np.concatenate([[True], gaps > WITHIN_BURST * period])
-    of = np.cumsum(starts) - 1
-    newest = np.append(np.flatnonzero(starts)[1:] - 1, len(t) - 1)
-    return Bursts(period, float(np.median(np.bincount(of))), of, newest)
+    recording, spec = drive.recording, drive.spec
+    streams: list[tuple[Stream, tuple[Variable, ...]]] = [(recording.command, spec.command)]
+    if recording.state is not None:
+        streams.append((recording.state, spec.state))
+    for stream, variables in streams:
+        sizes = np.percentile(np.abs(stream.values), UNIT_PERCENTILE, axis=0)
+        for variable, size in zip(variables, sizes, strict=True):
+            limit = max(abs(variable.min), abs(variable.max))
+            if size > WRONG_UNIT * limit:
+                raise RecordingError(
+                    f"{recording.source}: {variable.name} is {size:.4g} and more where its limit "
+                    f"is {limit:g} {variable.unit}; it must be in {variable.unit} (degrees, "
+                    "millimetres or revolutions per minute look like this)."
+                )
 
 
-def spread(t: Array, bursts: Bursts | None) -> Array:
-    """Estimates sample times (T,) from arrival stamps (T,) [s].
+def check_axes(drive: Drive) -> None:
+    """Refuses poses whose heading turns against the direction of travel.
 
-    The samples of a burst were taken one after the other since the previous burst, the newest
-    just before its arrival. After a gap they are assumed to fill one period, or more if the
-    burst is larger than usual.
+    In its own frame, a robot without sideways motion always travels in the same direction; that
+    of an omnidirectional robot depends on its state. If this is true only with the heading
+    mirrored, then x, y or heading is reversed.
+
+    Raises:
+        RecordingError: one axis of the pose is reversed.
     """
-    if bursts is None:
-        return t
-    count = np.bincount(bursts.of)
-    arrival = t[np.concatenate([[0], bursts.newest[:-1] + 1])]
-    since = np.diff(arrival, prepend=arrival[0] - bursts.period_s)
-    span = np.minimum(since, bursts.period_s * np.maximum(1.0, count / bursts.size))
-    behind = bursts.newest[bursts.of] - np.arange(len(t))
-    return np.asarray(arrival[bursts.of] - span[bursts.of] * behind / count[bursts.of])
+    recording = drive.recording
+    t, pose = _far_apart(drive.dated, TRAVEL_SHARE * drive.spec.footprint_radius)
+    if len(t) < MIN_DIRECTIONS or np.ptp(np.unwrap(pose[:, 2])) < MIN_TURN:
+        return
+    other = pose * np.array([1.0, 1.0, -1.0])
+    if not drive.spec.moves_sideways:
+        as_given, mirrored = _steadiness(pose), _steadiness(other)
+    elif recording.state is not None and recording.state.clock == recording.pose.clock:
+        as_given, mirrored = (_explained(t, p, recording.state) for p in (pose, other))
+    else:
+        return
+    if as_given < INCONSISTENT and mirrored > CONSISTENT:
+        raise RecordingError(
+            f"{recording.source}: pose: the heading turns one way and the path the other; one of "
+            "x, y and heading is reversed: they must be x forward, y left, heading "
+            "counter-clockwise (REP-103)."
+        )
 
 
-def newest(t: Array, bursts: Bursts | None) -> NDArray[np.intp]:
-    """Returns indices of the samples with the best known time: the newest per burst, or all."""
-    return np.arange(len(t)) if bursts is None else bursts.newest
+def _far_apart(dated: Stream, distance: float) -> tuple[Array, Array]:
+    """Returns stamps (n,) and poses (n, 3) of a stream, about `distance` [m] apart."""
+    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(dated.values[:, :2], axis=0).T)))
+    marks = np.arange(0.0, path[-1], max(distance, 1e-3))
+    chosen = np.unique(np.searchsorted(path, marks))
+    return dated.t[chosen], dated.values[chosen]
+
+
+def _steadiness(pose: Array) -> float:
+    """Returns the constancy (0 to 1) of the body-frame axis of travel, forward or backward."""
+    moved = geometry.log(geometry.between(pose[:-1], pose[1:]))[:, :2]
+    size = np.hypot(*moved.T)
+    course = np.exp(2j * np.arctan2(moved[:, 1], moved[:, 0]))
+    return float(np.abs((size * course).sum()) / max(float(size.sum()), 1e-12))
+
+
+def _explained(t: Array, pose: Array, state: Stream) -> float:
+    """Returns the share (0 to 1) of the velocity between poses (n, 3) that the state explains.
+
+    The body velocity is linear in the state.
+    """
+    span = np.diff(t)
+    keep = span > 0.0
+    velocity = geometry.log(geometry.between(pose[:-1], pose[1:]))[keep, :2] / span[keep, None]
+    means = interval_means(state.t, state.values, t[:-1][keep], t[1:][keep])
+    return 1.0 - float((unexplained(means, velocity) ** 2).mean())

@@ -1,6 +1,6 @@
 """Fit report: the model's equations, the quality of its fit, and what could not be learnt.
 
-List of all possible estimates of a calibration: value and uncertainty, or why there is none.
+Every estimate of a calibration is listed: value and uncertainty, or why there is none.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from textwrap import fill
 import numpy as np
 
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.dof import Alpha
-from nics_drl_bridge.identify.findings import Findings
+from nics_drl_bridge.identify.fit import Alpha
 from nics_drl_bridge.identify.identify import Identified
+from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.open_loop import OpenLoop
 from nics_drl_bridge.identify.statistics import Curve
 from nics_drl_bridge.recording.recording import Recording
@@ -130,8 +130,7 @@ def _curve(curve: Curve) -> list[str]:
 
 
 def _calibration(identified: Identified) -> list[str]:
-    found = estimates(identified.recording, identified.calibration, identified.findings)
-    return [f"  {estimate.text}" for estimate in found.values()]
+    return [f"  {estimate.text}" for estimate in estimates(identified).values()]
 
 
 def _item(note: str) -> str:
@@ -211,26 +210,23 @@ class CalibratedValue:
         return f"{self.name} {self.value:.4g}{spread} {self.unit}{remark}"
 
 
-def estimates(
-    recording: Recording, calibration: Calibration, findings: Findings
-) -> dict[str, CalibratedValue]:
-    """Returns all estimates by their names in `Calibration`."""
+def estimates(identified: Identified) -> dict[str, CalibratedValue]:
+    """Returns all estimates of the calibration by their names in `Calibration`."""
+    recording, calibration = identified.recording, identified.calibration
     return {
-        **_timing(recording, calibration, findings),
-        **_mounting(calibration, findings),
+        **_timing(recording, calibration),
+        **_mounting(calibration, identified.findings.mounting),
         **_wheels(recording, calibration),
     }
 
 
-def _timing(
-    recording: Recording, calibration: Calibration, findings: Findings
-) -> dict[str, CalibratedValue]:
+def _timing(recording: Recording, calibration: Calibration) -> dict[str, CalibratedValue]:
     sigma = calibration.uncertainty
     offset = CalibratedValue("clock offset", None, None, "s", "pose and commands are on one clock")
     if "clock_offset_s" in sigma:
         value = calibration.clock_offset_s
         offset = CalibratedValue("clock offset", value, sigma["clock_offset_s"], "s")
-    elif findings.clocks_differ:
+    elif recording.pose.clock != recording.command.clock:
         offset = CalibratedValue("clock offset", None, None, "s", "no command changed")
     why = "no command changed"
     if "clock_offset_s" in sigma:
@@ -247,24 +243,24 @@ def _timing(
     return {"clock_offset_s": offset, "command_latency_s": latency, "burst_period_s": bursts}
 
 
-def _mounting(calibration: Calibration, findings: Findings) -> dict[str, CalibratedValue]:
+def _mounting(calibration: Calibration, found: Mounting | None) -> dict[str, CalibratedValue]:
     names = {
         "rotation_rad": ("rotation of base_link", calibration.rotation_rad, "rad"),
         "lever_arm_x_m": ("lever arm x", calibration.lever_arm_m[0], "m"),
         "lever_arm_y_m": ("lever arm y", calibration.lever_arm_m[1], "m"),
     }
     why = "the drive shows too few directions of motion"
-    if findings.mounting is not None and not findings.mounting.turns:
+    if found is not None and not found.turns:
         why = "the robot never turned"
-    found = {}
+    values = {}
     for key, (name, value, unit) in names.items():
         sigma = calibration.uncertainty.get(key)
         if sigma is None:
-            found[key] = CalibratedValue(name, None, None, unit, why)
+            values[key] = CalibratedValue(name, None, None, unit, why)
         else:
             remark = "below its uncertainty: taken as zero" if value == 0.0 else ""
-            found[key] = CalibratedValue(name, value, sigma, unit, remark)
-    return found
+            values[key] = CalibratedValue(name, value, sigma, unit, remark)
+    return values
 
 
 def _wheels(recording: Recording, calibration: Calibration) -> dict[str, CalibratedValue]:

@@ -1,4 +1,4 @@
-"""Signals on a common time axis: held commands, lagged responses, poses between samples."""
+"""Signals in time: held commands, the states that follow them, means, resampled poses, noise."""
 
 from __future__ import annotations
 
@@ -12,7 +12,12 @@ from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
+
 SMOOTHING_BATCH = 64
+DEFAULT_LAG_S = 0.1
+DIFFERENCE = 6
+DIFFERENCE_GAIN = np.sqrt(924.0)  # white noise grows by this in a sixth difference
+GAUSSIAN_MAD = 0.6745
 
 
 def held(command: Stream, spec: RobotSpec, start: Array, end: Array) -> Array:
@@ -45,7 +50,7 @@ def held_features(
 def _before(command: Stream, spec: RobotSpec) -> Array:
     """Returns the command (C,) in effect before the first one."""
     still = np.clip(0.0, spec.command_low, spec.command_high)
-    return np.asarray(np.where(np.ptp(command.values, axis=0) > 0.0, still, command.values[0]))
+    return np.asarray(np.where(moved_commands(command), still, command.values[0]))
 
 
 def _means_of_held(t: Array, values: Array, start: Array, end: Array) -> Array:
@@ -82,6 +87,42 @@ def lagged(signal: Array, lags: Array, dt: float, initial: Array) -> Array:
     return np.stack(columns, axis=1) if columns else np.zeros((len(signal), 0))
 
 
+def moved_commands(command: Stream) -> NDArray[np.bool_]:
+    """Returns a mask (C,) of the commands that ever changed."""
+    return np.asarray(np.ptp(command.values, axis=0) > 0.0)
+
+
+def followed(spec: RobotSpec) -> NDArray[np.intp]:
+    """Returns the index (S,) of the command that each state variable follows."""
+    names = [c.name for c in spec.command]
+    return np.array([names.index(str(v.follows)) for v in spec.state], dtype=np.intp)
+
+
+def speed_index(spec: RobotSpec) -> int | None:
+    """Returns the index of the speed along the direction of travel; None if not unique."""
+    speeds = [i for i, v in enumerate(spec.state) if v.unit == "m/s"]
+    return speeds[0] if len(speeds) == 1 else None
+
+
+def nominal_lags(spec: RobotSpec) -> Array:
+    """Returns the spec's time constants (S,), `NAME_lag`, else a typical one [s]."""
+    return np.array([spec.parameters.get(f"{v.name}_lag", DEFAULT_LAG_S) for v in spec.state])
+
+
+def inferred_states(
+    command: Stream, spec: RobotSpec, lags: Array, latency: float, grid: Array
+) -> Array:
+    """Infers states (T, S) at uniform times (T,) on the commands' clock, with gain one.
+
+    Each state follows its command; if the command never changes, the state keeps its value.
+    """
+    dt = float(grid[1] - grid[0])
+    target = held(command, spec, grid - latency, grid + dt - latency)[:, followed(spec)]
+    long_ago = np.array([command.t[0] - 2.0])
+    initial = held(command, spec, long_ago, long_ago + 1.0)[0, followed(spec)]
+    return lagged(target, lags, dt, initial)
+
+
 def interval_means(t: Array, values: Array, start: Array, end: Array) -> Array:
     """Returns means (n, K) over intervals (n,) of values (T, K), linear between stamps (T,)."""
     steps = np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2.0
@@ -91,6 +132,14 @@ def interval_means(t: Array, values: Array, start: Array, end: Array) -> Array:
         for column in area.T
     ]
     return np.stack(means, axis=1) if means else np.zeros((len(start), 0))
+
+
+def white_noise(values: Array) -> Array:
+    """Returns the standard deviation (D,) of white noise on otherwise smooth series (T, D)."""
+    rest = np.diff(values, DIFFERENCE, axis=0) / DIFFERENCE_GAIN
+    if len(rest) < DIFFERENCE:
+        return np.zeros(values.shape[1])
+    return np.asarray(np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD)
 
 
 def unwrapped(pose: Array) -> Array:

@@ -1,15 +1,15 @@
-"""Statistics of a fit: standard errors, conditioning, errors per degree of freedom.
-
-Accuracy against the number of terms: the benefit of each further term of Eq. 2.
-"""
+"""Statistics of least squares: minima, standard errors, significance, accuracy of more terms."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
+from scipy.optimize import least_squares
 
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -20,6 +20,79 @@ UNLIKE = 0.05
 """Correlation below which residuals are assumed to be independent."""
 LONGEST = 0.1
 """Longest correlation of residuals, as a share of the rows."""
+CERTAIN = 3.0
+"""A term of a noisy fit must be this many times its standard error."""
+WEAK = 1e4
+"""Instruments are too weak if the condition number of their products with the features is
+larger."""
+DIFFERENCE, TOLERANCE, MAX_STEPS = 1e-4, 1e-7, 40
+"""Relative step, tolerance and steps of `minimise`."""
+BLOCKS = 5
+WORTH = 1e-3
+"""Terms that lower the error by less than this share of the rates' size are not kept."""
+
+
+def unexplained(chi: Array, signal: Array) -> Array:
+    """Returns the residual of a signal (n, D) on features (n, K) by least squares, flattened.
+
+    It is a share of each component's spread.
+    """
+    spread = signal.std(axis=0)
+    scaled = (signal - signal.mean(axis=0)) / np.where(spread > 1e-9, spread, 1e9)
+    norm = np.linalg.norm(chi, axis=0)
+    chi = chi / np.where(norm > 0.0, norm, 1.0)
+    beta = np.linalg.lstsq(np.concatenate([np.ones((len(chi), 1)), chi], axis=1), scaled, 1e-10)[0]
+    return np.asarray(scaled - beta[0] - chi @ beta[1:]).ravel()
+
+
+def minimise(
+    residual: Callable[[Array], Array],
+    start: Array,
+    scale: Array,
+    bounds: tuple[Array, Array] | None = None,
+    jacobian: Callable[[Array], Array] | None = None,
+) -> tuple[Array, Array, Array]:
+    """Minimises a residual by least squares, in steps of each parameter's scale.
+
+    Args:
+        residual: function of parameters (P,).
+        start: (P,).
+        scale: (P,) expected change of each parameter, whatever its value.
+        bounds: least and greatest parameters (P,).
+        jacobian: of the residual (n, P); by finite differences when None.
+
+    Returns:
+        Parameters (P,), and Jacobian (n, P) and residual (n,) there.
+    """
+    low, high = bounds or (np.full(len(start), -np.inf), np.full(len(start), np.inf))
+    slope: Any = "2-point"
+    if jacobian is not None:
+        slope = lambda z: jacobian(start + (z - 1.0) * scale) * scale  # noqa: E731
+    found = least_squares(
+        lambda z: residual(start + (z - 1.0) * scale),
+        np.ones(len(start)),
+        jac=slope,
+        bounds=((low - start) / scale + 1.0, (high - start) / scale + 1.0),
+        diff_step=DIFFERENCE,
+        xtol=TOLERANCE,
+        ftol=TOLERANCE,
+        max_nfev=MAX_STEPS,
+    )
+    return start + (found.x - 1.0) * scale, found.jac / scale, np.asarray(found.fun)
+
+
+def uncertainty(jacobian: Array, residual: Array) -> Array:
+    """Returns the standard uncertainty (P,) of least squares.
+
+    It is widened for autocorrelated residuals.
+    """
+    rest = residual - residual.mean()
+    power = float((rest**2).sum())
+    rho = float((rest[1:] * rest[:-1]).sum()) / power if power > 0.0 else 0.0
+    rho = float(np.clip(rho, 0.0, 0.95))
+    variance = power / max(1, len(residual) - jacobian.shape[1]) * (1.0 + rho) / (1.0 - rho)
+    covariance = np.linalg.pinv(jacobian.T @ jacobian) * variance
+    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
 
 
 def standard_errors(chi: Array, residual: Array) -> Array:
@@ -110,9 +183,49 @@ def errors_of(model: TaylorModel, samples: Samples) -> tuple[Array, Array]:
     return rmse, r2
 
 
-BLOCKS = 5
-WORTH = 1e-3
-"""Terms that lower the error by less than this share of the rates' size are not kept."""
+def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
+    """Selects the significant features (K,) of a noisy target (T,).
+
+    The least certain feature is removed until each coefficient is at least `CERTAIN` times its
+    standard error, which is widened for autocorrelated residuals.
+    """
+    rest = target - chi @ np.linalg.lstsq(chi, target, rcond=None)[0]
+    power = max(float(rest @ rest), np.finfo(np.float64).tiny)
+    rho = min(max(float(rest[1:] @ rest[:-1]) / power, 0.0), 0.98)
+    variance = power / max(1, len(chi) - chi.shape[1]) * (1.0 + rho) / (1.0 - rho)
+    gram, moment = chi.T @ chi, chi.T @ target
+    keep = np.ones(chi.shape[1], dtype=np.bool_)
+    while keep.any():
+        inverse = np.linalg.pinv(gram[np.ix_(keep, keep)], hermitian=True)
+        beta = inverse @ moment[keep]
+        error = np.sqrt(np.maximum(np.diag(inverse) * variance, np.finfo(np.float64).tiny))
+        ratio = np.abs(beta) / error
+        if ratio.min() >= CERTAIN:
+            break
+        keep[np.flatnonzero(keep)[int(np.argmin(ratio))]] = False
+    return keep
+
+
+def instrumental(chi: Array, instruments: Array, target: Array) -> tuple[Array, Array] | None:
+    """Returns coefficients (K,) by instrumental variables, and their standard errors (K,).
+
+    Soederstroem, Stoica: Instrumental variable methods for system identification, 1983; two-stage
+    least squares. None if the instruments are too weak.
+
+    Args:
+        chi: (T, K) features with noise.
+        instruments: (T, K) the same features of variables whose noise is independent.
+        target: (T,).
+    """
+    scale, size = np.linalg.norm(chi, axis=0), np.linalg.norm(instruments, axis=0)
+    chi, instruments = chi / scale, instruments / size
+    bread = instruments.T @ chi
+    if not np.linalg.cond(bread) < WEAK:
+        return None
+    inverse = np.linalg.inv(bread)
+    beta = inverse @ (instruments.T @ target)
+    middle = long_run(instruments, target - chi @ beta)
+    return beta / scale, np.sqrt(np.diag(inverse @ middle @ inverse.T)) / scale
 
 
 @dataclass(frozen=True)
@@ -122,18 +235,14 @@ class Curve:
     Attributes:
         dof: name.
         terms: (n,) terms in the order of Eq. 2, the largest weight first.
-        alpha: (n + 1,) share of the summed weights that the first 0..n terms reach.
         error: (n + 1,) RMSE of the first 0..n terms on blocks held out of their fit, in the unit
             of the rate.
-        sigma: (n + 1,) standard error of `error` over the blocks.
         kept: number of terms in the model.
     """
 
     dof: str
     terms: tuple[str, ...]
-    alpha: Array
     error: Array
-    sigma: Array
     kept: int
 
     @property
@@ -142,7 +251,7 @@ class Curve:
         return self.error / max(float(self.error[0]), np.finfo(np.float64).tiny)
 
 
-def curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array, beta: Array) -> Curve:
+def curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array) -> Curve:
     """Returns the curve of one degree of freedom; `kept` is its knee.
 
     Args:
@@ -150,13 +259,11 @@ def curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array, beta: Arr
         terms: (n,) names.
         chi: (T, n) standardised features, the largest weight first.
         target: (T,) rates.
-        beta: (n,) standardised coefficients.
     """
     squares = cross_validated(chi, target)
     error = np.sqrt(squares.mean(axis=0))
     sigma = squares.std(axis=0, ddof=1) / np.sqrt(len(squares)) / (2.0 * np.maximum(error, 1e-300))
-    weight = np.append(0.0, np.cumsum(np.abs(beta)))
-    return Curve(dof, terms, weight / max(weight[-1], 1e-300), error, sigma, knee(error, sigma))
+    return Curve(dof, terms, error, knee(error, sigma))
 
 
 def knee(error: Array, sigma: Array) -> int:

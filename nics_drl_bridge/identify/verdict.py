@@ -1,11 +1,7 @@
-"""Verdict on a drive: sentences on what it could not show, or a refusal.
-
-Assessment of a model: standard errors of refined coefficients, and quality on unseen data.
-"""
+"""Verdict on a drive and its model: quality on unseen data, doubts, usefulness, or a refusal."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from math import isfinite
 
@@ -13,31 +9,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import FitError, RecordingError
-from nics_drl_bridge.identify.align import align
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.excitation import plausible
-from nics_drl_bridge.identify.fit import Fit
-from nics_drl_bridge.identify.open_loop import OpenLoop
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.excitation import Excitation, plausible
+from nics_drl_bridge.identify.findings import Identified
+from nics_drl_bridge.identify.fit import ORDER, Fit
+from nics_drl_bridge.identify.open_loop import HORIZON_S, OpenLoop, open_loop_error
 from nics_drl_bridge.identify.statistics import errors_of
 from nics_drl_bridge.recording.recording import Recording, Samples
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import Quality, TaylorModel
 
+Array = NDArray[np.float64]
+
+MIN_ROWS = 20
 FEW_LEVELS = 2
 ILL_CONDITIONED = 1e6
 FAR_OFF = 0.25
 """Predictions whose mean error exceeds this share of the path are not to be trusted."""
 UNEXPLAINED = 0.5
 MANY_OUTLIERS = 0.001
+MOST_LEFT = 0.5
+"""Share of the error of standing still above which a model is hardly better."""
+COARSE = 2.0 / 3.0
+"""A state that changes by this share of its range between two rows is sampled too coarsely."""
+ENDS = (1.0, 99.0)
+"""Percentiles that bound the range of a state."""
+MIRRORED = -0.5
+"""Correlation of yaw rate and steering below which the robot turns the wrong way."""
 
 
-def refuse_unexcited(linear: Fit, spec: RobotSpec) -> None:
+def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
     """Refuses a drive that did not move every input independently.
 
     Raises:
         FitError: names the inputs.
     """
-    still = linear.excitation.unmoved
+    still = excitation.unmoved
     commands = [c.name for c in spec.command]
     named = [name for name in still if name in commands] or list(still)
     if named:
@@ -45,9 +53,9 @@ def refuse_unexcited(linear: Fit, spec: RobotSpec) -> None:
             f"{_list(named)} never moved in this drive; drive with {_list(named)} changing over "
             "the whole range, or allow a model without."
         )
-    if linear.excitation.together:
+    if excitation.together:
         raise FitError(
-            f"{_list(linear.excitation.together)} always moved together in this drive; drive with "
+            f"{_list(excitation.together)} always moved together in this drive; drive with "
             "each changing on its own, or allow a model without."
         )
 
@@ -132,49 +140,47 @@ def _list(names: tuple[str, ...] | list[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
-Array = NDArray[np.float64]
-Errors = Mapping[str, Mapping[str, float]]
-
-MIN_ROWS = 20
-
-
-def merged(model: TaylorModel, linear: TaylorModel, refined: Errors) -> TaylorModel:
-    """Returns the model with the standard errors of its coefficients.
-
-    Args:
-        model: the model.
-        linear: the linear fit; its errors apply to rows that the model has unchanged from it.
-        refined: errors of the refined coefficients; the larger of these and the linear fit's
-            errors is used.
-    """
-    first = linear.named_errors
-    own = {dof: row for dof, row in first.items() if _same_row(model, linear, dof)}
-    refined = {
-        dof: {term: max(error, first.get(dof, {}).get(term, 0.0)) for term, error in row.items()}
-        for dof, row in refined.items()
-    }
-    rows = {dof: {**own.get(dof, {}), **refined.get(dof, {})} for dof in model.dofs}
-    return model.with_errors(rows)
+def mirror_note(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
+    """Returns a sentence if the robot turns right when commanded to turn left."""
+    for i, command in enumerate(spec.command, start=len(spec.state)):
+        if command.cmd_vel != "angular.z":
+            continue
+        turn, wanted = samples.dq[:, 2], samples.x[:, i]
+        if command.unit == "rad":
+            wanted = wanted * np.sign(samples.dq[:, 0])
+        if min(turn.std(), wanted.std()) > 1e-3 and np.corrcoef(turn, wanted)[0, 1] < MIRRORED:
+            return (
+                f"The robot turns right where {command.name} is positive: the recording is a "
+                "mirror image (y and heading reversed), or the sign of the command is; the model "
+                "moves as recorded.",
+            )
+    return ()
 
 
-def _same_row(model: TaylorModel, linear: TaylorModel, dof: str) -> bool:
-    d = model.dofs.index(dof)
-    before = dict(zip(linear.term_names, linear.coefficients[d], strict=True))
-    after = dict(zip(model.term_names, model.coefficients[d], strict=True))
-    return all(before.get(name, 0.0) == value for name, value in after.items())
-
-
-def unseen_samples(
-    recording: Recording, calibration: Calibration, spec: RobotSpec, until: float
-) -> Samples | None:
+def unseen_samples(samples: Samples, drive: Drive, calibration: Calibration) -> Samples | None:
     """Returns the samples of the part of a drive that the fit did not see; None if too few."""
+    begin = drive.recording.pose.t[0] + calibration.clock_offset_s + drive.settings.train_until_s
+    unseen = samples.rows(samples.t > begin)
+    return unseen if len(unseen.t) >= MIN_ROWS else None
+
+
+def tried(
+    model: TaylorModel, calibration: Calibration, drive: Drive
+) -> tuple[OpenLoop | None, tuple[str, ...]]:
+    """Tries a model on the part of a drive that the fit did not see.
+
+    Returns:
+        Open-loop errors; or None, and a sentence, if the part is too short.
+    """
+    until = drive.settings.train_until_s
     try:
-        samples = align(recording, calibration, spec)
+        return open_loop_error(model, calibration, drive, until, drive.duration_s), ()
     except RecordingError:
-        return None
-    begin = recording.pose.t[0] + calibration.clock_offset_s + until
-    samples = samples.rows(samples.t > begin)
-    return samples if len(samples.t) >= MIN_ROWS else None
+        left = max(drive.duration_s - until, 0.0)
+        return None, (
+            f"The last {left:.1f} s, held out of the fit, are too short for a prediction over "
+            f"{HORIZON_S:g} s: the model was not tried on unseen data; record 20 s or more.",
+        )
 
 
 def with_quality(
@@ -212,5 +218,90 @@ def with_quality(
 
 
 def _usable(samples: Samples, spec: RobotSpec) -> Samples:
-    low, high = np.array([[v.min, v.max] for v in (*spec.state, *spec.command)]).T
-    return samples.rows(plausible(samples.x, low, high))
+    return samples.rows(plausible(samples.x, spec))
+
+
+def is_useless(error: float, standing: float, path: float, radius: float) -> bool:
+    """True if predictions are hardly better than assuming that the robot stands still.
+
+    Persistence is the usual baseline of a forecast (Murphy: Skill scores based on the mean square
+    error, Monthly Weather Review, 1988). A robot that drives in circles or turns on the spot
+    returns to its start: there the path and the robot's size set the scale.
+
+    Args:
+        error: median position error of the predictions [m]; NaN or inf if they diverge.
+        standing: median position error on the same windows if the robot stood still [m].
+        path: mean length of the measured path [m].
+        radius: of the robot [m].
+    """
+    return not error <= max(MOST_LEFT * standing, FAR_OFF * path, radius)
+
+
+def why_useless(identified: Identified, spec: RobotSpec, order: int = ORDER) -> str:
+    """Returns one sentence on why a model is useless; empty if it is useful or untested.
+
+    The median counts: a single permanent jump of the pose spoils only some of the predictions.
+    """
+    held_out, recording = identified.held_out, identified.recording
+    if held_out is None:
+        return ""
+    error, standing = held_out.median_position_error_m, held_out.median_displacement_m
+    if not np.isfinite(held_out.mean_position_error_m):
+        error = np.inf
+    if not is_useless(error, standing, held_out.mean_path_m, spec.footprint_radius):
+        return ""
+    return (
+        f"{recording.source}: the fitted model is of no use: on unseen data its predictions "
+        f"{_end(error)} after {held_out.horizon_s:g} s and a path of {held_out.mean_path_m:.2f} m, "
+        f"where a robot that stood still would be {standing:.2f} m off; "
+        f"{_suspicion(identified, spec, order)}."
+    )
+
+
+def _end(error: float) -> str:
+    return f"end {error:.3g} m off" if np.isfinite(error) else "have run away"
+
+
+def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
+    """Returns the likely cause of a bad fit, and its remedy."""
+    recording, unmoved = identified.recording, identified.fit.unmoved
+    coarsest = max(_steps(recording, spec, unmoved), default=(0.0, ""))
+    rows = recording.pose if recording.state is None else recording.state
+    apart = f"{np.median(np.diff(rows.t)):.2g} s apart"
+    if coarsest[0] > COARSE:
+        return (
+            f"{coarsest[1]} changes by {coarsest[0]:.0%} of its range between rows that are "
+            f"{apart}, so record at a higher rate"
+        )
+    if unmoved:
+        return (
+            f"{', '.join(unmoved)} never moved in its first {identified.train_until_s:.0f} s, from "
+            "which it is learnt, so change it from the beginning on"
+        )
+    if identified.alpha != "auto" or order < ORDER:
+        return f"it may lack terms, so leave the order at {ORDER} and alpha at `auto`"
+    return (
+        "the recording does not show why, so make sure that nothing held the robot up, that it got "
+        f"each command, that its pose did not jump and that rows {apart} show how it responds, and "
+        "record anew"
+    )
+
+
+def _steps(
+    recording: Recording, spec: RobotSpec, unmoved: tuple[str, ...]
+) -> list[tuple[float, str]]:
+    """Returns the step between rows and the name of each measured state that moved.
+
+    The step is the 99th percentile, as a share of the state's range.
+    """
+    if recording.state is None:
+        return []
+    moved = [i for i, v in enumerate(spec.state) if v.name not in unmoved]
+    values = recording.state.values[:, moved]
+    spread = np.ptp(np.percentile(values, ENDS, axis=0), axis=0)
+    steps = np.percentile(np.abs(np.diff(values, axis=0)), ENDS[1], axis=0)
+    return [
+        (float(step / size), spec.state[i].name)
+        for i, step, size in zip(moved, steps, spread, strict=True)
+        if size > 0.0
+    ]

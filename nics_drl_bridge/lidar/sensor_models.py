@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import AfterValidator, Field, TypeAdapter, field_validator
+from pydantic import AfterValidator, Field, field_validator
 
 from nics_drl_bridge.config import Schema, load_yaml
 
@@ -104,7 +104,6 @@ def _one_intensity(models: tuple[SensorModel, ...]) -> tuple[SensorModel, ...]:
 
 SensorModel = Annotated[IncidenceDropout | Intensity, Field(discriminator="kind")]
 SensorModels = Annotated[tuple[SensorModel, ...], AfterValidator(_one_intensity)]
-SENSOR_MODELS: TypeAdapter[tuple[SensorModel, ...]] = TypeAdapter(SensorModels)
 
 
 class SensorModelFile(Schema):

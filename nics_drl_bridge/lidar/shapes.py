@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, TypeAdapter, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, load_yaml
 from nics_drl_bridge.errors import ModelError
@@ -151,7 +151,6 @@ class Segment(Surface):
 
 
 Shape = Annotated[Circle | Rectangle | Polygon | Segment, Field(discriminator="kind")]
-SHAPES: TypeAdapter[tuple[Shape, ...]] = TypeAdapter(tuple[Shape, ...])
 
 
 class ShapeFile(Schema):

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,9 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from nics_drl_bridge.config import Schema, no_device
+from nics_drl_bridge.config import Schema, read_text, validate
 from nics_drl_bridge.errors import ModelError
-from nics_drl_bridge.files import sha256
+from nics_drl_bridge.files import (
+    MOST_BYTES,
+    check_sums,
+    whole_folder,
+    write_sums,
+    write_text,
+)
 from nics_drl_bridge.lidar.baked_kernels import (
     ABOUT,
     CELLS_PER_PART,
@@ -31,12 +37,14 @@ from nics_drl_bridge.lidar.baked_kernels import (
     ROUND_RADIUS,
 )
 from nics_drl_bridge.lidar.block_kernels import BLOCK
-from nics_drl_bridge.lidar.sensor_models import SENSOR_MODELS, SensorModel
-from nics_drl_bridge.lidar.shapes import SHAPES, Circle, Outlines, Shape
+from nics_drl_bridge.lidar.sensor_models import SensorModel, SensorModels
+from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.npz import npz_bytes, npz_mapped, read_file
 
-FORMAT = "nics_drl_bridge/lidar_table/3"
+FORMAT = "nics_drl_bridge/lidar_table/4"
+ABOUT_FILE, ARRAYS = "about.json", ("grid", "start", "cell", "rows")
+TABLE_FILES = (ABOUT_FILE, *(f"{name}.npy" for name in ARRAYS))
+"""The files of a table, in addition to its manifest."""
 POINT_ANGLE = 0.01
 """Greatest default angle between the points of a row, as far as `MOST_PHASES` allows [rad]."""
 MOST_PHASES = 8
@@ -70,6 +78,16 @@ class Density(Schema):
         if phases not in (1, 2, 4, 8):
             raise ValueError("phases must be 1, 2, 4 or 8")
         return phases
+
+
+class TableAbout(Schema):
+    """The content of `about.json`; see `LidarTable`."""
+
+    format: str
+    shapes: tuple[Shape, ...]
+    density: Density
+    beam_angle: float = Field(gt=0.0, lt=7.0)
+    sensor_model: SensorModels = ()
 
 
 def padding(beam_angle: float) -> int:
@@ -189,13 +207,26 @@ class LidarTable:
 
     @property
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        arrays: dict[str, NDArray[Any]] = {
-            "grid": self.grid,
-            "start": self.start,
-            "cell": self.cell,
-            "rows": self.rows,
-        }
-        return arrays
+        return {name: np.ascontiguousarray(getattr(self, name)) for name in ARRAYS}
+
+    @property
+    def _about(self) -> str:
+        about = TableAbout(
+            format=FORMAT,
+            shapes=self.shapes,
+            density=self.density,
+            beam_angle=self.beam_angle,
+            sensor_model=self.sensor_model,
+        )
+        return about.model_dump_json(indent=1, exclude_none=True) + "\n"
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """The SHA-256 of everything that `save` writes, in hexadecimal."""
+        digest = hashlib.sha256(self._about.encode())
+        for array in self._arrays.values():
+            digest.update(array.data)
+        return digest.hexdigest()
 
     def cells_of_shapes(self) -> list[tuple[int, int]]:
         """Returns the first cell of each shape (H,), and the one after its last."""
@@ -203,69 +234,49 @@ class LidarTable:
         ends = np.cumsum(counts)
         return list(zip((ends - counts).tolist(), ends.tolist(), strict=True))
 
-    def dump(self) -> bytes:
-        """Returns the table as the content of an `.npz` file that can be memory-mapped."""
-        about = np.frombuffer(self._about().encode(), np.uint8)
-        return npz_bytes({"about": about, **self._arrays}, packed=False)
-
-    def _about(self) -> str:
-        about: dict[str, Any] = {
-            "format": FORMAT,
-            "shapes": SHAPES.dump_python(self.shapes, mode="json", exclude_none=True),
-            "density": self.density.model_dump(),
-            "beam_angle": self.beam_angle,
-        }
-        if self.sensor_model:
-            about["sensor_model"] = SENSOR_MODELS.dump_python(self.sensor_model, mode="json")
-        return json.dumps(about | {"crc32": self._crc32(json.dumps(about))})
-
-    def _crc32(self, about: str) -> int:
-        """Checksum over the whole table, to detect damage."""
-        crc = zlib.crc32(about.encode())
-        for array in self._arrays.values():
-            crc = zlib.crc32(np.ascontiguousarray(array).data, crc)
-        return crc
-
-    @classmethod
-    def load(cls, path: str | Path, checksum: str | None = None) -> LidarTable:
-        """Memory-maps a table written by `dump`; processes share the memory.
-
-        Args:
-            path: of the file.
-            checksum: SHA-256 that the file must have, in hexadecimal.
+    def save(self, folder: str | Path) -> None:
+        """Writes the table as a folder of `.npy` files, completely or not at all.
 
         Raises:
-            ModelError: the file cannot be read, does not match its checksum, is damaged, or is not
-                a lidar table.
+            ConfigError: the folder contains something else.
         """
-        path = Path(path)
+        with whole_folder(folder, ABOUT_FILE) as temporary:
+            write_text(temporary / ABOUT_FILE, self._about)
+            for name, array in self._arrays.items():
+                np.save(temporary / f"{name}.npy", array, allow_pickle=False)
+            write_sums(temporary)
+
+    @classmethod
+    def load(cls, folder: str | Path, checked: bool = False) -> LidarTable:
+        """Memory-maps a table that `save` wrote; processes share the memory.
+
+        Args:
+            folder: of the table.
+            checked: True if the caller has compared its files with their checksums.
+
+        Raises:
+            ConfigError, ModelError: a file is missing, damaged or of another format.
+        """
+        folder = Path(folder)
+        if not checked:
+            check_sums(folder, TABLE_FILES)
+        path = folder / ABOUT_FILE
         try:
-            no_device(path).open("rb").close()
-            if checksum is not None and sha256(read_file(path)) != checksum:
-                raise ModelError(f"{path}: does not match its checksum; generate the model anew.")
-            arrays = npz_mapped(path)
-            about = json.loads(arrays.pop("about").tobytes())
-            if about["format"] != FORMAT:
-                raise ValueError(f"its format is {about['format']!r}, not {FORMAT!r}")
-            shapes = SHAPES.validate_python(about["shapes"])
-            density = Density.model_validate(about["density"])
-            model = SENSOR_MODELS.validate_python(about.get("sensor_model", ()))
-            angle = float(about["beam_angle"])
-            table = cls(shapes, density, angle, **arrays, sensor_model=model)
+            data = json.loads(read_text(path, MOST_BYTES))
+        except (RecursionError, ValueError) as error:
+            raise ModelError(f"{path}: is no JSON ({error}); generate the model anew.") from None
+        if not isinstance(data, dict) or data.get("format") != FORMAT:
+            raise ModelError(f"{path}: its format is not {FORMAT!r}; generate the model anew.")
+        about = validate(data, TableAbout, str(path))
+        arrays = {name: _mapped(folder / f"{name}.npy") for name in ARRAYS}
+        table = cls(
+            about.shapes, about.density, about.beam_angle, **arrays, sensor_model=about.sensor_model
+        )
+        try:
             table._check()
-            if table._about() != json.dumps(about):
-                raise ValueError("its numbers were damaged")
-        except OSError as error:
+        except (ArithmeticError, IndexError, ValueError) as error:
             raise ModelError(
-                f"{path}: can't be read ({error.strerror}); generate the model anew."
-            ) from None
-        except (
-            ArithmeticError, AttributeError, IndexError, KeyError, RecursionError, TypeError,
-            ValueError,
-        ) as error:  # fmt: skip
-            reason = " ".join(str(error).split())
-            raise ModelError(
-                f"{path}: is no lidar table ({reason}); generate the model anew."
+                f"{folder}: is no lidar table ({error}); generate the model anew."
             ) from None
         return table
 
@@ -274,13 +285,15 @@ class LidarTable:
         arrays: tuple[NDArray[Any], ...] = (self.grid, self.start, self.cell, self.rows)
         if [array.dtype for array in arrays] != [np.float64, np.int32, np.int16, np.float32]:
             raise ValueError("an array has another type of number")
+        if not all(array.flags.c_contiguous for array in arrays):
+            raise ValueError("an array has another order of its axes")
         if self.grid.shape != (len(self.shapes), 3) or not np.isfinite(self.grid).all():
             raise ValueError("the grid does not fit the shapes")
         counts = self.grid[:, 1] * self.density.distances
         cells = int(counts.sum())
         if (counts < 1).any() or not np.array_equal(self.grid[:, 2], np.cumsum(counts) - counts):
             raise ValueError("the grid does not fit the density")
-        if (self.grid[:, 0] <= self.outlines.radii).any() or not 0.0 < self.beam_angle < 7.0:
+        if (self.grid[:, 0] <= self.outlines.radii).any():
             raise ValueError("the grid has no extent")
         if self.start.shape != (cells,) or self.cell.shape != (cells, 6) or self.rows.ndim != 1:
             raise ValueError("the number of cells does not fit the grid")
@@ -296,3 +309,15 @@ class LidarTable:
         hint, other = self.cell[:, 2::2], self.cell[:, 3::2]
         if (hint < 0).any() or (hint >= corners).any() or (np.abs(other) >= corners).any():
             raise ValueError("a cell names a corner that its shape has not")
+
+
+def _mapped(path: Path) -> NDArray[Any]:
+    """Maps a `.npy` file into memory; what is written to the array never reaches the file."""
+    try:
+        with np.errstate(over="raise"):  # of a shape whose size is no number
+            array = np.load(path, mmap_mode="c", allow_pickle=False)
+        if not isinstance(array, np.memmap):
+            raise TypeError("an archive of arrays")
+    except Exception:  # noqa: BLE001 - a false header breaks numpy in any way
+        raise ModelError(f"{path}: is no array of numbers; generate the model anew.") from None
+    return np.asarray(array)

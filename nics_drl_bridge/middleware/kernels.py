@@ -22,7 +22,8 @@ LEAST_VARIANCE = 1e-18
 @kernel(allocates=True)
 def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
     """Computes the derivative (3 + S, V) of `rates` with respect to X."""
-    dof, coefficient, factors, count = terms
+    dof, coefficient = terms.dof, terms.coefficient
+    factors, count = terms.factors, terms.degree
     jacobian[:] = 0.0
     for k in range(dof.shape[0]):
         for f in range(count[k]):

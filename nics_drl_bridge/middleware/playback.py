@@ -6,6 +6,7 @@ is the bag's, so that nothing depends on the machine or its load.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +24,6 @@ from nics_drl_bridge.lidar.spec import ScanHeader, from_device
 from nics_drl_bridge.middleware.ekf import ANYWHERE
 from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.middleware import Middleware
-from nics_drl_bridge.npz import npz_bytes
 from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
 from nics_drl_bridge.recording.messages import command_row, pose_row, stamp, twist_row
@@ -284,11 +284,12 @@ def in_order(messages: Mapping[str, list[Message]]) -> Iterator[tuple[str, Messa
 def write_estimate(made: EstimatedDrive, path: str | Path) -> None:
     """Writes an estimate as `.npz`, or otherwise as CSV with numbers in full precision."""
     if Path(path).suffix == ".npz":
-        arrays = {
-            "stamp_ns": made.stamp_ns, "pose": made.pose, "twist": made.twist,
-            "covariance": made.covariance,
-        }  # fmt: skip
-        write_bytes(path, npz_bytes(arrays))
+        buffer = io.BytesIO()
+        np.savez_compressed(
+            buffer, stamp_ns=made.stamp_ns, pose=made.pose, twist=made.twist,
+            covariance=made.covariance,
+        )  # fmt: skip
+        write_bytes(path, buffer.getvalue())
         return
     lines = [",".join(("stamp_ns", *COLUMNS))]
     for ns, pose, twist in zip(made.stamp_ns, made.pose, made.twist, strict=True):

@@ -31,42 +31,40 @@ from rclpy.subscription import Subscription
 from nics_drl_bridge.recording.messages import Offer
 
 
-def _keep_last(depth: int, reliability: ReliabilityPolicy) -> QoSProfile:
+def profile_of(offer: Offer) -> QoSProfile:
+    """Returns an offer, or a request, as a profile."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=reliability,
-        durability=DurabilityPolicy.VOLATILE,
+        depth=offer.depth,
+        reliability=ReliabilityPolicy.RELIABLE if offer.reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL
+        if offer.transient_local
+        else DurabilityPolicy.VOLATILE,
     )
 
 
-SENSOR = _keep_last(5, ReliabilityPolicy.BEST_EFFORT)
+SENSOR = profile_of(Offer(5, reliable=False))
 """Subscriptions to scans, odometry, poses, IMU. A new datum beats a repeated old one: on a lossy
 link a reliable scan arrives half a second late and looks fresh. It matches every publisher. Also in
 lock-step: acknowledging each datum takes a tenth of a step, and lost data are requested again."""
 
-SENSOR_RELIABLE = _keep_last(10, ReliabilityPolicy.RELIABLE)
+SENSOR_RELIABLE = profile_of(Offer(10))
 """Publishers of the same, so that subscribers of both kinds match."""
 
-EVERY_COMMAND = _keep_last(10, ReliabilityPolicy.RELIABLE)
+EVERY_COMMAND = profile_of(Offer(10))
 """Commands in lock-step: each moves the world, and a second publisher must not replace the
 first one's unnoticed. Also `e_stop`, of which no press may be overwritten."""
 
-COMMAND = _keep_last(1, ReliabilityPolicy.RELIABLE)
+COMMAND = profile_of(Offer(1))
 """Commands and goals: only the newest counts, and it has to arrive."""
 
-TRANSFORMS = _keep_last(100, ReliabilityPolicy.RELIABLE)
+TRANSFORMS = profile_of(Offer(100))
 """`/tf`: like tf2's own broadcasters, whose listeners request reliable."""
 
-FIXED_TRANSFORMS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+FIXED_TRANSFORMS = profile_of(Offer(1, transient_local=True))
 """`/tf_static`: published once, and delivered to late joiners too."""
 
-DIAGNOSTICS = _keep_last(10, ReliabilityPolicy.RELIABLE)
+DIAGNOSTICS = profile_of(Offer(10))
 """`/diagnostics`: rare and small, and each message may concern something else; as the diagnostic
 aggregator expects it."""
 

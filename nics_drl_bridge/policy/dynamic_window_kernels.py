@@ -28,7 +28,7 @@ class ScanRays(NamedTuple):
 
 
 class LookAhead(NamedTuple):
-    """How a robot and its future are looked at.
+    """Parameters of the roll-outs of a robot.
 
     Attributes:
         reach: (3,) greatest change of a twist in one period.

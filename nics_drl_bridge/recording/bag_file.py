@@ -13,23 +13,24 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from nics_drl_bridge.config import no_device, parse_yaml, read_text
 from nics_drl_bridge.errors import LONGEST_NAME, BridgeError, RecordingError, shortened
-from nics_drl_bridge.recording.mcap import DamageError, check_message, check_packed
-from nics_drl_bridge.recording.mcap_check import check_mcap
-from nics_drl_bridge.recording.messages import Offer, offers_of, typestore
+from nics_drl_bridge.recording.messages import Offer, check_libraries, offers_of, typestore
+from nics_drl_bridge.recording.packing import check_message, unpack_file
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
     from rosbags.rosbag2 import Reader
 
-METADATA = "metadata.yaml"
+METADATA, ABOUT = "metadata.yaml", "rosbag2_bagfile_information"
 DATABASE = ".db3"
 SUFFIXES = (".mcap", DATABASE)
 COMPRESSED = (".zst", ".zstd")
 URI_SIGNS = "?#%"
+CURE = "save the rest with `nics bag salvage`, try `ros2 bag reindex`, or record anew."
 
 
 @dataclass(frozen=True)
@@ -67,27 +68,22 @@ def opened(path: str | Path) -> Iterator[BagFile]:
         path: the bag's folder, or its only file.
 
     Raises:
-        RecordingError: there is no such bag, it is damaged, empty or was not closed, or the
-            library rosbags is not installed.
+        RecordingError: there is no such bag, it is damaged, empty or was not closed, or a library
+            is not installed.
     """
-    try:
-        from rosbags.rosbag2 import Reader
-    except ImportError:
-        raise RecordingError(
-            f"{path}: reading a bag needs the library rosbags; install it with "
-            "pip install 'nics_drl_bridge[bags]'."
-        ) from None
     path = Path(path)
+    check_libraries(path, "reading")
+    from rosbags.rosbag2 import Reader
+
     try:
         place = _place(path)
         _check_name(place)
         for file in (place, *(place.iterdir() if place.is_dir() else ())):
             no_device(file)
-        if place.is_dir():
-            _check_metadata(place / METADATA)
+        with TemporaryDirectory() as room:  # before rosbags, which unpacks chunks of any size
+            for file in _listed(place, Path(room)) if place.is_dir() else [place]:
+                _check_storage(path, file)
         with Reader(place) as reader:
-            for storage in _storages(reader):
-                _check_storage(path, Path(str(storage.path)))
             _check_summary(path, reader)
             _check_topics(path, reader)
             yield BagFile(reader, str(path))
@@ -96,11 +92,15 @@ def opened(path: str | Path) -> Iterator[BagFile]:
     except Exception as error:  # noqa: BLE001 - the reader can raise anything on a damaged file
         raise RecordingError(
             f"{path}: can't be read as a bag ({_reason(error)}); it is damaged or was not closed: "
-            "save the rest with `nics bag salvage`, try `ros2 bag reindex`, or record anew."
+            f"{CURE}"
         ) from None
 
 
-def _reason(error: Exception) -> str:
+def _damaged(place: object, what: str) -> RecordingError:
+    return RecordingError(f"{place}: {what}; it is damaged: {CURE}")
+
+
+def _reason(error: object) -> str:
     text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
     return text if len(text) <= 200 else f"{text[:200]}..."
 
@@ -137,21 +137,29 @@ def _place(path: Path) -> Path:
     return file
 
 
-def _check_metadata(file: Path) -> None:
-    """Reads a bag's metadata within the limits of `strict_yaml`, which rosbags lacks.
+def metadata_of(folder: Path) -> dict[str, Any]:
+    """Returns a bag's metadata, read within the limits of `strict_yaml`, which rosbags lacks.
 
     Raises:
-        ValueError: it is not YAML or exceeds the limits, or a file would unpack to too much.
+        ValueError: they are not YAML, exceed the limits, or lack the part that rosbag2 writes.
     """
     try:
-        data = parse_yaml(read_text(file), file.name)
+        about = parse_yaml(read_text(folder / METADATA), METADATA).get(ABOUT)
     except BridgeError as error:
         raise ValueError(str(error)) from None
-    about = data.get("rosbag2_bagfile_information")
-    if isinstance(about, dict) and str(about.get("compression_mode", "")).lower() == "file":
-        for packed in sorted(file.parent.iterdir()):
-            if packed.suffix in COMPRESSED:
-                check_packed(packed)
+    if not isinstance(about, dict):
+        raise ValueError(f"{METADATA}: lacks {ABOUT}")
+    return about
+
+
+def _listed(folder: Path, room: Path) -> list[Path]:
+    """Returns the files of a bag; those compressed as a whole are unpacked to another folder."""
+    about = metadata_of(folder)
+    listed = [folder / Path(str(name)).name for name in about.get("relative_file_paths") or ()]
+    files = [file for file in listed if file.is_file()]
+    if str(about.get("compression_mode", "")).lower() != "file":
+        return files
+    return [unpack_file(file, room / file.stem) for file in files]
 
 
 def _storages(reader: Reader) -> list[Any]:
@@ -160,16 +168,16 @@ def _storages(reader: Reader) -> list[Any]:
 
 
 def _check_storage(path: Path, file: Path) -> None:
+    from nics_drl_bridge.recording.mcap import DamageError
+    from nics_drl_bridge.recording.mcap_check import check_mcap
+
     if file.suffix == DATABASE:
         _check_database(path, file)
         return
     try:
         check_mcap(file)
     except DamageError as damage:
-        raise RecordingError(
-            f"{path}: {file.name} is damaged at {damage}; save the rest with `nics bag salvage`, "
-            "or record anew."
-        ) from None
+        raise RecordingError(f"{path}: {file.name} is damaged at {damage}; {CURE}") from None
 
 
 def _check_database(path: Path, database: Path) -> None:
@@ -183,25 +191,17 @@ def _check_database(path: Path, database: Path) -> None:
     with closing(sqlite3.connect(place, uri=True)) as base:
         (verdict,) = base.execute("PRAGMA integrity_check(1)").fetchone()
     if verdict != "ok":
-        reason = " ".join(verdict.split())
-        raise RecordingError(
-            f"{path}: is damaged ({reason:.200}); save the rest with `nics bag salvage`, or "
-            "record the drive anew."
-        )
+        raise _damaged(path, f"its database is broken ({_reason(verdict)})")
 
 
 def _check_summary(path: Path, reader: Reader) -> None:
     counted = sum(connection.msgcount for connection in reader.connections)
     held = sum(storage.metadata.message_count for storage in _storages(reader))
     if held != counted:
-        raise RecordingError(
-            f"{path}: its summary speaks of {counted} messages, its files hold {held}; it is "
-            "damaged: save the rest with `nics bag salvage`, or record anew."
-        )
-    if reader.message_count != counted:
-        raise RecordingError(
-            f"{path}: its summary speaks of {reader.message_count} messages, those of its topics "
-            f"add up to {counted}; it is damaged: try `ros2 bag reindex`, or record anew."
+        raise _damaged(path, f"its summary speaks of {counted} messages, its files hold {held}")
+    if (whole := reader.message_count) != counted:
+        raise _damaged(
+            path, f"its summary speaks of {whole} messages, its topics add up to {counted}"
         )
     if counted == 0:
         raise RecordingError(f"{path}: holds no messages; record a drive of 20 s or more.")
@@ -213,20 +213,17 @@ def _check_topics(path: Path, reader: Reader) -> None:
     held: Counter[tuple[str, str]] = Counter()
     for connection in reader.connections:
         if not (isinstance(connection.topic, str) and connection.topic):
-            raise RecordingError(
-                f"{path}: its summary has lost the name of a topic; it is damaged: try `ros2 bag "
-                "reindex`, save the rest with `nics bag salvage`, or record anew."
-            )
+            raise _damaged(path, "its summary has lost the name of a topic")
         told[connection.topic, connection.msgtype] += connection.msgcount
     for storage in _storages(reader):
         for connection in storage.connections:
             held[connection.topic, connection.msgtype] += connection.msgcount
     for topic, kind in sorted(set(told + held), key=str):
         if told[topic, kind] != held[topic, kind]:
-            raise RecordingError(
-                f"{path}: topic {_short(topic)} of type {_short(kind)} has {held[topic, kind]} "
-                f"messages in its files, {told[topic, kind]} by its summary; it is damaged: try "
-                "`ros2 bag reindex`, save the rest with `nics bag salvage`, or record anew."
+            raise _damaged(
+                path,
+                f"topic {_short(topic)} of type {_short(kind)} has {held[topic, kind]} messages in "
+                f"its files, {told[topic, kind]} by its summary",
             )
     if reader.compression_mode == "message":
         for storage in _storages(reader):
@@ -291,27 +288,18 @@ class BagFile:
         connections = self._connections[topic]
         raw = [(c.msgtype, ns, data) for c, ns, data in self._reader.messages(connections)]
         promised = sum(connection.msgcount for connection in connections)
-        if len(raw) != promised:
-            raise RecordingError(
-                f"{self.place}: topic {topic!r} has {len(raw)} messages where the bag's summary "
-                f"promises {promised}; the bag is cut off or damaged: save the rest with "
-                "`nics bag salvage`, or record the drive anew."
-            )
         first, last = self.span_ns
+        if len(raw) != promised:
+            what = f"topic {topic!r} has {len(raw)} messages, by the bag's summary {promised}"
+            raise _damaged(self.place, what)
         if any(not first <= ns <= last for _, ns, _ in raw):
-            raise RecordingError(
-                f"{self.place}: topic {topic!r} has messages outside of the time span that the "
-                "bag's summary gives; the bag is damaged: save the rest with `nics bag salvage`, "
-                "or record the drive anew."
-            )
+            what = f"topic {topic!r} has messages outside of the time span of the bag's summary"
+            raise _damaged(self.place, what)
         return raw
 
     def _decoded(self, topic: str, k: int, kind: str, data: bytes) -> Any:
         try:
             return self._store.deserialize_cdr(data, kind)
         except Exception as error:  # noqa: BLE001 - the decoder can raise anything on damaged bytes
-            raise RecordingError(
-                f"{self.place}: topic {topic!r}: message {k} can't be decoded as {kind} "
-                f"({_reason(error)}); it is damaged: save the rest with `nics bag "
-                "salvage`, or record the drive anew."
-            ) from None
+            what = f"topic {topic!r}: message {k} can't be decoded as {kind} ({_reason(error)})"
+            raise _damaged(self.place, what) from None

@@ -1,15 +1,15 @@
-"""Conversion of a bag's messages to rows of numbers, and message types that rosbags lacks.
-
-Quality of service offered by publishers, as stored in a bag.
-"""
+"""Messages of a bag: their types, their rows of numbers, and the quality of service offered."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import topic_roles
 
@@ -24,6 +24,17 @@ ACKERMANN_DEFINITION = (
     "float32 acceleration\nfloat32 jerk\n"
 )
 ACKERMANN_STAMPED_DEFINITION = "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
+LIBRARIES = ("rosbags", "mcap")
+
+
+def check_libraries(path: Path, what: str, instead: str = "") -> None:
+    """Raises RecordingError if a library that `reading` or `writing` a bag needs is missing."""
+    for library in LIBRARIES:
+        if find_spec(library) is None:
+            raise RecordingError(
+                f"{path}: {what} a bag needs the library {library}; install it with "
+                f"pip install 'nics_drl_bridge[bags]'{instead}."
+            )
 
 
 def typestore() -> Typestore:
@@ -120,20 +131,13 @@ def offers_of(profiles: Sequence[Qos]) -> tuple[Offer, ...]:
 
 def profile_of(offer: Offer) -> Qos:
     """Converts an offer to a profile of rosbags; the other policies keep their defaults."""
-    from rosbags.interfaces import (
-        Qos,
-        QosDurability,
-        QosHistory,
-        QosLiveliness,
-        QosReliability,
-        QosTime,
-    )
+    from rosbags import interfaces as rosbags
 
-    forever = QosTime(9223372036, 854775807)
-    return Qos(
-        QosHistory.KEEP_LAST,
-        offer.depth,
-        QosReliability.RELIABLE if offer.reliable else QosReliability.BEST_EFFORT,
-        QosDurability.TRANSIENT_LOCAL if offer.transient_local else QosDurability.VOLATILE,
-        forever, forever, QosLiveliness.AUTOMATIC, forever, False,
+    forever = rosbags.QosTime(9223372036, 854775807)
+    reliability, durability = rosbags.QosReliability, rosbags.QosDurability
+    return rosbags.Qos(
+        rosbags.QosHistory.KEEP_LAST, offer.depth,
+        reliability.RELIABLE if offer.reliable else reliability.BEST_EFFORT,
+        durability.TRANSIENT_LOCAL if offer.transient_local else durability.VOLATILE,
+        forever, forever, rosbags.QosLiveliness.AUTOMATIC, forever, False,
     )  # fmt: skip

@@ -6,7 +6,9 @@ into `Samples`, the paper's data `D_t = (t, Q_t, X_t, dQ_t)` (Sec. IV-A) on one 
 
 from __future__ import annotations
 
+import io
 import json
+import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,15 +19,23 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.files import write_bytes
-from nics_drl_bridge.npz import is_sealed, npz_arrays, npz_bytes, read_file
+from nics_drl_bridge.files import (
+    MOST_BYTES,
+    check_sealed,
+    read_file,
+    sealed,
+    sha256,
+    write_bytes,
+)
 from nics_drl_bridge.robot.noise import Latency
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
-FORMAT = "nics_drl_bridge/recording/2"
+FORMAT = "nics_drl_bridge/recording/3"
+COMMENT_FORMAT = "nics_drl_bridge/recording/2"
+"""Format of files with a checksum in the comment of the archive, which can still be read,"""
 UNSEALED_FORMAT = "nics_drl_bridge/recording/1"
-"""Format of files without a checksum, which can still be read."""
+"""and of those without a checksum."""
 LARGEST_TURN = 1.5
 """A larger turn between neighbouring samples [rad] is implausible,"""
 TOO_FAST = 20.0
@@ -223,7 +233,10 @@ def _check_stream(place: str, stream: Stream, width: int) -> None:
 
 
 def save_recording(recording: Recording, path: str | Path) -> None:
-    """Writes a recording as `.npz`: `NAME_t` and `NAME` per stream, and `meta` as JSON text."""
+    """Writes a recording as `.npz`: `NAME_t` and `NAME` per stream, and `meta` as JSON text.
+
+    A checksum follows the archive, which `numpy.load` reads nevertheless.
+    """
     arrays: dict[str, NDArray[Any]] = {}
     clocks = {}
     for name, stream in recording.streams.items():
@@ -237,7 +250,9 @@ def save_recording(recording: Recording, path: str | Path) -> None:
     }
     if recording.latency.measured:
         meta["latency"] = recording.latency.model_dump(mode="json")
-    write_bytes(path, npz_bytes({"meta": np.array(json.dumps(meta)), **arrays}))
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, meta=np.array(json.dumps(meta)), **arrays)  # type: ignore[arg-type]
+    write_bytes(path, sealed(buffer.getvalue()))
 
 
 def load_recording(path: str | Path) -> Recording:
@@ -248,11 +263,10 @@ def load_recording(path: str | Path) -> Recording:
     """
     try:
         data = read_file(no_device(Path(path)))
-        sealed, arrays = is_sealed(data), npz_arrays(data, seal_needed=False)
+        arrays = _arrays(data)
         meta = json.loads(str(arrays["meta"]))
-        if meta["format"] == FORMAT and not sealed:
-            raise ValueError("there is no checksum at its end")
-        if meta["format"] not in (FORMAT, UNSEALED_FORMAT):
+        _check_seal(data, meta["format"])
+        if meta["format"] not in (FORMAT, COMMENT_FORMAT, UNSEALED_FORMAT):
             raise RecordingError(
                 f"{path}: format {meta['format']!r} is not {FORMAT!r}; record it anew or use the "
                 "version of the package that wrote it."
@@ -276,3 +290,23 @@ def load_recording(path: str | Path) -> Recording:
         raise RecordingError(
             f"{path}: can't be read as .npz ({error}); it may be damaged."
         ) from None
+
+
+def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
+    """The arrays of an `.npz` file's content. Raises ValueError if it is damaged or too large."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if sum(member.file_size for member in archive.infolist()) > MOST_BYTES:
+                raise ValueError(f"unpacked it is larger than {MOST_BYTES // 2**20} MB")
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except Exception as error:  # noqa: BLE001 - damage breaks zipfile and numpy in any way
+        raise ValueError(str(error) or type(error).__name__) from None
+
+
+def _check_seal(data: bytes, version: str) -> None:
+    """Raises ValueError unless the checksum of a file of this format fits its content."""
+    if version == FORMAT:
+        check_sealed(io.BytesIO(data))
+    elif version == COMMENT_FORMAT and data[-64:] != sha256(data[:-64]).encode():
+        raise ValueError("its checksum is missing or does not fit the rest")

@@ -1,17 +1,15 @@
 """Output of a drive: an `.npz` file, or the folder of a rosbag2.
 
-Writer of a recording as a rosbag2, without ROS, for third-party tools.
-
-Incremental writer of a rosbag2 recording: complete at the end, salvageable before.
+A rosbag2 is written without ROS, message by message: complete at the end, salvageable before.
 """
 
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -23,8 +21,7 @@ from nics_drl_bridge.files import check_above, sync_folder
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.recording.joints import POSITION_UNITS, WHEELS
-from nics_drl_bridge.recording.mcap import seal
-from nics_drl_bridge.recording.messages import Offer, profile_of, typestore
+from nics_drl_bridge.recording.messages import Offer, check_libraries, profile_of, typestore
 from nics_drl_bridge.recording.recording import Recording, Stream, save_recording
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -40,7 +37,8 @@ def check_out(path: str | Path) -> Path:
     """Checks an output path of a recording: an `.npz` file or the folder of a rosbag2.
 
     Raises:
-        ConfigError: it exists already, has another suffix, or needs rosbags, which is missing.
+        ConfigError: it exists already, or has another suffix.
+        RecordingError: it needs a library that is missing.
     """
     path = Path(path)
     if path.exists():
@@ -50,11 +48,8 @@ def check_out(path: str | Path) -> Path:
             f"{path}: unknown kind of recording {path.suffix!r}; name a file *{NPZ}, or the "
             "folder of a rosbag2 without suffix."
         )
-    if path.suffix != NPZ and find_spec("rosbags") is None:
-        raise ConfigError(
-            f"{path}: writing a rosbag2 needs the library rosbags; install it with pip install "
-            f"'nics_drl_bridge[bags]', or name a file *{NPZ}."
-        )
+    if path.suffix != NPZ:
+        check_libraries(path, "writing", f", or name a file *{NPZ}")
     return path
 
 
@@ -64,15 +59,10 @@ def write_drive(recording: Recording, path: str | Path, spec: RobotSpec) -> None
     Raises:
         RecordingError: it can't be written.
     """
-    path = Path(path)
-    if path.suffix == NPZ:
+    if Path(path).suffix == NPZ:
         save_recording(recording, path)
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as temporary:
-        folder = Path(temporary) / path.name
-        write_bag(recording, folder, spec)
-        os.rename(folder, path)
+    else:
+        write_bag(recording, path, spec)
 
 
 Array = NDArray[np.float64]
@@ -102,13 +92,11 @@ def write_bag(
         storage: format of the file in the folder.
 
     Raises:
-        RecordingError: the folder exists already, or rosbags is not installed.
+        RecordingError: the folder exists already, or a library is not installed.
     """
     with bag_sink(path, storage) as sink:
-        from rosbags.typesys import Stores, get_typestore
-
-        store = get_typestore(Stores.ROS2_JAZZY)
-        for topic, kind, stream, make in _topics(recording, spec, messages := _Messages(store)):
+        messages = _Messages(store := sink.store)
+        for topic, kind, stream, make in _topics(recording, spec, messages):
             sink.add_topic(topic, kind)
             stamps = np.round(stream.t * NS_PER_S).astype(np.int64) + START_NS
             receive = stamps + _to_commands_clock(recording, stream)
@@ -119,10 +107,14 @@ def write_bag(
 
 def _topics(
     recording: Recording, spec: RobotSpec, messages: _Messages
-) -> list[tuple[str, str, Stream, Make]]:
-    """Returns topic, type, stream and the function that makes a message of a row."""
+) -> Iterator[tuple[str, str, Stream, Make]]:
+    """Yields topic, type, stream and the function that makes a message of a row."""
     beside = recording.odometry is not None or recording.pose.clock != recording.command.clock
-    topics: list[tuple[str, str, Stream, Make]] = [
+    joints, names, still = recording.wheels, list(WHEELS), np.zeros(len(WHEELS), dtype=bool)
+    if recording.state is not None:
+        joints, names = recording.state, [v.name for v in spec.state]
+        still = np.array([v.unit in POSITION_UNITS for v in spec.state])
+    topics: list[tuple[str, str, Stream | None, Make]] = [
         (
             "/cmd_vel", topic_roles.TWIST, recording.command,
             lambda _, row: messages.twist(spec.to_cmd_vel(row)),
@@ -130,24 +122,16 @@ def _topics(
         ("/pose", topic_roles.POSE, recording.pose, messages.pose_stamped)
         if beside
         else ("/odom", topic_roles.ODOMETRY, recording.pose, messages.odometry),
-    ]  # fmt: skip
-    if recording.odometry is not None:
-        topics.append(("/odom", topic_roles.ODOMETRY, recording.odometry, messages.speeds))
-    if recording.state is not None:
-        names = [v.name for v in spec.state]
-        still = np.array([v.unit in POSITION_UNITS for v in spec.state])
-        topics.append((
-            "/joint_states", topic_roles.JOINTS, recording.state,
+        ("/odom", topic_roles.ODOMETRY, recording.odometry, messages.speeds),
+        (
+            "/joint_states", topic_roles.JOINTS, joints,
             lambda header, row: messages.joints(header, names, row * still, row * ~still),
-        ))  # fmt: skip
-    elif recording.wheels is not None:
-        topics.append((
-            "/joint_states", topic_roles.JOINTS, recording.wheels,
-            lambda header, row: messages.joints(header, list(WHEELS), 0.0 * row, row),
-        ))  # fmt: skip
-    if recording.imu is not None:
-        topics.append(("/imu", topic_roles.IMU, recording.imu, messages.imu))
-    return topics
+        ),
+        ("/imu", topic_roles.IMU, recording.imu, messages.imu),
+    ]  # fmt: skip
+    for topic, kind, stream, make in topics:
+        if stream is not None:
+            yield topic, kind, stream, make
 
 
 def _to_commands_clock(recording: Recording, stream: Stream) -> int:
@@ -171,21 +155,18 @@ class _Messages:
         stamp = self._new("builtin_interfaces/Time", stamp_ns // NS_PER_S, stamp_ns % NS_PER_S)
         return self._new("std_msgs/Header", stamp, FRAMES[0])
 
-    def _vector(self, x: float, y: float, z: float) -> Any:
+    def _vector(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Any:
         return self._new("geometry_msgs/Vector3", x, y, z)
 
     def twist(self, row: Array) -> Any:
         x, y, w = (float(value) for value in row)
-        return self._new("geometry_msgs/Twist", self._vector(x, y, 0.0), self._vector(0.0, 0.0, w))
+        return self._new("geometry_msgs/Twist", self._vector(x, y), self._vector(z=w))
 
     def _pose(self, row: Array) -> Any:
         x, y, heading = (float(value) for value in row)
-        position = self._new("geometry_msgs/Point", x, y, 0.0)
-        half = heading / 2.0
-        turned = (0.0, 0.0, float(np.sin(half)), float(np.cos(half)))
-        return self._new(
-            "geometry_msgs/Pose", position, self._new("geometry_msgs/Quaternion", *turned)
-        )
+        z, w = float(np.sin(heading / 2.0)), float(np.cos(heading / 2.0))
+        turned = self._new("geometry_msgs/Quaternion", 0.0, 0.0, z, w)
+        return self._new("geometry_msgs/Pose", self._new("geometry_msgs/Point", x, y, 0.0), turned)
 
     def pose_stamped(self, header: Any, row: Array) -> Any:
         return self._new("geometry_msgs/PoseStamped", header, self._pose(row))
@@ -195,9 +176,7 @@ class _Messages:
 
     def speeds(self, header: Any, row: Array) -> Any:
         """Makes an odometry message of which only the twist was recorded."""
-        unknown = np.zeros(36)
-        unknown[0] = -1.0
-        return self._odometry(header, np.zeros(3), row, unknown)
+        return self._odometry(header, np.zeros(3), row, np.append(-1.0, np.zeros(35)))
 
     def _odometry(self, header: Any, pose: Array, twist: Array, pose_covariance: Array) -> Any:
         where = self._new("geometry_msgs/PoseWithCovariance", self._pose(pose), pose_covariance)
@@ -209,12 +188,11 @@ class _Messages:
 
     def imu(self, header: Any, row: Array) -> Any:
         ax, ay, w = (float(value) for value in row)
-        unknown = np.full(9, -1.0)
+        level, unknown = self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0), np.full(9, -1.0)
+        rates, pulls, measured = self._vector(z=w), self._vector(ax, ay), np.zeros(9)
         return self._new(
-            "sensor_msgs/Imu", header,
-            self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0), unknown,
-            self._vector(0.0, 0.0, w), np.zeros(9), self._vector(ax, ay, 0.0), np.zeros(9),
-        )  # fmt: skip
+            "sensor_msgs/Imu", header, level, unknown, rates, measured, pulls, measured
+        )
 
 
 Storage = Literal["mcap", "sqlite3"]
@@ -230,10 +208,14 @@ class BagSink:
 
     Args:
         writer: open writer of rosbags.
+
+    Attributes:
+        store: known message types.
+        counts: number of messages by topic.
     """
 
     def __init__(self, writer: Writer) -> None:
-        self._writer, self._store = writer, typestore()
+        self._writer, self.store = writer, typestore()
         self._connections: dict[str, Connection] = {}
         self.counts: dict[str, int] = {}
 
@@ -254,22 +236,18 @@ class BagSink:
             texts: `.msg` texts of the type and its component types, if unknown to rosbags.
             definition: complete definition of the type as stored in a bag, instead.
         """
-        if kind not in self._store.fielddefs and texts:
-            self._register(texts)
-        known = kind in self._store.fielddefs
-        given = {} if known else {"msgdef": definition or "", "rihs01": NO_HASH}
+        from rosbags.typesys import get_types_from_msg
+
+        fields = self.store.fielddefs
+        for name, text in (texts or {}).items() if kind not in fields else ():
+            if name not in fields:
+                self.store.register(get_types_from_msg(text, name))
+        given = {} if kind in fields else {"msgdef": definition or "", "rihs01": NO_HASH}
         self._connections[topic] = self._writer.add_connection(
-            topic, kind, typestore=self._store, **given,
+            topic, kind, typestore=self.store, **given,
             offered_qos_profiles=[profile_of(offer) for offer in offers],
         )  # fmt: skip
         self.counts[topic] = 0
-
-    def _register(self, texts: Mapping[str, str]) -> None:
-        from rosbags.typesys import get_types_from_msg
-
-        for name, text in texts.items():
-            if name not in self._store.fielddefs:
-                self._store.register(get_types_from_msg(text, name))
 
     def write(self, topic: str, receive_ns: int, data: bytes) -> None:
         """Writes a serialized message."""
@@ -304,16 +282,15 @@ def bag_sink(path: str | Path, storage: Storage = "mcap") -> Iterator[BagSink]:
             found; SQLite has none.
 
     Raises:
-        RecordingError: the folder exists already or can't be written, or rosbags is not installed.
+        RecordingError: the folder exists already or can't be written, or a library is not
+            installed.
     """
-    try:
-        from rosbags.rosbag2 import StoragePlugin, Writer
-    except ImportError:
-        raise RecordingError(
-            f"{path}: writing a bag needs the library rosbags; install it with "
-            "pip install 'nics_drl_bridge[bags]'."
-        ) from None
     path = Path(path)
+    check_libraries(path, "writing")
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    from nics_drl_bridge.recording.mcap import seal
+
     if path.exists():
         raise RecordingError(f"{path}: is there already; give the name of a new folder.")
     check_above(path)
@@ -336,12 +313,6 @@ def bag_sink(path: str | Path, storage: Storage = "mcap") -> Iterator[BagSink]:
             "save it with `nics bag salvage` where there is room."
         ) from None
     except BaseException:
-        _remove(beside)
+        shutil.rmtree(beside)
         raise
-    _remove(beside)
-
-
-def _remove(folder: Path) -> None:
-    for file in sorted(folder.rglob("*"), reverse=True):
-        file.rmdir() if file.is_dir() else file.unlink()
-    folder.rmdir()
+    beside.rmdir()

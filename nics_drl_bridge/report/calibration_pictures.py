@@ -17,22 +17,14 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.identify import repair
-from nics_drl_bridge.identify.calibrate import tracked_twists
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.drift import drift_growth, odometry_residual
+from nics_drl_bridge.identify.clocks import residual_by_shift, response_residual, state_residual
+from nics_drl_bridge.identify.drive import Drive, pose_residual
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.noise import pose_residual
+from nics_drl_bridge.identify.noise import drift_growth, odometry_residual
 from nics_drl_bridge.identify.report import CalibratedValue, estimates
-from nics_drl_bridge.identify.signals import interval_means
-from nics_drl_bridge.identify.timing import (
-    moved_commands,
-    nominal_lags,
-    residual_by_shift,
-    response_residual,
-    state_residual,
-)
-from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.identify.responses import speed_along, wheel_means
+from nics_drl_bridge.identify.signals import moved_commands, nominal_lags
 from nics_drl_bridge.report.page import DARK, MEASURED, MODEL, OTHER, png
 from nics_drl_bridge.robot.noise import Level
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -59,22 +51,20 @@ def calibration_pictures(spec: RobotSpec, identified: Identified) -> dict[str, b
     `timing`, `bursts`, `mounting`, `wheels` and `noise`, each if the recording showed it; the
     report in text says why the others are missing.
     """
-    found = estimates(identified.recording, identified.calibration, identified.findings)
+    found = estimates(identified)
     drawn = {
-        "timing": timing(spec, identified, found),
+        "timing": timing(identified, found),
         "bursts": bursts(identified, found),
         "mounting": mounting(identified, found),
         "wheels": wheels(identified, found),
-        "noise": noise(spec, identified),
+        "noise": noise(identified),
     }
     return {name: picture for name, picture in drawn.items() if picture is not None}
 
 
-def timing(
-    spec: RobotSpec, identified: Identified, found: dict[str, CalibratedValue]
-) -> bytes | None:
+def timing(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
     """Draws the unexplained part over each shift in time, with the estimate and its uncertainty."""
-    curves = timing_curves(identified.recording, spec, identified.calibration)
+    curves = timing_curves(identified.drive, identified.calibration)
     if not curves:
         return None
     figure = Figure(figsize=(5.2 * len(curves), 3.8), layout="constrained")
@@ -98,12 +88,11 @@ def timing(
 
 def bursts(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
     """Draws stamps of the poses as they arrived, and as they were spread."""
-    t = identified.recording.pose.t
-    groups = repair.find_bursts(t)
+    t, groups = identified.recording.pose.t, identified.drive.bursts
     if groups is None:
         return None
     shown = slice(0, int(BURSTS_SHOWN * groups.size))
-    spread = repair.spread(t, groups)
+    spread = identified.drive.sample_t
     figure = Figure(figsize=(9.0, 3.8), layout="constrained")
     axes, intervals = figure.subplots(1, 2)
     number = np.arange(len(t))[shown]
@@ -128,7 +117,7 @@ def mounting(identified: Identified, found: dict[str, CalibratedValue]) -> bytes
     )
     if rotation.value is None:
         return None
-    tracked = tracked_twists(identified.recording).twist
+    tracked = identified.drive.twists.twist
     tracked = tracked[:: max(1, len(tracked) // MOST_POINTS)]
     calibration = identified.calibration
     turned = geometry.rotate(tracked[:, :2], -calibration.rotation_rad)
@@ -157,15 +146,11 @@ def _points(axes: Axes, tracked: Sequence[Array], base: Sequence[Array]) -> None
 
 def wheels(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
     """Draws wheel speeds against the motion: their scale, and which wheel is the left one."""
-    stream, calibration = identified.recording.wheels, identified.calibration
-    if stream is None or calibration.wheel_scale is None:
+    drive, calibration = identified.drive, identified.calibration
+    units = wheel_means(drive, calibration)
+    if units is None or calibration.wheel_scale is None:
         return None
-    twists = tracked_twists(identified.recording)
-    start, end = (t + calibration.clock_offset_s for t in (twists.start, twists.end))
-    units = interval_means(stream.t, stream.values, start, end)
-    turn = twists.twist[:, 2]
-    along = geometry.rotate(twists.twist[:, :2], -calibration.rotation_rad)[:, 0]
-    along = along + calibration.lever_arm_m[1] * turn
+    turn, along = drive.twists.twist[:, 2], speed_along(drive, calibration)
     rows: tuple[tuple[str, str, str, Array, Array], ...] = (
         ("wheel_scale", "mean of both wheels [unit]", "speed [m/s]", units.mean(axis=1), along),
         ("turn_scale", "right less left wheel [unit]", "yaw rate [rad/s]",
@@ -200,24 +185,23 @@ REACH = 5.0
 """Histograms end at this many standard deviations."""
 
 
-def noise(spec: RobotSpec, identified: Identified) -> bytes | None:
+def noise(identified: Identified) -> bytes | None:
     """Draws histograms of the residuals with the normal curve, and the growth of the drift.
 
     Returns None if the recording is free of noise.
     """
     levels, panels = identified.noise, []
-    pose = pose_residual(identified.recording.pose)
+    drive, calibration, model = identified.drive, identified.calibration, identified.model
+    pose = pose_residual(drive)
     if pose is not None:
         panels += [("pose position", levels.pose_position, pose[:, :2].ravel())]
         panels += [("pose heading", levels.pose_heading, pose[:, 2])]
-    odometry = odometry_residual(
-        identified.recording, identified.calibration, identified.model, identified.samples
-    )
+    odometry = odometry_residual(drive, calibration, model, identified.samples)
     if odometry is not None:
         panels += [("odometry, linear", levels.odom_linear, odometry[:, 0])]
         panels += [("odometry, angular", levels.odom_angular, odometry[:, 2])]
     panels = [p for p in panels if p[1].measured and p[1].std > 0.0]
-    grown = drift_growth(identified.recording, identified.calibration, identified.model, spec)
+    grown = drift_growth(drive, calibration, model)
     drifts = grown is not None and levels.position_drift.measured and bool(grown[1].max() > 1e-9)
     if not panels and not drifts:
         return None
@@ -287,25 +271,21 @@ class ShiftCurve:
 
 
 @one_blas_thread
-def timing_curves(
-    recording: Recording, spec: RobotSpec, calibration: Calibration
-) -> tuple[ShiftCurve, ...]:
+def timing_curves(drive: Drive, calibration: Calibration) -> tuple[ShiftCurve, ...]:
     """Returns a curve for the clock offset and one for the latency, if they were estimated."""
-    if not moved_commands(recording.command).any():
+    if not moved_commands(drive.recording.command).any():
         return ()
     curves = []
     for name in ("clock_offset_s", "command_latency_s"):
         if name in calibration.uncertainty:
-            found = _curve(recording, spec, calibration, name)
+            found = _curve(drive, calibration, name)
             curves += [found] if found is not None else []
     return tuple(curves)
 
 
-def _curve(
-    recording: Recording, spec: RobotSpec, calibration: Calibration, name: str
-) -> ShiftCurve | None:
+def _curve(drive: Drive, calibration: Calibration, name: str) -> ShiftCurve | None:
+    recording, spec, twists = drive.recording, drive.spec, drive.twists
     value = float(getattr(calibration, name)) + np.linspace(-REACH_S, REACH_S, POINTS)
-    twists = tracked_twists(recording)
     pose = twists.start, twists.end, twists.twist
     lags = np.array([r.lag_s for r in calibration.responses])
     lags = lags if len(lags) == len(spec.state) else nominal_lags(spec)

@@ -59,7 +59,7 @@ def fit_pictures(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
     """
     pictures = {"accuracy": accuracy(identified)}
     if identified.held_out is not None:
-        pictures["paths"] = held_out_paths(spec, identified)
+        pictures["paths"] = held_out_paths(identified)
     if identified.unseen is not None and np.abs(identified.unseen.dq).max() > LEAST_RATE:
         pictures["residuals"] = residuals(identified, identified.unseen)
     if (np.ptp(identified.recording.command.values, axis=0) > 0.0).any():
@@ -94,21 +94,20 @@ def accuracy(identified: Identified) -> bytes:
     return png(figure)
 
 
-def held_out_paths(spec: RobotSpec, identified: Identified) -> bytes:
+def held_out_paths(identified: Identified) -> bytes:
     """Draws open-loop predictions on unseen data and the measured paths, from the same start."""
-    recording, calibration = identified.recording, identified.calibration
-    duration = float(recording.pose.t[-1] - recording.pose.t[0])
-    free = max(duration - identified.train_until_s - HORIZON_S, 0.0)
+    drive, calibration, pose = identified.drive, identified.calibration, identified.recording.pose
+    free = max(drive.duration_s - identified.train_until_s - HORIZON_S, 0.0)
     chosen = windows(
-        recording, calibration, identified.train_until_s, duration, HORIZON_S, free / PATHS
+        drive, calibration, identified.train_until_s, drive.duration_s, HORIZON_S, free / PATHS
     )
-    predicted = _predicted(spec, identified, chosen)
+    predicted = _predicted(identified, chosen)
     count = min(len(predicted), PATHS)
     figure = Figure(figsize=(3.4 * min(count, 3), 3.4 * -(-count // 3) + 0.4), layout="constrained")
     grid = figure.subplots(-(-count // 3), min(count, 3), squeeze=False).ravel()
     for n, (axes, path) in enumerate(zip(grid, predicted, strict=False)):
-        during = (recording.pose.t >= chosen.start_t[n]) & (recording.pose.t <= chosen.end_t[n])
-        truth = recording.pose.values[during]
+        during = (pose.t >= chosen.start_t[n]) & (pose.t <= chosen.end_t[n])
+        truth = pose.values[during]
         axes.plot(*truth[:, :2].T, color=MEASURED, linewidth=3.5, alpha=0.55, label="measured")
         axes.plot(*path[:, :2].T, color=MODEL, linestyle="--", label="predicted")
         axes.plot(*truth[0, :2], "o", color="#333333", markersize=5, label="start")
@@ -194,7 +193,7 @@ def _response(
     other.set_ylabel(f"{model.dofs[d]} [{model.dof_units[d]}]", fontsize=9, color=MEASURED)
 
 
-def _predicted(spec: RobotSpec, identified: Identified, chosen: Windows) -> Array:
+def _predicted(identified: Identified, chosen: Windows) -> Array:
     """Open-loop paths (W, n, 3) over windows."""
     shares = np.linspace(0.02, 1.0, POINTS)
     ends = [chosen.start_t + share * (chosen.end_t - chosen.start_t) for share in shares]
@@ -202,8 +201,7 @@ def _predicted(spec: RobotSpec, identified: Identified, chosen: Windows) -> Arra
         predict(
             identified.model,
             identified.calibration,
-            identified.recording,
-            spec,
+            identified.drive,
             replace(chosen, end_t=end),
         )
         for end in ends

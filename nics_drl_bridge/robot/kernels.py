@@ -5,14 +5,14 @@ Only the kept terms cost time. A step of one robot consists of scalar functions,
 process several robots at a time. Both give bit-identical results for every batch size: one robot
 is a batch of one.
 
-Shared arguments: `terms` are the arrays of `term_arrays`; `x` contains state, command and a last
+Shared arguments: `terms` are `Terms`; `x` contains state, command and a last
 entry of 1; `dq` are the rates; `series` is `SERIES` in the type of the other arrays.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
@@ -24,7 +24,6 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 Array = NDArray[np.float64]
-Terms = tuple[NDArray[np.int64], Array, NDArray[np.int64], NDArray[np.int64]]
 
 SERIES: Array = np.array([1 / 6, 1 / 120, 1 / 5040, 1 / 2, 1 / 24, 1 / 720])
 """Coefficients of sin(t) / t and (1 - cos(t)) / t; exact to 1e-14 for turns below 0.1 rad per
@@ -34,10 +33,24 @@ WIDE_TURN = 0.5
 GREATEST_ORDER = 4
 
 
-def term_arrays(model: TaylorModel) -> Terms:
-    """Returns the kept terms: dof (T,), coefficient (T,), factors (T, order), their number (T,).
+class Terms(NamedTuple):
+    """The kept terms of a model.
 
-    A factor is an index into `x`; unused ones point to its last entry, which is 1.
+    Attributes:
+        dof: (T,) degree of freedom of each.
+        coefficient: (T,), or (T, n) of n robots.
+        factors: (T, order) indices into `x`; unused ones point to its last entry, which is 1.
+        degree: (T,) number of factors.
+    """
+
+    dof: NDArray[np.int64]
+    coefficient: Array
+    factors: NDArray[np.int64]
+    degree: NDArray[np.int64]
+
+
+def term_arrays(model: TaylorModel) -> Terms:
+    """Returns the kept terms of a model.
 
     Raises:
         ModelError: a term is of a higher order than the kernels support.
@@ -55,7 +68,7 @@ def term_arrays(model: TaylorModel) -> Terms:
         used = np.repeat(np.arange(one), model.powers[k])
         factors[row, : len(used)] = used
     count = (factors != one).sum(axis=1)
-    return dofs.astype(np.int64), model.coefficients[dofs, places], factors, count
+    return Terms(dofs.astype(np.int64), model.coefficients[dofs, places], factors, count)
 
 
 def scratch(model: TaylorModel) -> tuple[Array, Array]:
@@ -68,13 +81,12 @@ def scratch(model: TaylorModel) -> tuple[Array, Array]:
 @kernel
 def rates(dq, x, terms):  # type: ignore[no-untyped-def]
     """Computes dQ/dt (3 + S,) of one robot."""
-    dof, coefficient, factors, count = terms
     dq[:] = 0.0
-    for k in range(dof.shape[0]):
-        product = coefficient[k]
-        for factor in range(count[k]):
-            product *= x[factors[k, factor]]
-        dq[dof[k]] += product
+    for k in range(terms.dof.shape[0]):
+        product = terms.coefficient[k]
+        for factor in range(terms.degree[k]):
+            product *= x[terms.factors[k, factor]]
+        dq[terms.dof[k]] += product
 
 
 @kernel
@@ -165,26 +177,25 @@ def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
 
 @kernel
 def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
-    dof, coefficient, factors, count = terms
-    n = x.shape[1]
+    factors, n = terms.factors, x.shape[1]
     for d in range(dq.shape[0]):
         rate = dq[d]
         for i in range(n):
             rate[i] = 0.0
-    for k in range(dof.shape[0]):
-        rate, value, one = dq[dof[k]], coefficient[k], x[factors[k, 0]]
-        if count[k] == 1:
+    for k in range(terms.dof.shape[0]):
+        rate, value, one = dq[terms.dof[k]], terms.coefficient[k], x[factors[k, 0]]
+        if terms.degree[k] == 1:
             for i in range(n):
                 rate[i] += own(value, i) * one[i]
-        elif count[k] == 2:
+        elif terms.degree[k] == 2:
             other = x[factors[k, 1]]
             for i in range(n):
                 rate[i] += own(value, i) * one[i] * other[i]
-        elif count[k] == 3:
+        elif terms.degree[k] == 3:
             other, third = x[factors[k, 1]], x[factors[k, 2]]
             for i in range(n):
                 rate[i] += own(value, i) * one[i] * other[i] * third[i]
-        elif count[k] == 4:
+        elif terms.degree[k] == 4:
             other, third, last = x[factors[k, 1]], x[factors[k, 2]], x[factors[k, 3]]
             for i in range(n):
                 rate[i] += own(value, i) * one[i] * other[i] * third[i] * last[i]

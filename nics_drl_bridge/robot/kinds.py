@@ -1,28 +1,17 @@
-"""Kinds of robots: textbook kinematics and a drawing for each, found by name.
-
-A module of this folder that defines `KIND` adds a kind of the module's name, which a robot's YAML
-file selects by `textbook:`. Other packages add kinds by entry points of the group
-`nics_drl_bridge.kinds`, each of which names a `RobotKind`.
-"""
+"""Kinds of robots: textbook kinematics and a drawing for each, found by name, see `registry`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
-from importlib.util import find_spec
-from pathlib import Path
-from pkgutil import iter_modules
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge import extensions
 from nics_drl_bridge.errors import ConfigError
-
-if TYPE_CHECKING:  # it checks the names of kinds
-    from nics_drl_bridge.robot.spec import RobotSpec, StateVariable
+from nics_drl_bridge.robot.registry import find_kind, kind_names
+from nics_drl_bridge.robot.spec import RobotSpec, StateVariable
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -122,34 +111,6 @@ class RobotKind:
     drawing: Callable[[RobotSpec], Drawing]
 
 
-def kind_names() -> list[str]:
-    """Names of all kinds."""
-    modules = (module.name for module in iter_modules([str(Path(__file__).parent)]))
-    own = (name for name in modules if _own_kind(name) is not None)
-    return sorted({*own, *extensions.known("kinds")})
-
-
-def find_kind(name: str) -> RobotKind | None:
-    """Returns the kind of a name; None if there is none.
-
-    Raises:
-        ConfigError: a library that it needs is missing.
-    """
-    kind = _own_kind(name)
-    if kind is None and name in extensions.known("kinds"):
-        loaded: RobotKind = extensions.load("kinds", name)
-        return loaded
-    return kind
-
-
-def _own_kind(name: str) -> RobotKind | None:
-    place = f"{__package__}.{name}"
-    if not name.isidentifier() or find_spec(place) is None:
-        return None
-    kind = getattr(import_module(place), "KIND", None)
-    return kind if isinstance(kind, RobotKind) else None
-
-
 def textbook(spec: RobotSpec) -> Textbook:
     """Returns the textbook kinematics of a robot, with the parameters of its spec.
 
@@ -165,7 +126,7 @@ def drawing(spec: RobotSpec) -> Drawing:
 
 
 def _kind_of(spec: RobotSpec) -> RobotKind:
-    kind = find_kind(require_textbook(spec))
+    kind: RobotKind | None = find_kind(require_textbook(spec))
     if kind is None:
         raise ConfigError(
             f"robot {spec.name!r}: `textbook:` must be one of {', '.join(kind_names())}, not "

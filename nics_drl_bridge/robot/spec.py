@@ -13,7 +13,7 @@ from pydantic import Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.robot import kinds
+from nics_drl_bridge.robot.registry import find_kind, kind_names
 
 CmdVelField = Literal["linear.x", "linear.y", "angular.z"]
 CMD_VEL_FIELDS: tuple[CmdVelField, ...] = ("linear.x", "linear.y", "angular.z")
@@ -126,8 +126,8 @@ class RobotSpec(Schema):
     @field_validator("textbook")
     @classmethod
     def _known(cls, textbook: str | None) -> str | None:
-        if textbook is not None and kinds.find_kind(textbook) is None:
-            raise ValueError(f"must be one of {', '.join(kinds.kind_names())}")
+        if textbook is not None and find_kind(textbook) is None:
+            raise ValueError(f"must be one of {', '.join(kind_names())}")
         return textbook
 
     @model_validator(mode="before")

@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import combinations_with_replacement
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import ConfigDict, Field
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ModelError
 
 Array = NDArray[np.float64]
@@ -128,64 +129,24 @@ class TaylorModel:
             lines.append(f"{dof} = {text or '0'}  [{self.dof_units[d]}]")
         return lines
 
-    def to_dict(self) -> dict[str, Any]:
-        """Returns plain data for YAML; every number reads back bit-identical."""
+    @property
+    def named(self) -> NamedTaylorModel:
+        """The model by names, unchecked; every number is bit-identical."""
+        names = self.term_names
         terms = {
-            dof: {
-                term_name(self.powers[k], self.variables): float(self.coefficients[d, k])
-                for k in np.flatnonzero(self.coefficients[d])
-            }
-            for d, dof in enumerate(self.dofs)
+            dof: {names[k]: float(row[k]) for k in np.flatnonzero(row)}
+            for dof, row in zip(self.dofs, self.coefficients, strict=True)
         }
-        box = {
-            name: [float(low), float(high)]
-            for name, low, high in zip(self.variables, self.low, self.high, strict=True)
-        }
-        data: dict[str, Any] = {
-            "dt": self.dt,
-            "units": dict(zip(self.dofs, self.dof_units, strict=True)),
-            "terms": terms,
-            "valid": box,
-            "assumed": [list(pair) for pair in self.assumed],
-        }
-        if self.std_errors.size:
-            data["standard_errors"] = self.named_errors
-        if self.quality is not None:
-            data["quality"] = self.quality.to_dict()
-        return data
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> TaylorModel:
-        """Reads the output of `to_dict`. Raises ModelError with the wrong key."""
-        try:
-            variables, dofs = tuple(data["valid"]), tuple(data["terms"])
-            terms = data["terms"]
-            parsed = {name: parse_term(name, variables) for dof in dofs for name in terms[dof]}
-            names = sorted(parsed, key=lambda name: canonical(parsed[name]))
-            powers = np.array([parsed[name] for name in names], dtype=np.int64)
-            powers = powers.reshape(len(names), len(variables))
-            coefficients = np.array(
-                [[float(terms[dof].get(name, 0.0)) for name in names] for dof in dofs]
-            )
-            box = np.array([data["valid"][name] for name in variables], dtype=np.float64)
-            box = box.reshape(len(variables), 2)
-            units, dt = tuple(data["units"][dof] for dof in dofs), float(data["dt"])
-            assumed = tuple((str(dof), str(term)) for dof, term in data["assumed"])
-            errors = {
-                str(dof): {str(term): float(value) for term, value in row.items()}
-                for dof, row in data.get("standard_errors", {}).items()
-            }
-            quality = Quality.from_dict(data["quality"]) if "quality" in data else None
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise ModelError(
-                f"kinematics: {error!s} is missing or wrong; generate the model anew."
-            ) from None
-        if not (np.isfinite(coefficients).all() and np.isfinite(box).all() and 0.0 < dt < np.inf):
-            raise ModelError("kinematics: holds NaN, inf or dt <= 0; generate the model anew.")
-        return cls(
-            variables, dofs, units, powers, coefficients.reshape(len(dofs), len(names)), dt,
-            box[:, 0], box[:, 1], assumed, quality=quality,
-        ).with_errors(errors)  # fmt: skip
+        box = zip(self.low.tolist(), self.high.tolist(), strict=True)
+        return NamedTaylorModel.model_construct(
+            dt=self.dt,
+            units=dict(zip(self.dofs, self.dof_units, strict=True)),
+            terms=terms,
+            valid=dict(zip(self.variables, box, strict=True)),
+            assumed=self.assumed,
+            standard_errors=self.named_errors if self.std_errors.size else None,
+            quality=self.quality,
+        )
 
 
 def exponents(variables: int, order: int) -> NDArray[np.int64]:
@@ -262,6 +223,8 @@ class Quality:
         open_loop_path_m: mean length of the measured path [m].
     """
 
+    __pydantic_config__ = ConfigDict(extra="forbid")  # a figure of merit may be inf
+
     samples: int
     outliers: dict[str, float]
     condition: dict[str, float]
@@ -274,17 +237,46 @@ class Quality:
     open_loop_heading_error_rad: float = 0.0
     open_loop_path_m: float = 0.0
 
-    def to_dict(self) -> dict[str, Any]:
-        """Returns plain data for YAML."""
-        return {k: dict(v) if isinstance(v, dict) else v for k, v in vars(self).items()}
 
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Quality:
-        """Reads the output of `to_dict`. Raises KeyError, TypeError or ValueError otherwise."""
-        values: dict[str, Any] = {
-            name: {str(k): float(v) for k, v in value.items()}
-            if isinstance(value, dict)
-            else float(value)
-            for name, value in data.items()
-        }
-        return cls(**{**values, "samples": int(values["samples"])})
+class NamedTaylorModel(Schema):
+    """A TaylorModel by the names of its terms, as `model.yaml` holds it.
+
+    Attributes:
+        dt: the step for which the rates are valid [s].
+        units: of the rates, by degree of freedom.
+        terms: dof -> term -> coefficient; see `term_name`.
+        valid: least and greatest value of each variable in the recording.
+        assumed: terms (dof, term) that the drive could not show.
+        standard_errors: dof -> term -> standard error, as far as known.
+        quality: goodness of fit; None if unknown.
+    """
+
+    dt: float = Field(gt=0.0)
+    units: dict[str, str]
+    terms: dict[str, dict[str, float]]
+    valid: dict[str, tuple[float, float]]
+    assumed: tuple[tuple[str, str], ...]
+    standard_errors: dict[str, dict[str, float]] | None = None
+    quality: Quality | None = None
+
+    def model(self) -> TaylorModel:
+        """Returns the model as arrays. Raises ModelError if the names do not fit each other."""
+        variables, dofs = tuple(self.valid), tuple(self.terms)
+        try:
+            units = tuple(self.units[dof] for dof in dofs)
+            parsed = {
+                name: parse_term(name, variables) for row in self.terms.values() for name in row
+            }
+        except KeyError as error:
+            raise ModelError(f"kinematics: {error} has no unit; generate the model anew.") from None
+        except (OverflowError, ValueError) as error:
+            raise ModelError(f"kinematics: {error}; generate the model anew.") from None
+        names = sorted(parsed, key=lambda name: canonical(parsed[name]))
+        powers = np.array([parsed[name] for name in names], dtype=np.int64)
+        rows = [[self.terms[dof].get(name, 0.0) for name in names] for dof in dofs]
+        low, high = np.array(list(self.valid.values())).reshape(len(variables), 2).T
+        return TaylorModel(
+            variables, dofs, units, powers.reshape(len(names), len(variables)),
+            np.array(rows, dtype=np.float64).reshape(len(dofs), len(names)), self.dt, low, high,
+            self.assumed, quality=self.quality,
+        ).with_errors(self.standard_errors or {})  # fmt: skip

@@ -2,7 +2,7 @@
 
 All bodies move at the same time. At the first contact, each body that approached the other stops:
 a robot until the end of the substep, an obstacle until the end of the period. Then the next
-contact is sought. Shapes are those of `kernels`; `flights`, `events` and `scene` those of
+contact is sought. Shapes are those of `state`; the columns of `flights` and `events` are in
 `impact_kernels`.
 """
 
@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.robot.kernels import delayed, move, rates, wrap
+from nics_drl_bridge.robot.kernels import Terms, delayed, move, rates, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import impact_kernels as impact
 from nics_drl_bridge.sim.impact_kernels import (
@@ -28,8 +28,10 @@ from nics_drl_bridge.sim.impact_kernels import (
     VX,
     VY,
     WITH,
+    Moving,
 )
 from nics_drl_bridge.sim.sensing_kernels import drift_of
+from nics_drl_bridge.sim.state import Array, Dynamics, Nearby, Single, State, Surroundings
 
 SHARE = 1e-3
 """A body that contributes less than this share of the closing speed is not stopped."""
@@ -39,19 +41,23 @@ MOST_MOVES = 1000
 
 
 @kernel
-def rates_at(j, dq, x, state, history, n, m, delay, substeps, terms):  # type: ignore[no-untyped-def]
-    """Computes the rates dq in substep j of a period, under the command then in effect."""
-    row = delayed(j, delay, substeps, history.shape[2])
-    size = state.shape[2]
+def rates_at(n: int, m: int, j: int, state: State, motion: Dynamics, single: Single) -> None:
+    """Computes the rates of robot m in substep j of a period, under the command then in effect.
+
+    The result is in `single.dq`.
+    """
+    row = delayed(j, state.delay[n, m], motion.substeps, state.history.shape[2])
+    size, terms = state.state.shape[2], motion.terms
     for s in range(size):
-        x[s] = state[n, m, s]
-    for c in range(history.shape[3]):
-        x[size + c] = history[n, m, row, c]
-    rates(dq, x, terms)
+        single.x[s] = state.state[n, m, s]
+    for c in range(state.history.shape[3]):
+        single.x[size + c] = state.history[n, m, row, c]
+    own = Terms(terms.dof, state.coefficient[n, m], terms.factors, terms.degree)
+    rates(single.dq, single.x, own)
 
 
 @kernel
-def _put(body, base, flight, time, series):  # type: ignore[no-untyped-def]
+def _put(body: Array, base: Array, flight: Array, time: float, series: Array) -> None:
     """Writes to `body` (7,) a robot that began at `base` (7,), after `time` [s]."""
     turn = flight[TURN] * time
     body[0], body[1], body[3], body[4] = move(
@@ -62,72 +68,80 @@ def _put(body, base, flight, time, series):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _first_touch(m, begin, until, tight, events, scene):  # type: ignore[no-untyped-def]
+def _first_touch(
+    m: int,
+    begin: float,
+    until: float,
+    scene: Surroundings,
+    nearby: Nearby,
+    events: Array,
+    moving: Moving,
+) -> None:
     """Finds the first contact of robot m from a time of the substep on, see `impact_kernels`."""
-    meets, near, walls, grid = tight
-    world, _, first, _, _ = scene
-    event, me = events[m], first + m
+    near, world, meets = nearby.near, moving.world, nearby.meets[m]
+    event, me = events[m], moving.first + m
     event[TIME] = until
-    if meets[m] & contacts.BODIES and event[DEPTH] >= 0.0:
+    if meets & contacts.BODIES and event[DEPTH] >= 0.0:
         listed = near[m, 0] <= contacts.SEVERAL
         for i in range(near[m, 0] if listed else world.shape[0]):
             k = near[m, 1 + i] if listed else i
             if k != me and world[k, 5] > 0.0:
-                impact.touch_body(event, me, k, begin, scene)
-    if meets[m] & contacts.WALLS and event[DEPTH] >= 0.0:
-        impact.touch_walls(event, me, walls, begin, scene)
-    if meets[m] & contacts.MAP and event[DEPTH] >= 0.0:
-        impact.touch_map(event, me, grid, begin, scene)
+                impact.touch_body(event, me, k, begin, moving)
+    if meets & contacts.WALLS and event[DEPTH] >= 0.0:
+        impact.touch_walls(event, me, scene.walls, begin, moving)
+    if meets & contacts.MAP and event[DEPTH] >= 0.0:
+        impact.touch_map(event, me, scene.grid, begin, moving)
 
 
 @kernel
-def _leave(m, until, tight, events, scene, trial, spare):  # type: ignore[no-untyped-def]
+def _leave(
+    m: int, until: float, scene: Surroundings, nearby: Nearby, single: Single, moving: Moving
+) -> None:
     """Moves a robot that overlaps something for as long as it gets no deeper."""
-    meets, near, walls, grid = tight
-    world, flights, first, outlines, series = scene
-    flight, me = flights[first + m], first + m
-    way = math.sqrt(flight[VX] ** 2 + flight[VY] ** 2) + abs(flight[TURN]) * world[me, 5]
-    moves = int(min(max(math.ceil(way * until / (SMALL * world[me, 5])), 1), MOST_MOVES))
+    world, events, me = moving.world, single.events, moving.first + m
+    flight = moving.flights[me]
+    path = math.sqrt(flight[VX] ** 2 + flight[VY] ** 2) + abs(flight[TURN]) * world[me, 5]
+    moves = int(min(max(math.ceil(path * until / (SMALL * world[me, 5])), 1), MOST_MOVES))
     flight[STOP], events[m, AFTER] = 0.0, events[m, DEPTH]
     for i in range(1, moves + 1):
         time = until if i == moves else until * i / moves
-        _put(trial, world[me], flight, time, series)
-        depth, _ = contacts.contact(
-            trial, m, meets[m], near, world, walls, grid, outlines, spare, 0.0
-        )
+        _put(single.trial, world[me], flight, time, moving.series)
+        depth, _ = contacts.contact(single.trial, m, world, scene, nearby, single.spare, 0.0)
         if depth < events[m, AFTER]:
             break
         events[m, AFTER], flight[STOP] = depth, time
 
 
 @kernel
-def _within(p, b, until, world, flights, first):  # type: ignore[no-untyped-def]
+def _within(p: int, b: int, until: float, moving: Moving) -> bool:
     """True if robot p may come near body b within the substep."""
-    a = first + p
+    world, flights, a = moving.world, moving.flights, moving.first + p
     dx, dy = world[a, 0] - world[b, 0], world[a, 1] - world[b, 1]
-    ways = impact.speed_at(a, -1.0, flights) + impact.speed_at(b, -1.0, flights)
-    far = world[a, 5] + world[b, 5] + ways * until + impact.SLACK
-    return dx * dx + dy * dy <= far * far
+    paths = impact.speed_at(a, -1.0, flights) + impact.speed_at(b, -1.0, flights)
+    far = world[a, 5] + world[b, 5] + paths * until + impact.SLACK
+    return dx * dx + dy * dy <= far * far  # type: ignore[no-any-return]
 
 
 @kernel
-def _settle(until, tight, events, touched, scene):  # type: ignore[no-untyped-def]
+def _settle(
+    until: float, scene: Surroundings, nearby: Nearby, events: Array, touched: Array, moving: Moving
+) -> None:
     """Stops the bodies of a world at their contacts within a substep, in order of time.
 
     Args:
         until: length of the substep [s].
-        tight: what each robot may meet, bodies near it, walls and map, see `contact_kernels`.
+        scene: of the world.
+        nearby: what each robot may meet.
         events: (M, EVENT), updated in place.
         touched: (M,) set to 1 by a contact.
-        scene: its `flights` are updated in place.
+        moving: the bodies; their `flights` are updated in place.
     """
-    world, flights, first, _, _ = scene
-    meets, robots = tight[0], events.shape[0]
+    flights, first, meets, robots = moving.flights, moving.first, nearby.meets, events.shape[0]
     for m in range(robots):
         events[m, TIME] = until
         if meets[m] != contacts.FREE:
-            _first_touch(m, 0.0, until, tight, events, scene)
-    for _ in range(2 * world.shape[0] + 2):
+            _first_touch(m, 0.0, until, scene, nearby, events, moving)
+    for _ in range(2 * moving.world.shape[0] + 2):
         m = 0
         for p in range(1, robots):
             if events[p, TIME] < events[m, TIME]:
@@ -146,27 +160,31 @@ def _settle(until, tight, events, touched, scene):  # type: ignore[no-untyped-de
         for p in range(robots):
             if meets[p] != contacts.FREE and (
                 p == m
-                or _within(p, first + m, until, world, flights, first)
-                or (k >= 0 and _within(p, k, until, world, flights, first))
+                or _within(p, first + m, until, moving)
+                or (k >= 0 and _within(p, k, until, moving))
             ):
-                _first_touch(p, time, until, tight, events, scene)
+                _first_touch(p, time, until, scene, nearby, events, moving)
 
 
 @kernel
-def _begin_substep(n, time, dt, velocity, moving, bodies, start, flights):  # type: ignore[no-untyped-def]
+def _begin_substep(
+    n: int, time: float, dt: float, any_moves: bool, state: State, single: Single
+) -> None:
     """Places the obstacles at a time of the period and sets their flights from there."""
-    if moving:
-        contacts.move_obstacles(bodies, start, velocity, n, time)
+    velocity, flights = state.velocity, single.flights
+    if any_moves:
+        contacts.move_obstacles(state.bodies, single.start, velocity, n, time)
     for k in range(velocity.shape[1]):
         flights[k, VX], flights[k, VY] = velocity[n, k, 0], velocity[n, k, 1]
         flights[k, TURN], flights[k, STOP] = velocity[n, k, 2], dt
 
 
 @kernel
-def _hold_obstacles(n, time, dt, velocity, bodies, start, flights):  # type: ignore[no-untyped-def]
-    """Keeps obstacles at rest that were stopped within the substep that begins at `time`."""
+def _hold_obstacles(n: int, dt: float, state: State, single: Single) -> None:
+    """Keeps obstacles at rest that were stopped within the substep."""
+    bodies, velocity, start = state.bodies, state.velocity, single.start
     for k in range(velocity.shape[1]):
-        stop = flights[k, STOP]
+        stop = single.flights[k, STOP]
         if stop < dt:
             start[k, 0] = bodies[n, k, 0] + velocity[n, k, 0] * stop
             start[k, 1] = bodies[n, k, 1] + velocity[n, k, 1] * stop
@@ -177,98 +195,91 @@ def _hold_obstacles(n, time, dt, velocity, bodies, start, flights):  # type: ign
 
 
 @kernel
-def move_carefully(  # type: ignore[no-untyped-def]
-    n, meets, near, state, history, coefficient, delay, bodies, velocity, moving, walls, grid,
-    collided, pose, outlines, motion, room,
-):  # fmt: skip
+def move_carefully(
+    n: int, any_moves: bool, state: State, scene: Surroundings, motion: Dynamics, nearby: Nearby,
+    single: Single,
+) -> None:  # fmt: skip
     """Moves the robots of one world by one period, up to their contacts.
 
     A robot in contact is marked and stops for the rest of the substep, and again in the next ones
     while it would come nearer; it may move away. A robot that already overlaps something gets no
-    deeper. Without a contact it moves exactly as in `robot_kernels.move_freely`.
+    deeper. Without a contact it moves exactly as in `robot_kernels.move_freely`. An obstacle
+    stopped by a robot is left with its mean velocity over the period.
 
     Args:
         n: index of the world.
-        meets: (M,) what each robot may meet; those that meet nothing are not moved.
-        near: see `contact_kernels.find_near`.
-        state, history, coefficient, delay, motion: see `robot_kernels.move_freely`.
-        bodies: (N, K + M, 7) obstacles, then robots, see `lidar.shapes.BODY`; in place.
-        velocity, moving: velocities of the obstacles, and whether any moves. An obstacle stopped
-            by a robot is left with its mean velocity over the period.
-        walls: (W, 4).
-        grid: see `collision_kernels`.
-        collided: (N, M) set to 1 by a contact.
-        pose: (N, M, 3), in place.
-        outlines: corners, and the first corner of each outline.
-        room: see `worlds.arguments`.
+        any_moves: whether any of its obstacles moves.
+        state, scene, motion: see `state`.
+        nearby: what each robot may meet; those that meet nothing are not moved.
+        single: scratch memory.
     """
-    x, dq, trial, spare, start, began, flights, events = room
-    dof, factors, count, series, (dt, substeps) = motion
-    first, world, touched = velocity.shape[1], bodies[n], collided[n]
-    tight = (meets, near, walls, grid)
-    scene = (world, flights, first, outlines, series)
+    events, touched, dt = single.events, state.collided[n], motion.dt
+    first, meets = state.velocity.shape[1], nearby.meets
+    moving = Moving(state.bodies[n], single.flights, first, scene.outlines, motion.series)
     for m in range(meets.shape[0]):
-        flights[first + m, :] = 0.0
+        single.flights[first + m, :] = 0.0
         if meets[m] != contacts.FREE:
-            contacts.put_body(bodies, n, first + m, pose[n, m])
-            _look_within(m, tight, events, touched, scene, spare)
-    for j in range(substeps):
-        _begin_substep(n, j * dt, dt, velocity, moving, bodies, start, flights)
+            contacts.put_body(state.bodies, n, first + m, state.pose[n, m])
+            _check_overlap(m, scene, nearby, single, touched, moving)
+    for j in range(motion.substeps):
+        _begin_substep(n, j * dt, dt, any_moves, state, single)
         for m in range(meets.shape[0]):
             if meets[m] != contacts.FREE:
-                terms = (dof, coefficient[n, m], factors, count)
-                rates_at(j, dq, x, state, history, n, m, delay[n, m], substeps, terms)
-                flight = flights[first + m]
+                rates_at(n, m, j, state, motion, single)
+                flight, dq = single.flights[first + m], single.dq
                 flight[VX], flight[VY], flight[TURN], flight[STOP] = dq[0], dq[1], dq[2], dt
-                for s in range(state.shape[2]):
-                    state[n, m, s] += dt * dq[3 + s]
+                for s in range(state.state.shape[2]):
+                    state.state[n, m, s] += dt * dq[3 + s]
                 if events[m, DEPTH] < 0.0:
-                    _leave(m, dt, tight, events, scene, trial, spare)
-        _settle(dt, tight, events, touched, scene)
-        _arrive(meets, events, scene, trial)
-        if moving:
-            _hold_obstacles(n, j * dt, dt, velocity, bodies, start, flights)
-    if moving:
-        contacts.move_obstacles(bodies, start, velocity, n, substeps * dt)
-        _tell_velocities(n, substeps * dt, velocity, bodies, start, began)
+                    _leave(m, dt, scene, nearby, single, moving)
+        _settle(dt, scene, nearby, events, touched, moving)
+        _arrive(nearby, single, moving)
+        if any_moves:
+            _hold_obstacles(n, dt, state, single)
+    if any_moves:
+        period = motion.substeps * dt
+        contacts.move_obstacles(state.bodies, single.start, state.velocity, n, period)
+        _average_velocities(n, period, state, single)
     for m in range(meets.shape[0]):
         if meets[m] != contacts.FREE:
             for i in range(3):
-                pose[n, m, i] = world[first + m, i]
+                state.pose[n, m, i] = state.bodies[n, first + m, i]
 
 
 @kernel
-def _look_within(m, tight, events, touched, scene, spare):  # type: ignore[no-untyped-def]
+def _check_overlap(
+    m: int, scene: Surroundings, nearby: Nearby, single: Single, touched: Array, moving: Moving
+) -> None:
     """Records how deep robot m overlaps anything as the period begins; marks it if it does."""
-    meets, near, walls, grid = tight
-    world, _, first, outlines, _ = scene
+    events, body = single.events, moving.world[moving.first + m]
     depth, whom = contacts.contact(
-        world[first + m], m, meets[m], near, world, walls, grid, outlines, spare, 2.0 * NOTHING
+        body, m, moving.world, scene, nearby, single.spare, 2.0 * NOTHING
     )
     events[m, DEPTH] = min(depth, -np.finfo(np.float64).tiny) if depth <= NOTHING else 0.0
     if depth < 0.0:
         touched[m] = 1
-        if whom >= first:
-            touched[whom - first] = 1
+        if whom >= moving.first:
+            touched[whom - moving.first] = 1
 
 
 @kernel
-def _arrive(meets, events, scene, trial):  # type: ignore[no-untyped-def]
+def _arrive(nearby: Nearby, single: Single, moving: Moving) -> None:
     """Moves the robots to their poses at the end of the substep."""
-    world, flights, first, _, series = scene
-    for m in range(meets.shape[0]):
-        if meets[m] != contacts.FREE:
-            flight = flights[first + m]
-            _put(trial, world[first + m], flight, flight[STOP], series)
+    events, trial = single.events, single.trial
+    for m in range(nearby.meets.shape[0]):
+        if nearby.meets[m] != contacts.FREE:
+            body, flight = moving.world[moving.first + m], moving.flights[moving.first + m]
+            _put(trial, body, flight, flight[STOP], moving.series)
             for i in range(5):
-                world[first + m, i] = trial[i]
+                body[i] = trial[i]
             if events[m, DEPTH] < 0.0:
                 events[m, DEPTH] = events[m, AFTER]
 
 
 @kernel
-def _tell_velocities(n, period, velocity, bodies, start, began):  # type: ignore[no-untyped-def]
+def _average_velocities(n: int, period: float, state: State, single: Single) -> None:
     """Sets the velocity of stopped obstacles to their mean over the period."""
+    bodies, velocity, start, began = state.bodies, state.velocity, single.start, single.began
     for k in range(velocity.shape[1]):
         stopped = start[k, 0] != began[k, 0] or start[k, 1] != began[k, 1]
         if stopped or start[k, 2] != began[k, 2]:
@@ -278,27 +289,23 @@ def _tell_velocities(n, period, velocity, bodies, start, began):  # type: ignore
 
 
 @kernel
-def drift_carefully(  # type: ignore[no-untyped-def]
-    n, meets, near, state, noise, seed, step, bodies, walls, grid, collided, pose, outlines, motion,
-    room,
-):  # fmt: skip
+def drift_carefully(
+    n: int, state: State, scene: Surroundings, motion: Dynamics, nearby: Nearby, single: Single
+) -> None:
     """Lets the robots of one world drift, one after the other, up to their contacts.
 
     Args:
-        noise, seed: see `sensing_kernels.drift_of`.
-        step: number of the period, from 1.
-        n and others: see `move_carefully`.
+        n: index of the world.
+        state, scene, motion, nearby, single: see `move_carefully`.
     """
-    flights, events = room[6], room[7]
-    series, (dt, substeps) = motion[3], motion[4]
-    world, robots = bodies[n], pose.shape[1]
-    first = world.shape[0] - robots
-    tight, scene = (meets, near, walls, grid), (world, flights, first, outlines, series)
+    pose, collided, meets = state.pose, state.collided, nearby.meets
+    flights, events, first = single.flights, single.events, state.velocity.shape[1]
+    moving = Moving(state.bodies[n], flights, first, scene.outlines, motion.series)
     stood = False
-    for m in range(robots):
+    for m in range(pose.shape[1]):
         if collided[n, m] != 0:
             continue
-        ahead, aside, turn = drift_of(state, noise, n, m, seed, step * robots + m, dt * substeps)
+        ahead, aside, turn = drift_of(n, m, state, motion.dt * motion.substeps)
         if ahead == 0.0 and aside == 0.0 and turn == 0.0:
             continue
         stop = 1.0
@@ -306,10 +313,10 @@ def drift_carefully(  # type: ignore[no-untyped-def]
             flight = flights[first + m]
             if not stood:
                 flights[:], stood = 0.0, True
-            contacts.put_body(bodies, n, first + m, pose[n, m])
+            contacts.put_body(state.bodies, n, first + m, pose[n, m])
             flight[VX], flight[VY], flight[TURN], flight[STOP] = ahead, aside, turn, 1.0
             events[m, DEPTH] = 0.0
-            _first_touch(m, 0.0, 1.0, tight, events, scene)
+            _first_touch(m, 0.0, 1.0, scene, nearby, events, moving)
             flight[STOP] = 0.0
             if events[m, TIME] < 1.0:
                 stop, collided[n, m] = events[m, TIME], 1
@@ -317,8 +324,8 @@ def drift_carefully(  # type: ignore[no-untyped-def]
                     collided[n, int(events[m, WITH]) - first] = 1
         x, y, _, _ = move(
             pose[n, m, 0], pose[n, m, 1], math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2]),
-            ahead, aside, turn * stop, stop, series,
+            ahead, aside, turn * stop, stop, motion.series,
         )  # fmt: skip
         pose[n, m, 0], pose[n, m, 1], pose[n, m, 2] = x, y, wrap(pose[n, m, 2] + turn * stop)
         if meets[m] != contacts.FREE:
-            contacts.put_body(bodies, n, first + m, pose[n, m])
+            contacts.put_body(state.bodies, n, first + m, pose[n, m])

@@ -1,19 +1,12 @@
 """Compiled contacts: which robots may touch something within a period, and what they touch.
 
 A robot whose circle cannot meet anything within the period moves freely. For the others, `near`
-lists the bodies that they may meet, so that each substep tests only those. Shapes: N worlds, M
-robots, K obstacles; bodies are obstacles, then robots.
+lists the bodies that they may meet, so that each substep tests only those. Shapes are those of
+`state`; bodies are obstacles, then robots.
 
-Compiled broad phase: the bodies of one crowded world sorted into square cells.
-
-Rebuilt each period by a counting sort. A robot then tests only the bodies around it, and the cost
-per robot does not depend on how many share the world. Bodies larger than a cell are in no cell and
-are always tested.
-
-`cells` are scratch: begin (C^2 + 2,) index in `order` (K,) of the first body of each cell, the last
-cell being that of the large bodies; cell_of (K,); frame (5,): x, y [m] of the first cell, cells per
-metre, greatest radius of the bodies in cells [m], and greatest distance moved since by any body
-[m].
+In a crowded world the bodies are sorted into square cells, rebuilt each period by a counting sort.
+A robot then tests only the bodies around it, and the cost per robot does not depend on how many
+share the world. Bodies larger than a cell are in no cell and are always tested.
 """
 
 from __future__ import annotations
@@ -31,6 +24,7 @@ from nics_drl_bridge.sim.collision_kernels import (
     segment_distance2,
     wall_gap,
 )
+from nics_drl_bridge.sim.state import Array, Cells, Nearby, State, Surroundings
 
 FREE, BODIES, WALLS, MAP = 0, 1, 2, 4
 """Bit flags of what a robot may meet."""
@@ -39,20 +33,19 @@ SEVERAL = 32
 
 
 @kernel
-def reaches(reach, bodies, velocity, way, n, period):  # type: ignore[no-untyped-def]
-    """Bounds how far the circle of each body may reach from its present centre [m].
+def reaches(n: int, state: State, nearby: Nearby, period: float) -> tuple[float, bool]:
+    """Bounds how far the circle of each body may reach from its present centre.
 
     Args:
-        reach: (K + M,) result; 0 where there is no body.
-        bodies: (N, K + M, 7).
-        velocity: (N, K, 3) of the obstacles.
-        way: (M,) upper bound on the length of each robot's path [m].
         n: index of the world.
+        state: of all worlds.
+        nearby: its `way` is given; its `reach` is the result, 0 where there is no body.
         period: [s].
 
     Returns:
         The longest path of any body [m], and whether an obstacle moves.
     """
+    reach, way, bodies, velocity = nearby.reach, nearby.way, state.bodies, state.velocity
     longest, moving = 0.0, False
     obstacles = velocity.shape[1]
     for k in range(obstacles):
@@ -69,30 +62,29 @@ def reaches(reach, bodies, velocity, way, n, period):  # type: ignore[no-untyped
 
 
 @kernel
-def find_near(near, m, reach, bodies, n, walls, grid, crowded, cells, found):  # type: ignore[no-untyped-def]
+def find_near(
+    n: int, m: int, bodies: Array, scene: Surroundings, nearby: Nearby, cells: Cells
+) -> int:
     """Finds what robot m of world n may meet within the period.
 
     Args:
-        near: (M, 1 + SEVERAL) number and indices of the bodies; result.
-        m: index of the robot.
-        reach: see `reaches`.
+        n, m: indices of the world and the robot.
         bodies: (N, K + M, 7).
-        n: index of the world.
-        walls: (W, 4).
-        grid: see `collision_kernels`.
-        crowded: whether the bodies are in cells.
-        cells, found: see `cell_kernels`.
+        scene: of the world.
+        nearby: its `reach` is given; row m of its `near` is the result.
+        cells: of its bodies, if it is crowded.
 
     Returns:
         A combination of the flags of this module.
     """
+    near, reach, walls = nearby.near, nearby.reach, scene.walls
     me = bodies.shape[1] - near.shape[0] + m
     x, y, own = bodies[n, me, 0], bodies[n, me, 1], reach[me]
     count, several = 0, bodies.shape[1]
-    if crowded:
-        several = bodies_around(x, y, own, cells, found)
+    if scene.crowded:
+        several = bodies_around(x, y, own, cells)
     for i in range(several):
-        k = found[i] if crowded else i
+        k = cells.found[i] if scene.crowded else i
         dx, dy, far = bodies[n, k, 0] - x, bodies[n, k, 1] - y, own + reach[k]
         if dx * dx + dy * dy <= far * far and k != me and reach[k] > 0.0:
             if count < SEVERAL:
@@ -105,54 +97,63 @@ def find_near(near, m, reach, bodies, n, walls, grid, crowded, cells, found):  #
         if d2 <= own * own:
             meets |= WALLS
             break
-    if grid[0].size > 0 and map_bound(bodies[n, me], grid) <= own - bodies[n, me, 5]:
+    grid = scene.grid
+    if grid.distances.size > 0 and map_bound(bodies[n, me], grid) <= own - bodies[n, me, 5]:
         meets |= MAP
     return meets
 
 
 @kernel
-def contact(body, m, meets, near, bodies, walls, grid, outlines, spare, limit):  # type: ignore[no-untyped-def]
+def contact(
+    body: Array,
+    m: int,
+    world: Array,
+    scene: Surroundings,
+    nearby: Nearby,
+    spare: Array,
+    limit: float,
+) -> tuple[float, int]:
     """Returns the clearance of a robot, given as `body` (7,), to all that it may meet.
 
     Args:
         body: the robot.
-        m, meets, near: see `find_near`.
-        bodies: (K + M, 7) of its world.
-        walls: (W, 4).
-        grid, spare: see `collision_kernels`.
-        outlines: corners, and the first corner of each outline.
+        m: its index.
+        world: (K + M, 7) bodies of its world.
+        scene: of the world.
+        nearby: what the robots may meet.
+        spare: scratch memory, see `collision_kernels`.
         limit: greatest clearance that is measured [m].
 
     Returns:
         The clearance, at most `limit` [m], negative where it overlaps something; and the nearest
         body, or -1.
     """
-    corners, corner = outlines
+    corners, first, near = scene.outlines.corners, scene.outlines.first, nearby.near
     least, whom = limit, -1
-    if meets & BODIES:
-        me = bodies.shape[0] - near.shape[0] + m
+    if nearby.meets[m] & BODIES:
+        me = world.shape[0] - near.shape[0] + m
         listed = near[m, 0] <= SEVERAL
-        for i in range(near[m, 0] if listed else bodies.shape[0]):
+        for i in range(near[m, 0] if listed else world.shape[0]):
             k = near[m, 1 + i] if listed else i
-            if k == me or bodies[k, 5] <= 0.0:
+            if k == me or world[k, 5] <= 0.0:
                 continue
-            gap = body_gap(body, bodies[k], corners, corner, limit, spare)
+            gap = body_gap(body, world[k], corners, first, limit, spare)
             if gap < least:
                 least, whom = gap, k
-    if meets & WALLS:
-        for w in range(walls.shape[0]):
-            gap = wall_gap(body, walls[w], corners, corner, limit, spare)
+    if nearby.meets[m] & WALLS:
+        for w in range(scene.walls.shape[0]):
+            gap = wall_gap(body, scene.walls[w], corners, first, limit, spare)
             if gap < least:
                 least, whom = gap, -1
-    if meets & MAP:
-        gap = map_gap(body, grid, corners, corner, limit, spare)
+    if nearby.meets[m] & MAP:
+        gap = map_gap(body, scene.grid, corners, first, limit, spare)
         if gap < least:
             least, whom = gap, -1
     return least, whom
 
 
 @kernel
-def move_obstacles(bodies, start, velocity, n, time):  # type: ignore[no-untyped-def]
+def move_obstacles(bodies: Array, start: Array, velocity: Array, n: int, time: float) -> None:
     """Moves the obstacles of world n to their poses `time` after the start of the period.
 
     Args:
@@ -172,24 +173,25 @@ def move_obstacles(bodies, start, velocity, n, time):  # type: ignore[no-untyped
 
 
 @kernel
-def put_body(bodies, n, k, pose):  # type: ignore[no-untyped-def]
+def put_body(bodies: Array, n: int, k: int, pose: Array) -> None:
     """Places body k of world n at a pose (3,)."""
     bodies[n, k, 0], bodies[n, k, 1], bodies[n, k, 2] = pose[0], pose[1], pose[2]
     bodies[n, k, 3], bodies[n, k, 4] = math.cos(pose[2]), math.sin(pose[2])
 
 
 X, Y, PER_METRE, RADIUS, MOVED = range(5)
+"""Entries of `Cells.frame`."""
 
 
 @kernel
-def _clamp(place, side):  # type: ignore[no-untyped-def]
+def _clamp(place: float, side: int) -> int:
     return int(min(max(place, 0.0), side - 1.0))
 
 
 @kernel
-def sort_bodies(bodies, n, cells):  # type: ignore[no-untyped-def]
+def sort_bodies(bodies: Array, n: int, cells: Cells) -> None:
     """Sorts the bodies of world n into cells, about two cells per body."""
-    begin, order, cell_of, frame = cells
+    begin, order, cell_of, frame = cells.begin, cells.order, cells.cell_of, cells.frame
     count, side = bodies.shape[1], int(math.sqrt(begin.shape[0] - 2))
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
     for k in range(count):
@@ -224,9 +226,9 @@ def sort_bodies(bodies, n, cells):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def bodies_around(x, y, reach, cells, found):  # type: ignore[no-untyped-def]
-    """Writes to `found` (K,) the bodies that may be within `reach` [m] of (x, y); their number."""
-    begin, order, _, frame = cells
+def bodies_around(x: float, y: float, reach: float, cells: Cells) -> int:
+    """Writes to `cells.found` the bodies that may be within `reach` [m] of (x, y); their number."""
+    begin, order, frame, found = cells.begin, cells.order, cells.frame, cells.found
     side = int(math.sqrt(begin.shape[0] - 2))
     reach += frame[RADIUS] + frame[MOVED]
     left = _clamp((x - reach - frame[X]) * frame[PER_METRE], side)

@@ -1,8 +1,6 @@
 """DeviceWorld: one world of a simulator as seen by the devices in it, whatever moves them.
 
-Covariance of a pose by odometry after a drive, given the noise of the measured twist.
-
-The kernel of `dead_reckoning`: covariances (M, 3, 3) of odometry, propagated by one step.
+With the covariance of a pose by odometry after a drive, given the noise of the measured twist.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Simulator
-from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.sim.robot_kernels import propagate_in_place
 
 Array = NDArray[np.float64]
 
@@ -152,21 +150,3 @@ def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Arr
     poses = (np.ascontiguousarray(pose, np.float64) for pose in (before, after))
     propagate_in_place(after_that, *poses, added)
     return after_that
-
-
-@kernel
-def propagate_in_place(covariance, before, after, added):  # type: ignore[no-untyped-def]
-    """Computes P = F P F^T + Q of each robot in place; see `dead_reckoning.propagate`."""
-    for m in range(len(covariance)):
-        p = covariance[m]
-        u, v = before[m, 1] - after[m, 1], after[m, 0] - before[m, 0]
-        # F differs from the identity only in its last column, (u, v, 1).
-        for j in range(3):
-            p[0, j] += u * p[2, j]
-            p[1, j] += v * p[2, j]
-        for i in range(3):
-            p[i, 0] += u * p[i, 2]
-            p[i, 1] += v * p[i, 2]
-        for i in range(3):
-            for j in range(3):
-                p[i, j] += added[i, j]

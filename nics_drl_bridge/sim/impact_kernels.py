@@ -10,21 +10,20 @@ missed, at any speed.
 Two features touch when they are within `SLACK` and approach each other; they do not overlap then.
 Bodies that overlap at the outset are not handled here, see `careful_kernels`.
 
-Shared arguments: `world` (K + M, 7) obstacles, then robots, as the substep begins; `flights`
-(K + M, 5) their motion in it, columns below, velocities of obstacles (k < `first`) in the map
-frame and those of robots in the body frame; `outlines` corners, and the first corner of each
-outline; `series` see `robot.kernels`. Body index -1 is the map, which does not move.
+Times are those of the substep [s]. Body index -1 is the map, which does not move.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot.kernels import move
 from nics_drl_bridge.sim.collision_kernels import map_bound, segment_distance2
+from nics_drl_bridge.sim.state import Array, MapField, OutlineArrays
 
 VX, VY, TURN, STOP, FLIGHT = range(5)
 """Columns of `flights`: velocity [m/s, m/s, rad/s], and time of its stop in the substep [s]."""
@@ -40,16 +39,64 @@ MOST_LOOKS = 2000
 """Iterations after which a pair counts as touching: only absurdly fast rotations need more."""
 
 
+class Moving(NamedTuple):
+    """The bodies of one world within a substep.
+
+    Attributes:
+        world: (K + M, 7) obstacles, then robots, as the substep begins.
+        flights: (K + M, FLIGHT) their motion in it: velocities of obstacles in the map frame, those
+            of robots in the body frame.
+        first: index of the first robot.
+        outlines: of all shapes.
+        series: see `robot.kernels`.
+    """
+
+    world: Array
+    flights: Array
+    first: int
+    outlines: OutlineArrays
+    series: Array
+
+
+class Edge(NamedTuple):
+    """A straight line between two points [m]; both are the same for the centre of a circle."""
+
+    ax: float
+    ay: float
+    bx: float
+    by: float
+
+
+class Placed(NamedTuple):
+    """An edge of a body in the map at a time, and how it moves.
+
+    Attributes:
+        edge: in the map.
+        x, y: origin of the body [m].
+        vx, vy, turn: its velocity in the map [m/s, m/s, rad/s].
+        bend: acceleration of its origin [m/s^2].
+    """
+
+    edge: Edge
+    x: float
+    y: float
+    vx: float
+    vy: float
+    turn: float
+    bend: float
+
+
 @kernel
-def pose_at(b, time, world, flights, first, series):  # type: ignore[no-untyped-def]
-    """Returns x, y [m], cosine and sine of the heading of a body at a time of the substep [s]."""
+def pose_at(b: int, time: float, moving: Moving) -> tuple[float, float, float, float]:
+    """Returns x, y [m], cosine and sine of the heading of a body at a time."""
     if b < 0:
         return 0.0, 0.0, 1.0, 0.0
+    world, flights = moving.world, moving.flights
     time = min(time, flights[b, STOP])
     x, y, c, s = world[b, 0], world[b, 1], world[b, 3], world[b, 4]
     vx, vy, turn = flights[b, VX], flights[b, VY], flights[b, TURN] * time
-    if b >= first:
-        return move(x, y, c, s, vx, vy, turn, time, series)
+    if b >= moving.first:
+        return move(x, y, c, s, vx, vy, turn, time, moving.series)  # type: ignore[no-any-return]
     if turn != 0.0:
         cos, sin = math.cos(turn), math.sin(turn)
         c, s = c * cos - s * sin, s * cos + c * sin
@@ -57,19 +104,22 @@ def pose_at(b, time, world, flights, first, series):  # type: ignore[no-untyped-
 
 
 @kernel
-def velocity_at(b, time, c, s, flights, first):  # type: ignore[no-untyped-def]
-    """Returns velocity in the map, turn rate and acceleration of a body's origin at a time."""
-    if b < 0 or time >= flights[b, STOP]:
-        return 0.0, 0.0, 0.0, 0.0
-    vx, vy, turn = flights[b, VX], flights[b, VY], flights[b, TURN]
-    if b < first:
-        return vx, vy, turn, 0.0
+def _placed_at(b: int, edge: Edge, time: float, moving: Moving) -> Placed:
+    """Returns an edge, given in the frame of its body, in the map at a time."""
+    x, y, c, s = pose_at(b, time, moving)
+    there = _in_map(edge, x, y, c, s)
+    if b < 0 or time >= moving.flights[b, STOP]:
+        return Placed(there, x, y, 0.0, 0.0, 0.0, 0.0)
+    flight = moving.flights[b]
+    vx, vy, turn = flight[VX], flight[VY], flight[TURN]
+    if b < moving.first:
+        return Placed(there, x, y, vx, vy, turn, 0.0)
     bend = abs(turn) * math.sqrt(vx * vx + vy * vy)
-    return c * vx - s * vy, s * vx + c * vy, turn, bend
+    return Placed(there, x, y, c * vx - s * vy, s * vx + c * vy, turn, bend)
 
 
 @kernel
-def speed_at(b, time, flights):  # type: ignore[no-untyped-def]
+def speed_at(b: int, time: float, flights: Array) -> float:
     """Speed of the origin of a body from a time on [m/s]."""
     if b < 0 or time >= flights[b, STOP]:
         return 0.0
@@ -77,7 +127,9 @@ def speed_at(b, time, flights):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _from_segment(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
+def _from_segment(
+    x: float, y: float, ax: float, ay: float, bx: float, by: float
+) -> tuple[float, float]:
     """Returns the vector from the nearest point of a segment to (x, y)."""
     ex, ey, dx, dy = bx - ax, by - ay, x - ax, y - ay
     along = dx * ex + dy * ey
@@ -88,10 +140,10 @@ def _from_segment(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _between(p, q):  # type: ignore[no-untyped-def]
-    """Returns the vector from the nearest point of segment q to that of p; zero if they cross."""
-    ax, ay, bx, by = p
-    cx, cy, dx, dy = q
+def _between(p: Edge, q: Edge) -> tuple[float, float]:
+    """Returns the vector from the nearest point of q to that of p; zero where they cross."""
+    ax, ay, bx, by = p.ax, p.ay, p.bx, p.by
+    cx, cy, dx, dy = q.ax, q.ay, q.bx, q.by
     nx, ny = _from_segment(ax, ay, cx, cy, dx, dy)
     if ax == bx and ay == by:
         return nx, ny
@@ -114,8 +166,8 @@ def _between(p, q):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _root(gap, rate, bend):  # type: ignore[no-untyped-def]
-    """Returns the first time t > 0 with gap + rate t - bend t^2 / 2 = 0, for a gap > 0."""
+def _root(gap: float, rate: float, bend: float) -> float:
+    """Returns when gap + rate t - bend t^2 / 2 reaches zero, for a gap > 0."""
     if bend == 0.0:
         return np.inf if rate >= 0.0 else -gap / rate
     both = math.sqrt(rate * rate + 2.0 * bend * gap)
@@ -123,72 +175,94 @@ def _root(gap, rate, bend):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _placed(edge, x, y, c, s):  # type: ignore[no-untyped-def]
-    """Returns an edge (ax, ay, bx, by) of a body at x, y, with cosine and sine of its heading."""
-    ax, ay, bx, by = edge
-    return x + c * ax - s * ay, y + s * ax + c * ay, x + c * bx - s * by, y + s * bx + c * by
+def _in_map(edge: Edge, x: float, y: float, c: float, s: float) -> Edge:
+    """Returns an edge of a body that stands at x, y with a heading."""
+    ax, ay, bx, by = edge.ax, edge.ay, edge.bx, edge.by
+    return Edge(x + c * ax - s * ay, y + s * ax + c * ay, x + c * bx - s * by, y + s * bx + c * by)
 
 
 @kernel
-def _reach(edge):  # type: ignore[no-untyped-def]
-    ax, ay, bx, by = edge
+def _reach(edge: Edge) -> float:
+    """Distance of the farther end from the origin [m]."""
+    ax, ay, bx, by = edge.ax, edge.ay, edge.bx, edge.by
     return math.sqrt(max(ax * ax + ay * ay, bx * bx + by * by))
 
 
 @kernel
-def _next_stop(b, time, until, flights):  # type: ignore[no-untyped-def]
-    """Returns the time a body stops if that is between two times, otherwise the later one."""
-    return flights[b, STOP] if b >= 0 and time < flights[b, STOP] < until else until
+def _next_stop(b: int, time: float, until: float, flights: Array) -> float:
+    """Returns when a body stops, if it does between two times; otherwise the later one."""
+    if b >= 0 and time < flights[b, STOP] < until:
+        return flights[b, STOP]  # type: ignore[no-any-return]
+    return until
 
 
 @kernel
-def touch(a, edge, round_a, b, other, round_b, begin, until, world, flights, first, series):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Finds the time at which an edge of one body first touches an edge of another.
+def _rate(nx: float, ny: float, body: Placed, x: float, y: float) -> float:
+    """Velocity of a point of a body along n [m/s]."""
+    # A turn moves a point (x, y) from the origin along n by turn * (x ny - y nx).
+    return nx * (body.vx - body.turn * (y - body.y)) + ny * (body.vy + body.turn * (x - body.x))
+
+
+@kernel
+def _free_time(
+    p: Placed, q: Placed, nx: float, ny: float, gap: float, bend: float
+) -> tuple[float, float, float]:
+    """Returns a time in which two edges cannot meet, and the rates of the corners that bound it.
+
+    Args:
+        p, q: the edges, `gap` [m] apart along n, which points from q to p.
+        nx, ny: n.
+        gap: between their surfaces [m].
+        bend: upper bound on the acceleration between them [m/s^2].
+    """
+    far, far2 = nx * p.edge.ax + ny * p.edge.ay, nx * p.edge.bx + ny * p.edge.by
+    near, near2 = nx * q.edge.ax + ny * q.edge.ay, nx * q.edge.bx + ny * q.edge.by
+    rate_p, rate_p2 = _rate(nx, ny, p, p.edge.ax, p.edge.ay), _rate(nx, ny, p, p.edge.bx, p.edge.by)
+    rate_q = -_rate(nx, ny, q, q.edge.ax, q.edge.ay)
+    rate_q2 = -_rate(nx, ny, q, q.edge.bx, q.edge.by)
+    front, beyond = min(far, far2), max(near, near2)
+    keep = 0.5 * SLACK if gap > SLACK else 0.25 * gap
+    free, own, others = np.inf, 0.0, 0.0
+    for i in range(2):
+        room_p = (far if i == 0 else far2) - front
+        u = rate_p if i == 0 else rate_p2
+        for j in range(2):
+            room_q = beyond - (near if j == 0 else near2)
+            v = rate_q if j == 0 else rate_q2
+            root = _root(gap - keep + room_p + room_q, u + v, bend)
+            if root < free:
+                free, own, others = root, u, v
+    return free, own, others
+
+
+@kernel
+def touch(
+    a: int, edge: Edge, round_a: float, b: int, other: Edge, round_b: float,
+    begin: float, until: float, moving: Moving,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Finds the first contact of an edge of one body with an edge of another.
 
     Args:
         a, b: the bodies.
-        edge, other: (4,) the ends of their edges in the bodies' frames [m].
+        edge, other: their edges in the bodies' frames [m].
         round_a, round_b: the radii around them [m].
-        begin, until: times of the substep [s].
+        begin, until: times [s].
+        moving: the bodies.
 
     Returns:
-        The time [s], inf if not before `until`; and the rates of the nearest point of each along
-        the direction between them [m/s], negative if it approaches.
+        The time [s], inf if not before `until`; and the velocities of the nearest points of both
+        along the direction between them, negative if approaching [m/s].
     """
-    reach_a, reach_b, time = _reach(edge), _reach(other), begin
+    reach_a, reach_b, time, flights = _reach(edge), _reach(other), begin, moving.flights
     for _ in range(MOST_LOOKS):
-        x, y, c, s = pose_at(a, time, world, flights, first, series)
-        vx, vy, turn, bend_a = velocity_at(a, time, c, s, flights, first)
-        p = _placed(edge, x, y, c, s)
-        ox, oy, oc, os = pose_at(b, time, world, flights, first, series)
-        wx, wy, spin, bend_b = velocity_at(b, time, oc, os, flights, first)
-        q = _placed(other, ox, oy, oc, os)
-        nx, ny = _between(p, q)
+        p, q = _placed_at(a, edge, time, moving), _placed_at(b, other, time, moving)
+        nx, ny = _between(p.edge, q.edge)
         away = math.sqrt(nx * nx + ny * ny)
         if away <= NOTHING:
             return time, -1.0, -1.0
         gap, nx, ny = max(away - round_a - round_b, NOTHING), nx / away, ny / away
-        bend = bend_a + bend_b + turn * turn * reach_a + spin * spin * reach_b
-        # A turn moves a point (x, y) from the origin along n by turn * (x ny - y nx).
-        rate_p = nx * (vx - turn * (p[1] - y)) + ny * (vy + turn * (p[0] - x))
-        rate_p2 = nx * (vx - turn * (p[3] - y)) + ny * (vy + turn * (p[2] - x))
-        rate_q = -nx * (wx - spin * (q[1] - oy)) - ny * (wy + spin * (q[0] - ox))
-        rate_q2 = -nx * (wx - spin * (q[3] - oy)) - ny * (wy + spin * (q[2] - ox))
-        far, far2 = nx * p[0] + ny * p[1], nx * p[2] + ny * p[3]
-        near, near2 = nx * q[0] + ny * q[1], nx * q[2] + ny * q[3]
-        beyond = max(near, near2)
-        front = min(far, far2)
-        keep = 0.5 * SLACK if gap > SLACK else 0.25 * gap
-        free, own, others = np.inf, 0.0, 0.0
-        for i in range(2):
-            room_p = (far if i == 0 else far2) - front
-            u = rate_p if i == 0 else rate_p2
-            for j in range(2):
-                room_q = beyond - (near if j == 0 else near2)
-                v = rate_q if j == 0 else rate_q2
-                root = _root(gap - keep + room_p + room_q, u + v, bend)
-                if root < free:
-                    free, own, others = root, u, v
+        bend = p.bend + q.bend + p.turn * p.turn * reach_a + q.turn * q.turn * reach_b
+        free, own, others = _free_time(p, q, nx, ny, gap, bend)
         rest = _next_stop(b, time, _next_stop(a, time, until, flights), flights) - time
         if free >= rest:
             if time + rest >= until:
@@ -203,116 +277,120 @@ def touch(a, edge, round_a, b, other, round_b, begin, until, world, flights, fir
 
 
 @kernel
-def _edge_of(v, begin, end, corners):  # type: ignore[no-untyped-def]
-    """Returns edge v of an outline, or the origin for a circle, which has no edges."""
+def _edge_of(v: int, begin: int, end: int, corners: Array) -> Edge:
+    """Returns edge v of an outline, or the origin of a circle's, which has none."""
     if begin == end:
-        return 0.0, 0.0, 0.0, 0.0
-    w = v + 1 if begin + v + 1 < end else 0
-    return (
-        corners[begin + v, 0], corners[begin + v, 1], corners[begin + w, 0], corners[begin + w, 1],
-    )  # fmt: skip
+        return Edge(0.0, 0.0, 0.0, 0.0)
+    i, j = begin + v, begin + (v + 1 if begin + v + 1 < end else 0)
+    return Edge(corners[i, 0], corners[i, 1], corners[j, 0], corners[j, 1])
 
 
 @kernel
-def _edges(begin, end):  # type: ignore[no-untyped-def]
-    """Number of edges of an outline: one for a segment, and one without extent for a circle."""
+def _edges(begin: int, end: int) -> int:
+    """Number of edges of an outline: one of a segment, and a circle counts as a single point."""
     return end - begin if end - begin > 2 else 1
 
 
 @kernel
-def _touch_edge(event, a, b, other, round_b, begin, scene):  # type: ignore[no-untyped-def]
-    """Sets `event` (EVENT,) to the first contact of body a with an edge of body b, if sooner.
+def _touch_edge(
+    event: Array, a: int, b: int, other: Edge, round_b: float, begin: float, moving: Moving
+) -> None:
+    """Makes `event` (EVENT,) the first contact of body a with an edge of body b, if it is sooner.
 
     Args:
-        begin: earliest time [s].
-        scene: world, flights, first, outlines, series.
+        event: of body a.
+        a, b: the bodies.
+        other: an edge of b, in its frame.
+        round_b: the radius around it [m].
+        begin: time from which to search [s].
+        moving: the bodies.
     """
-    world, flights, first, (corners, corner), series = scene
-    x, y, _, _ = pose_at(a, begin, world, flights, first, series)
-    ox, oy, oc, os = pose_at(b, begin, world, flights, first, series)
-    px, py, qx, qy = _placed(other, ox, oy, oc, os)
+    world, flights, outlines = moving.world, moving.flights, moving.outlines
+    x, y, _, _ = pose_at(a, begin, moving)
+    ox, oy, oc, os = pose_at(b, begin, moving)
+    there = _in_map(other, ox, oy, oc, os)
     spin = abs(flights[b, TURN]) if b >= 0 and begin < flights[b, STOP] else 0.0
     speed = speed_at(a, begin, flights) + speed_at(b, begin, flights) + spin * _reach(other)
     far = world[a, 5] + round_b + speed * (event[TIME] - begin)
     if speed == 0.0 and (begin >= flights[a, STOP] or flights[a, TURN] == 0.0):
         return
-    if segment_distance2(x, y, px, py, qx, qy) > far * far:
+    if segment_distance2(x, y, there.ax, there.ay, there.bx, there.by) > far * far:
         return
-    low, high = corner[int(world[a, 6])], corner[int(world[a, 6]) + 1]
+    low, high = outlines.first[int(world[a, 6])], outlines.first[int(world[a, 6]) + 1]
     round_a = world[a, 5] if low == high else 0.0
     for v in range(_edges(low, high)):
-        edge = _edge_of(v, low, high, corners)
-        time, own, others = touch(
-            a, edge, round_a, b, other, round_b, begin, event[TIME], world, flights, first, series
-        )
+        edge = _edge_of(v, low, high, outlines.corners)
+        time, own, others = touch(a, edge, round_a, b, other, round_b, begin, event[TIME], moving)
         if time < event[TIME]:
             event[TIME], event[WITH], event[OWN], event[OTHERS] = time, b, own, others
 
 
 @kernel
-def touch_body(event, a, b, begin, scene):  # type: ignore[no-untyped-def]
-    """As `_touch_edge`, for all edges of body b."""
-    world, flights, first, (corners, corner), series = scene
-    x, y, _, _ = pose_at(a, begin, world, flights, first, series)
-    ox, oy, _, _ = pose_at(b, begin, world, flights, first, series)
+def touch_body(event: Array, a: int, b: int, begin: float, moving: Moving) -> None:
+    """Does the same as `_touch_edge` for all of body b."""
+    world, flights, outlines = moving.world, moving.flights, moving.outlines
+    x, y, _, _ = pose_at(a, begin, moving)
+    ox, oy, _, _ = pose_at(b, begin, moving)
     speed = speed_at(a, begin, flights) + speed_at(b, begin, flights)
     far = world[a, 5] + world[b, 5] + speed * (event[TIME] - begin)
     if (x - ox) * (x - ox) + (y - oy) * (y - oy) > far * far:
         return
-    low, high = corner[int(world[b, 6])], corner[int(world[b, 6]) + 1]
+    low, high = outlines.first[int(world[b, 6])], outlines.first[int(world[b, 6]) + 1]
     round_b = world[b, 5] if low == high else 0.0
     for v in range(_edges(low, high)):
-        _touch_edge(event, a, b, _edge_of(v, low, high, corners), round_b, begin, scene)
+        edge = _edge_of(v, low, high, outlines.corners)
+        _touch_edge(event, a, b, edge, round_b, begin, moving)
 
 
 @kernel
-def touch_walls(event, a, walls, begin, scene):  # type: ignore[no-untyped-def]
-    """As `_touch_edge`, for straight walls (W, 4)."""
+def touch_walls(event: Array, a: int, walls: Array, begin: float, moving: Moving) -> None:
+    """Does the same as `_touch_edge` for straight walls (W, 4)."""
     for w in range(walls.shape[0]):
-        wall = walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
-        _touch_edge(event, a, -1, wall, 0.0, begin, scene)
+        wall = Edge(walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3])
+        _touch_edge(event, a, -1, wall, 0.0, begin, moving)
 
 
 @kernel
-def _solid(distances, i, j):  # type: ignore[no-untyped-def]
+def _solid(distances: Array, i: int, j: int) -> bool:
     inside = 0 <= i < distances.shape[0] and 0 <= j < distances.shape[1]
-    return inside and distances[i, j] <= 0.0
+    return inside and bool(distances[i, j] <= 0.0)
 
 
 @kernel
-def touch_map(event, a, grid, begin, scene):  # type: ignore[no-untyped-def]
-    """As `_touch_edge`, for the sides of the solid cells of a map, see `collision_kernels`."""
-    world, flights, first, _, series = scene
-    distances, frame = grid
+def _side_of_cell(i: int, j: int, side: int, frame: Array) -> Edge:
+    """Returns a side of cell (i, j) of a map: below, right, above or left, in the map."""
+    size, c, s = frame[4], frame[2], frame[3]
+    u, v = (0, 1, 1, 0)[side], (1, 1, 0, 0)[side]
+    u2, v2 = (1, 1, 0, 0)[side], (1, 0, 0, 1)[side]
+    x, y, x2, y2 = (j + u) * size, (i + v) * size, (j + u2) * size, (i + v2) * size
+    return Edge(
+        frame[0] + c * x - s * y, frame[1] + s * x + c * y,
+        frame[0] + c * x2 - s * y2, frame[1] + s * x2 + c * y2,
+    )  # fmt: skip
+
+
+@kernel
+def touch_map(event: Array, a: int, grid: MapField, begin: float, moving: Moving) -> None:
+    """Does the same as `_touch_edge` for the sides of the solid cells of a map."""
+    distances, frame, world = grid.distances, grid.frame, moving.world
     if distances.size == 0:
         return
-    speed = speed_at(a, begin, flights)
+    speed = speed_at(a, begin, moving.flights)
     if map_bound(world[a], grid) > speed * event[TIME]:
         return
-    way = speed * (event[TIME] - begin)
-    px, py, _, _ = pose_at(a, begin, world, flights, first, series)
+    path = speed * (event[TIME] - begin)
+    px, py, _, _ = pose_at(a, begin, moving)
     size, c, s = frame[4], frame[2], frame[3]
     x, y = c * (px - frame[0]) + s * (py - frame[1]), c * (py - frame[1]) - s * (px - frame[0])
-    far = world[a, 5] + way + SLACK
-    for i in range(
-        max(math.floor((y - far) / size), 0),
-        min(math.floor((y + far) / size), distances.shape[0] - 1) + 1,
-    ):
-        for j in range(
-            max(math.floor((x - far) / size), 0),
-            min(math.floor((x + far) / size), distances.shape[1] - 1) + 1,
-        ):
+    far = world[a, 5] + path + SLACK
+    low_i, high_i = max(math.floor((y - far) / size), 0), math.floor((y + far) / size)
+    low_j, high_j = max(math.floor((x - far) / size), 0), math.floor((x + far) / size)
+    for i in range(low_i, min(high_i, distances.shape[0] - 1) + 1):
+        for j in range(low_j, min(high_j, distances.shape[1] - 1) + 1):
             if distances[i, j] > 0.0:
                 continue
             for side in range(4):
-                beside = (1, 0, -1, 0)[side], (0, 1, 0, -1)[side]
-                if _solid(distances, i + beside[0], j + beside[1]):
-                    continue  # nothing can touch a side between two solid cells
-                u, v = (0, 1, 1, 0)[side], (1, 1, 0, 0)[side]
-                u2, v2 = (1, 1, 0, 0)[side], (1, 0, 0, 1)[side]
-                u, v, u2, v2 = (j + u) * size, (i + v) * size, (j + u2) * size, (i + v2) * size
-                edge = (
-                    frame[0] + c * u - s * v, frame[1] + s * u + c * v,
-                    frame[0] + c * u2 - s * v2, frame[1] + s * u2 + c * v2,
-                )  # fmt: skip
-                _touch_edge(event, a, -1, edge, 0.0, begin, scene)
+                # A side between two solid cells is met by nothing.
+                if not _solid(distances, i + (1, 0, -1, 0)[side], j + (0, 1, 0, -1)[side]):
+                    edge = _side_of_cell(i, j, side, frame)
+                    _touch_edge(event, a, -1, edge, 0.0, begin, moving)

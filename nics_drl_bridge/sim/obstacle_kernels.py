@@ -1,7 +1,7 @@
 """Compiled motion of obstacles: one call at reset, and one per world and control period.
 
 Shared arguments: `marks` (N, K, F) the obstacles' memory, and `plans`, the rows (K, P) and
-waypoints (Q, 2) of `motion.plan_arrays`; the columns of both are in `motion_layout`. `bodies`
+waypoints (Q, 2) of `obstacles.plan_arrays`; their columns are in `separation_kernels`. `bodies`
 (N, K + M, 7), obstacles, then from index `first` the robots, see `lidar.shapes.BODY`. Each
 obstacle is represented by its enclosing circle. All draws depend on seed, step and k alone.
 
@@ -21,7 +21,7 @@ import math
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.sim import obstacles as at
+from nics_drl_bridge.sim import separation_kernels as at
 from nics_drl_bridge.sim.separation_kernels import (
     clearance,
     map_direction,
@@ -91,7 +91,7 @@ def steer(velocity, marks, n, bodies, first, speeds, plans, walls, half, seed, s
         seed: of the episode.
         step: control periods since the reset, from 0 or 1.
         period: [s].
-        distances: of a static map, see `motion.distance_arrays`.
+        distances: of a static map, see `obstacles.distance_arrays`.
     """
     rows, waypoints = plans
     count = velocity.shape[1]
@@ -315,7 +315,7 @@ def walk(marks, k, scene, first, speeds, row, seed, counter, step, period):  # t
     """Returns the next velocity of walker k and updates its goal in its row of marks.
 
     Args:
-        marks: (K, F) of this world, columns as in `motion_layout`.
+        marks: (K, F) of this world, columns as in `separation_kernels`.
         scene, first, speeds: see `separation_kernels`.
         row: (P,) the walker's plan.
         seed, counter: of the random draws; it takes fewer than 64.

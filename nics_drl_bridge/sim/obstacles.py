@@ -1,7 +1,4 @@
-"""Motion of obstacles: straight ahead, from waypoint to waypoint, or as people walk.
-
-Columns of the arrays for the motion of obstacles; `motion.py` explains them.
-"""
+"""Motion of obstacles: straight ahead, from waypoint to waypoint, or as people walk."""
 
 from __future__ import annotations
 
@@ -17,9 +14,31 @@ from pydantic import AfterValidator, Field, model_validator
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import Coordinate
+from nics_drl_bridge.sim.separation_kernels import (
+    BEHIND,
+    COUNT,
+    FIRST,
+    FLUCTUATION,
+    FORESIGHT,
+    KIND,
+    LOOP,
+    PATROL,
+    PAUSE,
+    PEDESTRIAN,
+    PLAN,
+    RANGE,
+    RELAXATION,
+    REPULSION,
+    SPEED_HIGH,
+    SPEED_LOW,
+    VIEW,
+    WALL_RANGE,
+    WALL_REPULSION,
+    WANDER,
+)  # fmt: skip
 
 __all__ = [
-    "MARK", "NO_DISTANCES", "PLAN", "Motion", "Patrol", "Pedestrian", "Wander",
+    "NO_DISTANCES", "Motion", "Patrol", "Pedestrian", "Wander",
     "distance_arrays", "plan_arrays",
 ]  # fmt: skip
 
@@ -126,7 +145,7 @@ def plan_arrays(motions: Sequence[Wander | Patrol | Pedestrian | None]) -> Plans
         motions: (K), None for an obstacle that stands still.
 
     Returns:
-        (K, P) rows, columns as in `motion_layout`, and (Q, 2) waypoints of all patrols [m].
+        (K, P) rows, columns as in `separation_kernels`, and (Q, 2) waypoints of all patrols [m].
     """
     rows, waypoints = np.zeros((len(motions), PLAN)), np.zeros((0, 2))
     for row, motion in zip(rows, motions, strict=True):
@@ -151,19 +170,3 @@ def plan_arrays(motions: Sequence[Wander | Patrol | Pedestrian | None]) -> Plans
 def distance_arrays(grid: GridMap | None) -> Distances:
     """Returns the kernels' argument `distances`: distance field of a static map, and its frame."""
     return NO_DISTANCES if grid is None else (grid.distance_field, grid.arrays[1])
-
-
-# A row of a plan (K, P): the motion of an obstacle.
-(
-    KIND, SPEED_LOW, SPEED_HIGH, FIRST, COUNT, LOOP, PAUSE,
-    RELAXATION, REPULSION, RANGE, WALL_REPULSION, WALL_RANGE, FORESIGHT, VIEW, BEHIND,
-    FLUCTUATION,
-) = range(16)  # fmt: skip
-PLAN = 16
-
-# Values of the column KIND.
-STILL, WANDER, PATROL, PEDESTRIAN = range(4)
-
-# Memory of an obstacle, a row of marks (N, K, F).
-SPEED, VX, VY, DIRECTION, AIM, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST = range(11)
-MARK = 11

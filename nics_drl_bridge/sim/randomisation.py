@@ -1,15 +1,7 @@
-"""Domain randomisation: robot, sensors and scene of an episode, drawn from ranges in YAML.
-
-Compiled draws of domain randomisation, each fixed by seed, robot, group and column alone.
-
-Shared arguments: `seeds` (n,) of the episodes; `group` is the purpose of the numbers, one of the
-constants below; `place` is a column. A column whose bounds are equal takes that value and draws
-nothing, and a group never shifts the draws of another.
-"""
+"""Domain randomisation: robot, sensors and scene of an episode, drawn from ranges in YAML."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,13 +9,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.config import find_config, load_yaml
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import fault_kernels
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim import randomisation_ranges as bounds
+from nics_drl_bridge.sim.randomisation_kernels import (
+    KINEMATICS,
+    LATENCY,
+    LIDAR,
+    OBSTACLES,
+    ODOMETRY,
+    draw_between,
+    draw_choice,
+    draw_whole,
+)
 from nics_drl_bridge.sim.randomisation_ranges import Randomisation
 
 __all__ = ["Draws", "Label", "Randomisation", "Sampler", "load_randomisation"]
@@ -182,50 +182,3 @@ class Sampler:
 
 def _varies(ends: bounds.Bounds, column: int) -> bool:
     return bool(ends[0][column] != ends[1][column])
-
-
-KINEMATICS, LATENCY, ODOMETRY, LIDAR, CHOICES, OBSTACLES = range(6)
-PLACES = 1 << 20
-"""More than a group has columns; the counters of two groups never collide."""
-GROUPS = 8
-
-
-@kernel(allocates=True)
-def _share(seed, robot, group, place):  # type: ignore[no-untyped-def]
-    """Returns the draw in [0, 1) of one column."""
-    counter = (robot * GROUPS + group) * PLACES + place
-    return random.uniform(seed, random.RANDOMISATION_STREAM, counter)
-
-
-@kernel(allocates=True)
-def _between(low, high, seed, robot, group, place):  # type: ignore[no-untyped-def]
-    """Draws a number between `low` and `high`; exactly `low` if they are equal."""
-    return low if high == low else low + _share(seed, robot, group, place) * (high - low)
-
-
-@kernel(allocates=True)
-def draw_between(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
-    """Fills out (n, M, Q) uniformly between low (Q,) and high (Q,)."""
-    for n in range(out.shape[0]):
-        for m in range(out.shape[1]):
-            for q in range(out.shape[2]):
-                out[n, m, q] = _between(low[q], high[q], seeds[n], m, group, q)
-
-
-@kernel(allocates=True)
-def draw_whole(out, low, high, seeds, group):  # type: ignore[no-untyped-def]
-    """Fills out (n, M, Q) with integers: uniform between low (Q,) and high (Q,), floored."""
-    for n in range(out.shape[0]):
-        for m in range(out.shape[1]):
-            for q in range(out.shape[2]):
-                value = _between(low[q], high[q], seeds[n], m, group, q)
-                out[n, m, q] = np.int64(math.floor(value))
-
-
-@kernel(allocates=True)
-def draw_choice(out, column, values, seeds):  # type: ignore[no-untyped-def]
-    """Fills one column of out (n, M, P) with one of the values (V,), all equally likely."""
-    for n in range(out.shape[0]):
-        for m in range(out.shape[1]):
-            share = _share(seeds[n], m, CHOICES, column)
-            out[n, m, column] = values[int(share * values.shape[0])]

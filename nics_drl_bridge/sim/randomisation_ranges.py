@@ -220,7 +220,7 @@ def coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bou
             spans[d, _term(d, term, model, f"{place}, rate {dof!r}")] = span
     _check_stable(model, spans, where)
     kept = np.nonzero(model.coefficients)
-    base = term_arrays(model)[1]
+    base = term_arrays(model).coefficient
     return base * spans[kept][:, 0], base * spans[kept][:, 1]
 
 

@@ -1,15 +1,9 @@
-"""Compiled inner loops of the simulator: noise and latency of the odometry, drift of the motion.
+"""Compiled inner loops of the simulator: odometry, drift of the motion, and scans.
 
 Observations may be delayed: `past` (N, M, R, 12) is a ring buffer of the values at the ends of the
 last R periods, step i in row i % R: true pose, true twist, pose by odometry, measured twist.
-Between two rows, values are interpolated linearly.
-
-Shapes: N worlds, M robots, S state, R periods.
-
-Compiled inner loops of the simulator: scans from the place and time of each lidar.
-
-Shapes: N worlds, M robots, K obstacles, W walls, B beams, G slices of a sweep, R periods of `past`,
-see `sensing_kernels`.
+Between two rows, values are interpolated linearly. Shapes are those of `state`; G slices of a
+sweep.
 """
 
 from __future__ import annotations
@@ -20,28 +14,41 @@ from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import fault_kernels, scan_kernels
 from nics_drl_bridge.robot.kernels import move, wrap
-from nics_drl_bridge.sim import contact_kernels as crowd
+from nics_drl_bridge.sim import contact_kernels as contacts
+from nics_drl_bridge.sim.state import (
+    Array,
+    Cells,
+    Dynamics,
+    LidarView,
+    Scans,
+    Scratch,
+    State,
+    Surroundings,
+)
 
 POSE, TWIST, ODOM, MEASURED, PAST = 0, 3, 6, 9, 12
 """Columns of `past`."""
 
 
 @kernel
-def begin(past, n, m, pose, odom, twist):  # type: ignore[no-untyped-def]
-    """Records the values of a robot at the beginning of an episode."""
+def begin(n: int, m: int, state: State) -> None:
+    """Records the true state of a robot at the start of an episode."""
+    past, pose, odom, twist = state.past, state.pose, state.odom, state.twist
     for i in range(3):
         past[n, m, 0, POSE + i], past[n, m, 0, TWIST + i] = pose[n, m, i], 0.0
         past[n, m, 0, ODOM + i], past[n, m, 0, MEASURED + i] = odom[n, m, i], twist[n, m, i]
 
 
 @kernel
-def lag_of(age, steps, rows, substeps):  # type: ignore[no-untyped-def]
+def lag_of(age: int, steps: int, rows: int, substeps: int) -> int:
     """Age of an observation [substeps], limited to the present episode and the ring buffer."""
     return max(min(age, min(steps, rows - 1) * substeps), 0)
 
 
 @kernel
-def at_lag(past, n, m, column, lag, steps, substeps):  # type: ignore[no-untyped-def]
+def at_lag(
+    past: Array, n: int, m: int, column: int, lag: int, steps: int, substeps: int
+) -> tuple[float, float, float]:
     """Returns three columns of `past`, `lag` substeps before the end of period `steps`."""
     rows = past.shape[2]
     new, share = (steps - lag // substeps) % rows, (lag % substeps) / substeps
@@ -60,100 +67,90 @@ def at_lag(past, n, m, column, lag, steps, substeps):  # type: ignore[no-untyped
 
 
 @kernel
-def advanced(x, y, heading, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
-    """Returns the pose after the exact arc of a body twist; see `robot.kernels.move`."""
-    x, y, _, _ = move(x, y, math.cos(heading), math.sin(heading), vx, vy, turn, dt, series)
-    return x, y, wrap(heading + turn)
+def _odometry_noise(n: int, m: int, state: State) -> tuple[float, float, float]:
+    """Draws the noise of the measured twist [m/s, m/s, rad/s]."""
+    std, seed = state.noise, state.seeds[n]
+    counter = state.steps[n] * state.pose.shape[1] + m
+    x = y = turn = 0.0
+    if std[n, m, 0] > 0.0:
+        x = std[n, m, 0] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter)
+        y = std[n, m, 0] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter + 1)
+    if std[n, m, 1] > 0.0:
+        turn = std[n, m, 1] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter + 2)
+    return x, y, turn
 
 
 @kernel
-def measure(  # type: ignore[no-untyped-def]
-    odom, twist, past, before, pose, n, m, now, std, steps, seed, counter, age, dt, substeps,
-    series,
-):  # fmt: skip
+def measure(
+    n: int, m: int, state: State, pose: Array, before: Array, now: Array, motion: Dynamics
+) -> None:
     """Measures a robot's odometry of one period: a drifting pose and a noisy twist, maybe delayed.
 
     Args:
-        odom: (N, M, 3) odometry pose, result.
-        twist: (N, M, 3) measured twist, result.
-        past: the ring buffer, see the module; the row of this period is written.
-        before: (3,) true pose at the start of the period.
-        pose: (N, M, 3) true poses at its end.
         n, m: indices of world and robot.
-        now: (3 + S,) true rates at its end.
-        std: (N, M, 2 + 3 + S) standard deviation of the linear [m/s] and the angular twist
-            [rad/s], then of the drift.
-        steps: periods since the reset, this one included.
-        seed, counter: of the random draws.
-        age: of the observation [substeps].
-        dt, substeps: length of a substep [s], and substeps in a period.
-        series: see `robot.kernels`.
+        state: its `odom`, `twist` and the row of this period in `past` are the results.
+        pose: (N, M, 3) poses at the end of the period, as the wheels have it.
+        before: (3,) pose at its start.
+        now: (3 + S,) rates at its end.
+        motion: of the robots.
     """
-    rows = past.shape[2]
+    steps, rows, substeps = state.steps[n], state.past.shape[2], motion.substeps
     this = steps % rows
-    last = this - 1 if this > 0 else rows - 1
-    noise_x = noise_y = noise_turn = 0.0
-    if std[n, m, 0] > 0.0:
-        noise_x = std[n, m, 0] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter)
-        noise_y = std[n, m, 0] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter + 1)
-    if std[n, m, 1] > 0.0:
-        noise_turn = std[n, m, 1] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter + 2)
+    last = state.past[n, m, this - 1 if this > 0 else rows - 1]
+    noise_x, noise_y, noise_turn = _odometry_noise(n, m, state)
     c, s = math.cos(before[2]), math.sin(before[2])
     dx, dy = pose[n, m, 0] - before[0], pose[n, m, 1] - before[1]
     ahead, aside, turned = c * dx + s * dy, c * dy - s * dx, pose[n, m, 2] - before[2]
-    x, y, heading = past[n, m, last, ODOM], past[n, m, last, ODOM + 1], past[n, m, last, ODOM + 2]
+    x, y, heading = last[ODOM], last[ODOM + 1], last[ODOM + 2]
     c, s = math.cos(heading), math.sin(heading)
     x, y, heading = x + (c * ahead - s * aside), y + (s * ahead + c * aside), heading + turned
-    period = dt * substeps
     if noise_x != 0.0 or noise_y != 0.0 or noise_turn != 0.0:
-        x, y, heading = advanced(
-            x, y, heading, noise_x, noise_y, noise_turn * period, period, series
-        )
-    row = past[n, m, this]
+        period, c, s = motion.dt * substeps, math.cos(heading), math.sin(heading)
+        turn = noise_turn * period
+        x, y, _, _ = move(x, y, c, s, noise_x, noise_y, turn, period, motion.series)
+        heading = wrap(heading + turn)
+    row = state.past[n, m, this]
     row[ODOM], row[ODOM + 1], row[ODOM + 2] = x, y, wrap(heading)
-    row[MEASURED], row[MEASURED + 1], row[MEASURED + 2] = (
-        now[0] + noise_x, now[1] + noise_y, now[2] + noise_turn,
-    )  # fmt: skip
+    row[MEASURED], row[MEASURED + 1] = now[0] + noise_x, now[1] + noise_y
+    row[MEASURED + 2] = now[2] + noise_turn
     for i in range(3):
         row[POSE + i], row[TWIST + i] = pose[n, m, i], now[i]
+    age = state.age[n, m]
     lag = lag_of(age, steps, rows, substeps) if age > 0 else 0
+    odom, twist = state.odom[n, m], state.twist[n, m]
     if lag == 0:
         for i in range(3):
-            odom[n, m, i], twist[n, m, i] = row[ODOM + i], row[MEASURED + i]
+            odom[i], twist[i] = row[ODOM + i], row[MEASURED + i]
         return
-    x, y, heading = at_lag(past, n, m, ODOM, lag, steps, substeps)
-    odom[n, m, 0], odom[n, m, 1], odom[n, m, 2] = x, y, heading
-    x, y, heading = at_lag(past, n, m, MEASURED, lag, steps, substeps)
-    twist[n, m, 0], twist[n, m, 1], twist[n, m, 2] = x, y, heading
+    odom[0], odom[1], odom[2] = at_lag(state.past, n, m, ODOM, lag, steps, substeps)
+    twist[0], twist[1], twist[2] = at_lag(state.past, n, m, MEASURED, lag, steps, substeps)
 
 
 @kernel
-def most_drift(std, n, m, period):  # type: ignore[no-untyped-def]
+def most_drift(std: Array, n: int, m: int, period: float) -> float:
     """Upper bound on the distance by which `drift_of` can move a robot in a period [m]."""
-    return math.sqrt(3.0 * period) * (std[n, m, 2] + std[n, m, 3])
+    return math.sqrt(3.0 * period) * (std[n, m, 2] + std[n, m, 3])  # type: ignore[no-any-return]
 
 
 @kernel
-def drift_of(state, std, n, m, seed, counter, period):  # type: ignore[no-untyped-def]
-    """Draws the motion of a robot in addition to its model: it grows with the root of the time.
+def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float, float]:
+    """Draws the motion of a robot that its model does not explain; it grows with root time.
 
     Args:
-        state: (N, M, S), in place.
-        std: (N, M, 2 + 3 + S) of the odometry, then along x, y and heading of the body, and of
-            the state, after a second.
         n, m: indices of world and robot.
-        seed, counter: of the random draws.
+        state: its `state` is updated in place.
         period: [s].
 
     Returns:
-        Displacement forwards and to the left [m], and turn [rad].
+        Ahead and aside [m], and turn [rad].
     """
-    # Uniform draws of this variance are cheap; over several periods their sum is nearly normal.
+    std, counter = state.noise, state.steps[n] * state.pose.shape[1] + m
+    # Uniform draws of this variance are cheap, and over some periods they add up to a normal one.
     count, scale = std.shape[2] - 2, math.sqrt(12.0 * period)
     ahead = aside = turn = 0.0
     for i in range(count):
         if std[n, m, 2 + i] > 0.0:
-            share = random.uniform(seed, random.DRIFT_STREAM, counter * count + i) - 0.5
+            share = random.uniform(state.seeds[n], random.DRIFT_STREAM, counter * count + i) - 0.5
             draw = scale * std[n, m, 2 + i] * share
             if i == 0:
                 ahead = draw
@@ -162,139 +159,143 @@ def drift_of(state, std, n, m, seed, counter, period):  # type: ignore[no-untype
             elif i == 2:
                 turn = draw
             else:
-                state[n, m, i - 3] += draw
+                state.state[n, m, i - 3] += draw
     return ahead, aside, turn
 
 
 @kernel
-def needs_own(n, age, faults):  # type: ignore[no-untyped-def]
-    """True if a robot of world n needs a delayed or skewed scan."""
-    for m in range(age.shape[1]):
-        if age[n, m] > 0 or faults[n, m, fault_kernels.SKEW] != 0.0:
+def _needs_own(n: int, state: State) -> bool:
+    """True if a robot of world n needs a scan that is not of its present pose."""
+    for m in range(state.age.shape[1]):
+        if state.age[n, m] > 0 or state.faults[n, m, fault_kernels.SKEW] != 0.0:
             return True
     return False
 
 
-@kernel
-def look_alone(  # type: ignore[no-untyped-def]
-    n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, crowded, view, sensors,
-    crowding, dt, substeps,
-):  # fmt: skip
-    """Scans world n, each robot from its own place and time.
-
-    Args:
-        n: index of the world.
-        pose and others: fields of `worlds.Worlds`.
-        walls: (W, 4).
-        crowded: whether the bodies are in cells.
-        view, sensors, crowding: see `worlds.arguments`.
-        dt, substeps: length of a substep [s], and substeps in a period.
-    """
-    for m in range(pose.shape[1]):
-        lag = lag_of(age[n, m], steps[n], past.shape[2], substeps)
-        _look_alone(
-            n, m, lag, pose, bodies, ranges, steps, faults[n, m, fault_kernels.SKEW], velocity,
-            past, walls, crowded, view, sensors, crowding, dt, substeps,
-        )  # fmt: skip
-
-
 @kernel(inline=True)
-def look_or_wait(  # type: ignore[no-untyped-def]
-    n, together, pose, bodies, ranges, steps, faults, age, velocity, past, walls, crowded, view,
-    sensors, crowding, dt, substeps,
-):  # fmt: skip
-    """Scans world n, or queues it for `look_together`; returns the number of queued worlds.
+def scan_or_wait(
+    n: int,
+    waiting: int,
+    state: State,
+    scene: Surroundings,
+    view: LidarView,
+    motion: Dynamics,
+    scratch: Scratch,
+) -> int:
+    """Scans world n, unless `scan_together` can; returns how many worlds now wait for it.
 
     Args:
         n: index of the world.
-        together: number of worlds queued before.
-        pose and others: see `look_alone`.
+        waiting: number of worlds that waited before.
+        state, scene, view, motion, scratch: see `state`.
     """
-    if crowded or needs_own(n, age, faults):
-        look_alone(
-            n, pose, bodies, ranges, steps, faults, age, velocity, past, walls, crowded, view,
-            sensors, crowding, dt, substeps,
-        )  # fmt: skip
-        return together
-    sensors[1][together] = n
-    return together + 1
+    if not scene.scattered and not _needs_own(n, state):
+        scratch.scans.waiting[waiting] = n
+        return waiting + 1
+    for m in range(state.pose.shape[1]):
+        _scan_alone(n, m, state, scene, view, motion, scratch)
+    return waiting
 
 
 @kernel
-def look_together(together, pose, bodies, ranges, first, walls, view, sensors):  # type: ignore[no-untyped-def]
-    """Scans the first `together` worlds queued in `sensors`, at the present poses."""
-    chosen, scan_room = sensors[1][:together], sensors[8]
-    sensor, map_arrays, exact = view[0], view[1], view[2]
-    scan_kernels.scan_worlds(ranges, pose, chosen, bodies, first, walls, sensor, scan_room)
-    if map_arrays[0].size > 0:
-        scan_kernels.add_map(ranges, pose, chosen, sensor, map_arrays, exact, scan_room)
+def scan_together(
+    waiting: int, state: State, scene: Surroundings, view: LidarView, scans: Scans
+) -> None:
+    """Scans the first `waiting` worlds of the list in `scans`, as they stand."""
+    chosen, first = scans.waiting[:waiting], state.velocity.shape[1]
+    scan_kernels.scan_worlds(
+        state.ranges, state.pose, chosen, state.bodies, first, scene.walls, view.sensor,
+        scans.lookup,
+    )  # fmt: skip
+    if view.grid[0].size > 0:
+        scan_kernels.add_map(
+            state.ranges, state.pose, chosen, view.sensor, view.grid, view.exact, scans.lookup
+        )
 
 
 @kernel
-def distort(low, high, ranges, faults, steps, seeds, view):  # type: ignore[no-untyped-def]
-    """Applies noise and faults of each robot's lidar to the scans of the worlds [low, high)."""
-    limits, robots = view[4], ranges.shape[1]
+def distort(low: int, high: int, state: State, view: LidarView) -> None:
+    """Applies the faults of each robot's device to the scans of the worlds [low, high)."""
+    robots = state.ranges.shape[1]
     for n in range(low, high):
         for m in range(robots):
-            counter = steps[n] * robots + m
-            fault_kernels.distort(ranges[n, m], limits, faults[n, m], seeds[n], counter)
-
-
-@kernel(inline=True)
-def _look_alone(  # type: ignore[no-untyped-def]
-    n, m, lag, pose, bodies, ranges, steps, skew, velocity, past, walls, crowded, view, sensors,
-    crowding, dt, substeps,
-):  # fmt: skip
-    """Scans from one robot `lag` substeps ago, maybe skewed; see `look_alone`."""
-    _, _, _, mount, limits, sweep_time = view
-    spot, slices, part, drive, none = sensors[3], sensors[4], sensors[5], sensors[6], sensors[7]
-    this, beams = steps[n] % past.shape[2], ranges.shape[2]
-    for i in range(3):
-        spot[0, 0, i] = pose[n, m, i]
-        drive[i] = past[n, m, this, TWIST + i] if steps[n] > 0 else 0.0
-    if lag > 0:
-        x, y, heading = at_lag(past, n, m, POSE, lag, steps[n], substeps)
-        spot[0, 0, 0], spot[0, 0, 1], spot[0, 0, 2] = x, y, heading
-        x, y, heading = at_lag(past, n, m, TWIST, lag, steps[n], substeps)
-        drive[0], drive[1], drive[2] = x, y, heading
-    reach = limits[1] + math.hypot(mount[0], mount[1])
-    if skew != 0.0:
-        reach += math.hypot(drive[0], drive[1]) * sweep_time
-    count = _gather(
-        n, m, lag, spot[0, 0], reach, bodies, velocity, past, steps[n], crowded, sensors[2],
-        crowding, dt, substeps,
-    )  # fmt: skip
-    seen = sensors[2][: count * 7].reshape((1, count, 7))
-    begin = (n * ranges.shape[1] + m) * beams
-    scan = ranges.reshape(-1)[begin : begin + beams].reshape((1, 1, beams))
-    sensor, map_arrays, exact = view[0], view[1], view[2]
-    groups = 1 if skew == 0.0 else slices.shape[0]
-    if groups > 1:
-        fault_kernels.slice_poses(slices, spot[0, 0], drive, sweep_time, skew)
-    for g in range(groups):  # a single call site: the functions below take long to compile
-        out = scan if groups == 1 else part
-        for i in range(3 if groups > 1 else 0):
-            spot[0, 0, i] = slices[g, i]
-        scan_kernels.scan_worlds(out, spot, none, seen, -1, walls, sensor, sensors[8])
-        if map_arrays[0].size > 0:
-            scan_kernels.add_map(out, spot, none, sensor, map_arrays, exact, sensors[8])
-        for i in range(g * beams // groups, (g + 1) * beams // groups if groups > 1 else 0):
-            scan[0, 0, i] = part[0, 0, i]
+            counter = state.steps[n] * robots + m
+            fault_kernels.distort(
+                state.ranges[n, m], view.limits, state.faults[n, m], state.seeds[n], counter
+            )
 
 
 @kernel
-def _gather(  # type: ignore[no-untyped-def]
-    n, m, lag, spot, reach, bodies, velocity, past, steps, crowded, seen, crowding, dt, substeps
-):
-    """Copies to `seen` the bodies near a spot as of `lag` substeps ago; returns their number."""
-    cells, found = crowding
-    first = velocity.shape[1]
-    several, in_cells = bodies.shape[1], crowded and lag == 0  # cells are of this period only
+def _place_lidar(n: int, m: int, lag: int, state: State, scans: Scans, substeps: int) -> None:
+    """Writes pose and twist of a robot, `lag` substeps ago, to `spot` and `drive`."""
+    spot, drive, steps = scans.spot[0, 0], scans.drive, state.steps[n]
+    row = state.past[n, m, steps % state.past.shape[2]]
+    for i in range(3):
+        spot[i] = state.pose[n, m, i]
+        drive[i] = row[TWIST + i] if steps > 0 else 0.0
+    if lag > 0:
+        spot[0], spot[1], spot[2] = at_lag(state.past, n, m, POSE, lag, steps, substeps)
+        drive[0], drive[1], drive[2] = at_lag(state.past, n, m, TWIST, lag, steps, substeps)
+
+
+@kernel
+def _scan_alone(
+    n: int,
+    m: int,
+    state: State,
+    scene: Surroundings,
+    view: LidarView,
+    motion: Dynamics,
+    scratch: Scratch,
+) -> None:
+    """Scans one robot from its own place and time, maybe skewed."""
+    scans, beams, skew = (
+        scratch.scans,
+        state.ranges.shape[2],
+        state.faults[n, m, fault_kernels.SKEW],
+    )
+    spot, drive = scans.spot, scans.drive
+    lag = lag_of(state.age[n, m], state.steps[n], state.past.shape[2], motion.substeps)
+    _place_lidar(n, m, lag, state, scans, motion.substeps)
+    reach = view.limits[1] + math.hypot(view.mount[0], view.mount[1])
+    if skew != 0.0:
+        reach += math.hypot(drive[0], drive[1]) * view.sweep_time
+    count = _gather(n, m, lag, reach, state, scene, motion, scans, scratch.cells)
+    seen = scans.seen[: count * 7].reshape((1, count, 7))
+    begin = (n * state.ranges.shape[1] + m) * beams
+    scan = state.ranges.reshape(-1)[begin : begin + beams].reshape((1, 1, beams))
+    groups = 1 if skew == 0.0 else scans.slices.shape[0]
+    if groups > 1:
+        fault_kernels.slice_poses(scans.slices, spot[0, 0], drive, view.sweep_time, skew)
+    for g in range(groups):  # large functions are called below: compiling them once is enough
+        out = scan if groups == 1 else scans.part
+        for i in range(3 if groups > 1 else 0):
+            spot[0, 0, i] = scans.slices[g, i]
+        scan_kernels.scan_worlds(
+            out, spot, scans.none, seen, -1, scene.walls, view.sensor, scans.lookup
+        )
+        if view.grid[0].size > 0:
+            scan_kernels.add_map(
+                out, spot, scans.none, view.sensor, view.grid, view.exact, scans.lookup
+            )
+        for i in range(g * beams // groups, (g + 1) * beams // groups if groups > 1 else 0):
+            scan[0, 0, i] = scans.part[0, 0, i]
+
+
+@kernel
+def _gather(
+    n: int, m: int, lag: int, reach: float, state: State, scene: Surroundings, motion: Dynamics,
+    scans: Scans, cells: Cells,
+) -> int:  # fmt: skip
+    """Copies the bodies around `spot`, as they were `lag` substeps ago; returns their number."""
+    seen, spot, bodies, velocity = scans.seen, scans.spot[0, 0], state.bodies, state.velocity
+    first, several = velocity.shape[1], bodies.shape[1]
+    in_cells = scene.scattered and lag == 0  # the cells are of this period
     if in_cells:
-        several = crowd.bodies_around(spot[0], spot[1], reach, cells, found)
-    count, ago = 0, lag * dt
+        several = contacts.bodies_around(spot[0], spot[1], reach, cells)
+    count, ago = 0, lag * motion.dt
     for i in range(several):
-        k = found[i] if in_cells else i
+        k = cells.found[i] if in_cells else i
         radius = bodies[n, k, 5]
         if k == first + m or radius <= 0.0:
             continue
@@ -303,8 +304,10 @@ def _gather(  # type: ignore[no-untyped-def]
             seen[at + j] = bodies[n, k, j]
         turned = False
         if lag > 0 and k >= first:
-            x, y, heading = at_lag(past, n, k - first, POSE, lag, steps, substeps)
-            seen[at], seen[at + 1], seen[at + 2], turned = x, y, heading, True
+            seen[at], seen[at + 1], seen[at + 2] = at_lag(
+                state.past, n, k - first, POSE, lag, state.steps[n], motion.substeps
+            )
+            turned = True
         elif lag > 0:
             seen[at] -= velocity[n, k, 0] * ago
             seen[at + 1] -= velocity[n, k, 1] * ago

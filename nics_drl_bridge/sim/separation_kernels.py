@@ -7,7 +7,7 @@ Schwager 2017). A displacement within all half planes is free of contacts throug
 
 Shared arguments, all of one world: `bodies` (K + M, 7), see `lidar.shapes.BODY`, robots from index
 `first`; `walls` (W, 4); `half` (2,) half the size of the field [m]; `distances` see
-`motion.distance_arrays`; `scene` is (bodies, walls, half, distances).
+`obstacles.distance_arrays`; `scene` is (bodies, walls, half, distances).
 """
 
 from __future__ import annotations
@@ -17,7 +17,21 @@ import math
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.sim import obstacles as at
+
+# A row of a plan (K, P): the motion of an obstacle.
+(
+    KIND, SPEED_LOW, SPEED_HIGH, FIRST, COUNT, LOOP, PAUSE,
+    RELAXATION, REPULSION, RANGE, WALL_REPULSION, WALL_RANGE, FORESIGHT, VIEW, BEHIND,
+    FLUCTUATION,
+) = range(16)  # fmt: skip
+PLAN = 16
+
+# Values of the column KIND.
+STILL, WANDER, PATROL, PEDESTRIAN = range(4)
+
+# Memory of an obstacle, a row of marks (N, K, F).
+SPEED, VX, VY, DIRECTION, AIM, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST = range(11)
+MARK = 11
 
 SLACK = 1e-6
 """Margin that is never used [m]: rounding must not make two bodies touch."""
@@ -137,7 +151,7 @@ def _hold_bodies(dx, dy, k, bodies, first, speeds, rows, period, bend):  # type:
         if j >= first:
             towards = speeds[j - first, 0] * nx + speeds[j - first, 1] * ny
             room += min(towards, 0.0) * period
-        elif rows[j, at.KIND] != at.STILL:
+        elif rows[j, KIND] != STILL:
             room *= 0.5
         dx, dy = _hold(dx, dy, nx, ny, room, bend)
     return dx, dy

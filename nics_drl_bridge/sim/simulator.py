@@ -15,10 +15,11 @@ from nics_drl_bridge.lidar.bake import with_shapes
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
 from nics_drl_bridge.lidar.shapes import SHAPE, place
 from nics_drl_bridge.sim import step_kernels
+from nics_drl_bridge.sim.allocation import SLICES, Sizes, allocate, part_of, split
 from nics_drl_bridge.sim.obstacles import distance_arrays, plan_arrays
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
-from nics_drl_bridge.sim.state import SLICES, Sizes, Worlds, allocate, arguments, split
+from nics_drl_bridge.sim.state import Movers, State
 from nics_drl_bridge.sim.validity import (
     CommandBox,
     OutsideValidityWarning,
@@ -28,7 +29,7 @@ from nics_drl_bridge.sim.validity import (
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.threads import Crew
 
-__all__ = ["SLICES", "FastSimulator", "OutsideValidityWarning", "Worlds"]
+__all__ = ["SLICES", "FastSimulator", "OutsideValidityWarning", "State"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -72,7 +73,7 @@ class FastSimulator:
         tell: called with a message when commands leave the range that the model was fitted to.
 
     Attributes:
-        data: all mutable state, see `Worlds`.
+        data: all mutable state, see `State`.
         goals: (N, M, 2) of the episodes [m].
         parts: the worlds that each thread steps.
         sampler: draws the scenes.
@@ -140,9 +141,9 @@ class FastSimulator:
         moves = any(motion is not None for motion in motions)
         low_x, low_y, high_x, high_y = self.world.extent
         half = np.array([max(-low_x, high_x), max(-low_y, high_y)])
-        movers = (moves, plan_arrays(motions), half, distance_arrays(self.world.grid))
+        movers = Movers(moves, plan_arrays(motions), half, distance_arrays(self.world.grid))
         of = (self.data, self.model, self._scanner, walls, movers, self._sizes)
-        return {part.start: step_kernels.pack(arguments(*of, part)) for part in self.parts}
+        return {part.start: step_kernels.pack(part_of(*of, part)) for part in self.parts}
 
     def __getstate__(self) -> dict[str, Any]:
         """Returns the state without `packed`, which a copy rebuilds."""

@@ -1,44 +1,28 @@
-"""Worlds: all mutable state of a simulation, and the other arguments of its kernels."""
+"""Everything that the simulator's kernels take, by name: NamedTuples of arrays.
+
+numba reads their fields by name, so that no order lives in a docstring. N worlds, n of them in one
+part, M robots, S state, C command, T kinematic terms, H periods of command history, K obstacles,
+W walls, B beams, L lanes, R periods of the past.
+"""
 
 from __future__ import annotations
 
-import itertools
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
-from nics_drl_bridge.lidar.scanner import Scanner
-from nics_drl_bridge.lidar.shapes import BODY
-from nics_drl_bridge.robot.kernels import SERIES, scratch, term_arrays
-from nics_drl_bridge.sim.contact_kernels import SEVERAL
-from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT
-from nics_drl_bridge.sim.obstacles import MARK
-from nics_drl_bridge.sim.sensing_kernels import PAST
+from nics_drl_bridge.robot.kernels import Terms
 
 Array = NDArray[np.float64]
-SLICES = 16
-"""Number of groups of beams in which a skewed scan is rendered."""
-LANES = 256
-"""Number of robots moved side by side: their arrays stay in the L1 cache."""
-CROWD = 4096
-"""Least number of pairs of a robot and a body for sorting the bodies of a world into cells."""
-FEWEST_OF_A_CROWD = 8
-"""Least number of robots: for fewer, sorting takes longer than testing all bodies."""
-SCATTERED = 64
-"""Least number of bodies in cells for scanning each robot only among those around it; for fewer,
-testing all of them takes less time than a separate scan for each robot."""
+Integers = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class Worlds:
-    """All mutable state of a simulation; the order is that of `kernels.step_worlds`.
+class State(NamedTuple):
+    """All that changes in a simulation.
 
     `faults`, `coefficient`, `delay`, `age` and `noise` are parameters of each robot: those of the
-    model unless overwritten, as by domain randomisation. A reset keeps them.
+    model unless written to, as domain randomisation does. A reset keeps them.
 
     Attributes:
         pose: (N, M, 3) true pose of `base_link` in `map`.
@@ -55,13 +39,13 @@ class Worlds:
         coefficient: (N, M, T) of the kinematic terms, in the order of
             `robot.kernels.term_arrays`.
         delay: (N, M) latency of the commands [substeps], at most the simulator's `longest_delay`.
-        age: (N, M) age of scan and odometry when they are observed [substeps], at most the
+        age: (N, M) age of scan and odometry when they are reported [substeps], at most the
             simulator's `longest_age`.
         noise: (N, M, 2 + 3 + S) standard deviation of the odometry, linear [m/s] and angular
             [rad/s]; and, after a second, of the drift along x, y [m], heading [rad], and state.
         velocity: (N, K, 3) of the obstacles in `map`, constant for a period [m/s, m/s, rad/s].
         past: (N, M, R, 12) of the last periods, see `sensing_kernels`.
-        marks: (N, K, F) memory of moving obstacles, see `motion_layout`.
+        marks: (N, K, F) memory of moving obstacles, columns as in `separation_kernels`.
     """
 
     pose: Array
@@ -72,166 +56,231 @@ class Worlds:
     twist: Array
     ranges: NDArray[np.float32]
     collided: NDArray[np.uint8]
-    steps: NDArray[np.int64]
-    seeds: NDArray[np.int64]
+    steps: Integers
+    seeds: Integers
     faults: Array
     coefficient: Array
-    delay: NDArray[np.int64]
-    age: NDArray[np.int64]
+    delay: Integers
+    age: Integers
     noise: Array
     velocity: Array
     past: Array
     marks: Array
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """Dimensions of a simulation.
+class OutlineArrays(NamedTuple):
+    """Outlines of all shapes, see `lidar.shapes.Outlines`.
 
     Attributes:
-        worlds: N.
-        robots: M in each.
-        obstacles: K in each.
-        longest_delay: greatest latency of commands [substeps].
-        longest_age: greatest age of an observation [substeps].
+        corners: (sum V, 2) of all outlines [m].
+        first: (H + 1,) first corner of each outline.
     """
 
-    worlds: int
-    robots: int
-    obstacles: int
-    longest_delay: int
-    longest_age: int
-
-    @property
-    def crowded(self) -> bool:
-        """True if it pays to sort the bodies of a world into cells."""
-        pairs = self.robots * (self.robots + self.obstacles)
-        return self.robots >= FEWEST_OF_A_CROWD and pairs >= CROWD
-
-    @property
-    def scattered(self) -> bool:
-        """True if it pays to scan each robot among the bodies around it only."""
-        return self.crowded and self.robots + self.obstacles >= SCATTERED
+    corners: Array
+    first: Integers
 
 
-def allocate(model: SimulatorModel, sizes: Sizes) -> Worlds:
-    """Allocates the arrays of worlds before their first reset, with the model's parameters."""
-    size, width = len(model.robot.state), len(model.robot.command)
-    _, substeps, delay = model.timing
-    shape, bodies = (sizes.worlds, sizes.robots), sizes.obstacles + sizes.robots
-    noise = [*model.noise.odometry, *model.noise.simulated_drift(model.robot)]
-    # One row for the newest; an age within a period needs the end of the period before it, too.
-    rows = -(-sizes.longest_age // substeps) + 1
-    return Worlds(
-        pose=np.zeros((*shape, 3)),
-        state=np.zeros((*shape, size)),
-        history=np.zeros((*shape, -(-sizes.longest_delay // substeps) + 1, width)),
-        bodies=np.zeros((sizes.worlds, bodies, BODY)),
-        odom=np.zeros((*shape, 3)),
-        twist=np.zeros((*shape, 3)),
-        ranges=np.full((*shape, model.lidar.beams), np.inf, np.float32),
-        collided=np.zeros(shape, np.uint8),
-        steps=np.zeros(sizes.worlds, np.int64),
-        seeds=np.zeros(sizes.worlds, np.int64),
-        faults=np.tile(model.lidar.fault_parameters, (*shape, 1)),
-        coefficient=np.tile(term_arrays(model.kinematics)[1], (*shape, 1)),
-        delay=np.full(shape, delay, np.int64),
-        age=np.zeros(shape, np.int64),
-        noise=np.tile(noise, (*shape, 1)),
-        velocity=np.zeros((sizes.worlds, sizes.obstacles, 3)),
-        past=np.zeros((*shape, rows, PAST)),
-        marks=np.zeros((sizes.worlds, sizes.obstacles, MARK)),
-    )
+class MapField(NamedTuple):
+    """The static map, see `collision_kernels`; without cells where there is none.
 
-
-def split(worlds: int, threads: int) -> tuple[slice, ...]:
-    """Splits N worlds into contiguous parts of nearly equal size, one per thread."""
-    edges = np.arange(min(threads, worlds) + 1) * worlds // min(threads, worlds)
-    return tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(edges))
-
-
-def arguments(
-    data: Worlds,
-    model: SimulatorModel,
-    scanner: Scanner,
-    walls: Array,
-    movers: tuple[Any, ...],
-    sizes: Sizes,
-    part: slice,
-) -> tuple[Any, ...]:
-    """Returns the kernels' arguments for one part: `data`, constants, and its scratch memory.
-
-    Returns:
-        The fields of `data`; scene: walls, map (distances, frame), outlines, whether the bodies
-        are sorted, whether scans use the cells, and `movers`: whether any obstacle moves, and
-        plans, half size and distances of `motion_kernels`; view: the lidar's arguments, its map,
-        whether it scans exactly, mount, limits, time of a sweep; motion, see
-        `robot_kernels.move_freely`; and scratch, see `_scratch`.
+    Attributes:
+        distances: (rows, columns) to the nearest solid cell [m], float32.
+        frame: (5,) x, y [m], cosine, sine of its origin, resolution [m].
     """
-    lidar, grid = model.lidar, scanner.grid
-    dof, _, factors, count = term_arrays(model.kinematics)
-    dt, substeps, _ = model.timing
-    view = (
-        scanner.arguments,
-        NO_MAP if grid is None else grid.arrays,
-        scanner.renderer == "exact",
-        np.array(lidar.mount, dtype=np.float64),
-        np.array([lidar.range_min, lidar.range_max], dtype=np.float64),
-        float(lidar.sweep_time),
-    )
-    outlines = scanner.table.outlines.arguments
-    scene = (walls, _collision_map(grid), outlines, sizes.crowded, sizes.scattered, movers)
-    motion = (dof, factors, count, SERIES, (float(dt), int(substeps)))
-    room = _scratch(model, scanner, sizes, part.stop - part.start)
-    return tuple(vars(data).values()), scene, view, motion, room
+
+    distances: NDArray[np.float32]
+    frame: Array
 
 
-def _collision_map(grid: GridMap | None) -> tuple[NDArray[np.float32], Array]:
-    """Returns the argument `grid` of `collision_kernels`."""
-    if grid is None:
-        return np.zeros((0, 0), np.float32), np.zeros(5)
-    return np.ascontiguousarray(grid.distance_field), grid.arrays[1]
+class Movers(NamedTuple):
+    """Motion of the obstacles.
 
-
-def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int) -> tuple[Any, ...]:
-    """Allocates the scratch memory of one thread for a number of worlds.
-
-    Returns:
-        Scratch for the robots that move side by side; for one that moves carefully; for the robots
-        of one world; for the cells of a crowded world; for the scans.
+    Attributes:
+        moves: whether any obstacle moves.
+        plans: rows and waypoints, see `obstacles.plan_arrays`.
+        half: (2,) half the size of the field [m].
+        distances: of a static map, see `obstacles.distance_arrays`.
     """
-    kinematics, robots = model.kinematics, sizes.robots
-    bodies = sizes.obstacles + robots
-    blocks = -(-worlds * robots // LANES)
-    lanes = robots * min(worlds, -(-worlds // blocks))
-    x = np.ones((len(kinematics.variables) + 1, lanes))
-    side = int(np.sqrt(2.0 * bodies)) if sizes.crowded else 1
-    corners = int(np.diff(scanner.table.outlines.corner).max(initial=4))
-    return (
-        (
-            np.zeros((6, lanes)), x, np.zeros((len(kinematics.dofs), lanes)),
-            np.zeros((np.count_nonzero(kinematics.coefficients), lanes)), np.zeros(lanes, np.int64),
-        ),
-        (
-            *scratch(kinematics), np.zeros(BODY), np.zeros((max(corners, 4), 2)),
-            np.zeros((sizes.obstacles, 3)), np.zeros((sizes.obstacles, 3)),
-            np.zeros((bodies, FLIGHT)), np.zeros((robots, EVENT)),
-        ),
-        (
-            np.zeros((robots, 1 + SEVERAL), np.int64), np.zeros(robots, np.int64),
-            np.zeros(robots), np.zeros(bodies), np.zeros((robots, 2)),
-        ),
-        (
-            (
-                np.zeros(side * side + 2, np.int64), np.zeros(bodies, np.int64),
-                np.zeros(bodies, np.int64), np.zeros(5),
-            ),
-            np.zeros(bodies, np.int64),
-        ),
-        (
-            np.zeros((lanes, 3)), np.zeros(worlds, np.int64), np.zeros((bodies + 1) * BODY),
-            np.zeros((1, 1, 3)), np.zeros((SLICES, 3)),
-            np.zeros((1, 1, model.lidar.beams), np.float32), np.zeros(3), np.zeros(1, np.int64),
-            scanner.room(bodies),
-        ),
-    )  # fmt: skip
+
+    moves: bool
+    plans: tuple[Array, Array]
+    half: Array
+    distances: tuple[NDArray[np.float32], Array]
+
+
+class Surroundings(NamedTuple):
+    """Everything that stands in every world, and how its bodies are searched.
+
+    Attributes:
+        walls: (W, 4).
+        grid: the static map.
+        outlines: of all shapes.
+        crowded: whether the bodies of a world are sorted into cells.
+        scattered: whether scans use the cells too.
+        movers: motion of the obstacles.
+    """
+
+    walls: Array
+    grid: MapField
+    outlines: OutlineArrays
+    crowded: bool
+    scattered: bool
+    movers: Movers
+
+
+class LidarView(NamedTuple):
+    """The lidar.
+
+    Attributes:
+        sensor: see `lidar.scanner.Scanner.arguments`.
+        grid: the static map as scanned, see `lidar.maps.GridMap.arrays`.
+        exact: whether the map is scanned exactly.
+        mount: (3,) pose of the lidar on the robot.
+        limits: (2,) least and greatest range [m].
+        sweep_time: duration of a sweep [s].
+    """
+
+    sensor: Any
+    grid: Any
+    exact: bool
+    mount: Array
+    limits: Array
+    sweep_time: float
+
+
+class Dynamics(NamedTuple):
+    """Kinematics of the robots.
+
+    Attributes:
+        terms: with the model's coefficients, for those of a robot see `State.coefficient`.
+        series: see `robot.kernels`.
+        dt: length of a substep [s].
+        substeps: in a control period.
+    """
+
+    terms: Terms
+    series: Array
+    dt: float
+    substeps: int
+
+
+class Lanes(NamedTuple):
+    """Robots side by side, see `robot.kernels.run`.
+
+    Attributes:
+        pose: (6, L); x: (V + 1, L); dq: (D, L); coefficient: (T, L); late: (L,) substep at which
+            the command of each changes.
+    """
+
+    pose: Array
+    x: Array
+    dq: Array
+    coefficient: Array
+    late: Integers
+
+
+class Single(NamedTuple):
+    """Scratch memory of one world whose robots move carefully.
+
+    Attributes:
+        x, dq: of one robot, see `robot.kernels.scratch`.
+        trial: (7,) a body.
+        spare: (V, 2) corners.
+        start: (K, 3) poses of the obstacles, as if they had always moved by their velocity.
+        began: (K, 3) their poses at the start of the period.
+        flights: (K + M, FLIGHT), see `impact_kernels`.
+        events: (M, EVENT), see `impact_kernels`.
+    """
+
+    x: Array
+    dq: Array
+    trial: Array
+    spare: Array
+    start: Array
+    began: Array
+    flights: Array
+    events: Array
+
+
+class Nearby(NamedTuple):
+    """Bodies and walls that the robots of one world may meet in the period, see `contact_kernels`.
+
+    Attributes:
+        near: (M, 1 + SEVERAL) number and indices of the bodies near each robot.
+        meets: (M,) flags.
+        way: (M,) upper bound on the length of each robot's path [m].
+        reach: (K + M,) how far each body may reach from its present centre [m].
+        speeds: (M, 2) velocity in `map` [m/s].
+    """
+
+    near: Integers
+    meets: Integers
+    way: Array
+    reach: Array
+    speeds: Array
+
+
+class Cells(NamedTuple):
+    """The bodies of one crowded world in square cells, see `contact_kernels`.
+
+    Attributes:
+        begin: (G^2 + 2,) index in `order` of the first body of each cell, the last cell being
+            that of the large bodies.
+        order: (K + M,) the bodies, cell by cell.
+        cell_of: (K + M,) cell of each body.
+        frame: (5,) x, y [m] of the first cell, cells per metre, greatest radius of the bodies in
+            cells [m], and greatest distance moved since by any body [m].
+        found: (K + M,) bodies found around a point.
+    """
+
+    begin: Integers
+    order: Integers
+    cell_of: Integers
+    frame: Array
+    found: Integers
+
+
+class Scans(NamedTuple):
+    """Scratch memory of the scans.
+
+    Attributes:
+        before: (L, 3) poses at the start of the period.
+        waiting: (n,) worlds that are scanned together.
+        seen: ((K + M + 1) * 7,) bodies around one robot.
+        spot: (1, 1, 3) pose of one robot.
+        slices: (G, 3) poses during a sweep.
+        part: (1, 1, B) scan of a slice.
+        drive: (3,) twist of one robot.
+        none: (1,) index of the only world of one robot.
+        lookup: see `lidar.scanner.Scanner.room`.
+    """
+
+    before: Array
+    waiting: Integers
+    seen: Array
+    spot: Array
+    slices: Array
+    part: NDArray[np.float32]
+    drive: Array
+    none: Integers
+    lookup: Any
+
+
+class Scratch(NamedTuple):
+    """Memory that one thread needs to itself."""
+
+    lanes: Lanes
+    single: Single
+    nearby: Nearby
+    cells: Cells
+    scans: Scans
+
+
+class Part(NamedTuple):
+    """Everything that the kernels need to step the worlds of one part."""
+
+    state: State
+    scene: Surroundings
+    lidar: LidarView
+    motion: Dynamics
+    scratch: Scratch

@@ -19,7 +19,7 @@ def test_no_kill_tears_a_file_although_kills_hit_writes():
     assert found["kills"] == 48
     assert found["kills_during_a_write"] > 0
     assert set(found["artefacts"]) == {
-        "drive.npz", "model", "table.npz", "stop.jsonl", "policy.onnx", "checkpoint.pt",
+        "drive.npz", "model", "table", "stop.jsonl", "policy.onnx", "checkpoint.pt",
     }  # fmt: skip
 
 

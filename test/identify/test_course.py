@@ -8,8 +8,15 @@ import pytest
 from identify.drives import drive
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.open_loop import predict, windows
-from nics_drl_bridge.identify.windows import course_of, relative_ends, tracked_ends, tracked_slopes
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.open_loop import (
+    course_of,
+    predict,
+    relative_ends,
+    tracked_ends,
+    tracked_slopes,
+    windows,
+)
 
 MOUNTING = Calibration(rotation_rad=0.4, lever_arm_m=(0.1, -0.05))
 STEP = 1e-6
@@ -19,21 +26,21 @@ STEP = 1e-6
 def courses(request):
     """Model, drive, windows and their course; of some a step ends within the last window."""
     spec = builtin_model("mecanum").robot
-    model, recording = builtin_model("mecanum").kinematics, drive(spec, duration=20.0)
-    chosen = windows(recording, MOUNTING, 0.0, 20.0, 1.0, 1.0)
+    model, driven = builtin_model("mecanum").kinematics, Drive(drive(spec, duration=20.0), spec)
+    chosen = windows(driven, MOUNTING, 0.0, 20.0, 1.0, 1.0)
     chosen = replace(chosen, end_t=chosen.start_t + request.param * 2.0)
-    return model, recording, spec, chosen, course_of(model, MOUNTING, recording, spec, chosen)
+    return model, driven, chosen, course_of(model, MOUNTING, driven, chosen)
 
 
 def test_a_course_ends_where_the_prediction_does(courses):
-    model, recording, spec, chosen, course = courses
+    model, driven, chosen, course = courses
     ends = tracked_ends(course, MOUNTING, relative_ends(course, model)[0])
-    expected = predict(model, MOUNTING, recording, spec, chosen)
+    expected = predict(model, MOUNTING, driven, chosen)
     assert ends == pytest.approx(expected, abs=1e-9)
 
 
 def test_the_derivatives_are_those_of_finite_differences(courses):
-    model, _, _, _, course = courses
+    model, _, _, course = courses
     model = replace(model, coefficients=model.coefficients * 1.03)
     free = model.coefficients != 0.0
     free[3:] = False

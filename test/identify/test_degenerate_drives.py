@@ -157,7 +157,7 @@ def test_repeated_rows_are_left_out_and_change_nothing(car):
     }
     plain, twice = identify(once, car), identify(Recording(**again), car)
     assert said(twice, "repeat the row before them")
-    assert twice.model.to_dict()["terms"] == plain.model.to_dict()["terms"]
+    assert twice.model.named.terms == plain.model.named.terms
 
 
 def test_rows_of_nan_are_refused_with_their_place(car):
@@ -228,7 +228,7 @@ def test_commands_beyond_the_limits_are_held_there_and_told(differential):
     commands = random_commands(differential) * [3.0, 1.5]
     found = identify(driven(differential, commands), differential)
     assert said(found, "forward_command was beyond the robot's limits, 0 to 1 m/s")
-    terms = found.model.to_dict()["terms"]
+    terms = found.model.named.terms
     assert terms["d_left_wheel"]["left_wheel"] == pytest.approx(-9.06, abs=0.1)  # dt is 20 ms
     assert found.fit.r2[3:].min() > 0.999
 

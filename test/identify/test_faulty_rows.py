@@ -11,9 +11,10 @@ from identify.drives import drive
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.align import align
 from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.repair import repair
+from nics_drl_bridge.identify.repair import repaired
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -53,10 +54,10 @@ def same_motion(a, b, share: float) -> None:
 @pytest.mark.parametrize("noise", [(0.0, 0.0), (5e-4, 1e-3), (2e-3, 5e-3)])
 def test_a_recording_without_faults_is_not_touched(name, noise):
     spec = load_robot(name)
-    recording = drive(spec, duration=20.0, noise=noise)
-    repaired = repair(recording, spec)
-    assert repaired.notes == ()
-    assert repaired.recording is recording
+    whole = Drive(drive(spec, duration=20.0, noise=noise), spec)
+    found, notes = repaired(whole)
+    assert notes == ()
+    assert found is whole
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -124,7 +125,7 @@ def test_steps_of_unequal_length_have_their_own():
 
 
 def test_rows_of_samples_that_jump_are_left_out_of_the_fit(car):
-    samples = align(drive(car, noise=(0.0, 0.0)), Calibration(), car)
+    samples = align(Drive(drive(car, noise=(0.0, 0.0)), car), Calibration())
     rng = np.random.default_rng(3)
     bad = rng.random(len(samples.t)) < 0.05
     dq, x = samples.dq.copy(), samples.x.copy()
@@ -132,7 +133,7 @@ def test_rows_of_samples_that_jump_are_left_out_of_the_fit(car):
     x[bad[::-1], 0] += 40.0
     clean = fit(samples, car)
     faulty = fit(Samples(samples.t, samples.q, x, dq, samples.dt), car)
-    terms, others = faulty.model.to_dict()["terms"], clean.model.to_dict()["terms"]
+    terms, others = faulty.model.named.terms, clean.model.named.terms
     for dof in ("vx", "d_speed", "d_steering"):
         assert terms[dof] == pytest.approx(others[dof], rel=1e-5)
     assert terms["wz"]["speed*steering"] == pytest.approx(others["wz"]["speed*steering"], rel=0.05)
@@ -153,7 +154,7 @@ def test_noise_of_the_measured_state_does_not_bend_its_lag(differential):
     noise = np.random.default_rng(0).normal(size=plain.state.values.shape) * 0.2
     state = replace(plain.state, values=plain.state.values + noise)
     model = identify(replace(plain, state=state), differential).model
-    value = model.to_dict()["terms"]["d_left_wheel"]["left_wheel"]
+    value = model.named.terms["d_left_wheel"]["left_wheel"]
     error = model.named_errors["d_left_wheel"]["left_wheel"]
     assert error < 0.2
     assert abs(value - (np.exp(-0.1) - 1.0) / 0.01) < 3.0 * error

@@ -45,13 +45,13 @@ def aligned(drive: Recording) -> Samples:
 
 
 def term(model, dof, name):
-    return model.to_dict()["terms"][dof].get(name, 0.0)
+    return model.named.terms[dof].get(name, 0.0)
 
 
 def test_a_polynomial_of_second_order_is_found_with_its_own_terms_only():
     x = random_x()
     result = fit(samples_of(x, rates_of(x)), PAIR, alpha=1.0)
-    terms = result.model.to_dict()["terms"]
+    terms = result.model.named.terms
     assert {dof: set(named) for dof, named in terms.items()} == {
         "vx": {"a", "a*b"},
         "vy": {"1", "b^2"},

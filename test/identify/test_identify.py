@@ -7,9 +7,10 @@ import pytest
 
 from identify.drives import drive
 from nics_drl_bridge.errors import FitError, RecordingError
-from nics_drl_bridge.identify import identify as module
+from nics_drl_bridge.identify.align import align
 from nics_drl_bridge.identify.assume import assume_textbook
 from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import cut, identify
 from nics_drl_bridge.identify.open_loop import open_loop_error, predict, windows
@@ -19,7 +20,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 
 def term(model, dof: str, name: str) -> float:
-    return model.to_dict()["terms"][dof].get(name, 0.0)
+    return model.named.terms[dof].get(name, 0.0)
 
 
 def constant_steering(car: RobotSpec, angle: float) -> tuple[RobotSpec, Recording]:
@@ -71,12 +72,12 @@ def test_the_held_out_part_is_not_used_for_the_model(car):
 def test_a_prediction_knows_no_pose_after_its_start(car):
     recording = drive(car, noise=(5e-4, 1e-3), measured_state=False)
     found = identify(recording, car)
-    chosen = windows(recording, found.calibration, 30.0, 36.0, 5.0, 0.1)
+    chosen = windows(found.drive, found.calibration, 30.0, 36.0, 5.0, 0.1)
     values = recording.pose.values.copy()
     values[recording.pose.t > chosen.start_t[-1]] = 7.0
-    blind = replace(recording, pose=replace(recording.pose, values=values))
-    seen = predict(found.model, found.calibration, recording, car, chosen)
-    assert np.array_equal(seen, predict(found.model, found.calibration, blind, car, chosen))
+    blind = Drive(replace(recording, pose=replace(recording.pose, values=values)), car)
+    seen = predict(found.model, found.calibration, found.drive, chosen)
+    assert np.array_equal(seen, predict(found.model, found.calibration, blind, chosen))
 
 
 def test_a_noisy_drive_in_bursts_without_state_still_gives_the_textbook_terms(car):
@@ -151,7 +152,7 @@ def test_at_zero_steering_the_parameters_of_the_spec_are_assumed(car):
 
 def test_nothing_is_assumed_where_everything_moved(car):
     recording = drive(car, duration=20.0)
-    model = fit(module.align(recording, Calibration(), car), car).model
+    model = fit(align(Drive(recording, car), Calibration()), car).model
     completed, notes = assume_textbook(model, car, ())
     assert notes == ()
     assert completed.equations() == model.equations()
@@ -174,7 +175,7 @@ def test_a_part_without_a_window_is_refused(car):
     recording = drive(car, duration=20.0)
     model = identify(recording, car).model
     with pytest.raises(RecordingError, match="hold no window of 5 s"):
-        open_loop_error(model, Calibration(), recording, car, 17.0, 20.0)
+        open_loop_error(model, Calibration(), Drive(recording, car), 17.0, 20.0)
 
 
 @pytest.mark.parametrize("name", ["mecanum", "differential"])

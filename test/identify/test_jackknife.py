@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from identify.drives import drive
-from nics_drl_bridge.identify.calibrate import tracked_twists
+from nics_drl_bridge.identify.drive import Drive, TwistIntervals
 from nics_drl_bridge.identify.mounting import Mounting, jackknifed
-from nics_drl_bridge.identify.noise import TwistIntervals
 
 
 def mean_of_twists(_, twists: TwistIntervals) -> Mounting:
@@ -16,12 +15,12 @@ def mean_of_twists(_, twists: TwistIntervals) -> Mounting:
 
 
 def test_the_spread_is_the_standard_error_of_a_mean(mecanum):
-    recording = drive(mecanum, duration=40.0)
-    twists = tracked_twists(recording)
+    driven = Drive(drive(mecanum, duration=40.0), mecanum)
+    twists = driven.twists
     rng = np.random.default_rng(0)
     noisy = TwistIntervals(twists.start, twists.end, rng.normal(size=twists.twist.shape))
     expected = 1.0 / np.sqrt(len(noisy.start))
-    found = jackknifed(recording, noisy, 0.0, mean_of_twists)
+    found = jackknifed(driven, noisy, 0.0, mean_of_twists)
     assert found is not None
     sizes = np.array([found.rotation_sigma, *found.lever_sigma])
     assert (sizes > 0.4 * expected).all()
@@ -29,15 +28,15 @@ def test_the_spread_is_the_standard_error_of_a_mean(mecanum):
 
 
 def test_what_lasts_for_a_block_widens_the_uncertainty(mecanum):
-    recording = drive(mecanum, duration=40.0)
-    twists = tracked_twists(recording)
+    driven = Drive(drive(mecanum, duration=40.0), mecanum)
+    twists = driven.twists
     slip = np.repeat(np.random.default_rng(0).normal(size=8), -(-len(twists.start) // 8))
     alike = TwistIntervals(twists.start, twists.end, np.tile(slip[: len(twists.start), None], 3))
-    found = jackknifed(recording, alike, 0.0, mean_of_twists)
+    found = jackknifed(driven, alike, 0.0, mean_of_twists)
     assert found is not None
     assert found.rotation_sigma == pytest.approx(slip.std() / np.sqrt(7.0), rel=0.3)
 
 
 def test_a_drive_that_shows_nothing_has_no_mounting(mecanum):
-    recording = drive(mecanum, duration=20.0)
-    assert jackknifed(recording, tracked_twists(recording), 0.0, lambda *_: None) is None
+    driven = Drive(drive(mecanum, duration=20.0), mecanum)
+    assert jackknifed(driven, driven.twists, 0.0, lambda *_: None) is None

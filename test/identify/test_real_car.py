@@ -10,8 +10,8 @@ import pytest
 
 from identify.drives import without
 from nics_drl_bridge.errors import FitError
-from nics_drl_bridge.identify.calibrate import calibrate
-from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.identify import calibrate, identify
 from nics_drl_bridge.identify.open_loop import open_loop_error
 from nics_drl_bridge.recording.readers import read_recording
 
@@ -48,14 +48,14 @@ def test_its_model_predicts_five_seconds_of_unseen_drive_to_three_centimetres(
 
 @pytest.mark.parametrize("name", ["constant_drive_51s", "constant_drive_214s"])
 def test_its_model_predicts_other_drives_too(real_drives, car, found, name):
-    other = read_recording(real_drives / name)
-    end = float(other.pose.t[-1])
-    result = open_loop_error(found.model, found.calibration, other, car, 2.0, end)
+    other = Drive(read_recording(real_drives / name), car)
+    end = float(other.recording.pose.t[-1])
+    result = open_loop_error(found.model, found.calibration, other, 2.0, end)
     assert result.mean_position_error_m < 0.03
 
 
 def test_its_model_is_short_and_steers_by_assumption_only(found):
-    terms = found.model.to_dict()["terms"]
+    terms = found.model.named.terms
     assert terms["vx"] == {"speed": 1.0}
     assert list(terms["wz"]) == ["speed*steering"]
     assert terms["wz"]["speed*steering"] * -0.5 == pytest.approx(-2.31, abs=0.05)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from identify.drives import in_bursts
-from nics_drl_bridge.identify.repair import find_bursts, newest, spread
+from nics_drl_bridge.identify.drive import find_bursts, newest, spread
 
 
 def test_uniform_stamps_are_not_bursts_and_stay_as_they_are():

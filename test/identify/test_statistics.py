@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from nics_drl_bridge.config import dump_yaml, parse_yaml
+from nics_drl_bridge.config import dump_yaml, parse_yaml, validate
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.identify.dof import parse_alpha
 from nics_drl_bridge.identify.excitation import commands_together
-from nics_drl_bridge.identify.fit import fit
+from nics_drl_bridge.identify.fit import fit, parse_alpha
 from nics_drl_bridge.identify.statistics import (
     clustered_errors,
     condition,
@@ -21,7 +20,7 @@ from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import load_robot
-from nics_drl_bridge.robot.taylor import TaylorModel
+from nics_drl_bridge.robot.taylor import NamedTaylorModel
 
 RATE = 9.5163
 KNOWN = {
@@ -66,7 +65,7 @@ def test_known_coefficients_lie_within_three_standard_errors(name):
     spec, inside, short = load_robot(name), [], []
     for seed in range(40):
         result = fit(noisy_samples(spec, seed), spec, order=1, noisy=True)
-        terms, errors = result.model.to_dict()["terms"], result.model.named_errors
+        terms, errors = result.model.named.terms, result.model.named_errors
         for dof, row in KNOWN[name].items():
             if dof == "wz" and name == "ackermann":
                 continue
@@ -82,7 +81,7 @@ def test_the_known_product_of_a_car_lies_within_three_standard_errors():
     spec, inside = load_robot("ackermann"), []
     for seed in range(30):
         model = fit(noisy_samples(spec, seed), spec, noisy=True, alpha=0.9).model
-        value = model.to_dict()["terms"]["wz"]["speed*steering"]
+        value = model.named.terms["wz"]["speed*steering"]
         inside.append(abs(value - 5.0) < 3.0 * model.named_errors["wz"]["speed*steering"])
     assert np.mean(inside) > 0.9
 
@@ -135,11 +134,10 @@ def test_cross_validation_is_that_of_separate_fits():
 def test_auto_keeps_what_is_worth_it_at_every_order(order):
     spec = load_robot("differential")
     result = fit(noisy_samples(spec, 1), spec, order=order, alpha="auto", noisy=True)
-    terms = result.model.to_dict()["terms"]
+    terms = result.model.named.terms
     assert set(terms["vx"]) == {"left_wheel", "right_wheel"}
     assert set(terms["wz"]) == {"left_wheel", "right_wheel"}
     for curve in result.curves:
-        assert curve.alpha[-1] == pytest.approx(1.0)
         assert len(curve.error) == len(curve.terms) + 1
         assert curve.error[curve.kept] <= curve.error[0]
 
@@ -158,11 +156,12 @@ def test_a_fourth_order_shows_the_cube_of_a_cars_steering():
 def test_errors_and_quality_survive_yaml():
     spec = load_robot("differential")
     model = fit(noisy_samples(spec, 2), spec, noisy=True).model
-    data = model.to_dict()
-    assert set(data["standard_errors"]["vx"]) == set(data["terms"]["vx"])
-    back = TaylorModel.from_dict(parse_yaml(dump_yaml(data), "model.yaml"))
-    assert np.array_equal(back.std_errors, model.std_errors)
-    assert back.to_dict() == data
+    named = model.named
+    assert set(named.standard_errors["vx"]) == set(named.terms["vx"])
+    text = dump_yaml(named.model_dump(exclude_none=True))
+    read = validate(parse_yaml(text, "model.yaml"), NamedTaylorModel, "model.yaml")
+    assert np.array_equal(read.model().std_errors, model.std_errors)
+    assert read == read.model().named == named
 
 
 def test_commands_that_move_apart_are_not_together():

@@ -68,7 +68,7 @@ def omni_twist(state):
 
 
 def terms(found):
-    return found.model.to_dict()["terms"]
+    return found.model.named.terms
 
 
 @pytest.mark.parametrize("noise", [(0.0, 0.0), (5e-4, 1e-3)])

@@ -8,9 +8,10 @@ import pytest
 
 from identify.drives import drive
 from nics_drl_bridge import geometry
+from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.open_loop import open_loop_error
-from nics_drl_bridge.identify.usefulness import is_useless, why_useless
+from nics_drl_bridge.identify.verdict import is_useless, why_useless
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -72,8 +73,8 @@ def test_standing_still_is_off_by_the_way_from_start_to_end(car):
     along = 0.2 * recording.pose.t
     straight = np.stack([3.0 + 0.6 * along, 0.8 * along, 0.0 * along], axis=1)
     found = identify(recording, car)
-    moved = replace(recording, pose=replace(recording.pose, values=straight))
-    result = open_loop_error(found.model, found.calibration, moved, car, 0.0, 20.0)
+    moved = Drive(replace(recording, pose=replace(recording.pose, values=straight)), car)
+    result = open_loop_error(found.model, found.calibration, moved, 0.0, 20.0)
     assert result.median_displacement_m == pytest.approx(1.0)
     assert result.mean_path_m == pytest.approx(1.0)
 

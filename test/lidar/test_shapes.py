@@ -8,7 +8,6 @@ from pydantic import ValidationError
 
 from nics_drl_bridge.errors import ConfigError, ModelError
 from nics_drl_bridge.lidar.shapes import (
-    SHAPES,
     SQUARE,
     STRIP,
     Circle,
@@ -16,6 +15,7 @@ from nics_drl_bridge.lidar.shapes import (
     Polygon,
     Rectangle,
     Segment,
+    ShapeFile,
     convex_hull,
     describe,
     load_shapes,
@@ -122,7 +122,8 @@ def test_place_writes_pose_its_direction_radius_and_shape():
 
 def test_every_shape_is_read_back_from_plain_data_and_has_a_description():
     shapes = random_shapes(0)
-    assert SHAPES.validate_python(SHAPES.dump_python(shapes, mode="json")) == shapes
+    plain = ShapeFile(shapes=shapes).model_dump(mode="json")
+    assert ShapeFile.model_validate(plain).shapes == shapes
     assert describe(Segment(ends=((0.0, 0.0), (3.0, 4.0)))) == "segment of 5 m"
     assert len({describe(shape) for shape in shapes}) > 7
 

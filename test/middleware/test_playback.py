@@ -13,7 +13,6 @@ import bags
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.middleware.playback import estimate, write_estimate
-from nics_drl_bridge.npz import npz_arrays
 
 DURATION_S = 6.0
 MODEL = builtin_model("ackermann")
@@ -83,8 +82,9 @@ def test_the_storage_makes_no_difference(tmp_path):
 def test_an_estimate_is_written_exactly(bag, tmp_path):
     made = estimate(bag, MODEL, {})
     write_estimate(made, tmp_path / "estimate.npz")
-    arrays = npz_arrays((tmp_path / "estimate.npz").read_bytes())
-    assert np.array_equal(arrays["pose"], made.pose)
+    with np.load(tmp_path / "estimate.npz", allow_pickle=False) as arrays:
+        for name in ("stamp_ns", "pose", "twist", "covariance"):
+            assert np.array_equal(arrays[name], getattr(made, name))
     write_estimate(made, tmp_path / "estimate.csv")
     head, *rows = (tmp_path / "estimate.csv").read_text().splitlines()
     assert head == "stamp_ns,x,y,heading,vx,vy,wz"

@@ -1,14 +1,9 @@
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.append(str(Path(__file__).resolve().parents[1] / "calibration"))
-
 from identify.drives import drive, with_wheels
 
 from nics_drl_bridge.identify.identify import Identified, identify
@@ -53,8 +48,7 @@ def exact() -> Found:
 
 
 def listed(found: Found):
-    identified = found[1]
-    return estimates(identified.recording, identified.calibration, identified.findings)
+    return estimates(found[1])
 
 
 def test_every_estimate_of_a_disturbed_drive_has_its_picture(disturbed):
@@ -81,8 +75,8 @@ def test_the_estimates_are_right_within_their_uncertainty(disturbed):
 
 
 def test_a_shift_explains_most_at_the_estimate(disturbed):
-    spec, identified = disturbed
-    curves = timing_curves(identified.recording, spec, identified.calibration)
+    _, identified = disturbed
+    curves = timing_curves(identified.drive, identified.calibration)
     assert [c.name for c in curves] == ["clock_offset_s", "command_latency_s"]
     for curve in curves:
         best = curve.value[np.argmin(curve.unexplained)]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.config import dump_yaml, parse_yaml
-from nics_drl_bridge.errors import ModelError
-from nics_drl_bridge.robot.taylor import TaylorModel
+from nics_drl_bridge.config import dump_yaml, parse_yaml, validate
+from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
 
 
 @pytest.fixture
@@ -57,14 +57,20 @@ def test_a_model_reads_back_from_yaml_to_the_same_bits(model):
     rng = np.random.default_rng(0)
     odd = rng.normal(size=(4, 3)) * 10.0 ** rng.uniform(-12, 12, (4, 3))
     model = TaylorModel(**{**vars(model), "coefficients": odd, "dt": 0.1 / 3.0})
-    back = TaylorModel.from_dict(parse_yaml(dump_yaml(model.to_dict()), "model.yaml"))
-    assert back.to_dict() == model.to_dict()
+    back = read(model.named.model_dump(exclude_none=True))
+    assert back.named == model.named
     for name, value in vars(model).items():
         assert np.array_equal(getattr(back, name), value), name
 
 
+def read(data):
+    """The model in the plain data of a file."""
+    plain = parse_yaml(dump_yaml(data), "model.yaml")
+    return validate(plain, NamedTaylorModel, "model.yaml").model()
+
+
 def broken(model, path, value):
-    data = deepcopy(model.to_dict())
+    data = deepcopy(model.named.model_dump(exclude_none=True))
     *folders, last = path
     inner = data
     for folder in folders:
@@ -78,8 +84,8 @@ def broken(model, path, value):
 
 @pytest.mark.parametrize("key", ["dt", "units", "terms", "valid", "assumed"])
 def test_a_missing_key_is_named(model, key):
-    with pytest.raises(ModelError, match=f"kinematics: '{key}' is missing or wrong"):
-        TaylorModel.from_dict(broken(model, [key], KeyError))
+    with pytest.raises(ConfigError, match=f"the key '{key}' is missing; add it"):
+        read(broken(model, [key], KeyError))
 
 
 @pytest.mark.parametrize(
@@ -96,6 +102,10 @@ def test_a_missing_key_is_named(model, key):
         (["terms", "vx", "s"], float("nan")),
         (["terms", "vx", "ghost"], 1.0),
         (["terms", "vx", "s^-1"], 1.0),
+        (["terms", "vx", f"s^{10**30}"], 1.0),
+        (["terms", "vx", "s"], "2.0"),
+        (["terms", "vx", "s"], True),
+        (["colour"], "red"),
         (["units", "wz"], KeyError),
         (["valid", "s"], [0.0]),
         (["valid", "s"], [0.0, 1.0, 2.0]),
@@ -108,5 +118,5 @@ def test_a_missing_key_is_named(model, key):
     ],
 )
 def test_what_is_wrong_is_one_sentence(model, path, value):
-    with pytest.raises(ModelError, match=r"^kinematics: [^\n]*generate the model anew\.$"):
-        TaylorModel.from_dict(broken(model, path, value))
+    with pytest.raises(BridgeError, match=r"^(model\.yaml|kinematics): [^\n]*$"):
+        read(broken(model, path, value))

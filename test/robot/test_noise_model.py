@@ -11,8 +11,8 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.config import dump_yaml, parse_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model, load_model, save_model
-from nics_drl_bridge.identify.drift import measure_noise
 from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.noise import motion_noise
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.noise import MEASURED, Level, Noise
@@ -113,7 +113,7 @@ def test_the_drift_of_a_model_that_runs_away_is_assumed(car):
     coefficients[3:] *= -20.0
     unstable = replace(found.model, coefficients=coefficients)
     with np.errstate(all="ignore"):
-        noise = measure_noise(recording, found.calibration, unstable, found.samples, car)
+        noise = motion_noise(Noise(), found.drive, found.calibration, unstable, found.samples)
     assert found.noise.position_drift.measured
     assert noise.position_drift == Noise().position_drift
     assert not noise.heading_drift.measured

@@ -13,7 +13,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.sim import obstacle_kernels as kernels
-from nics_drl_bridge.sim import obstacles as at
+from nics_drl_bridge.sim import separation_kernels as at
 from nics_drl_bridge.sim.obstacles import (
     MARK,
     NO_DISTANCES,

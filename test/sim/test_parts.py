@@ -9,7 +9,7 @@ import pytest
 from robots import direct_model, field, lidar
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.sim import state as sizes
+from nics_drl_bridge.sim import allocation as sizes
 from nics_drl_bridge.sim.simulator import FastSimulator
 
 STEPS = 500
@@ -50,7 +50,7 @@ def digests(worlds, threads=1, robots=2, steps=STEPS, parts=False):
         else:
             simulator.step(command)
         for n in range(worlds):
-            for array in vars(simulator.data).values():
+            for array in simulator.data:
                 found[n].update(array[n].tobytes())
     assert simulator.data.collided.sum() > 0
     return [digest.hexdigest() for digest in found]

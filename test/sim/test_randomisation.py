@@ -42,7 +42,7 @@ def test_nothing_named_is_exactly_the_model():
     assert drawn.count is None
     assert drawn.size is None
     for array, value in (
-        (drawn.coefficient, term_arrays(model().kinematics)[1]),
+        (drawn.coefficient, term_arrays(model().kinematics).coefficient),
         (drawn.noise, [0.05, 0.03, 0.0, 0.0, 0.0]),
         (drawn.faults, model().lidar.fault_parameters),
         (drawn.delay, 7),
@@ -58,7 +58,7 @@ def test_nothing_named_is_exactly_the_model():
 def test_the_shipped_ranges_fit_every_shipped_robot(name, robot):
     sampler = Sampler(load_randomisation(name), builtin_model(robot), 2)
     drawn = sampler.draw(SEEDS)
-    nominal = term_arrays(builtin_model(robot).kinematics)[1]
+    nominal = term_arrays(builtin_model(robot).kinematics).coefficient
     low, high = load_randomisation(name).kinematics.scale
     factor = drawn.coefficient / nominal
     assert factor.min() >= low * (1.0 - 1e-12)
@@ -99,7 +99,7 @@ def test_naming_one_range_does_not_shift_the_draws_of_another():
 
 def test_each_coefficient_is_scaled_evenly_and_on_its_own():
     drawn = Sampler(given(kinematics={"scale": [0.5, 2.0]}), builtin_model("ackermann")).draw(SEEDS)
-    nominal = term_arrays(builtin_model("ackermann").kinematics)[1]
+    nominal = term_arrays(builtin_model("ackermann").kinematics).coefficient
     factor = (drawn.coefficient / nominal)[:, 0]
     for column in factor.T:
         assert_even(column, 0.5, 2.0)

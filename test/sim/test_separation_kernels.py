@@ -7,9 +7,9 @@ from shapely import LineString, MultiLineString, Point
 
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import place
-from nics_drl_bridge.sim import obstacles as at
-from nics_drl_bridge.sim.obstacles import NO_DISTANCES, PLAN, distance_arrays
-from nics_drl_bridge.sim.separation_kernels import clearance, map_distance, on_wall, restrain
+from nics_drl_bridge.sim import separation_kernels as at
+from nics_drl_bridge.sim.obstacles import NO_DISTANCES, distance_arrays
+from nics_drl_bridge.sim.separation_kernels import PLAN, clearance, map_distance, on_wall, restrain
 
 HALF = np.array([1.5, 1.0])
 WALLS = np.concatenate([sides(HALF), [(-1.5, 0.2, -0.4, 0.3), (0.5, -1.0, 0.5, -0.2)]])

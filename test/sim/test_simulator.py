@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from robots import FOOTPRINT, RADIUS, circles, direct_model, field, lidar
@@ -11,7 +9,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.lidar.faults import scan_skewed, slice_poses
 from nics_drl_bridge.lidar.scanner import Scanner
-from nics_drl_bridge.sim.simulator import SLICES, FastSimulator, Worlds
+from nics_drl_bridge.sim.simulator import SLICES, FastSimulator, State
 from nics_drl_bridge.sim.world import load_world
 
 ORIGIN = np.zeros((1, 1, 3))
@@ -30,7 +28,7 @@ def drive(simulator, seeds, commands, starts=None):
     history = []
     for command in commands:
         simulator.step(command)
-        history.append({name: array.copy() for name, array in vars(simulator.data).items()})
+        history.append({name: array.copy() for name, array in simulator.data._asdict().items()})
     return history
 
 
@@ -46,7 +44,7 @@ def assert_same(one, other, names, rows=slice(None), other_rows=slice(None)):
             assert np.array_equal(a[name][rows], b[name][other_rows]), name
 
 
-ALL = tuple(entry.name for entry in dataclasses.fields(Worlds))
+ALL = State._fields
 
 
 @pytest.mark.parametrize("renderer", ["baked", "exact"])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from nics_drl_bridge.commands.console import needs_ros, one_sentence, roles_of, table
+from nics_drl_bridge.commands.console import intact, needs_ros, one_sentence, roles_of, table
 
 if TYPE_CHECKING:
     from nics_drl_bridge.extras.bags.info import BagInfo, BagTopic
@@ -50,8 +50,8 @@ def record(
         order = BagOrder(
             out, tuple(topics or ()), everything, namespace, duration, kind, use_sim_time
         )
-        recorded = record_bag(order, lambda line: typer.echo(line, err=True))
-        for topic, count in sorted(recorded.counts.items()):
+        counts = record_bag(order, lambda line: typer.echo(line, err=True))
+        for topic, count in sorted(counts.items()):
             typer.echo(f"{topic}: {count} messages")
         typer.echo(f"bag written to {out}")
 
@@ -65,12 +65,9 @@ def info(
     """Tells what is in a bag: topics, rates, gaps, and whose clock stamped them."""
     with one_sentence():
         from nics_drl_bridge.extras.bags.info import bag_info
-        from nics_drl_bridge.extras.bags.salvage import salvaged
 
-        with salvaged(path, salvage) as (whole, lines):
+        with intact(path, salvage) as whole:
             told = bag_info(whole)
-        for line in lines:
-            typer.echo(line, err=True)
         if as_json:
             typer.echo(json.dumps(asdict(told) | {"path": str(path)}))
         else:
@@ -110,20 +107,15 @@ def replay(
     salvage: SalvageOption = False,
 ) -> None:
     """Plays a bag over ROS 2, or gives the estimate that the middleware makes of it."""
-    with one_sentence():
-        from nics_drl_bridge.extras.bags.salvage import salvaged
-
-        with salvaged(path, salvage) as (whole, lines):
-            for line in lines:
-                typer.echo(line, err=True)
-            if estimate:
-                _estimate(whole, model, topic or [], out)
-                return
-            with needs_ros("nics bag replay"):
-                from nics_drl_bridge.extras.bags.play import PlayOrder, play_bag
-            order = PlayOrder(whole, tuple(topics or ()), rate, loop, clock, namespace, lockstep)
-            sent = play_bag(order, lambda line: typer.echo(line, err=True))
-            typer.echo(f"{sent} messages were published")
+    with one_sentence(), intact(path, salvage) as whole:
+        if estimate:
+            _estimate(whole, model, topic or [], out)
+            return
+        with needs_ros("nics bag replay"):
+            from nics_drl_bridge.extras.bags.play import PlayOrder, play_bag
+        order = PlayOrder(whole, tuple(topics or ()), rate, loop, clock, namespace, lockstep)
+        sent = play_bag(order, lambda line: typer.echo(line, err=True))
+        typer.echo(f"{sent} messages were published")
 
 
 @bag.command()
@@ -134,9 +126,12 @@ def salvage(
 ) -> None:
     """Writes what is intact of a damaged bag as a new one, and says how much is lost."""
     with one_sentence():
-        from nics_drl_bridge.extras.bags import salvage as bag_salvage
+        from nics_drl_bridge.recording.messages import check_libraries
 
-        kept = bag_salvage.salvage(path, out, _storage(storage))
+        check_libraries(path, "reading")
+        from nics_drl_bridge.extras.bags.salvage import salvage as salvage_bag
+
+        kept = salvage_bag(path, out, _storage(storage))
         for line in kept.lines():
             typer.echo(line)
         typer.echo(f"bag written to {out}")

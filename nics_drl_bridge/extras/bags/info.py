@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.interface import S_PER_NS
-from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
+from nics_drl_bridge.recording.bag_file import BagFile, opened
 from nics_drl_bridge.recording.messages import stamp
 from nics_drl_bridge.recording.stamping import MAX_WANDER_S, SAME_CLOCK_S
 
@@ -102,15 +102,10 @@ def _received(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]
         return np.array([ns for ns, _ in bag.serialized(topic)], dtype=np.int64), UNKNOWN
     messages = bag.messages(topic)
     receive = np.array([m.receive_ns for m in messages], dtype=np.int64)
-    stamps = _stamps(messages)
-    return receive, stamps if isinstance(stamps, str) else receive - stamps
-
-
-def _stamps(messages: list[Message]) -> Nanoseconds | str:
     if not messages or not hasattr(messages[0].content, "header"):
-        return NO_HEADER
+        return receive, NO_HEADER
     stamps = np.array([stamp(m.content) for m in messages], dtype=np.int64)
-    return stamps if stamps.any() else UNSTAMPED
+    return receive, receive - stamps if stamps.any() else UNSTAMPED
 
 
 def _topic(topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str) -> BagTopic:
@@ -120,7 +115,8 @@ def _topic(topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str)
         low, middle, high = np.percentile(delays * S_PER_NS, (5.0, 50.0, 95.0))
         delay, jitter = float(middle), float(high - low)
         backwards = int((np.diff(since - delays) < 0).sum())
-        clock = clock_of(delay, jitter)
+        near = SAME_CLOCK_S[0] <= delay <= SAME_CLOCK_S[1]
+        clock = SEVERAL if jitter > MAX_WANDER_S else RECORDER if near else FOREIGN
     if not len(since):
         return BagTopic(topic, kind, 0, clock=clock)
     apart = np.diff(since) * S_PER_NS
@@ -133,10 +129,3 @@ def _topic(topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str)
         longest_gap_s=float(apart.max()) if len(apart) else None,
         clock=clock, delay_s=delay, jitter_s=jitter, backwards=backwards,
     )  # fmt: skip
-
-
-def clock_of(delay_s: float, jitter_s: float) -> str:
-    """Returns the clock of stamps with the given median delay to receipt and its jitter [s]."""
-    if jitter_s > MAX_WANDER_S:
-        return SEVERAL
-    return RECORDER if SAME_CLOCK_S[0] <= delay_s <= SAME_CLOCK_S[1] else FOREIGN

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import heapq
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,12 +14,12 @@ from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
 from nics_drl_bridge.errors import BackendError, RecordingError, nearest
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.message_types import message_type
+from nics_drl_bridge.nodes.qos import profile_of
 from nics_drl_bridge.nodes.runner import DELIVERY_S, open_context
 from nics_drl_bridge.recording.bag_file import BagFile, opened
 from nics_drl_bridge.recording.messages import Offer
@@ -89,7 +88,12 @@ class _Player:
         space = self._order.namespace.strip("/")
         shared = topic in (CLOCK, "/tf", "/tf_static")
         name = topic if shared or not space else f"/{space}{topic}"
-        self._publishers[topic] = self._node.create_publisher(found, name, _quality(offers))
+        best = Offer(  # matches any subscriber of one of the publishers
+            max((offer.depth for offer in offers), default=QUEUE),
+            not offers or any(offer.reliable for offer in offers),
+            any(offer.transient_local for offer in offers),
+        )
+        self._publishers[topic] = self._node.create_publisher(found, name, profile_of(best))
         return True
 
     def ready(self) -> None:
@@ -195,7 +199,7 @@ def play_bag(order: PlayOrder, say: Callable[[str], None]) -> int:
         played = {t: m for t, m in messages.items() if player.offer(t, kinds[t], offers[t])}
         for topic in sorted(kinds.keys() - played.keys()):
             say(f"left out: {topic} is of {kinds[topic]}, whose package is not installed.")
-        timed = list(_in_order(played))
+        timed = _in_order(played)
         if not timed:
             raise RecordingError(f"{order.bag}: holds nothing that can be played here.")
         player.ready()
@@ -221,22 +225,8 @@ def _wanted(bag: BagFile, order: PlayOrder) -> list[str]:
     ]
 
 
-def _in_order(messages: Mapping[str, list[tuple[int, bytes]]]) -> Iterator[Timed]:
+def _in_order(messages: Mapping[str, list[tuple[int, bytes]]]) -> list[Timed]:
     """Returns all messages in the order of receipt, at equal times in that of their topics."""
-    each = [
-        [(ns, place, topic, data) for ns, data in sorted(some, key=lambda one: one[0])]
-        for place, (topic, some) in enumerate(sorted(messages.items()))
-    ]
-    return heapq.merge(*each, key=lambda one: one[:2])
-
-
-def _quality(offers: tuple[Offer, ...]) -> QoSProfile:
-    """Returns the best that the publishers offered, to match any subscriber of one of them."""
-    reliable = not offers or any(offer.reliable for offer in offers)
-    kept = any(offer.transient_local for offer in offers)
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=max((offer.depth for offer in offers), default=QUEUE),
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
-    )
+    ranked = enumerate(sorted(messages.items()))
+    timed = [(ns, rank, topic, data) for rank, (topic, some) in ranked for ns, data in some]
+    return sorted(timed, key=lambda one: one[:2])

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes.message_types import message_texts, message_type
-from nics_drl_bridge.nodes.qos import QosWatch, offer_of
+from nics_drl_bridge.nodes.qos import QosWatch, offer_of, profile_of
 from nics_drl_bridge.nodes.runner import run_node
+from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.recording.write import BagSink, Storage, bag_sink
 
 ROBOT = (
@@ -64,28 +64,6 @@ class BagOrder:
         return topic in {name if name.startswith("/") else f"{space}/{name}" for name in names}
 
 
-@dataclass
-class _Heard:
-    """A topic with a subscription."""
-
-    subscription: Subscription[Any]
-    profile: tuple[bool, bool]
-    kind: str
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """Result of a recording.
-
-    Attributes:
-        counts: number of messages of each topic.
-        skipped: a sentence for each topic that could not be.
-    """
-
-    counts: dict[str, int]
-    skipped: list[str] = field(default_factory=list)
-
-
 class BagRecorder(QosWatch):
     """Writes the messages of all wanted topics into a bag, serialised as received.
 
@@ -108,7 +86,7 @@ class BagRecorder(QosWatch):
             start_parameter_services=False,
         )  # fmt: skip
         self._order, self._sink, self._say = order, sink, say
-        self._heard: dict[str, _Heard] = {}
+        self._heard: dict[str, tuple[Offer, Subscription[Any]]] = {}
         self.skipped: dict[str, str] = {}
         self._began = self._flushed = time.monotonic()
         self.create_timer(LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -132,9 +110,11 @@ class BagRecorder(QosWatch):
         if not publishers or topic in self.skipped:
             return
         offers = [offer_of(info.qos_profile) for info in publishers]
-        profile = all(o.reliable for o in offers), all(o.transient_local for o in offers)
+        wanted = Offer(
+            QUEUE, all(o.reliable for o in offers), all(o.transient_local for o in offers)
+        )
         known = self._heard.get(topic)
-        if known is not None and (known.profile == profile or known.profile == (False, False)):
+        if known is not None and known[0] in (wanted, Offer(QUEUE, False)):
             return
         kind = message_type(kinds[0])
         if len(kinds) > 1 or kind is None:
@@ -144,11 +124,11 @@ class BagRecorder(QosWatch):
             self._sink.add_topic(topic, kinds[0], offers, message_texts(kinds[0]))
             self._say(f"{topic} ({kinds[0]})")
         else:
-            self.destroy_subscription(known.subscription)
+            self.destroy_subscription(known[1])
         subscription = self.create_subscription(
-            kind, topic, self._taker(topic), _quality(*profile), raw=True
+            kind, topic, self._taker(topic), profile_of(wanted), raw=True
         )
-        self._heard[topic] = _Heard(subscription, profile, kinds[0])
+        self._heard[topic] = wanted, subscription
 
     def _skip(self, topic: str, kinds: Sequence[str]) -> None:
         if len(kinds) > 1:
@@ -172,23 +152,15 @@ class BagRecorder(QosWatch):
         return int(info.get("received_timestamp") or time.time_ns())
 
 
-def _quality(reliable: bool, transient_local: bool) -> QoSProfile:
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=QUEUE,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL
-        if transient_local
-        else DurabilityPolicy.VOLATILE,
-    )
-
-
-def record_bag(order: BagOrder, say: Callable[[str], None]) -> Recorded:
+def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
     """Records until the duration is over, SIGINT or SIGTERM.
 
     Args:
         order: what to record.
         say: called with a sentence when a topic begins or can't be recorded.
+
+    Returns:
+        The number of messages of each topic.
 
     Raises:
         BackendError: nothing was received.
@@ -202,11 +174,11 @@ def record_bag(order: BagOrder, say: Callable[[str], None]) -> Recorded:
             return nodes[-1]
 
         run_node(make, ["nics"])
-        skipped = list(nodes[-1].skipped.values()) if nodes else []
+        skipped = nodes[-1].skipped.values() if nodes else ()
         if not sum(sink.counts.values()):
             raise BackendError(
                 "nothing was heard on any of the topics, so no bag is written; start the robot, "
                 "or correct --topics, --namespace or ROS_DOMAIN_ID."
                 + (f" Not recorded: {' '.join(skipped)}" if skipped else "")
             )
-    return Recorded(sink.counts, skipped)
+    return sink.counts

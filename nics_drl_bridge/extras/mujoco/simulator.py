@@ -18,7 +18,7 @@ from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.sim.driven import Driven, DrivenSimulator
 from nics_drl_bridge.sim.scenes import Scenes
-from nics_drl_bridge.sim.state import Worlds
+from nics_drl_bridge.sim.state import State
 from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
@@ -73,8 +73,8 @@ class MujocoSimulator:
         self.reset([0])
 
     @property
-    def data(self) -> Worlds:
-        """All state; `pose`, `twist` and others are (1, M, ...), see `Worlds`."""
+    def data(self) -> State:
+        """All state; `pose`, `twist` and others are (1, M, ...), see `State`."""
         return self._driven.fast.data
 
     @property

@@ -10,9 +10,10 @@ pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 
 import bags
 
+from nics_drl_bridge.commands.console import intact
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.extras.bags.info import bag_info
-from nics_drl_bridge.extras.bags.salvage import salvage, salvaged
+from nics_drl_bridge.extras.bags.salvage import salvage
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.bag_file import opened
 from nics_drl_bridge.recording.messages import Offer
@@ -149,11 +150,11 @@ def test_a_bag_of_nothing_intact_is_refused(tmp_path):
 
 
 def test_nothing_is_salvaged_unless_asked_for(sealed):
-    with salvaged(sealed, wanted=False) as (path, lines):
-        assert (path, lines) == (sealed, ())
-    with salvaged(sealed, wanted=True) as (path, lines):
+    with intact(sealed, salvage=False) as path:
+        assert path == sealed
+    with intact(sealed, salvage=True) as path:
+        assert path != sealed
         assert held(path) == held(sealed)
-        assert lines
 
 
 def test_info_tells_rates_gaps_and_clocks(tmp_path):

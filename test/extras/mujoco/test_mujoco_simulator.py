@@ -152,7 +152,7 @@ def test_the_same_seed_and_commands_give_the_same_bits():
     for simulator in (one, other):
         simulator.reset([9])
         drive(simulator, forward(model, 0.5), 10)
-    for name, array in vars(one.data).items():
+    for name, array in one.data._asdict().items():
         assert np.array_equal(array, getattr(other.data, name)), name
 
 

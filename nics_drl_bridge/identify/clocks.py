@@ -1,10 +1,8 @@
-"""Delays and lags: the shift in time that makes a signal a function of the commands.
+"""Clocks: offset, latency and lags of a drive, from any stream that follows the commands.
 
-Every estimate is a separable least squares: for a given delay (and lags) the best linear
-combination of the paper's features (Eq. 1) has a closed form, so the search is over the delay
-and the lags only.
-
-Clocks: offset, latency and lags of a recording, from any stream that follows the commands.
+Each is the shift in time that makes a signal a function of the commands, by a separable least
+squares: for a given delay (and lags) the best linear combination of the paper's features (Eq. 1)
+has a closed form, so the search is over the delay and the lags only.
 """
 
 from __future__ import annotations
@@ -15,9 +13,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.identify.least_squares import minimise, uncertainty, unexplained
-from nics_drl_bridge.identify.noise import TwistIntervals
-from nics_drl_bridge.identify.signals import held, held_features, interval_means, lagged
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.identify.drive import MIN_STAMPS, Drive, TwistIntervals
+from nics_drl_bridge.identify.signals import (
+    followed,
+    held,
+    held_features,
+    inferred_states,
+    interval_means,
+    moved_commands,
+    nominal_lags,
+    speed_index,
+)
+from nics_drl_bridge.identify.statistics import minimise, uncertainty, unexplained
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -28,13 +36,11 @@ STEP_S = 0.01
 LEAD_S = 2.0  # for the states to forget their initial values
 STEPS_S = (0.05, 0.005, 0.0005)
 SEARCH_S = 5.0
-DEFAULT_LAG_S = 0.1
 LAG_RANGE_S = (0.005, 2.0)
 MAX_ROWS = 2000
 EXACT = 1e-6
 LONG_STEP = 1.5
 """A step longer than this many usual steps is a gap."""
-REGULAR = 0.8
 
 
 @dataclass(frozen=True)
@@ -54,36 +60,6 @@ class DelayEstimate:
     lags: Array
     lag_sigma: Array
     explained: float
-
-
-def followed(spec: RobotSpec) -> NDArray[np.intp]:
-    """Returns the index (S,) of the command that each state variable follows."""
-    names = [c.name for c in spec.command]
-    return np.array([names.index(str(v.follows)) for v in spec.state], dtype=np.intp)
-
-
-def moved_commands(command: Stream) -> NDArray[np.bool_]:
-    """Returns a mask (C,) of the commands that ever changed."""
-    return np.asarray(np.ptp(command.values, axis=0) > 0.0)
-
-
-def nominal_lags(spec: RobotSpec) -> Array:
-    """Returns the spec's time constants (S,), `NAME_lag`, else a typical one [s]."""
-    return np.array([spec.parameters.get(f"{v.name}_lag", DEFAULT_LAG_S) for v in spec.state])
-
-
-def inferred_states(
-    command: Stream, spec: RobotSpec, lags: Array, latency: float, grid: Array
-) -> Array:
-    """Infers states (T, S) at uniform times (T,) on the commands' clock, with gain one.
-
-    Each state follows its command; if the command never changes, the state keeps its value.
-    """
-    dt = float(grid[1] - grid[0])
-    target = held(command, spec, grid - latency, grid + dt - latency)[:, followed(spec)]
-    long_ago = np.array([command.t[0] - 2.0])
-    initial = held(command, spec, long_ago, long_ago + 1.0)[0, followed(spec)]
-    return lagged(target, lags, dt, initial)
 
 
 def delay_of_response(
@@ -139,29 +115,6 @@ def response_residual(
     return residual
 
 
-def fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
-    """Returns a mask of the times (n,) at which the command is known; rows may be missing.
-
-    If commands are recorded irregularly, each is assumed to be held until the next.
-    """
-    span = np.diff(command.t)
-    usual = float(np.median(span)) if len(span) else 0.0
-    if not (span < LONG_STEP * usual).mean() > REGULAR:
-        return np.ones(len(start), dtype=np.bool_)
-    row = np.searchsorted(command.t, start + 1e-9, "right") - 1
-    return np.asarray(np.append(span, 0.0)[np.clip(row, 0, None)] < LONG_STEP * usual)
-
-
-def latency_of_state(command: Stream, state: Stream, spec: RobotSpec) -> DelayEstimate | None:
-    """Estimates the delay with which a measured state starts to follow the commands.
-
-    None if no command changed; exactly zero if zero explains the state to rounding.
-    """
-    if not moved_commands(command).any():
-        return None
-    return _search_or_zero(state_residual(command, state, spec))
-
-
 def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Callable[[Array], Array]:
     """Returns the residual of a measured state's rates, given a delay (1,) of the commands [s]."""
     span = np.diff(state.t)
@@ -177,13 +130,6 @@ def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Callable[
         return unexplained(np.concatenate([np.ones((len(u), 1)), middle, u], axis=1), rates)
 
     return residual
-
-
-def delay_of_pose(
-    state: Stream, target: tuple[Array, Array, Array], centers: tuple[float, ...]
-) -> DelayEstimate:
-    """Estimates the delay of the pose's clock behind that of a measured state."""
-    return _search_or_zero(residual_by_shift(state, target), centers)
 
 
 def residual_by_shift(
@@ -203,6 +149,7 @@ def residual_by_shift(
 def _search_or_zero(
     residual: Callable[[Array], Array], centers: tuple[float, ...] = (0.0,)
 ) -> DelayEstimate:
+    """Estimates a delay; exactly zero if zero explains the signal to rounding."""
     nothing = np.zeros(0)
     if np.sqrt((residual(np.zeros(1)) ** 2).mean()) < EXACT:
         return DelayEstimate(0.0, 0.0, nothing, nothing, 1.0)
@@ -262,23 +209,54 @@ class TimingEstimate:
     separated: bool
 
 
-def timing_of(recording: Recording, spec: RobotSpec, twists: TwistIntervals) -> TimingEstimate:
-    """Estimates clock offset, latency and lags as far as the recording allows."""
+def timing_of(drive: Drive) -> TimingEstimate:
+    """Estimates clock offset, latency and lags as far as the recording allows.
+
+    Raises:
+        RecordingError: the state can't be known, or there are too few poses.
+    """
+    recording, spec = drive.recording, drive.spec
+    _require_state(recording, spec)
+    twists = drive.twists
+    if len(twists.start) < MIN_STAMPS:
+        raise RecordingError(
+            f"{recording.source}: pose: only {len(twists.start)} usable intervals; record a drive "
+            "of 20 s or more without long gaps."
+        )
     if recording.state is not None:
-        return _timing_of_measured_state(recording, recording.state, spec, twists)
+        return _timing_of_measured_state(drive, recording.state)
     if not moved_commands(recording.command).any():
-        nothing = np.full(len(spec.state), np.nan)
         start = recording.command.t[0] - recording.pose.t[0]
-        offset = float(start) if abs(start) > 60.0 else 0.0
-        return TimingEstimate(offset, 0.0, {}, nominal_lags(spec), nothing, False)
+        return nominal_timing(drive, float(start) if abs(start) > 60.0 else 0.0)
     target = (twists.start, twists.end, twists.twist)
-    centers = _likely_shifts(recording)
     if recording.pose.clock == recording.command.clock:
         delay = delay_of_response(recording.command, spec, target)
         latency = if_certain(max(delay.value, 0.0), delay.sigma, MIN_TIME_S)
         sigma = {"command_latency_s": delay.sigma}
         return TimingEstimate(0.0, latency, sigma, delay.lags, delay.lag_sigma, True)
-    wheels = _wheel_delay(recording, spec)
+    return _timing_of_two_clocks(recording, spec, target)
+
+
+def nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:
+    """Returns a timing with nominal lags and no latency, of which nothing was estimated."""
+    lags = nominal_lags(drive.spec) if drive.recording.state is None else np.zeros(0)
+    return TimingEstimate(offset, 0.0, {}, lags, np.full(len(lags), np.nan), False)
+
+
+def _require_state(recording: Recording, spec: RobotSpec) -> None:
+    missing = [v.name for v in spec.state if v.follows is None]
+    if recording.state is None and missing:
+        raise RecordingError(
+            f"{recording.source}: has no measured state, and {missing[0]!r} of robot {spec.name!r} "
+            "follows no command; record the state too, or add `follows:` to the robot's YAML file."
+        )
+
+
+def _timing_of_two_clocks(
+    recording: Recording, spec: RobotSpec, target: tuple[Array, Array, Array]
+) -> TimingEstimate:
+    """Estimates offset and latency apart if the wheels follow the commands, else their sum."""
+    centers, wheels = _likely_shifts(recording), _wheel_delay(recording, spec)
     delay = delay_of_response(
         recording.command, spec, target, centers, None if wheels is None else wheels.lags
     )
@@ -295,23 +273,21 @@ def timing_of(recording: Recording, spec: RobotSpec, twists: TwistIntervals) -> 
     )
 
 
-def _timing_of_measured_state(
-    recording: Recording, state: Stream, spec: RobotSpec, twists: TwistIntervals
-) -> TimingEstimate:
-    found = latency_of_state(recording.command, state, spec)
-    step = float(np.median(np.diff(state.t)))
-    sigma, latency = {}, 0.0
-    if found is not None:
+def _timing_of_measured_state(drive: Drive, state: Stream) -> TimingEstimate:
+    recording, twists, sigma = drive.recording, drive.twists, {}
+    latency, offset, nothing = 0.0, 0.0, np.zeros(0)
+    separated = bool(moved_commands(recording.command).any())
+    if separated:
+        found = _search_or_zero(state_residual(recording.command, state, drive.spec))
         sigma["command_latency_s"] = found.sigma
-        latency = if_certain(max(found.value, 0.0), found.sigma, 0.05 * step)
-    offset = 0.0
+        least = 0.05 * float(np.median(np.diff(state.t)))
+        latency = if_certain(max(found.value, 0.0), found.sigma, least)
     if recording.pose.clock != state.clock:
-        target = (twists.start, twists.end, twists.twist)
-        delay = delay_of_pose(state, target, _likely_shifts(recording))
+        by_shift = residual_by_shift(state, (twists.start, twists.end, twists.twist))
+        delay = _search_or_zero(by_shift, _likely_shifts(recording))
         sigma["clock_offset_s"] = delay.sigma
         offset = -if_certain(delay.value, delay.sigma, MIN_TIME_S)
-    nothing = np.zeros(0)
-    return TimingEstimate(offset, latency, sigma, nothing, nothing, found is not None)
+    return TimingEstimate(offset, latency, sigma, nothing, nothing, separated)
 
 
 def _likely_shifts(recording: Recording) -> tuple[float, ...]:
@@ -334,3 +310,19 @@ def _wheel_delay(recording: Recording, spec: RobotSpec) -> DelayEstimate | None:
 def if_certain(value: float, sigma: float, least: float) -> float:
     """Returns a correction, or zero if it is too small or too uncertain."""
     return value if abs(value) > max(CERTAIN * sigma, least) else 0.0
+
+
+def expected_states(drive: Drive, twists: TwistIntervals, timing: TimingEstimate) -> Array:
+    """Returns the mean state (n, S) over the intervals of the twists; inferred ones at gain 1."""
+    recording, (start, end) = drive.recording, twists.on_clock(timing.offset)
+    if recording.state is not None:
+        return interval_means(recording.state.t, recording.state.values, start, end)
+    grid = np.arange(min(start[0], recording.command.t[0]) - 1.0, end[-1] + 0.01, 0.01)
+    states = inferred_states(recording.command, drive.spec, timing.lags, timing.latency, grid)
+    return interval_means(grid, states, start, end)
+
+
+def expected_speed(drive: Drive, timing: TimingEstimate) -> Array | None:
+    """Returns the speed (n,) over the intervals of the twists, at gain 1; None if not unique."""
+    speed = speed_index(drive.spec)
+    return None if speed is None else expected_states(drive, drive.twists, timing)[:, speed]

@@ -1,0 +1,272 @@
+"""Drive: a recording of a robot, prepared: whatever several stages derive from it, derived once.
+
+Bursts: poses that a driver hands over together share an arrival time; their sample times are
+estimated. Twists: the motion of the tracked body, over intervals long enough for the pose's noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.identify.fit import ALPHA, ORDER, Alpha
+from nics_drl_bridge.identify.signals import (
+    DIFFERENCE,
+    DIFFERENCE_GAIN,
+    GAUSSIAN_MAD,
+    unwrapped,
+)
+from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.robot.spec import RobotSpec
+
+Array = NDArray[np.float64]
+
+MIN_STAMPS = 20
+BURSTY = 5.0
+"""In bursts the mean interval is more than this many times the 30th percentile."""
+WITHIN_BURST = 0.25
+"""Stamps less than this share of the period apart belong to one burst."""
+UNEVEN = 0.5
+LEAST_WHOLE = 0.1  # share of gap-free stretches from which on only those are used
+NEGLIGIBLE = 1e-6  # m, rad
+REST_SAMPLES = 12
+REST_DRIFT = 3.0  # standard errors; straight motion shows at least 4
+SLOPE_NOISE = 0.05
+MAX_SPAN_S = 0.2
+MAX_GAP_S = 0.25
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Options of an identification.
+
+    Attributes:
+        order: of the Taylor expansion (Eq. 1).
+        alpha: of the pruning (Eq. 2), or `auto`.
+        train_until_s: end of the part to learn from, from the first pose [s].
+        assume: completes the model by the textbook for inputs that never moved.
+        strict: refuses a drive that did not move every input independently, instead of returning
+            a model without those inputs.
+    """
+
+    order: int = ORDER
+    alpha: Alpha = ALPHA
+    train_until_s: float = float("inf")
+    assume: bool = False
+    strict: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A recording of a robot, or a part of one; what is derived from it is computed on first use.
+
+    Attributes:
+        recording: the streams.
+        spec: the robot.
+        settings: of the identification.
+    """
+
+    recording: Recording
+    spec: RobotSpec
+    settings: Settings = field(default_factory=Settings)
+
+    def part(self, recording: Recording) -> Drive:
+        """Returns a drive of the same robot with other streams."""
+        return self if recording is self.recording else replace(self, recording=recording)
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first pose to the last [s]."""
+        return float(self.recording.pose.t[-1] - self.recording.pose.t[0])
+
+    @cached_property
+    def bursts(self) -> Bursts | None:
+        """Bursts of the poses; None if they arrive one by one."""
+        return find_bursts(self.recording.pose.t)
+
+    @cached_property
+    def sample_t(self) -> Array:
+        """Estimated sample times (T,) of the poses, on their clock [s]."""
+        return spread(self.recording.pose.t, self.bursts)
+
+    @cached_property
+    def dated(self) -> Stream:
+        """Poses with the best known time: the newest of each burst, or all."""
+        pose = self.recording.pose
+        rows = newest(pose.t, self.bursts)
+        return replace(pose, t=pose.t[rows], values=pose.values[rows])
+
+    @cached_property
+    def pose_noise(self) -> tuple[float, float] | None:
+        """Standard deviations of position [m] and heading [rad]; None if they do not show."""
+        return pose_noise(self.recording.pose, self.bursts)
+
+    @cached_property
+    def twists(self) -> TwistIntervals:
+        """Twists of the tracked body over intervals as long as the pose noise requires."""
+        return twists_of(self.dated, self.bursts, self.pose_noise or (0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Bursts:
+    """Bursts of arrivals.
+
+    Attributes:
+        period_s: usual time between two bursts [s].
+        size: usual number of samples per burst.
+        of: (T,) index of the burst of each sample.
+        newest: (K,) index of the last sample of each burst, the freshest on arrival.
+    """
+
+    period_s: float
+    size: float
+    of: NDArray[np.intp]
+    newest: NDArray[np.intp]
+
+
+def find_bursts(t: Array) -> Bursts | None:
+    """Finds bursts in stamps (T,) [s]; None if the samples arrive one by one."""
+    if len(t) < MIN_STAMPS:
+        return None
+    gaps = np.diff(t)
+    if gaps.mean() <= BURSTY * np.percentile(gaps, 30):
+        return None
+    period = float(np.median(gaps[gaps > gaps.mean()]))
+    starts = np.concatenate([[True], gaps > WITHIN_BURST * period])
+    of = np.cumsum(starts) - 1
+    newest = np.append(np.flatnonzero(starts)[1:] - 1, len(t) - 1)
+    return Bursts(period, float(np.median(np.bincount(of))), of, newest)
+
+
+def spread(t: Array, bursts: Bursts | None) -> Array:
+    """Estimates sample times (T,) from arrival stamps (T,) [s].
+
+    The samples of a burst were taken one after the other since the previous burst, the newest
+    just before its arrival. After a gap they are assumed to fill one period, or more if the
+    burst is larger than usual.
+    """
+    if bursts is None:
+        return t
+    count = np.bincount(bursts.of)
+    arrival = t[np.concatenate([[0], bursts.newest[:-1] + 1])]
+    since = np.diff(arrival, prepend=arrival[0] - bursts.period_s)
+    span = np.minimum(since, bursts.period_s * np.maximum(1.0, count / bursts.size))
+    behind = bursts.newest[bursts.of] - np.arange(len(t))
+    return np.asarray(arrival[bursts.of] - span[bursts.of] * behind / count[bursts.of])
+
+
+def newest(t: Array, bursts: Bursts | None) -> NDArray[np.intp]:
+    """Returns indices of the samples with the best known time: the newest per burst, or all."""
+    return np.arange(len(t)) if bursts is None else bursts.newest
+
+
+def pose_noise(pose: Stream, bursts: Bursts | None) -> tuple[float, float] | None:
+    """Returns standard deviations of position [m] and heading [rad] of poses.
+
+    They come from sixth differences, in which smooth motion vanishes, over gap-free stretches. In
+    bursts, whose sample times are not known well enough, they come from the stretches in which
+    the robot stood still. None if there are none.
+    """
+    if bursts is None:
+        rest = _high_differences(pose)
+        if len(rest) < DIFFERENCE:
+            return None
+        sigma = np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD
+    else:
+        found = _spread_at_rest(unwrapped(pose.values))
+        if found is None:
+            return None
+        sigma = found
+    sigma = np.where(sigma < NEGLIGIBLE, 0.0, sigma)
+    return float(np.hypot(sigma[0], sigma[1]) / np.sqrt(2.0)), float(sigma[2])
+
+
+def pose_residual(drive: Drive) -> Array | None:
+    """Returns the noise (n, 3) of poses at its own scale; None for bursts or too few poses."""
+    pose = drive.recording.pose
+    if drive.bursts is not None or len(pose.t) <= 2 * DIFFERENCE:
+        return None
+    return _high_differences(pose)
+
+
+def _high_differences(pose: Stream) -> Array:
+    """Returns sixth differences (n, 3) at the scale of the noise, over gap-free stretches."""
+    rest = np.diff(unwrapped(pose.values), DIFFERENCE, axis=0) / DIFFERENCE_GAIN
+    if not len(rest):
+        return np.asarray(rest)
+    span = np.diff(pose.t)
+    even = np.abs(span - np.median(span)) < UNEVEN * np.median(span)
+    whole = np.convolve(even, np.ones(DIFFERENCE), "valid") > DIFFERENCE - 0.5
+    return np.asarray(rest[whole] if whole.mean() > LEAST_WHOLE else rest)
+
+
+def _spread_at_rest(pose: Array) -> Array | None:
+    """Returns the spread (3,) in stretches whose two halves do not differ; None if too few."""
+    count = len(pose) // REST_SAMPLES
+    blocks = pose[: count * REST_SAMPLES].reshape(count, REST_SAMPLES, 3)
+    spread = blocks.std(axis=1, ddof=1)
+    half = REST_SAMPLES // 2
+    drift = np.abs(blocks[:, :half].mean(axis=1) - blocks[:, half:].mean(axis=1))
+    still = (drift < REST_DRIFT * spread / np.sqrt(half)).all(axis=1)
+    still &= (spread < 10.0 * np.maximum(spread.min(axis=0), NEGLIGIBLE)).all(axis=1)
+    if still.sum() < 2:
+        return None
+    return np.asarray(np.sqrt((spread[still] ** 2).mean(axis=0)))
+
+
+@dataclass(frozen=True)
+class TwistIntervals:
+    """Twists of the tracked body over intervals.
+
+    Attributes:
+        start, end: (n,) of the intervals, on the pose's clock [s].
+        twist: (n, 3) constant twist whose arc joins the poses at both ends, in the frame of the
+            tracked body.
+    """
+
+    start: Array
+    end: Array
+    twist: Array
+
+    def on_clock(self, offset: float) -> tuple[Array, Array]:
+        """Returns start (n,) and end (n,) on a clock that is ahead of the pose's by an offset."""
+        return self.start + offset, self.end + offset
+
+
+def twists_of(dated: Stream, bursts: Bursts | None, noise: tuple[float, float]) -> TwistIntervals:
+    """Returns twists of the tracked body over intervals long enough for the noise.
+
+    Args:
+        dated: (T, 3) poses, of each burst only the newest.
+        bursts: of the stream.
+        noise: of position [m] and heading [rad].
+    """
+    t, pose = dated.t, dated.values
+    stride = 1 if bursts is not None else _stride(t, pose, noise)
+    limit = 1.8 * bursts.period_s if bursts is not None else MAX_GAP_S
+    t, pose = t[::stride], pose[::stride]
+    span = np.diff(t)
+    usable = (span > 0.0) & (span < max(limit, 3.0 * float(np.median(span))))
+    relative = geometry.between(pose[:-1], pose[1:])[usable]
+    return TwistIntervals(
+        t[:-1][usable], t[1:][usable], geometry.log(relative) / span[usable, None]
+    )
+
+
+def _stride(t: Array, pose: Array, noise: tuple[float, float]) -> int:
+    """Returns the number of samples between poses that makes motion stand out of the noise."""
+    dt = float(np.median(np.diff(t)))
+    coarse = max(1, round(MAX_SPAN_S / dt))
+    far = geometry.log(geometry.between(pose[:-coarse:coarse], pose[coarse::coarse])) / (
+        coarse * dt
+    )
+    speed = float(np.sqrt((far[:, :2] ** 2).sum(axis=1).mean())) if len(far) else 0.0
+    turn = float(np.sqrt((far[:, 2] ** 2).mean())) if len(far) else 0.0
+    needed = max(
+        noise[0] / max(SLOPE_NOISE * speed, 1e-9), noise[1] / max(SLOPE_NOISE * turn, 1e-9)
+    )
+    return int(np.clip(np.ceil(np.sqrt(2.0) * needed / dt), 1, coarse))

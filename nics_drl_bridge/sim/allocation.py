@@ -1,0 +1,186 @@
+"""Allocation of worlds, as the kernels take them: state, surroundings, and scratch memory."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
+from nics_drl_bridge.lidar.scanner import Scanner
+from nics_drl_bridge.lidar.shapes import BODY
+from nics_drl_bridge.robot.kernels import SERIES, scratch, term_arrays
+from nics_drl_bridge.sim.contact_kernels import SEVERAL
+from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT
+from nics_drl_bridge.sim.sensing_kernels import PAST
+from nics_drl_bridge.sim.separation_kernels import MARK
+from nics_drl_bridge.sim.state import (
+    Cells,
+    Dynamics,
+    Lanes,
+    LidarView,
+    MapField,
+    Movers,
+    Nearby,
+    OutlineArrays,
+    Part,
+    Scans,
+    Scratch,
+    Single,
+    State,
+    Surroundings,
+)
+
+Array = NDArray[np.float64]
+SLICES = 16
+"""Number of groups of beams in which a skewed scan is rendered."""
+LANES = 256
+"""Number of robots moved side by side: their arrays stay in the L1 cache."""
+CROWD = 4096
+"""Least number of pairs of a robot and a body for sorting the bodies of a world into cells."""
+FEWEST_OF_A_CROWD = 8
+"""Least number of robots: for fewer, sorting takes longer than testing all bodies."""
+SCATTERED = 64
+"""Least number of bodies in cells for scanning each robot only among those around it; for fewer,
+testing all of them takes less time than a separate scan for each robot."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Dimensions of a simulation.
+
+    Attributes:
+        worlds: N.
+        robots: M in each.
+        obstacles: K in each.
+        longest_delay: greatest latency of commands [substeps].
+        longest_age: greatest age of an observation [substeps].
+    """
+
+    worlds: int
+    robots: int
+    obstacles: int
+    longest_delay: int
+    longest_age: int
+
+    @property
+    def crowded(self) -> bool:
+        """True if it pays to sort the bodies of a world into cells."""
+        pairs = self.robots * (self.robots + self.obstacles)
+        return self.robots >= FEWEST_OF_A_CROWD and pairs >= CROWD
+
+    @property
+    def scattered(self) -> bool:
+        """True if it pays to scan each robot among the bodies around it only."""
+        return self.crowded and self.robots + self.obstacles >= SCATTERED
+
+
+def allocate(model: SimulatorModel, sizes: Sizes) -> State:
+    """Allocates the arrays of worlds before their first reset, with the model's parameters."""
+    size, width = len(model.robot.state), len(model.robot.command)
+    _, substeps, delay = model.timing
+    shape, bodies = (sizes.worlds, sizes.robots), sizes.obstacles + sizes.robots
+    noise = [*model.noise.odometry, *model.noise.simulated_drift(model.robot)]
+    # One row for the newest; an age within a period needs the end of the period before it, too.
+    rows = -(-sizes.longest_age // substeps) + 1
+    return State(
+        pose=np.zeros((*shape, 3)),
+        state=np.zeros((*shape, size)),
+        history=np.zeros((*shape, -(-sizes.longest_delay // substeps) + 1, width)),
+        bodies=np.zeros((sizes.worlds, bodies, BODY)),
+        odom=np.zeros((*shape, 3)),
+        twist=np.zeros((*shape, 3)),
+        ranges=np.full((*shape, model.lidar.beams), np.inf, np.float32),
+        collided=np.zeros(shape, np.uint8),
+        steps=np.zeros(sizes.worlds, np.int64),
+        seeds=np.zeros(sizes.worlds, np.int64),
+        faults=np.tile(model.lidar.fault_parameters, (*shape, 1)),
+        coefficient=np.tile(term_arrays(model.kinematics).coefficient, (*shape, 1)),
+        delay=np.full(shape, delay, np.int64),
+        age=np.zeros(shape, np.int64),
+        noise=np.tile(noise, (*shape, 1)),
+        velocity=np.zeros((sizes.worlds, sizes.obstacles, 3)),
+        past=np.zeros((*shape, rows, PAST)),
+        marks=np.zeros((sizes.worlds, sizes.obstacles, MARK)),
+    )
+
+
+def split(worlds: int, threads: int) -> tuple[slice, ...]:
+    """Splits N worlds into contiguous parts of nearly equal size, one per thread."""
+    edges = np.arange(min(threads, worlds) + 1) * worlds // min(threads, worlds)
+    return tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(edges))
+
+
+def part_of(
+    state: State,
+    model: SimulatorModel,
+    scanner: Scanner,
+    walls: Array,
+    movers: Movers,
+    sizes: Sizes,
+    part: slice,
+) -> Part:
+    """Returns the arguments of the kernels for one part of the worlds, with scratch of its own."""
+    lidar, grid = model.lidar, scanner.grid
+    dt, substeps, _ = model.timing
+    outlines = OutlineArrays(*scanner.table.outlines.arguments)
+    scene = Surroundings(walls, _grid(grid), outlines, sizes.crowded, sizes.scattered, movers)
+    view = LidarView(
+        scanner.arguments,
+        NO_MAP if grid is None else grid.arrays,
+        scanner.renderer == "exact",
+        np.array(lidar.mount, dtype=np.float64),
+        np.array([lidar.range_min, lidar.range_max], dtype=np.float64),
+        float(lidar.sweep_time),
+    )
+    motion = Dynamics(term_arrays(model.kinematics), SERIES, float(dt), int(substeps))
+    return Part(state, scene, view, motion, _scratch(model, scanner, sizes, part.stop - part.start))
+
+
+def _grid(grid: GridMap | None) -> MapField:
+    if grid is None:
+        return MapField(np.zeros((0, 0), np.float32), np.zeros(5))
+    return MapField(np.ascontiguousarray(grid.distance_field), grid.arrays[1])
+
+
+def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int) -> Scratch:
+    """Returns the scratch memory that one thread needs to step this many worlds."""
+    kinematics, robots, count = model.kinematics, sizes.robots, sizes.obstacles
+    bodies = count + robots
+    blocks = -(-worlds * robots // LANES)
+    lanes = robots * min(worlds, -(-worlds // blocks))
+    side = int(np.sqrt(2.0 * bodies)) if sizes.crowded else 1
+    corners = max(int(np.diff(scanner.table.outlines.corner).max(initial=4)), 4)
+    x, dq = scratch(kinematics)
+    return Scratch(
+        lanes=Lanes(
+            pose=np.zeros((6, lanes)),
+            x=np.ones((len(kinematics.variables) + 1, lanes)),
+            dq=np.zeros((len(kinematics.dofs), lanes)),
+            coefficient=np.zeros((np.count_nonzero(kinematics.coefficients), lanes)),
+            late=np.zeros(lanes, np.int64),
+        ),
+        single=Single(
+            x=x, dq=dq, trial=np.zeros(BODY), spare=np.zeros((corners, 2)),
+            start=np.zeros((count, 3)), began=np.zeros((count, 3)),
+            flights=np.zeros((bodies, FLIGHT)), events=np.zeros((robots, EVENT)),
+        ),
+        nearby=Nearby(
+            near=np.zeros((robots, 1 + SEVERAL), np.int64), meets=np.zeros(robots, np.int64),
+            way=np.zeros(robots), reach=np.zeros(bodies), speeds=np.zeros((robots, 2)),
+        ),
+        cells=Cells(
+            begin=np.zeros(side * side + 2, np.int64), order=np.zeros(bodies, np.int64),
+            cell_of=np.zeros(bodies, np.int64), frame=np.zeros(5),
+            found=np.zeros(bodies, np.int64),
+        ),
+        scans=Scans(
+            before=np.zeros((lanes, 3)), waiting=np.zeros(worlds, np.int64),
+            seen=np.zeros((bodies + 1) * BODY), spot=np.zeros((1, 1, 3)),
+            slices=np.zeros((SLICES, 3)), part=np.zeros((1, 1, model.lidar.beams), np.float32),
+            drive=np.zeros(3), none=np.zeros(1, np.int64), lookup=scanner.room(bodies),
+        ),
+    )  # fmt: skip

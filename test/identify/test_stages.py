@@ -1,0 +1,109 @@
+"""The row of stages: each adds what it says, and says what is missing where it is taken out."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from identify.drives import drive
+from nics_drl_bridge.errors import FitError
+from nics_drl_bridge.identify import drive as prepared
+from nics_drl_bridge.identify.drive import Drive, Settings
+from nics_drl_bridge.identify.findings import Findings
+from nics_drl_bridge.identify.identify import STAGES, begun, identify, run
+from nics_drl_bridge.robot.spec import RobotSpec
+
+NAMES = tuple(stage.__name__ for stage in STAGES)
+ADDED = {
+    "repair": {"training", "whole", "repairs"},
+    "clocks": {"timing", "calibration"},
+    "mounting": {"speed", "mounting", "calibration"},
+    "responses": {"calibration"},
+    "noise": {"calibration", "noise"},
+    "fit": {"samples", "regression"},
+    "prune": {"linear", "model"},
+    "refine": {"model", "calibration", "refinement"},
+    "complete": {"model", "assumptions"},
+    "judge": {"calibration", "noise", "model", "unseen", "held_out", "notes"},
+}
+SETTINGS = Settings(train_until_s=14.0, assume=True)
+
+
+def without(name: str):
+    return tuple(stage for stage in STAGES if stage.__name__ != name)
+
+
+@pytest.fixture(scope="module")
+def disturbed(car) -> Drive:
+    """A drive in which each stage finds something: disturbed, and always at one steering angle."""
+    data = car.model_dump()
+    speed, steering = data["command"]
+    held = {**steering, "min": -0.4 - 1e-9, "max": -0.4 + 1e-9}
+    locked = RobotSpec.model_validate({**data, "command": [speed, held]})
+    recording = drive(locked, duration=21.0, latency=0.05, rotation=0.4, noise=(5e-4, 1e-3))
+    command, pose = recording.command.values.copy(), recording.pose
+    command[:, 1] = -0.4
+    twice = np.sort(np.append(np.arange(len(pose.t)), 700))
+    repeated = replace(pose, t=pose.t[twice], values=pose.values[twice])
+    still = replace(recording.command, values=command)
+    return Drive(replace(recording, pose=repeated, command=still), car, SETTINGS)
+
+
+def test_the_row_is_the_road_from_a_recording_to_a_model():
+    assert tuple(ADDED) == NAMES
+
+
+def test_a_stage_adds_what_it_says_and_leaves_the_rest(disturbed):
+    before = begun(disturbed)
+    for stage in STAGES:
+        after = stage(disturbed, before)
+        names = {f.name for f in fields(Findings)}
+        changed = {n for n in names if getattr(after, n) is not getattr(before, n)}
+        assert changed == ADDED[stage.__name__]
+        before = after
+
+
+@pytest.mark.parametrize(
+    ("name", "missing"),
+    [
+        ("repair", lambda found: found.repairs == () and 0.0 in np.diff(found.whole.sample_t)),
+        ("clocks", lambda found: found.calibration.command_latency_s == 0.0),
+        ("mounting", lambda found: found.calibration.rotation_rad == 0.0),
+        ("noise", lambda found: found.calibration.position_noise_m == 0.0),
+        ("refine", lambda found: found.refinement == () and found.model is found.linear.model),
+        ("complete", lambda found: found.model.assumed == ()),
+        ("judge", lambda found: found.notes == () and found.model.quality is None),
+    ],
+)
+def test_without_a_stage_its_finding_is_missing_and_the_rest_is_there(disturbed, name, missing):
+    assert not missing(run(STAGES, disturbed))
+    found = run(without(name), disturbed)
+    assert missing(found)
+    assert found.model.terms_kept > 0
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("responses", "the response of each state is missing; put the stage 'responses' before"),
+        ("fit", "the fit of all terms is missing; put the stage 'fit' before"),
+        ("prune", "the pruned fit is missing; put the stage 'prune' before"),
+    ],
+)
+def test_without_a_stage_that_others_need_the_row_says_which(car, name, sentence):
+    inferred = Drive(drive(car, duration=21.0, measured_state=False), car, SETTINGS)
+    with pytest.raises(FitError, match=sentence):
+        run(without(name), inferred)
+
+
+def test_the_bursts_of_a_drive_are_found_once(differential, monkeypatch):
+    asked = []
+    find = prepared.find_bursts
+    monkeypatch.setattr(prepared, "find_bursts", lambda t: asked.append(len(t)) or find(t))
+    recording = drive(differential, duration=21.0, burst=0.1, noise=(5e-4, 1e-3))
+    found = identify(recording, differential)
+    assert found.drive.bursts is not None
+    assert asked.count(len(recording.pose.t)) == 1
+    assert asked.count(len(found.findings.training.recording.pose.t)) == 1

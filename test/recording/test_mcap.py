@@ -1,0 +1,174 @@
+from __future__ import annotations
+
+import struct
+import zlib
+
+import pytest
+import yaml
+
+pytest.importorskip("rosbags", reason="needs the extra 'bags'")
+pytest.importorskip("mcap", reason="needs the extra 'bags'")
+
+from mcap.writer import CompressionType, IndexType, Writer
+
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.extras.bags.salvage import salvage
+from nics_drl_bridge.recording import messages, packing
+from nics_drl_bridge.recording.bag_file import opened
+from nics_drl_bridge.recording.mcap import MAGIC, PREFIX, DamageError, records, seal
+from nics_drl_bridge.recording.mcap_check import check_mcap
+
+TWIST, COUNT = "geometry_msgs/msg/Twist", 200
+DATA = b"\x00\x01\x00\x00" + struct.pack("<6d", 1.0, 0.0, 0.0, 0.0, 0.0, 0.5)
+FORMS = {
+    "zstd": {"compression": CompressionType.ZSTD},
+    "lz4": {"compression": CompressionType.LZ4},
+    "plain": {"compression": CompressionType.NONE},
+    "no chunks": {"use_chunking": False},
+    "sealed": {"enable_data_crcs": True},
+    "bare": {
+        "compression": CompressionType.NONE, "index_types": IndexType.NONE, "enable_crcs": False,
+        "repeat_channels": False, "repeat_schemas": False, "use_statistics": False,
+        "use_summary_offsets": False,
+    },
+}  # fmt: skip
+
+
+def written(path, size=2000, data=DATA, **options):
+    """A file of the library's own writer, with a topic and an attachment."""
+    writer = Writer(str(path), chunk_size=size, **options)
+    writer.start(profile="ros2", library="test")
+    schema = writer.register_schema(TWIST, "ros2msg", b"geometry_msgs/Vector3 linear")
+    channel = writer.register_channel("/cmd_vel", "cdr", schema)
+    for k in range(COUNT):
+        writer.add_message(channel, 10**9 + k, data, 10**9 + k)
+    writer.add_attachment(0, 0, "note", "text/plain", b"a note")
+    writer.finish()
+    return path
+
+
+def framed(op, content):
+    return struct.pack("<BQ", op, len(content)) + content
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_files_of_another_writer_are_whole_and_salvaged(tmp_path, form):
+    path = written(tmp_path / "drive.mcap", **FORMS[form])
+    check_mcap(path)
+    with opened(path) as bag:
+        assert len(bag.serialized("/cmd_vel")) == COUNT
+    assert salvage(path, tmp_path / "kept").kept == {"/cmd_vel": COUNT}
+    seal(tmp_path / "kept" / "kept.mcap")  # a second time changes nothing
+    check_mcap(tmp_path / "kept" / "kept.mcap")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_file_that_is_cut_off_anywhere_is_refused(tmp_path, form):
+    path = written(tmp_path / "drive.mcap", **FORMS[form])
+    data = path.read_bytes()
+    for end in range(0, len(data), len(data) // 50):
+        path.write_bytes(data[:end])
+        with pytest.raises(DamageError):
+            check_mcap(path)
+        path.write_bytes(data[:end] + MAGIC)
+        with pytest.raises(DamageError):
+            check_mcap(path)
+
+
+@pytest.mark.parametrize(
+    ("record", "said"),
+    [
+        (framed(1, struct.pack("<I4sI", 4, b"ros2", 0)), None),
+        (framed(0x90, b"of another program"), None),
+        (framed(1, struct.pack("<I4sII", 4, b"ros2", 0, 0)), None),  # the format may grow
+        (framed(1, struct.pack("<I4sI", 4, b"ros2", 9)), "shorter than"),
+        (framed(1, struct.pack("<I4sI", 2**32 - 1, b"ros2", 9)), "shorter than"),
+        (framed(1, struct.pack("<I4sI", 4, b"\xff\xff\xff\xff", 0)), "not UTF-8"),
+        (framed(5, bytes(22)), None),
+        (framed(5, bytes(21)), "shorter than"),
+        (framed(5, bytes(17)), "shorter than"),
+        (framed(6, bytes(24) + struct.pack("<IIQ", 0, 0, 2**64 - 1)), "shorter than"),
+        (framed(0x10, b""), "no record of kind 16"),
+        (framed(1, bytes(8))[:-1], "cut off"),
+        (b"\x01\x00", "cut off"),
+        (struct.pack("<BQ", 1, 2**64 - 1), "cut off"),
+    ],
+)
+def test_a_record_that_is_shorter_than_its_fields_is_refused(record, said):
+    """Also the last one, and whatever follows."""
+    good = framed(15, bytes(4))
+    for data in (good + record, good + record + bytes(40) * (said != "cut off")):
+        if said is None:
+            found = list(records(memoryview(good + record + good)))
+            assert [each.offset for each in found] == [0, 13, 13 + len(record)]
+            assert found[-1].end == 26 + len(record)
+            continue
+        with pytest.raises(DamageError, match=said) as caught:
+            list(records(memoryview(data)))
+        assert caught.value.offset == len(good)
+        if caught.value.end is not None:
+            assert caught.value.end == len(good) + len(record)
+
+
+def test_a_chunk_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
+    """Also in a file without summary, whose chunks rosbags unpacks when it opens it."""
+    path = written(tmp_path / "drive.mcap", size=2**22, data=DATA + bytes(2**14), **FORMS["zstd"])
+    monkeypatch.setattr(packing, "MOST_UNPACKED", 2**20)
+    for data in (path.read_bytes(), without_summary(path.read_bytes())):
+        path.write_bytes(data)
+        with pytest.raises(RecordingError, match="more than 1048576 bytes"), opened(path):
+            pass
+        bag = packed_as_a_whole(tmp_path / "bag", data)
+        with pytest.raises(RecordingError, match="more than 1048576 bytes"), opened(bag):
+            pass
+
+
+def packed_as_a_whole(folder, data):
+    folder.mkdir(exist_ok=True)
+    (folder / "drive.mcap.zstd").write_bytes(packing._zstd().compress(data))
+    about = {"compression_mode": "FILE", "relative_file_paths": ["drive.mcap.zstd"]}
+    text = yaml.safe_dump({"rosbag2_bagfile_information": about})
+    (folder / "metadata.yaml").write_text(text, encoding="utf-8")
+    return folder
+
+
+def test_a_chunk_that_says_that_it_is_terabytes_is_refused(tmp_path):
+    path = written(tmp_path / "drive.mcap", **FORMS["bare"])
+    data = bytearray(path.read_bytes())
+    (chunk, *_) = (r for r in records(memoryview(bytes(data)), len(MAGIC)) if data[r.offset] == 6)
+    struct.pack_into("<Q", data, chunk.offset + PREFIX + 16, 2**42)
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match="not as long as it says"), opened(path):
+        pass
+
+
+def without_summary(data):
+    end = next(r for r in records(memoryview(data), len(MAGIC)) if data[r.offset] == 15).end
+    return data[: end - 4] + bytes(4) + framed(2, bytes(20)) + MAGIC
+
+
+def test_a_file_without_summary_is_read(tmp_path):
+    path = written(tmp_path / "drive.mcap")
+    path.write_bytes(without_summary(path.read_bytes()))
+    check_mcap(path)
+    with opened(path) as bag:
+        assert len(bag.serialized("/cmd_vel")) == COUNT
+
+
+def test_a_flipped_bit_of_a_sealed_file_is_found(tmp_path):
+    path = written(tmp_path / "drive.mcap", **FORMS["sealed"])
+    data = path.read_bytes()
+    end = next(r for r in records(memoryview(data), len(MAGIC)) if data[r.offset] == 15).offset
+    assert zlib.crc32(data[:end]) == struct.unpack_from("<I", data, end + PREFIX)[0]
+    for place in range(len(MAGIC), len(data), 41):
+        path.write_bytes(data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :])
+        with pytest.raises(DamageError):
+            check_mcap(path)
+
+
+def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):
+    path = written(tmp_path / "drive.mcap")
+    monkeypatch.setattr(messages, "find_spec", lambda name: None if name == "mcap" else name)
+    said = r"library mcap; .*nics_drl_bridge\[bags\]"
+    with pytest.raises(RecordingError, match=said), opened(path):
+        pass

@@ -1,0 +1,120 @@
+"""Machine code is kept as long as nothing that it was compiled from changed, in every process."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from nics_drl_bridge import kernels
+
+LOW = """
+from nics_drl_bridge.constants import STEP
+from nics_drl_bridge.kernels import kernel
+
+@kernel
+def low(x):
+    return x + STEP
+"""
+HIGH = """
+from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.low_kernels import low
+
+@kernel
+def high(x):
+    return 10.0 * low(x)
+
+@kernel(allocates=True)
+def broken(x):
+    return 1.0 / x
+"""
+OTHER = """
+from nics_drl_bridge.kernels import kernel
+
+@kernel
+def other(x):
+    return -x
+"""
+ASK = """
+from nics_drl_bridge.high_kernels import broken, high
+from nics_drl_bridge.other_kernels import other
+print(high(1.0), other(1.0), broken(0.0))
+print(sum(high._cache_misses.values()), sum(other._cache_misses.values()))
+"""
+
+
+@pytest.fixture
+def package(tmp_path):
+    folder = tmp_path / "nics_drl_bridge"
+    folder.mkdir()
+    shutil.copy(kernels.__file__, folder)
+    for name, text in {
+        "__init__.py": "", "constants.py": "STEP = 1.0\n", "low_kernels.py": LOW,
+        "high_kernels.py": HIGH, "other_kernels.py": OTHER,
+    }.items():  # fmt: skip
+        (folder / name).write_text(text)
+    return folder
+
+
+def ask(package: Path) -> tuple[list[float], list[int]]:
+    """What the kernels give in a fresh process, and how many were compiled there."""
+    done = subprocess.run(
+        [sys.executable, "-c", ASK], cwd=package.parent, capture_output=True, text=True,
+        check=False, env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    values, compiled = done.stdout.splitlines()
+    return [float(word) for word in values.split()], [int(word) for word in compiled.split()]
+
+
+def test_a_second_process_compiles_nothing_and_a_division_by_zero_is_inf(package):
+    assert ask(package) == ([20.0, -1.0, float("inf")], [1, 1])
+    assert ask(package) == ([20.0, -1.0, float("inf")], [0, 0])
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "expected"),
+    [
+        ("low_kernels.py", "x + STEP", "x - STEP", 0.0),
+        ("constants.py", "1.0", "3.0", 40.0),
+        ("high_kernels.py", "10.0 *", "20.0 *", 40.0),
+    ],
+)
+def test_an_edit_of_what_a_kernel_is_made_of_compiles_it_anew_and_no_other(
+    package, file, old, new, expected
+):
+    ask(package)
+    path = package / file
+    stamp = path.stat()
+    path.write_text(path.read_text().replace(old, new))
+    os.utime(path, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))  # by content, not by time
+    values, compiled = ask(package)
+    assert (values[0], compiled) == (expected, [1, 0])
+    assert ask(package)[1] == [0, 0]
+
+
+def test_a_kernel_that_moves_within_its_file_leaves_nothing_behind(package):
+    ask(package)
+    before = len(list(package.rglob("*.nbi")))
+    path = package / "high_kernels.py"
+    path.write_text("\n\n" + path.read_text())
+    ask(package)
+    assert len(list(package.rglob("*.nbi"))) == before
+
+
+def test_imports_are_read_in_every_spelling(tmp_path):
+    path = tmp_path / "some.py"
+    path.write_text(
+        "import nics_drl_bridge.geometry\n"
+        "from nics_drl_bridge import random_kernels as files\n"
+        "from nics_drl_bridge.robot import (\n    kernels,\n    spec as config,\n)\n"
+        "def f():\n    from nics_drl_bridge.errors import BridgeError\n"
+    )
+    found = {each.relative_to(kernels.PACKAGE).as_posix() for each in kernels.imports_of(path)}
+    assert found == {
+        "geometry.py", "random_kernels.py", "robot/kernels.py", "robot/spec.py", "errors.py",
+    }  # fmt: skip
