@@ -5,6 +5,7 @@ A group is `nics_drl_bridge.GROUP`; `docs/extensions.md` says what each expects.
 
 from __future__ import annotations
 
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
@@ -22,6 +23,7 @@ INSTALL = {
 """Libraries, and the extra of this package that brings each."""
 
 
+@cache
 def known(group: str) -> dict[str, EntryPoint]:
     """The extensions of a group by name, sorted; one of another package goes before one of ours."""
     found = entry_points(group=f"{PACKAGE}.{group}")

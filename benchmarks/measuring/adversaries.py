@@ -13,6 +13,7 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.policy.policies import open_policy
+from nics_drl_bridge.robot.kinds import steady_twist
 from nics_drl_bridge.sim.space_kernels import wall_distance
 
 Array = NDArray[np.float64]
@@ -68,7 +69,6 @@ class Adversary:
 
     def __init__(self, kind: str, model: SimulatorModel, rng: np.random.Generator) -> None:
         self._kind, self._robot, self._rng = kind, model.robot, rng
-        self._wheelbase = model.robot.parameters.get("wheelbase", 0.0)
         self._held, self._left = np.zeros(len(model.robot.command)), 0
 
     def act(self, truth: Truth) -> Array:
@@ -95,9 +95,7 @@ class Adversary:
 
     def _nearest(self, truth: Truth, commands: Array) -> Array:
         """(n,) clearances [m] that commands (n, C) lead to, at the end or on the way."""
-        twist = self._robot.to_cmd_vel(commands)
-        if self._wheelbase > 0.0:
-            twist[:, 2] = twist[:, 0] * np.tan(twist[:, 2]) / self._wheelbase
+        twist = steady_twist(self._robot, commands)
         moved = geometry.exp(np.multiply.outer(np.array(HORIZON_S), twist))
         places = geometry.compose(truth.pose, moved)[..., :2]
         away = np.array([[wall_distance(x, y, truth.walls) for x, y in row] for row in places])

@@ -29,10 +29,9 @@ def find_kind(name: str) -> Any | None:
     Raises:
         ConfigError: a library that it needs is missing.
     """
-    kind = _own_kind(name)
-    if kind is None and name in extensions.known("kinds"):
+    if name in extensions.known("kinds"):
         return extensions.load("kinds", name)
-    return kind
+    return _own_kind(name)
 
 
 def _own_kind(name: str) -> Any | None:

@@ -139,12 +139,13 @@ def test_mujoco_says_that_it_has_no_machine_of_it():
         build_machine(load_robot(NEW))
 
 
-def test_another_package_adds_a_kind_by_an_entry_point(monkeypatch):
-    points = {"tank": EntryPoint("tank", f"nics_drl_bridge.robot.{NEW}:KIND", "")}
+@pytest.mark.parametrize("name", ["tank", "mecanum"])
+def test_another_package_adds_a_kind_by_an_entry_point_or_takes_the_place_of_one(monkeypatch, name):
+    points = {name: EntryPoint(name, f"nics_drl_bridge.robot.{NEW}:KIND", "")}
     monkeypatch.setattr(extensions, "known", lambda group: points if group == "kinds" else {})
-    robot = RobotSpec.model_validate(load_robot(NEW).model_dump() | {"textbook": "tank"})
+    robot = RobotSpec.model_validate(load_robot(NEW).model_dump() | {"textbook": name})
     assert textbook(robot).twist(np.array([1.0, 0.0])) == pytest.approx([1.0, 0.0, 0.0])
-    assert "tank" in kind_names()
+    assert name in kind_names()
 
 
 def test_an_unknown_kind_is_refused_with_all_that_there_are():
