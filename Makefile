@@ -16,6 +16,8 @@ OUT ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
+COMMA := ,
+SPACE := $(subst ,, )
 
 # The ROS wheels start python again with these two and leave them to all its children, where
 # another environment's python would load the wrong libraries.
@@ -34,61 +36,90 @@ FOREIGN_ROS := $(if $(BASE)$(SYSTEM_ROS),$(if $(SYSTEM_ROS),,$(shell $(BASE) -c 
 WHEELS_EXIST := $(filter Linux-x86_64,$(shell uname -s)-$(shell uname -m))
 ROS := $(if $(SYSTEM_ROS),system,$(if $(WHEELS_EXIST),wheels,none))
 EXTRAS := $(if $(SYSTEM_ROS),dev-without-ros,dev)
+DEMO_EXTRAS := deploy,train$(if $(SYSTEM_ROS),,$(COMMA)ros)
 
 # Written last, so a half-built .venv has none and is built anew; its name says for which Python
-# and which ROS 2 the environment is.
+# and which ROS 2 the environment is. The demo needs a part of it only.
 READY := $(VENV)/.ready-py$(VERSION)-$(ROS)
+READY_FOR_DEMO := $(VENV)/.demo-py$(VERSION)-$(ROS)
 # An environment that has lost its executables is installed into anew.
 ifeq ($(wildcard $(BIN)/nics),)
-.PHONY: $(READY)
+.PHONY: $(READY) $(READY_FOR_DEMO)
 endif
 DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Makefile
 
 OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
 
-.PHONY: help setup demo test test-jazzy test-ray test-messages test-clients ros-status lint format types pytest benchmark tables clean distclean
+.PHONY: help setup demo test test-quick test-all test-jazzy test-ray test-messages test-clients ros-status lint format types pytest benchmark tables clean distclean
 
 help: ## list the targets
-	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 15
 
 setup: $(READY) ## build .venv: the package (editable) and all that tests and demo need
 
-$(READY): $(DESCRIBED_BY)
-	@if [ -z "$(BASE)" ]; then \
-		echo "make setup: $(PYTHON) does not run here; $(OTHER_PYTHON)." >&2; exit 1; fi
-	@case "$(VERSION)" in 3.10|3.11|3.12|3.13|3.14) ;; *) \
-		echo "make setup: $(PYTHON) is Python $(VERSION), but 3.10 to 3.14 is needed;" \
-			"$(OTHER_PYTHON)." >&2; exit 1;; esac
-	@if ! $(BASE) -c 'import ensurepip, venv' 2>/dev/null; then \
-		echo "make setup: $(BASE) has no venv module; install it (Debian, Ubuntu: apt install" \
-			"python$(VERSION)-venv) or $(OTHER_PYTHON)." >&2; exit 1; fi
-	@if [ -n "$(FOREIGN_ROS)" ]; then \
-		echo "make setup: the ROS 2 that is sourced here ($(FOREIGN_ROS)) does not load in Python" \
-			"$(VERSION); take a shell without it, or $(OTHER_PYTHON)." >&2; exit 1; fi
-	@if [ ! -e $@ ]; then \
-		echo "Building $(VENV) with Python $(VERSION)."; \
-		rm -rf $(VENV); \
-		$(BASE) -m venv $(if $(SYSTEM_ROS),--system-site-packages) $(VENV); \
-	fi
-	@rm -f $@
-	@# A ROS 2 built against numpy 1 crashes on numpy 2, which some of the pins need.
-	@if [ "$(ROS)" = system ] && $(BASE) -c \
-			'import numpy, sys; sys.exit(numpy.__version__[:2] != "1.")' 2>/dev/null; then \
-		sed -E 's/^numpy==[^ ;]+/numpy<2/; /^(contourpy|matplotlib|scipy|shapely)==/d' \
-			constraints.txt > $(VENV)/constraints.txt; \
-	else \
-		cp constraints.txt $(VENV)/constraints.txt; \
-	fi
-	@echo "Installing nics_drl_bridge[$(EXTRAS)] into $(VENV); the first time takes a minute or more."
-	@export PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_CONSTRAINT=$(VENV)/constraints.txt; \
-		$(BIN)/python -m pip install -qq setuptools; \
-		$(BIN)/python -m pip install -qq --no-build-isolation --editable '.[$(EXTRAS)]'
-	@touch $@
+# $(1): the environment's file. $(2): extras to install.
+define BUILD
+@if [ -z "$(BASE)" ]; then \
+	echo "make setup: $(PYTHON) does not run here; $(OTHER_PYTHON)." >&2; exit 1; fi
+@case "$(VERSION)" in 3.10|3.11|3.12|3.13|3.14) ;; *) \
+	echo "make setup: $(PYTHON) is Python $(VERSION), but 3.10 to 3.14 is needed;" \
+		"$(OTHER_PYTHON)." >&2; exit 1;; esac
+@if ! $(BASE) -c 'import ensurepip, venv' 2>/dev/null; then \
+	echo "make setup: $(BASE) has no venv module; install it (Debian, Ubuntu: apt install" \
+		"python$(VERSION)-venv) or $(OTHER_PYTHON)." >&2; exit 1; fi
+@if [ -n "$(FOREIGN_ROS)" ]; then \
+	echo "make setup: the ROS 2 that is sourced here ($(FOREIGN_ROS)) does not load in Python" \
+		"$(VERSION); take a shell without it, or $(OTHER_PYTHON)." >&2; exit 1; fi
+@if [ ! -e $(READY) ] && [ ! -e $(READY_FOR_DEMO) ]; then \
+	echo "Building $(VENV) with Python $(VERSION)."; \
+	rm -rf $(VENV); \
+	$(BASE) -m venv $(if $(SYSTEM_ROS),--system-site-packages) $(VENV); \
+fi
+@rm -f $(1)
+@# A ROS 2 built against numpy 1 crashes on numpy 2, which some of the pins need.
+@if [ "$(ROS)" = system ] && $(BASE) -c \
+		'import numpy, sys; sys.exit(numpy.__version__[:2] != "1.")' 2>/dev/null; then \
+	sed -E 's/^numpy==[^ ;]+/numpy<2/; /^(contourpy|matplotlib|scipy|shapely)==/d' \
+		constraints.txt > $(VENV)/constraints.txt; \
+else \
+	cp constraints.txt $(VENV)/constraints.txt; \
+fi
+@echo "Installing nics_drl_bridge[$(2)] into $(VENV); the first time takes a minute or so."
+@PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install -qq -c $(VENV)/constraints.txt uv
+@$(UV_INSTALL) setuptools
+@$(UV_INSTALL) --no-build-isolation --editable .
+@# The kernels are compiled while the larger libraries arrive.
+@$(BIN)/nics warmup & compiling=$$!; \
+	$(UV_INSTALL) $(TORCH) --no-build-isolation --editable '.[$(2)]' \
+		|| $(if $(TORCH),$(UV_INSTALL) --no-build-isolation --editable '.[$(2)]',exit 1); \
+	wait $$compiling || echo "make: the kernels are compiled when they are first called."
+@touch $(1)
+endef
 
-demo: setup ## run the whole chain on a recording: make demo [RECORDING=folder]
+# uv knows nothing of pip's settings. PyTorch's own index has wheels for Linux without the
+# libraries of GPUs, which are five times the size; without it, those with them have to do.
+WHEELS := $(subst $(SPACE),$(COMMA),$(strip $(or $(UV_FIND_LINKS),$(PIP_FIND_LINKS))))
+TORCH := $(if $(WHEELS),,--torch-backend cpu)
+UV_INSTALL = $(if $(WHEELS),UV_FIND_LINKS=$(WHEELS)) $(if $(PIP_INDEX_URL),UV_DEFAULT_INDEX=$(PIP_INDEX_URL)) \
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --constraints $(VENV)/constraints.txt
+
+$(READY): $(DESCRIBED_BY)
+	$(call BUILD,$@,$(EXTRAS))
+
+$(READY_FOR_DEMO): $(DESCRIBED_BY)
+	$(call BUILD,$@,$(DEMO_EXTRAS))
+
+demo: $(or $(wildcard $(READY)),$(READY_FOR_DEMO)) ## run the whole chain on a recording: make demo [RECORDING=folder]
 	$(BIN)/nics demo $(if $(RECORDING),--recording "$(RECORDING)") --out runs/demo
 
 test: ros-status setup lint types pytest ## lint, types and tests: make test [PYTEST_ARGS="-k lidar"]
+
+test-quick: setup ## under a minute, after each edit: no processes, no training
+	$(BIN)/python -m pytest -q $(PARALLEL) -m "not (ros or process or slow or campaign)" $(PYTEST_ARGS)
+
+test-all: test ## before a release: the long campaigns, other distributions, clients and Ray too
+	$(BIN)/python -m pytest $(PARALLEL) -m campaign $(PYTEST_ARGS)
+	$(MAKE) test-jazzy test-messages test-clients test-ray
 
 ros-status:
 ifeq ($(ROS),system)
@@ -112,7 +143,7 @@ types: setup ## mypy
 	$(BIN)/mypy nics_drl_bridge
 
 pytest: setup
-	$(BIN)/python -m pytest $(PARALLEL) $(PYTEST_ARGS)
+	$(BIN)/python -m pytest $(PARALLEL) -m "not campaign" $(PYTEST_ARGS)
 
 # Environments apart, of what clashes with .venv; what they share with it has the same pins.
 # $(1): folder. $(2): command that prints its constraints. $(3): what it holds.

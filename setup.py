@@ -65,6 +65,7 @@ EXTRAS = {
         "setuptools",
         "shapely",
         "types-PyYAML",
+        "uv",  # the Makefile installs with it
     ],
 }
 # What `make setup` installs: where a ROS 2 is sourced, and where none is.

@@ -22,9 +22,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any, overload
 
-import numba
 from numba.core import event
 from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.registry import CPUDispatcher
+from numba.core.sigutils import normalize_signature
 
 PACKAGE = Path(__file__).parent
 PATIENCE_S = 2.0
@@ -68,33 +70,82 @@ def kernel(
     Returns:
         numba's dispatcher; without `function`, a decorator.
     """
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    options: dict[str, Any] = {"nopython": True, "nogil": True, "error_model": "numpy"}
+    options |= {"boundscheck": None, "no_cfunc_wrapper": True}
     options |= {} if allocates else {"_nrt": False}
     options |= {"fastmath": {"contract"}} if contracts else {}
     options |= {"forceinline": True} if inline else {}
 
     def compiled(function: Callable[..., Any]) -> Any:
-        dispatcher = numba.njit(**options)(function)
-        dispatcher._cache = _Cache(function)
+        dispatcher = _Kernel(
+            function, targetoptions=options | {"nopython": True, "boundscheck": None}
+        )
         KERNELS.append(dispatcher)
         return dispatcher
 
     return compiled if function is None else compiled(function)
 
 
+class _Kernel(CPUDispatcher):  # type: ignore[misc]
+    """numba's dispatcher, which makes a function callable from Python only when Python calls it.
+
+    Most kernels are called by kernels alone; what unpacks their arguments from Python objects would
+    take a third of the time of compiling.
+    """
+
+    def __init__(self, function: Callable[..., Any], targetoptions: dict[str, Any]) -> None:
+        super().__init__(function, targetoptions=targetoptions)
+        self._cache, self._inner_cache = _Cache(function), _Cache(function, ".inner")
+        self._inner, self._inner_only = False, set[tuple[Any, ...]]()
+
+    @property
+    def is_warm(self) -> bool:
+        """It was compiled before, for whichever arguments."""
+        return any(cache.is_warm for cache in (self._cache, self._inner_cache))
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """Is called when a kernel that calls this one is compiled."""
+        before = self._inner, self._cache
+        self._inner, self._cache = True, self._inner_cache
+        self.targetoptions["no_cpython_wrapper"] = True
+        try:
+            return super().get_call_template(args, kws)
+        finally:
+            self._inner, self._cache = before
+            self.targetoptions["no_cpython_wrapper"] = self._inner
+
+    def compile(self, sig: Any) -> Any:
+        """Compiles for a signature, or finds it in memory or on disk."""
+        with global_compiler_lock:
+            args = tuple(normalize_signature(sig)[0])
+            if not self._inner and args in self._inner_only:
+                self._inner_only.remove(args)
+                del self.overloads[args]
+            return super().compile(sig)
+
+    def add_overload(self, cres: Any) -> None:
+        """Takes what was compiled; Python does not see what only kernels can call."""
+        if not self._inner:
+            super().add_overload(cres)
+            return
+        args = tuple(cres.signature.args)
+        self.overloads[args] = cres
+        self._inner_only.add(args)
+
+
 class _Cache(FunctionCache):  # type: ignore[misc]
     """Machine code on disk, stamped with the content of all that it was compiled from."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., Any], kind: str = "") -> None:
         super().__init__(function)
         # Without the line of the function: it may move, and leaves nothing behind.
-        name = re.sub(r"-\d+(\.py\d+\w*)$", r"\1", self._impl.filename_base)
+        name = re.sub(r"-\d+(\.py\d+\w*)$", rf"{kind}\1", self._impl.filename_base)
         stamp = digest_of(Path(function.__code__.co_filename))
         self._cache_file = IndexDataCacheFile(self._cache_path, name, stamp)
 
     @property
     def is_warm(self) -> bool:
-        """True when something usable is on disk."""
+        """Something usable is on disk."""
         return bool(self._cache_file._load_index())
 
 
@@ -128,24 +179,31 @@ def imports_of(file: Path) -> tuple[Path, ...]:
     return tuple(place for place in places if place.is_file())
 
 
-class _Wait(event.Listener):  # type: ignore[misc]
-    """Tells whoever waits for the compiler that it is at work, once in a process."""
+class _Compiling(event.Listener):  # type: ignore[misc]
+    """Counts what this process compiles, and says so once to whoever waits for it.
+
+    Attributes:
+        count: specialisations of kernels, and of what they call.
+        cpu_s: CPU time that compiling took [s].
+        quiet: nothing is to be said, or it has been.
+    """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._depth, self._begun, self._spent, self._done, self._told = 0, 0.0, 0.0, 0, False
+        self.count, self.cpu_s = 0, 0.0
+        self.quiet, self._lock, self._depth = False, threading.Lock(), 0
+        self._begun, self._begun_cpu, self._spent = 0.0, 0.0, 0.0
 
     def on_start(self, event: event.Event) -> None:
         """A function begins to be compiled, maybe for another that is."""
         with self._lock:
             if self._depth == 0:
-                self._begun = time.monotonic()
+                self._begun, self._begun_cpu = time.monotonic(), time.thread_time()
             self._depth += 1
             spent = self._spent + time.monotonic() - self._begun
-            if spent > PATIENCE_S and not self._told:
-                self._told = True
-                left = sum(not each._cache.is_warm for each in KERNELS)
-                seconds = left * spent / max(self._done, 1)
+            if spent > PATIENCE_S and not self.quiet:
+                self.quiet = True
+                left = sum(not each.is_warm for each in KERNELS)
+                seconds = left * spent / max(self.count, 1)
                 sys.stderr.write(
                     f"nics_drl_bridge: compiling up to {left} kernels, once on this machine: about "
                     f"{seconds:.0f} s\n"
@@ -154,9 +212,11 @@ class _Wait(event.Listener):  # type: ignore[misc]
     def on_end(self, event: event.Event) -> None:
         """It was compiled, or could not be."""
         with self._lock:
-            self._depth, self._done = self._depth - 1, self._done + 1
+            self._depth, self.count = self._depth - 1, self.count + 1
             if self._depth == 0:
                 self._spent += time.monotonic() - self._begun
+                self.cpu_s += time.thread_time() - self._begun_cpu
 
 
-event.register("numba:compile", _Wait())
+COMPILING = _Compiling()
+event.register("numba:compile", COMPILING)

@@ -18,6 +18,7 @@ from nics_drl_bridge.commands.policy import policy
 from nics_drl_bridge.commands.record import record
 from nics_drl_bridge.commands.replay import replay
 from nics_drl_bridge.commands.train import train
+from nics_drl_bridge.commands.warmup import warmup
 from nics_drl_bridge.errors import LONGEST, shortened
 
 app = typer.Typer(
@@ -46,7 +47,7 @@ def _options(
     """Options of every command."""
 
 
-for command in (generate, record, replay, doctor, urdf, train, evaluate, demo):
+for command in (generate, record, replay, doctor, urdf, train, evaluate, demo, warmup):
     app.command()(command)
 app.add_typer(policy, name="policy")
 for name, extension in extensions.known("commands").items():
