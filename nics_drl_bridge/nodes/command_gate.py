@@ -1,27 +1,27 @@
 """command_gate: passes the policy's commands on while they can be trusted.
 
-Inputs of the gate, read from serialised messages (`wire`) into records of `safety`.
-
-rclpy would first make a Python object of each field, which at 50 Hz costs the gate more than
-deciding.
-
-Real-time priority of a process, if the system allows it.
+Messages are read from their bytes (`wire`): rclpy would first make a Python object of each field,
+which at 50 Hz costs the gate more than deciding.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
+from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
@@ -41,20 +41,176 @@ from nics_drl_bridge.gate.inputs import (
     Scan,
     Tick,
 )
-from nics_drl_bridge.gate.limits import PERIOD_S
-from nics_drl_bridge.gate.state import Decision, begin
+from nics_drl_bridge.gate.limits import PERIOD_S, Limits, load_limits
+from nics_drl_bridge.gate.state import Decision, GateConfig, ShieldConfig, begin
+from nics_drl_bridge.gate.stopping import doubtful, require_possible, shield_config
+from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
 from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.conversions import is_rotation
-from nics_drl_bridge.nodes.diagnostics import Condition, Diagnostics
 from nics_drl_bridge.nodes.gate_log import GateLog
-from nics_drl_bridge.nodes.gate_parameters import declare_gate
 from nics_drl_bridge.nodes.qos import QosWatch
-from nics_drl_bridge.nodes.runner import declare, last_word, run_node
+from nics_drl_bridge.nodes.runner import (
+    Condition,
+    Diagnostics,
+    declare,
+    declare_model,
+    last_word,
+    run_node,
+)
 from nics_drl_bridge.nodes.wire import UNREADABLE, TwistWriter
 
 STALE_S = 0.05
 """A motion that was decided on longer ago than this is decided on again [s]."""
+SCAN_PERIODS = 1.75
+"""For a slow lidar, the default age limit of a command's scan, in periods of the lidar."""
+ROTATION = slice(3, 7)
+"""Position of an odometry's quaternion among its numbers."""
+VARIANCES = [wire.POSE_COVARIANCE, wire.POSE_COVARIANCE + 7, wire.POSE_COVARIANCE + 35]
+"""Positions of the variances of x, y and heading."""
+HIGHEST = 99
+REFUSED = (
+    "parameter 'priority': the system does not allow a real-time priority of {priority} ({error}); "
+    "allow it by `ulimit -r {priority}`, `LimitRTPRIO={priority}` in its systemd unit or the "
+    "capability CAP_SYS_NICE, or set 0. It goes on without."
+)
+
+
+def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
+    """Declares the parameters of a gate, reads them, and logs doubts about them.
+
+    Raises ConfigError if a value can't be used, or would never let the robot move.
+    """
+    lidar, robot = model.lidar, model.robot
+    about = "Limits of the robot: a shipped file, or a YAML file; no default."
+    file = str(declare(node, "limits", "", about, read_only=True))
+    limits = load_limits(file, robot) if file else None
+    config = GateConfig(
+        fields=tuple(int(i) for i in np.flatnonzero(robot.to_cmd_vel(np.ones(len(robot.command))))),
+        limits=limits,
+        beam_angles=lidar.angles,
+        mount=lidar.mount,
+        range_min=lidar.range_min,
+        range_max=lidar.range_max,
+        scan_rate=lidar.rate,
+        simulated=bool(node.get_parameter("use_sim_time").value),
+        odom_std=model.noise.odometry,
+        shield=_declare_shield(node, model, limits, file),
+        **_declare_rules(node, model),
+    )
+    require_possible(config)
+    doubt = doubtful(config, model.control_period)
+    if doubt:
+        node.get_logger().warning(doubt)
+    return config
+
+
+def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
+    """Declares the parameters of the rules; returns their values by the field of the config."""
+    scan_age = max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate)
+    heard = "Whether e_stop must have been heard before arming; false in simulations alone."
+    default, seconds = GateConfig, (0.01, 10.0)
+    rows: tuple[tuple[str, float | bool, str, tuple[float, ...]], ...] = (
+        ("odom_rate", 1.0 / model.control_period, "Of odom [Hz].", (0.1, 1e4)),
+        ("scan_age_s", scan_age, "Oldest scan, and behind a command [s].", seconds),
+        ("odom_age_s", default.odom_age_s, "Oldest odometry [s].", seconds),
+        ("command_age_s", default.command_age_s, "Oldest command [s].", seconds),
+        ("rate_tolerance", default.rate_tolerance, "Of both rates.", (0.01, 0.9)),
+        ("clock_rate", 1.0, "Of stamps: simulated seconds per second.", (0.01, 100.0)),
+        ("e_stop_required", True, heard, ()),
+        ("e_stop_silence_s", default.e_stop_silence_s, "Silence of e_stop [s].", seconds),
+        ("estimate_required", True, "Whether arming needs odometry/filtered.", ()),
+        ("estimate_std", default.estimate_std, "Greatest [m, rad].", (1e-3, 1e3)),
+    )
+    return {
+        field: declare(node, field.removesuffix("_s"), value, about, *span, read_only=True)
+        for field, value, about, span in rows
+    }
+
+
+def declare_black_box(node: Node) -> Path:
+    """Declares the folder of the recordings of stops, and returns that of the node's namespace."""
+    about = "Where a stop's last 30 s are written, by namespace; ~/.ros/black_box if empty."
+    given = str(declare(node, "black_box", "", about, read_only=True))
+    home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
+    # So that no gate of another namespace removes its files.
+    return (Path(given) if given else home / "black_box") / node.get_namespace().strip("/")
+
+
+def _declare_shield(
+    node: Node, model: SimulatorModel, limits: Limits | None, file: str
+) -> ShieldConfig | None:
+    """Returns the shield, None if it is off, and logs a sentence about it."""
+    on = declare(node, "shield", True, "Whether to stop before obstacles.", read_only=True)
+    values = {}
+    for name, about in (
+        ("latency", "Until the robot has taken up a command, measured [s]"),
+        ("deceleration", "Of the robot, measured [m/s^2]"),
+        ("margin", "Kept free around the footprint [m]"),
+        ("obstacle_speed", "At which what moves may come on [m/s]"),
+    ):
+        about = f"{about}; .nan: by the limits' file, or derived from the model."
+        value = float(declare(node, f"shield_{name}", math.nan, about, read_only=True))
+        if not math.isnan(value):
+            values[name] = value
+    if not on:
+        node.get_logger().warning("the shield is off: obstacles do not stop the robot")
+        return None
+    config, sentence = shield_config(model, limits, file, values)
+    node.get_logger().info(sentence)
+    return config
+
+
+def scan(lidar: LidarSpec, content: bytes) -> Scan:
+    """Reads a serialised LaserScan; raises `wire.UNREADABLE`, as the next four."""
+    ranges = from_device(wire.ranges_of(content), lidar)
+    return Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
+
+
+def odometry(content: bytes) -> Odometry:
+    """Reads a serialised Odometry; without a rotation its pose is NaN."""
+    pose, twist = wire.odometry_of(content)
+    if not is_rotation(*wire.numbers_of(content)[ROTATION].tolist()):
+        pose = np.full(3, np.nan)
+    return Odometry(wire.stamp_of(content), pose, twist)
+
+
+def estimate(content: bytes) -> Estimate:
+    """Reads a serialised Odometry of an estimator."""
+    x, y, heading = wire.numbers_of(content)[VARIANCES]
+    with np.errstate(invalid="ignore"):  # a negative variance gives NaN, too
+        std = np.sqrt([np.maximum(x, y), heading])
+    return Estimate(wire.odometry_of(content)[1], std)
+
+
+def command(content: bytes) -> Command:
+    """Reads a serialised TwistStamped."""
+    return Command(wire.stamp_of(content), np.array(wire.stamped_twist_of(content)))
+
+
+def e_stop(content: bytes) -> EStop:
+    """Reads a serialised Bool."""
+    return EStop(wire.truth_of(content))
+
+
+def take_priority(priority: int) -> str:
+    """Gives all threads of this process priority over every ordinary one (SCHED_FIFO), if not 0.
+
+    This includes the threads of the middleware: a gate that waits for them gains nothing by its own
+    priority alone. Threads created later have the priority of their creator. Returns a sentence
+    with the reason and the fix if it fails, otherwise an empty one.
+    """
+    if priority == 0:
+        return ""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        for thread in os.listdir("/proc/self/task"):
+            with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
+                os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(priority))
+    except (OSError, AttributeError) as error:  # the latter on systems without it
+        reason = str(getattr(error, "strerror", None) or "it has none").lower()
+        return REFUSED.format(priority=priority, error=reason)
+    return ""
 
 
 class CommandGate(QosWatch):
@@ -62,28 +218,22 @@ class CommandGate(QosWatch):
 
     It starts disarmed. `~/arm` lets commands pass if all checks succeed, `~/e_stop` presses the
     emergency stop, `~/reset` clears a latched stop and leaves the gate disarmed. All decisions are
-    made in `safety`, on the steady clock.
-
-    Args:
-        context: of the node.
+    made in the room `gate`, on the steady clock.
     """
 
     def __init__(self, context: Context) -> None:
         super().__init__("command_gate", context=context)
-        parameters = declare_gate(self)
-        self._config, self._lidar = parameters.config, parameters.lidar
+        model, logger = declare_model(self), self.get_logger()
+        self._lidar, self._config = model.lidar, declare_gate(self, model)
         self._state = begin(self._config)
-        self._log = GateLog(parameters, self.get_logger())
+        self._log = GateLog(self._config, declare_black_box(self), model.robot.name, logger)
         if not self._config.e_stop_required:
-            self.get_logger().warning(
+            logger.warning(
                 "e_stop_required is false: an e_stop that was never heard does not stop the robot. "
                 "That is for simulations; set it on a vehicle."
             )
         if self._config.shield is not None:
-            self.get_logger().info(parameters.shield_said)
             shield.rehearse()
-        else:
-            self.get_logger().warning(parameters.shield_said)
         self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
         self._twists = TwistWriter()
         self._zero = self._twists.write(np.zeros(3))
@@ -95,7 +245,7 @@ class CommandGate(QosWatch):
         priority = declare(self, "priority", 0, about, low=0, high=HIGHEST, read_only=True)
         refused = take_priority(priority)  # once all threads exist
         if refused:
-            self.get_logger().warning(refused)
+            logger.warning(refused)
 
     def _listen(self) -> None:
         for kind, topic, read, profile in (
@@ -149,16 +299,12 @@ class CommandGate(QosWatch):
     def _say(self, decision: Decision, now: float) -> Input | None:
         """Publishes a decision; the only path to the robot except `stop`.
 
-        Returns:
-            An input to decide on instead, or None. What is not finite is sent as zero and presses
-            the e-stop. A motion that was decided on too long ago, in a process frozen since, is not
-            sent at all; so the clock is read immediately before.
+        Returns an input to decide on instead, or None. What is not finite is sent as zero and
+        presses the e-stop. A motion that was decided on too long ago, in a process frozen since, is
+        not sent at all; so the clock is read immediately before.
         """
-        finite, content = (
-            bool(np.isfinite(decision.twist).all()),
-            self._twists.write(decision.twist),
-        )
-        if not finite:
+        content = self._twists.write(decision.twist)
+        if not np.isfinite(decision.twist).all():
             self._out.publish(self._zero)
             self._log.no_number(decision.twist.tolist())
             return Press()
@@ -173,9 +319,9 @@ class CommandGate(QosWatch):
         others = self.count_publishers(self._out.topic_name) - 1
         if others < 1:
             return found
-        told = f"others publish on cmd_vel, too ({others}), and move the robot past this gate"
-        self.get_logger().warning(told, throttle_duration_sec=10.0)
-        return found._replace(message=f"{found.message}; {told}", warns=True)
+        warning = f"others publish on cmd_vel, too ({others}), and move the robot past this gate"
+        self.get_logger().warning(warning, throttle_duration_sec=10.0)
+        return found._replace(message=f"{found.message}; {warning}", warns=True)
 
     def stop(self) -> None:
         """Leaves a zero command behind."""
@@ -195,74 +341,3 @@ def main(args: list[str] | None = None) -> None:
 
 if __name__ == "__main__":
     main()
-
-
-ROTATION = slice(3, 7)
-"""Position of an odometry's quaternion among its numbers."""
-VARIANCES = wire.POSE_COVARIANCE, wire.POSE_COVARIANCE + 7, wire.POSE_COVARIANCE + 35
-"""Positions of the variances of x, y and heading."""
-
-
-def scan(lidar: LidarSpec, content: bytes) -> Scan:
-    """Reads a serialised LaserScan. Raises `wire.UNREADABLE`."""
-    ranges = from_device(wire.ranges_of(content), lidar)
-    return Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
-
-
-def odometry(content: bytes) -> Odometry:
-    """Reads a serialised Odometry; without a rotation its pose is NaN. Raises `wire.UNREADABLE`."""
-    pose, twist = wire.odometry_of(content)
-    if not is_rotation(*wire.numbers_of(content)[ROTATION].tolist()):
-        pose = np.full(3, np.nan)
-    return Odometry(wire.stamp_of(content), pose, twist)
-
-
-def estimate(content: bytes) -> Estimate:
-    """Reads a serialised Odometry of an estimator. Raises `wire.UNREADABLE`."""
-    x, y, heading = (wire.numbers_of(content)[place] for place in VARIANCES)
-    with np.errstate(invalid="ignore"):  # a negative variance gives NaN, too
-        std = np.sqrt([np.maximum(x, y), heading])
-    return Estimate(wire.odometry_of(content)[1], std)
-
-
-def command(content: bytes) -> Command:
-    """Reads a serialised TwistStamped. Raises `wire.UNREADABLE`."""
-    return Command(wire.stamp_of(content), np.array(wire.stamped_twist_of(content)))
-
-
-def e_stop(content: bytes) -> EStop:
-    """Reads a serialised Bool. Raises `wire.UNREADABLE`."""
-    return EStop(wire.truth_of(content))
-
-
-HIGHEST = 99
-REFUSED = (
-    "parameter 'priority': the system does not allow a real-time priority of {priority} ({error}); "
-    "allow it by `ulimit -r {priority}`, `LimitRTPRIO={priority}` in its systemd unit or the "
-    "capability CAP_SYS_NICE, or set 0. It goes on without."
-)
-
-
-def take_priority(priority: int) -> str:
-    """Gives all threads of this process priority over every ordinary one (SCHED_FIFO).
-
-    This includes the threads of the middleware: a gate that waits for them gains nothing by its own
-    priority alone. Threads created later have the priority of their creator.
-
-    Args:
-        priority: 1 to 99; 0 leaves everything as it is.
-
-    Returns:
-        A sentence with the reason and the fix if it fails; empty otherwise.
-    """
-    if priority == 0:
-        return ""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-        for thread in os.listdir("/proc/self/task"):
-            with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
-                os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(priority))
-    except (OSError, AttributeError) as error:  # the latter on systems without it
-        reason = str(getattr(error, "strerror", None) or "it has none").lower()
-        return REFUSED.format(priority=priority, error=reason)
-    return ""

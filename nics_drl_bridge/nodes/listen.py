@@ -10,7 +10,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from nics_drl_bridge.nodes.message_types import message_type
+from nics_drl_bridge.nodes.conversions import message_type
 from nics_drl_bridge.nodes.qos import offer_of
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.report.doctor_facts import KINDS, Endpoints, Facts, names_in

@@ -19,7 +19,7 @@ from nics_drl_bridge.env.registry import COOPERATIVE_REACHING, NAVIGATION
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import link, qos
-from nics_drl_bridge.nodes.dds_backend import DdsBackend
+from nics_drl_bridge.nodes.backends import DdsBackend
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.sim.world import load_world
 

@@ -17,7 +17,7 @@ from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
 from nics_drl_bridge.generator import builtin_model, save_model
 from nics_drl_bridge.interface import Start
-from nics_drl_bridge.nodes.dds_backend import DdsBackend
+from nics_drl_bridge.nodes.backends import DdsBackend
 from nics_drl_bridge.policy.evaluation import drive_all
 from nics_drl_bridge.policy.policies import make_policy
 from nics_drl_bridge.sim.world import load_world

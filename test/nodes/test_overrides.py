@@ -7,7 +7,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
-from nics_drl_bridge.nodes.runner import declare, open_context, warn_of_unknown
+from nics_drl_bridge.nodes.runner import declare, open_context, unknown
 
 pytestmark = pytest.mark.ros
 
@@ -59,10 +59,9 @@ def test_a_description_and_a_range_are_told_to_ros2_param_describe(started):
     assert (span.from_value, span.to_value) == (0.1, 10.0)
 
 
-def test_a_misspelt_parameter_is_warned_of_with_the_nearest_name(started, capfd):
+def test_a_misspelt_parameter_is_named_with_the_nearest_one(started):
     node = started("command_timout:=2.0", "qos_overrides./scan.publisher.depth:=3")
     declare(node, "command_timeout", 0.5, "Silence.")
-    warn_of_unknown(node)
-    (line,) = capfd.readouterr().err.splitlines()
+    (line,) = unknown(node)
     assert "'command_timout'" in line
     assert "did you mean 'command_timeout'?" in line

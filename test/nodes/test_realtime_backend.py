@@ -19,7 +19,7 @@ from nics_drl_bridge.env.registry import NAVIGATION
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import conversions, qos, realtime_backend
-from nics_drl_bridge.nodes.observer import EpisodeServices
+from nics_drl_bridge.nodes.link import EpisodeServices
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.sim.world import load_world
 

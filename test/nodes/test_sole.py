@@ -14,6 +14,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
+from nics_drl_bridge.nodes.single_instance import sole
 from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
@@ -21,7 +22,6 @@ from sensor_msgs.msg import LaserScan
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.device_node import WATCH_S
-from nics_drl_bridge.nodes.single_instance import sole
 from nodes.peer import DEADLINE_S
 
 pytestmark = pytest.mark.ros

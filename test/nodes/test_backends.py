@@ -24,7 +24,7 @@ from nics_drl_bridge.errors import BackendError, ModelError, StaleDataError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import qos
-from nics_drl_bridge.nodes.dds_backend import DdsBackend, _Mailbox
+from nics_drl_bridge.nodes.backends import DdsBackend, _Mailbox
 from nics_drl_bridge.nodes.executor import HANDED_OVER
 from nics_drl_bridge.sim.world import load_world
 
@@ -194,20 +194,6 @@ def test_what_is_lost_on_the_way_is_asked_for_again_and_counts_once(connect, mon
     assert holed[1][f"{topic}_stamp_ns"] == holed[1]["stamp_ns"]
 
 
-@pytest.mark.skipif(
-    not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2,
-    reason="needs two cores and a system that lets threads choose",
-)
-def test_the_executor_shares_a_core_with_whoever_steps_who_stays_free_to_run_anywhere(connect):
-    backend, free = connect(), os.sched_getaffinity(0)
-    backend.reset(START)
-    (helper,) = {t.native_id for t in threading.enumerate() if t.name == "dds_backend"}
-    for _ in range(20):
-        backend.step(np.array([0.5, 0.1]))
-        assert os.sched_getaffinity(0) == free
-    assert len(os.sched_getaffinity(helper)) == 1
-
-
 def test_a_lost_asking_is_made_again(connect, monkeypatch):
     backend = connect()
     drive(backend)
@@ -225,7 +211,7 @@ def test_a_lost_asking_is_made_again(connect, monkeypatch):
             return Future()
         return ask(request)
 
-    monkeypatch.setattr("nics_drl_bridge.nodes.observer.LOST_S", 0.1)
+    monkeypatch.setattr("nics_drl_bridge.nodes.link.LOST_S", 0.1)
     monkeypatch.setattr(backend._mail, "put", lossy)
     monkeypatch.setattr(backend._episodes._repeat, "call_async", deaf)
     view, facts = backend.step(np.array([0.5, 0.1]))
