@@ -6,6 +6,7 @@ import array
 import math
 import re
 import sys
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -110,7 +111,7 @@ def odometry_to_ros(
     pose: ArrayLike,
     twist: ArrayLike,
     time_ns: int,
-    frames: tuple[str, str],
+    frames: Sequence[str],
     variance: tuple[float, float, float, float],
 ) -> Odometry:
     """Returns pose (3,) and body twist (3,), in a fixed and a body frame, as an Odometry message.

@@ -30,10 +30,7 @@ ANY_PUBLISHER = QoSProfile(
 def listen(seconds: float, namespace: str = "", domain_id: int | None = None) -> Facts:
     """Listens to a robot without sending anything.
 
-    Args:
-        seconds: duration from the first message on, which is awaited for at most 10 s.
-        namespace: of the robot.
-        domain_id: DDS domain; the environment's by default.
+    The seconds count from the first message on, which is awaited for at most 10 s.
     """
     context = open_context([], domain_id)
     node = Node(NAME, context=context, start_parameter_services=False)

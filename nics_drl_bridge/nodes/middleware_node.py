@@ -13,10 +13,15 @@ from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.middleware.measurement import Health
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.diagnostics import Condition, Diagnostics
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
-from nics_drl_bridge.nodes.runner import declare, declare_model_name, run_node
+from nics_drl_bridge.nodes.runner import (
+    Condition,
+    Diagnostics,
+    declare,
+    declare_model_name,
+    run_node,
+)
 
 SILENCE_S = 5.0
 """Diagnostics warn of a topic that has been silent for this long [s]."""
@@ -28,9 +33,6 @@ class MiddlewareNode(ManagedNode):
     `RobotTopics` describes these topics, `docs/middleware.md` their use. `~/reset` clears all
     state, so that the next odometry fixes `map` anew. It listens when configured and publishes the
     estimate when active; diagnostics are published in every state.
-
-    Args:
-        context: of the node.
     """
 
     def __init__(self, context: Context) -> None:
@@ -61,10 +63,7 @@ class MiddlewareNode(ManagedNode):
         # A pose or a yaw rate may have been newer.
         stamp_ns = max(stamp_ns, estimator.time_ns)
         view = self._topics.middleware.view(stamp_ns)
-        frames = (
-            str(self.get_parameter("map_frame").value),
-            str(self.get_parameter("base_frame").value),
-        )
+        frames = [str(self.get_parameter(f"{name}_frame").value) for name in ("map", "base")]
         message = conversions.odometry_to_ros(view.pose, view.twist, stamp_ns, frames, (0.0,) * 4)
         message.pose.covariance = conversions.covariance_to_ros(estimator.covariance[:3, :3])
         message.twist.covariance = conversions.covariance_to_ros(estimator.twist_covariance)
@@ -98,16 +97,16 @@ def silence(health: Health, expected: Sequence[str]) -> str:
 
 def facts(health: Health) -> dict[str, str]:
     """Returns the health as keys and values for people."""
-    told = {}
+    found = {}
     for topic, each in health.topics.items():
-        told[f"{topic} received"] = str(each.received)
-        told[f"{topic} rate [Hz]"] = f"{each.rate_hz:.3g}"
-        told[f"{topic} age [s]"] = f"{each.age_s:.3f}"
+        found[f"{topic} received"] = str(each.received)
+        found[f"{topic} rate [Hz]"] = f"{each.rate_hz:.3g}"
+        found[f"{topic} age [s]"] = f"{each.age_s:.3f}"
         if not math.isnan(each.innovation):
-            told[f"{topic} innovation"] = f"{each.innovation:.3g}"
-    told |= {f"rejected, {reason}": str(count) for reason, count in health.rejected.items()}
-    told |= {f"noticed, {reason}": str(count) for reason, count in health.noticed.items()}
-    return told | {"late and put in place": str(health.replayed)}
+            found[f"{topic} innovation"] = f"{each.innovation:.3g}"
+    found |= {f"rejected, {reason}": str(count) for reason, count in health.rejected.items()}
+    found |= {f"noticed, {reason}": str(count) for reason, count in health.noticed.items()}
+    return found | {"late and put in place": str(health.replayed)}
 
 
 def main(args: list[str] | None = None) -> None:

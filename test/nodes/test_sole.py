@@ -21,7 +21,7 @@ from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.device_node import WATCH_S
+from nics_drl_bridge.nodes.simulator_node import WATCH_S
 from nodes.peer import DEADLINE_S
 
 pytestmark = pytest.mark.ros
