@@ -147,8 +147,9 @@ def same(one: Ranges, other: Ranges) -> bool:
 def shown_again(config: GateConfig, old: Ranges, ranges: Ranges, moved: Array) -> bool:
     """True if a scan (B,) repeats an old one (B,) although the robot has moved (3,) [m, m, rad]."""
     telling = must_differ(config, old, moved)
-    enough = np.count_nonzero(telling) >= LEAST_BEAMS
-    return enough and _but_for_one((old == ranges) & telling, telling, TELLING_SHARE)
+    if np.count_nonzero(telling) < LEAST_BEAMS:
+        return False
+    return _but_for_one((old == ranges) & telling, telling, TELLING_SHARE)
 
 
 def _but_for_one(same: Flags, counted: Flags, share: float) -> bool:

@@ -102,8 +102,9 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
         _check(f"{path}: key 'commands.{variable.name}", file.commands[variable.name], variable)
     each = [file.commands[wanted] for wanted in names]
     units = np.array([variable.unit for variable in robot.command])
-    bounds = np.array([(limit.min, limit.max, limit.rate, limit.jerk) for limit in each]).T
-    limits = Limits(*bounds, linear=units == SPEED, turn=units == TURN)
+    bounds = np.array([(limit.min, limit.max, limit.rate, limit.jerk) for limit in each])
+    low, high, rate, jerk = bounds.T.copy()
+    limits = Limits(low, high, rate, jerk, linear=units == SPEED, turn=units == TURN)
     if greatest(limits, limits.linear | limits.turn) < LEAST_MOTION:
         raise ConfigError(
             f"{path}: the robot could never move: none of its speeds and turn rates may reach "

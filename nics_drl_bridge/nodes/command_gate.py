@@ -110,20 +110,20 @@ def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
     scan_age = max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate)
     heard = "Whether e_stop must have been heard before arming; false in simulations alone."
     default, seconds = GateConfig, (0.01, 10.0)
-    rows: tuple[tuple[str, float | bool, str, tuple[float, ...]], ...] = (
+    rows: tuple[tuple[str, float | bool, str, tuple[float, float] | None], ...] = (
         ("odom_rate", 1.0 / model.control_period, "Of odom [Hz].", (0.1, 1e4)),
         ("scan_age_s", scan_age, "Oldest scan, and behind a command [s].", seconds),
         ("odom_age_s", default.odom_age_s, "Oldest odometry [s].", seconds),
         ("command_age_s", default.command_age_s, "Oldest command [s].", seconds),
         ("rate_tolerance", default.rate_tolerance, "Of both rates.", (0.01, 0.9)),
         ("clock_rate", 1.0, "Of stamps: simulated seconds per second.", (0.01, 100.0)),
-        ("e_stop_required", True, heard, ()),
+        ("e_stop_required", True, heard, None),
         ("e_stop_silence_s", default.e_stop_silence_s, "Silence of e_stop [s].", seconds),
-        ("estimate_required", True, "Whether arming needs odometry/filtered.", ()),
+        ("estimate_required", True, "Whether arming needs odometry/filtered.", None),
         ("estimate_std", default.estimate_std, "Greatest [m, rad].", (1e-3, 1e3)),
     )
     return {
-        field: declare(node, field.removesuffix("_s"), value, about, *span, read_only=True)
+        field: declare(node, field.removesuffix("_s"), value, about, span, read_only=True)
         for field, value, about, span in rows
     }
 
@@ -134,7 +134,8 @@ def declare_black_box(node: Node) -> Path:
     given = str(declare(node, "black_box", "", about, read_only=True))
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     # So that no gate of another namespace removes its files.
-    return (Path(given) if given else home / "black_box") / node.get_namespace().strip("/")
+    namespace = str(node.get_namespace()).strip("/")
+    return (Path(given) if given else home / "black_box") / namespace
 
 
 def _declare_shield(
@@ -242,7 +243,7 @@ class CommandGate(QosWatch):
         self.create_timer(PERIOD_S, lambda: self._decide(Tick()), clock=steady)
         Diagnostics(self, "gate", self._look)
         about = "Real-time priority (SCHED_FIFO) of its process, 1 to 99; 0 for none."
-        priority = declare(self, "priority", 0, about, low=0, high=HIGHEST, read_only=True)
+        priority = declare(self, "priority", 0, about, (0, HIGHEST), read_only=True)
         refused = take_priority(priority)  # once all threads exist
         if refused:
             logger.warning(refused)

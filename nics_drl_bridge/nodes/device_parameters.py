@@ -91,9 +91,9 @@ def declare_device(node: Node, laser_frame: str) -> None:
         ("command_latency", own, own, 10.0,
          "From a command to its effect [s]; -1 for the measured one of the model."),
     ):  # fmt: skip
-        declare(node, name, value, about, low=low, high=high, read_only=True)
+        declare(node, name, value, about, (low, high), read_only=True)
     silence = "Stops after this silence on cmd_vel [simulated s]; not in lockstep."
-    declare(node, "command_timeout", 0.5, silence, low=0.0, high=3600.0)
+    declare(node, "command_timeout", 0.5, silence, span=(0.0, 3600.0))
     declare(node, "episode_seed", 0, "Seed of the episode that ~/reset begins.")
     start = "Start x, y, heading of that episode, of each robot."
     declare(node, "episode_start", [0.0, 0.0, 0.0], start)

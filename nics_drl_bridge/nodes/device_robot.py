@@ -252,17 +252,17 @@ class Transforms:
     """Publishes transforms; if tf2_msgs is not installed, it logs that once."""
 
     def __init__(self, node: Node) -> None:
-        self._kind: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
-        self.published = self._kind is not None
-        if not self.published:
+        kind = conversions.message_type("tf2_msgs/msg/TFMessage")
+        self.published = kind is not None
+        if kind is None:
             node.get_logger().warning(
                 "the message package tf2_msgs is not installed, so that neither /tf nor /tf_static "
                 "is published; install it with your ROS 2 distribution."
             )
             return
-        self._message = self._kind()
-        self._moving = node.create_publisher(self._kind, "/tf", qos.TRANSFORMS)
-        self._fixed = node.create_publisher(self._kind, "/tf_static", qos.FIXED_TRANSFORMS)
+        self._kind, self._message = kind, kind()
+        self._moving = node.create_publisher(kind, "/tf", qos.TRANSFORMS)
+        self._fixed = node.create_publisher(kind, "/tf_static", qos.FIXED_TRANSFORMS)
 
     def publish_fixed(self, transforms: list[TransformStamped]) -> None:
         """Publishes once what never changes; late joiners get it, too."""

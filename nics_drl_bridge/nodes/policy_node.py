@@ -68,7 +68,7 @@ class PolicyNode(ManagedNode):
         ):
             declare(self, name, default, about, read_only=True)
         about = "So many late inferences in a row command zero."
-        declare(self, "late_limit", 3, about, low=1, high=1000, read_only=True)
+        declare(self, "late_limit", 3, about, span=(1, 1000), read_only=True)
         self._acted_ns = 0
         Diagnostics(self, "policy", self._look)
 

@@ -77,7 +77,7 @@ def declare_drive(node: Node) -> DriveParameters:
     return DriveParameters(
         plan,
         out,
-        odom_timeout=get("odom_timeout", 0.5, silence, low=0.05, high=10.0),
+        odom_timeout=get("odom_timeout", 0.5, silence, span=(0.05, 10.0)),
         stamped=get("stamped", False, "Whether cmd_vel is a TwistStamped."),
         roles=topic_roles(Path(topics) if topics else None),
     )
@@ -217,11 +217,11 @@ class DriveLog:
             wheels = wheels_of(table, self._roles, PLACE)
             data |= {n: d for n, d in (("state", state), ("wheels", wheels)) if d is not None}
         try:
-            found = streams(data, self._roles.stamps, PLACE)
+            found: dict[str, Any] = dict(streams(data, self._roles.stamps, PLACE))
         except RecordingError:
             # Poorer stamps are better than no recording of a drive that is over.
-            found = streams(data, "receive", PLACE)
-        return Recording(**dict(found), source=PLACE, variables=self._spec.variable_names)
+            found = dict(streams(data, "receive", PLACE))
+        return Recording(**found, source=PLACE, variables=self._spec.variable_names)
 
 
 @dataclass(frozen=True)

@@ -224,11 +224,10 @@ def declare(
     name: str,
     default: Any,
     description: str,
-    low: float | None = None,
-    high: float | None = None,
+    span: tuple[float, float] | None = None,
     read_only: bool = False,
 ) -> Any:
-    """Declares a parameter of the default's type, and returns its value.
+    """Declares a parameter of the default's type, and returns its value, which lies in a span.
 
     In a managed node `read_only` applies from configure to cleanup. `rate:=2` may be given for a
     floating-point parameter: rclpy itself refuses an integer.
@@ -237,9 +236,9 @@ def declare(
         node.fixed.add(name)
         read_only = False
     descriptor = ParameterDescriptor(description=description, read_only=read_only)
-    if low is not None:
+    if span is not None:
         kind, field = RANGES[type(default)]
-        setattr(descriptor, field, [kind(from_value=low, to_value=high)])
+        setattr(descriptor, field, [kind(from_value=span[0], to_value=span[1])])
     given, many = _given_values(node), isinstance(default, list)
     if name in given and isinstance(default[0] if many else default, float):
         types, value = Parameter.Type, given[name].value

@@ -23,7 +23,7 @@ def mujoco_simulator(node: Node, model: SimulatorModel, world: World, robots: in
     """Makes robots in MuJoCo, with the lidar and the floor that the parameters name."""
     declare(node, "renderer", "exact", "Lidar: baked or exact.", read_only=True)
     floor = "Friction between tyres and floor; ice has 0.1."
-    friction = declare(node, "friction", 1.0, floor, low=0.01, high=2.0, read_only=True)
+    friction = declare(node, "friction", 1.0, floor, span=(0.01, 2.0), read_only=True)
     renderer = cast(Renderer, choice(node, "renderer", RENDERERS))
     return MujocoSimulator(model, world, robots, renderer, replace(Physics(), friction=friction))
 
