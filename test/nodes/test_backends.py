@@ -65,9 +65,9 @@ def connect(simulator, model, arena):
 
 
 @pytest.fixture
-def own_simulator(launch, domain_id, model, arena):
+def own_simulator(launch_process, domain_id, model, arena):
     """A backend on a simulator that the test may harm, in a namespace."""
-    process = launch("simulator_node", domain_id, namespace=NAMESPACE, mode="lockstep")
+    process = launch_process("simulator_node", domain_id, namespace=NAMESPACE, mode="lockstep")
     backend = DdsBackend(
         model, arena, namespace=NAMESPACE, domain_id=domain_id, timeout_s=TIMEOUT_S
     )
@@ -242,7 +242,6 @@ def test_the_executor_rests_only_for_a_caller_that_waits_and_now_has_all():
 
     worked, got = [], []
     mail = _Mailbox(("odom", "scan"), lambda stamp, *_: worked.append(stamp))
-    mail._core.help = lambda: None  # this thread is not to be kept on one core
     assert mail.put("odom", stamped(1)) is mail.put("scan", stamped(1)) is None
     caller = threading.Thread(target=lambda: got.append(mail.wait(2 * NS_PER_S, TIMEOUT_S)))
     caller.start()
@@ -362,6 +361,7 @@ def test_somebody_else_who_moves_the_simulator_is_found_out(connect, commands_he
     drive(backend)
 
 
+@pytest.mark.process
 def test_in_a_namespace_it_notices_the_death_of_its_simulator(own_simulator):
     backend, process, _ = own_simulator
     drive(backend)
@@ -375,6 +375,7 @@ def test_in_a_namespace_it_notices_the_death_of_its_simulator(own_simulator):
         backend.reset(START)
 
 
+@pytest.mark.process
 def test_a_simulator_that_hangs_is_noticed_and_serves_again_when_it_wakes(own_simulator):
     backend, process, _ = own_simulator
     drive(backend)

@@ -88,6 +88,7 @@ def test_it_refuses_to_be_taken_for_another_model(node, robot):
         backend.close()
 
 
+@pytest.mark.process
 def test_without_mujoco_the_node_ends_with_one_sentence():
     code = (
         "import sys; sys.modules['mujoco'] = None; sys.argv = ['mujoco_node']\n"
