@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -22,7 +22,7 @@ from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.device_parameters import default_namespaces
 from nics_drl_bridge.nodes.executor import HANDED_OVER
-from nics_drl_bridge.nodes.link import EpisodeServices, Link
+from nics_drl_bridge.nodes.link import EpisodeServices, Link, halted_after_an_error
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.robot_topics import data_facts
 from nics_drl_bridge.sim.world import World
@@ -128,7 +128,12 @@ class DdsBackend:
 
     Model and world must be those that the simulator node runs. `truth` waits for `ground_truth`
     too, and puts the true pose into `info`; `timeout_s` bounds each wait for a peer or an answer.
-    Raises BackendError if no simulator is there.
+
+    Raises:
+        BackendError: no simulator is there, it refuses or does not answer, another node moved it,
+            or it is not in lock-step.
+        ModelError: it runs another model or world.
+        StaleDataError: its data do not arrive.
     """
 
     def __init__(
@@ -160,12 +165,8 @@ class DdsBackend:
             raise
 
     def reset(self, start: Start) -> RobotView:
-        """Begins the episode of a seed in the simulator; see `interface.Backend`.
-
-        Raises BackendError if the simulator refuses or does not answer, ModelError if it runs
-        another model or world, StaleDataError if its data do not arrive.
-        """
-        with self._link.zero_after_an_error():
+        """Begins the episode of a seed in the simulator; see `interface.Backend`."""
+        with halted_after_an_error(self._link):
             self.choose(start)
             return self.first(self.begin(), start.pose)
 
@@ -186,18 +187,14 @@ class DdsBackend:
         return self._measure()[0]
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
-        """Publishes a command and waits for the data after it; see `interface.Backend`.
-
-        Raises BackendError if another node moved the simulator, or it is not in lock-step, and
-        StaleDataError if the data do not arrive.
-        """
+        """Publishes a command and waits for the data after it; see `interface.Backend`."""
         self.send(command)
         return self.receive()
 
     def send(self, command: Array) -> None:
         """The first half of a step: checks and publishes a command (C,)."""
         self._link.check_open()
-        with self._link.zero_after_an_error():
+        with halted_after_an_error(self._link):
             # Data that arrived before the command would be taken for its answer.
             self._check_stamps()
             twist = self._robot.to_cmd_vel(command)
@@ -210,22 +207,19 @@ class DdsBackend:
 
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
         """The second half: waits for the data after the command; returns the view and `info`."""
-        with self._link.zero_after_an_error():
+        with halted_after_an_error(self._link):
             return self._measure()
 
     def _check_stamps(self) -> None:
+        """Raises BackendError if a newest datum is not stamped with the present step."""
         for topic in self._topics:
-            self._check_stamp(topic)
-
-    def _check_stamp(self, topic: str) -> None:
-        """Raises BackendError if the newest datum is not stamped with the present step."""
-        off_ns = self._mail.stamp_ns(topic) - self._now_ns
-        if off_ns:
-            self._link.check_alone()
-            raise BackendError(
-                f"topic {topic!r}: stamped {off_ns / NS_PER_S:+.3f} s off the step; start "
-                "the simulator with mode:=lockstep, and move it from here alone."
-            )
+            off_ns = self._mail.stamp_ns(topic) - self._now_ns
+            if off_ns:
+                self._link.check_alone()
+                raise BackendError(
+                    f"topic {topic!r}: stamped {off_ns / NS_PER_S:+.3f} s off the step; start "
+                    "the simulator with mode:=lockstep, and move it from here alone."
+                )
 
     def _measure(self) -> tuple[RobotView, dict[str, Any]]:
         """Returns the view at the present stamp. Raises BackendError if the data have another."""
@@ -235,10 +229,7 @@ class DdsBackend:
         message, arrival = messages[SCAN]
         ranges = from_device(_read(SCAN, wire.ranges_of, message), self._lidar)
         self._middleware.scan(now, arrival, ranges)
-        facts: dict[str, Any] = {
-            "stamp_ns": now,
-            **data_facts(self._middleware, time.monotonic_ns()),
-        }
+        facts = {"stamp_ns": now, **data_facts(self._middleware, time.monotonic_ns())}
         if TRUTH in self._topics:
             facts["true_pose"] = _read(TRUTH, wire.odometry_of, messages[TRUTH][0])[0]
             self._known = {"true_pose": facts["true_pose"]}
@@ -318,7 +309,7 @@ class FleetBackend:
     def reset(self, start: Start) -> RobotView:
         """Begins one episode for all robots, at poses (M, 3); see `DdsBackend.reset`."""
         leader = self._robots[0]
-        with self._zero_after_an_error():
+        with halted_after_an_error(self):
             leader.choose(start)
             stamp_ns = leader.begin()
             both = zip(self._robots, start.pose, strict=True)
@@ -326,7 +317,7 @@ class FleetBackend:
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Publishes all commands (M, C) and waits for all data after them."""
-        with self._zero_after_an_error():
+        with halted_after_an_error(self):
             for robot, one in zip(self._robots, command, strict=True):
                 robot.send(one)
             views, facts = zip(*(robot.receive() for robot in self._robots), strict=True)
@@ -335,14 +326,6 @@ class FleetBackend:
     def facts(self) -> BackendFacts:
         """Returns what is known of all robots, stacked."""
         return cast("BackendFacts", together([robot.facts() for robot in self._robots]))
-
-    @contextmanager
-    def _zero_after_an_error(self) -> Iterator[None]:
-        try:
-            yield
-        except BaseException:
-            self.halt()
-            raise
 
     def halt(self) -> None:
         """Publishes a zero command for each robot, even if one of them raises."""

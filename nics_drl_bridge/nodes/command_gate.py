@@ -18,46 +18,25 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
-from nav_msgs.msg import Odometry as OdometryMessage
-from rclpy.clock import Clock, ClockType
+from nav_msgs.msg import Odometry
 from rclpy.context import Context
 from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
-from std_srvs.srv import Trigger
 
-from nics_drl_bridge.gate import shield
+from nics_drl_bridge.gate import inputs, shield
 from nics_drl_bridge.gate.black_box import Entry
 from nics_drl_bridge.gate.gate import decide
-from nics_drl_bridge.gate.inputs import (
-    Arm,
-    Command,
-    Estimate,
-    EStop,
-    Input,
-    Odometry,
-    Press,
-    Reset,
-    Scan,
-    Tick,
-)
 from nics_drl_bridge.gate.limits import PERIOD_S, Limits, load_limits
 from nics_drl_bridge.gate.state import Decision, GateConfig, ShieldConfig, begin
 from nics_drl_bridge.gate.stopping import doubtful, require_possible, shield_config
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
-from nics_drl_bridge.nodes import qos, wire
+from nics_drl_bridge.nodes import qos, runner, wire
 from nics_drl_bridge.nodes.conversions import is_rotation
 from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.qos import QosWatch
-from nics_drl_bridge.nodes.runner import (
-    Condition,
-    Diagnostics,
-    declare,
-    declare_model,
-    last_word,
-    run_node,
-)
+from nics_drl_bridge.nodes.runner import declare
 from nics_drl_bridge.nodes.wire import UNREADABLE, TwistWriter
 
 STALE_S = 0.05
@@ -162,36 +141,36 @@ def _declare_shield(
     return config
 
 
-def scan(lidar: LidarSpec, content: bytes) -> Scan:
+def scan(lidar: LidarSpec, content: bytes) -> inputs.Scan:
     """Reads a serialised LaserScan; raises `wire.UNREADABLE`, as the next four."""
     ranges = from_device(wire.ranges_of(content), lidar)
-    return Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
+    return inputs.Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
 
 
-def odometry(content: bytes) -> Odometry:
+def odometry(content: bytes) -> inputs.Odometry:
     """Reads a serialised Odometry; without a rotation its pose is NaN."""
     pose, twist = wire.odometry_of(content)
     if not is_rotation(*wire.numbers_of(content)[ROTATION].tolist()):
         pose = np.full(3, np.nan)
-    return Odometry(wire.stamp_of(content), pose, twist)
+    return inputs.Odometry(wire.stamp_of(content), pose, twist)
 
 
-def estimate(content: bytes) -> Estimate:
+def estimate(content: bytes) -> inputs.Estimate:
     """Reads a serialised Odometry of an estimator."""
     x, y, heading = wire.numbers_of(content)[VARIANCES]
     with np.errstate(invalid="ignore"):  # a negative variance gives NaN, too
         std = np.sqrt([np.maximum(x, y), heading])
-    return Estimate(wire.odometry_of(content)[1], std)
+    return inputs.Estimate(wire.odometry_of(content)[1], std)
 
 
-def command(content: bytes) -> Command:
+def command(content: bytes) -> inputs.Command:
     """Reads a serialised TwistStamped."""
-    return Command(wire.stamp_of(content), np.array(wire.stamped_twist_of(content)))
+    return inputs.Command(wire.stamp_of(content), np.array(wire.stamped_twist_of(content)))
 
 
-def e_stop(content: bytes) -> EStop:
+def e_stop(content: bytes) -> inputs.EStop:
     """Reads a serialised Bool."""
-    return EStop(wire.truth_of(content))
+    return inputs.EStop(wire.truth_of(content))
 
 
 def take_priority(priority: int) -> str:
@@ -219,12 +198,12 @@ class CommandGate(QosWatch):
 
     It starts disarmed. `~/arm` lets commands pass if all checks succeed, `~/e_stop` presses the
     emergency stop, `~/reset` clears a latched stop and leaves the gate disarmed. All decisions are
-    made in the room `gate`, on the steady clock.
+    made by `gate.gate.decide`, on the steady clock.
     """
 
     def __init__(self, context: Context) -> None:
         super().__init__("command_gate", context=context)
-        model, logger = declare_model(self), self.get_logger()
+        model, logger = runner.declare_model(self), self.get_logger()
         self._lidar, self._config = model.lidar, declare_gate(self, model)
         self._state = begin(self._config)
         self._log = GateLog(self._config, declare_black_box(self), model.robot.name, logger)
@@ -239,9 +218,8 @@ class CommandGate(QosWatch):
         self._twists = TwistWriter()
         self._zero = self._twists.write(np.zeros(3))
         self._listen()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(PERIOD_S, lambda: self._decide(Tick()), clock=steady)
-        Diagnostics(self, "gate", self._look)
+        runner.steadily(self, PERIOD_S, lambda: self._decide(inputs.Tick()))
+        runner.Diagnostics(self, "gate", self._look)
         about = "Real-time priority (SCHED_FIFO) of its process, 1 to 99; 0 for none."
         priority = declare(self, "priority", 0, about, (0, HIGHEST), read_only=True)
         refused = take_priority(priority)  # once all threads exist
@@ -251,18 +229,18 @@ class CommandGate(QosWatch):
     def _listen(self) -> None:
         for kind, topic, read, profile in (
             (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),
-            (OdometryMessage, "odom", odometry, qos.SENSOR),
-            (OdometryMessage, "odometry/filtered", estimate, qos.SENSOR),
+            (Odometry, "odom", odometry, qos.SENSOR),
+            (Odometry, "odometry/filtered", estimate, qos.SENSOR),
             (TwistStamped, "cmd_vel_raw", command, qos.COMMAND),
             (Bool, "e_stop", e_stop, qos.EVERY_COMMAND),
         ):
             taker = partial(self._take, topic, read)
             self.create_subscription(kind, topic, taker, profile, raw=True)
-        self.create_service(Trigger, "~/arm", self._on_arm)
-        self.create_service(Trigger, "~/reset", self._on_reset)
-        self.create_service(Trigger, "~/e_stop", self._on_e_stop_call)
+        runner.serve(self, "~/arm", self._arm)
+        runner.serve(self, "~/reset", lambda: self._answer(inputs.Reset()))
+        runner.serve(self, "~/e_stop", self._press)
 
-    def _take(self, topic: str, read: Callable[[bytes], Input], content: bytes) -> None:
+    def _take(self, topic: str, read: Callable[[bytes], inputs.Input], content: bytes) -> None:
         try:
             given = read(content)
         except UNREADABLE as error:  # of a middleware with another encoding
@@ -270,34 +248,29 @@ class CommandGate(QosWatch):
             return
         self._decide(given)
 
-    def _on_arm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._answer(Arm(self.count_publishers(self._out.topic_name)), response)
+    def _arm(self) -> tuple[bool, str]:
+        return self._answer(inputs.Arm(self.count_publishers(self._out.topic_name)))
 
-    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._answer(Reset(), response)
+    def _press(self) -> tuple[bool, str]:
+        self._decide(inputs.Press())
+        return True, "the e-stop is pressed; ~/reset releases it"
 
-    def _on_e_stop_call(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._decide(Press())
-        response.success, response.message = True, "the e-stop is pressed; ~/reset releases it"
-        return response
-
-    def _answer(self, given: Input, response: Trigger.Response) -> Trigger.Response:
+    def _answer(self, given: inputs.Input) -> tuple[bool, str]:
         decision = self._decide(given)
-        response.success, response.message = decision.granted, decision.answer
         self.get_logger().info(f"{type(given).__name__.lower()}: {decision.answer}")
-        return response
+        return decision.granted, decision.answer
 
-    def _decide(self, given: Input) -> Decision:
+    def _decide(self, given: inputs.Input) -> Decision:
         now, before = time.monotonic(), self._state
         self._state, decision = decide(self._config, before, given, now)
         # Publish first: the rest may take its time.
         instead = self._say(decision, now) if decision.publish else None
         self._log.note(Entry(now, given, before, decision))
-        if instead is not None and not isinstance(given, Press):
+        if instead is not None and not isinstance(given, inputs.Press):
             self._decide(instead)
         return decision
 
-    def _say(self, decision: Decision, now: float) -> Input | None:
+    def _say(self, decision: Decision, now: float) -> inputs.Input | None:
         """Publishes a decision; the only path to the robot except `stop`.
 
         Returns an input to decide on instead, or None. What is not finite is sent as zero and
@@ -308,13 +281,13 @@ class CommandGate(QosWatch):
         if not np.isfinite(decision.twist).all():
             self._out.publish(self._zero)
             self._log.no_number(decision.twist.tolist())
-            return Press()
+            return inputs.Press()
         if decision.cause is None and time.monotonic() - now > STALE_S:
-            return Tick()
+            return inputs.Tick()
         self._out.publish(content)
         return None
 
-    def _look(self) -> Condition:
+    def _look(self) -> runner.Condition:
         """Returns the finding for `/diagnostics`; other publishers are reported, not prevented."""
         found = self._log.finding(self._state)
         others = self.count_publishers(self._out.topic_name) - 1
@@ -326,13 +299,13 @@ class CommandGate(QosWatch):
 
     def stop(self) -> None:
         """Leaves a zero command behind."""
-        last_word(self._out, self._zero)
+        runner.last_word(self._out, self._zero)
         self._log.close()
 
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of the executable."""
-    run_node(CommandGate, args, "command_gate")
+    runner.run_node(CommandGate, args, "command_gate")
     sys.stdout.flush()
     sys.stderr.flush()
     # Everything is closed. Tearing down the interpreter as well takes half a second of a core, and

@@ -13,7 +13,14 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseStamped, PoseWithCovarianceStamped, Quaternion, Twist
+from geometry_msgs.msg import (
+    Pose,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Quaternion,
+    Twist,
+    TwistStamped,
+)
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
 from sensor_msgs.msg import Imu, JointState, LaserScan
@@ -70,6 +77,13 @@ def twist_to_ros(twist: ArrayLike) -> Twist:
     x, y, w = (float(value) for value in np.asarray(twist))
     message = Twist()
     message.linear.x, message.linear.y, message.angular.z = x, y, w
+    return message
+
+
+def stamped_to_ros(twist: ArrayLike, time_ns: int, frame: str) -> TwistStamped:
+    """Returns linear.x, linear.y, angular.z (3,) as a TwistStamped."""
+    message = TwistStamped(twist=twist_to_ros(twist))
+    message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
     return message
 
 

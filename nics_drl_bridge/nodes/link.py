@@ -40,10 +40,20 @@ LOST_S = 1.0
 """A request to repeat data that stays unanswered for longer was itself lost [s]."""
 
 
+@contextlib.contextmanager
+def halted_after_an_error(robot: Any) -> Iterator[None]:
+    """Calls a robot's `halt`, which publishes a zero command, if the body ends by any exception."""
+    try:
+        yield
+    except BaseException:
+        robot.halt()
+        raise
+
+
 class Link:
     """A node in its own context, one executor thread, and the command topic.
 
-    `close`, an error inside `zero_after_an_error`, garbage collection and the end of the process,
+    `close`, an error inside `halted_after_an_error`, garbage collection and the end of the process,
     SIGTERM included, leave a zero command behind. SIGKILL can't be handled: `command_gate` and the
     base's own timeout are for that. Commands are TwistStamped if `stamped`; one without a successor
     within the timeout [s] is followed by a zero.
@@ -96,26 +106,14 @@ class Link:
         self._timeout.begin(moving=True)
         if self._kind is Twist:
             self.commands.publish(self._twists.write(twist))
-            return
-        message = TwistStamped(twist=conversions.twist_to_ros(twist))
-        message.header.stamp = conversions.stamp_to_ros(stamp_ns)
-        message.header.frame_id = "base_link"
-        self.commands.publish(message)
+        else:
+            self.commands.publish(conversions.stamped_to_ros(twist, stamp_ns, "base_link"))
 
     def halt(self) -> None:
         """Publishes a zero command."""
         if self._context.ok():
             self._timeout.begin(moving=False)
             self.commands.publish(self._kind())
-
-    @contextlib.contextmanager
-    def zero_after_an_error(self) -> Iterator[None]:
-        """Publishes a zero command if the body ends by any exception."""
-        try:
-            yield
-        except BaseException:
-            self.halt()
-            raise
 
     def check_open(self) -> None:
         """Raises BackendError if the link is closed."""

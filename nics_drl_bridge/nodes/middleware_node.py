@@ -7,21 +7,13 @@ from collections.abc import Sequence
 
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
-from std_srvs.srv import Trigger
 
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.middleware.measurement import Health
 from nics_drl_bridge.middleware.middleware import rehearse
-from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
-from nics_drl_bridge.nodes.runner import (
-    Condition,
-    Diagnostics,
-    declare,
-    declare_model_name,
-    run_node,
-)
 
 SILENCE_S = 5.0
 """Diagnostics warn of a topic that has been silent for this long [s]."""
@@ -37,12 +29,12 @@ class MiddlewareNode(ManagedNode):
 
     def __init__(self, context: Context) -> None:
         super().__init__("middleware_node", context)
-        declare_model_name(self)
+        runner.declare_model_name(self)
         declare_sensors(self)
-        declare(self, "map_frame", "map", "Frame id of the estimate.")
-        declare(self, "base_frame", "base_link", "Frame id of the robot.")
-        self.create_service(Trigger, "~/reset", self._on_reset)
-        Diagnostics(self, "topics", self._look)
+        runner.declare(self, "map_frame", "map", "Frame id of the estimate.")
+        runner.declare(self, "base_frame", "base_link", "Frame id of the robot.")
+        runner.serve(self, "~/reset", self._reset)
+        runner.Diagnostics(self, "topics", self._look)
 
     def configure(self) -> None:
         """Opens the model and subscribes."""
@@ -69,21 +61,19 @@ class MiddlewareNode(ManagedNode):
         message.twist.covariance = conversions.covariance_to_ros(estimator.twist_covariance)
         self._filtered.publish(message)
 
-    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reset(self) -> tuple[bool, str]:
         if self.state == UNCONFIGURED:
-            response.success, response.message = False, "it is not configured, so knows nothing"
-            return response
+            return False, "it is not configured, so knows nothing"
         self._topics.restart()
-        response.success, response.message = True, "the next odometry fixes the map frame"
-        return response
+        return True, "the next odometry fixes the map frame"
 
-    def _look(self) -> Condition:
+    def _look(self) -> runner.Condition:
         if self.state == UNCONFIGURED:
-            return Condition(self.state, warns=False, facts={})
+            return runner.Condition(self.state, warns=False, facts={})
         health = self._topics.middleware.health(self._topics.now_ns())
         trouble = silence(health, self._topics.expected)
         message = trouble or ("receiving" if self.state == ACTIVE else self.state)
-        return Condition(message, bool(trouble), facts(health), self._hardware)
+        return runner.Condition(message, bool(trouble), facts(health), self._hardware)
 
 
 def silence(health: Health, expected: Sequence[str]) -> str:
@@ -111,7 +101,7 @@ def facts(health: Health) -> dict[str, str]:
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of the executable."""
-    run_node(MiddlewareNode, args, "middleware_node")
+    runner.run_node(MiddlewareNode, args, "middleware_node")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 
 from nics_drl_bridge.errors import BridgeError, ConfigError, shortened
@@ -19,17 +18,10 @@ from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
-from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
-from nics_drl_bridge.nodes.runner import (
-    Condition,
-    Diagnostics,
-    declare,
-    declare_model_name,
-    last_word,
-    run_node,
-)
+from nics_drl_bridge.nodes.runner import declare
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
 
@@ -51,7 +43,7 @@ class PolicyNode(ManagedNode):
 
     def __init__(self, context: Context) -> None:
         super().__init__("policy_node", context)
-        declare_model_name(self)
+        runner.declare_model_name(self)
         declare_sensors(self)
         declare(self, "base_frame", "base_link", "Frame id of the robot.")
         rate = (
@@ -70,7 +62,7 @@ class PolicyNode(ManagedNode):
         about = "So many late inferences in a row command zero."
         declare(self, "late_limit", 3, about, span=(1, 1000), read_only=True)
         self._acted_ns = 0
-        Diagnostics(self, "policy", self._look)
+        runner.Diagnostics(self, "policy", self._look)
 
     def configure(self) -> None:
         """Opens model and policy, and subscribes."""
@@ -87,13 +79,12 @@ class PolicyNode(ManagedNode):
             self, model, on_odometry=self._act, on_scan=self._act, on_lidar=self._on_lidar
         )
         self.undo.callback(self._topics.close)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        timer = self.create_timer(POLLS * model.control_period, self._act, clock=steady)
+        timer = runner.steadily(self, POLLS * model.control_period, self._act)
         self.undo.callback(self.destroy_timer, timer)
 
     def deactivate(self) -> None:
         """Leaves a zero command behind."""
-        last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
+        runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
 
     def _declared_pace(self, control_period: float) -> tuple[ActionPace, Deadline]:
         rate, limit, patience = (
@@ -161,13 +152,13 @@ class PolicyNode(ManagedNode):
             sent = twist if answer is Answer.SEND and np.isfinite(twist).all() else np.zeros(3)
             self._raw.publish(self._message(sent, scan_ns))
 
-    def _look(self) -> Condition:
+    def _look(self) -> runner.Condition:
         if self.state == UNCONFIGURED:
-            return Condition(self.state, warns=False, facts={})
+            return runner.Condition(self.state, warns=False, facts={})
         late, longest = self._deadline.late, f"{1e3 * self._deadline.longest_s:.2f}"
         answered = self._deadline.answered
         facts = {"answered": answered, "late": late, "longest inference [ms]": longest}
-        return Condition(f"{self.state}; {late} late inferences", late > 0, facts)
+        return runner.Condition(f"{self.state}; {late} late inferences", late > 0, facts)
 
     def _twist(self) -> NDArray[np.float64]:
         """Returns the command (3,) for the present view; zero without a goal, at it, or on contact.
@@ -202,15 +193,13 @@ class PolicyNode(ManagedNode):
             ) from error
 
     def _message(self, twist: NDArray[np.float64], stamp_ns: int) -> TwistStamped:
-        message = TwistStamped(twist=conversions.twist_to_ros(twist))
-        message.header.stamp = conversions.stamp_to_ros(stamp_ns)
-        message.header.frame_id = str(self.get_parameter("base_frame").value)
-        return message
+        frame = str(self.get_parameter("base_frame").value)
+        return conversions.stamped_to_ros(twist, stamp_ns, frame)
 
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of the executable."""
-    run_node(PolicyNode, args, "policy_node")
+    runner.run_node(PolicyNode, args, "policy_node")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, BackendFacts, RobotView, Start
 from nics_drl_bridge.middleware.measurement import SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
-from nics_drl_bridge.nodes.link import EpisodeServices, Link
+from nics_drl_bridge.nodes.link import EpisodeServices, Link, halted_after_an_error
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_sensors
 from nics_drl_bridge.sim.world import World
 
@@ -77,8 +77,14 @@ class RealtimeBackend:
     A step publishes its command at once, waits for the end of the period, and returns the newest
     view. A late caller misses deadlines, which are counted and not made up for: the next step again
     ends on the grid of periods. Data feed the middleware as they arrive, in one executor thread;
-    late and unordered ones are put in their place there. A simulator must run the same model and
-    world. Raises ConfigError for an option that can't be used, BackendError if no peer is there.
+    late and unordered ones are put in their place there.
+
+    Raises:
+        ConfigError: an option can't be used.
+        BackendError: no peer is there, a simulator refuses, or a vehicle does not come to rest at
+            its start.
+        ModelError: a simulator runs another model or world.
+        StaleDataError: the newest datum of a topic is older than `stale_after_s`.
     """
 
     def __init__(self, model: SimulatorModel, world: World, **options: Any) -> None:
@@ -117,13 +123,9 @@ class RealtimeBackend:
             raise
 
     def reset(self, start: Start) -> RobotView:
-        """Begins an episode: by a simulator's service, or when a vehicle stands at the start.
-
-        Raises BackendError if the simulator refuses, or the vehicle does not come to rest there,
-        and StaleDataError if its data do not arrive.
-        """
+        """Begins an episode: by a simulator's service, or when a vehicle stands at the start."""
         self._link.check_open()
-        with self._link.zero_after_an_error():
+        with halted_after_an_error(self._link):
             self._link.halt()
             if self._is_vehicle():
                 self._await_start(start)
@@ -214,26 +216,14 @@ class RealtimeBackend:
         return oldest, ages[oldest]
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
-        """Publishes a command, waits for the end of the period; see `interface.Backend`.
-
-        Raises StaleDataError if the newest datum of a topic is older than `stale_after_s`.
-        """
-        self.send(command)
-        return self.receive()
-
-    def send(self, command: Array) -> None:
-        """The first half of a step: publishes a command (C,)."""
+        """Publishes a command, waits for the end of the period; see `interface.Backend`."""
         self._link.check_open()
-        with self._link.zero_after_an_error():
+        with halted_after_an_error(self._link):
             stamp_ns = 0
             if self._options.stamped or self._options.gated:
                 with self._topics.lock:
                     stamp_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
             self._link.send(self._robot.to_cmd_vel(command), stamp_ns)
-
-    def receive(self) -> tuple[RobotView, dict[str, Any]]:
-        """The second half: waits for the end of the period, and returns the newest view."""
-        with self._link.zero_after_an_error():
             late_ns = time.monotonic_ns() - self._deadline_ns
             if late_ns > 0:
                 missed = late_ns // self._period_ns + 1

@@ -14,7 +14,6 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -25,7 +24,7 @@ from nics_drl_bridge.errors import BackendError, BridgeError, RecordingError
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.qos import QosWatch
-from nics_drl_bridge.nodes.runner import EXIT_BAD_INPUT, declare, last_word, run_node
+from nics_drl_bridge.nodes.runner import EXIT_BAD_INPUT, declare, last_word, run_node, steadily
 from nics_drl_bridge.recording.drive_plan import DrivePlan
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S
 from nics_drl_bridge.recording.joints import JointMessage, gather, state_of, wheels_of
@@ -264,8 +263,7 @@ class RecordNode(QosWatch):
         self._pose: Array | None = None
         self._start: Array = np.zeros(3)
         # Steady: the robot's guard must not depend on the time source of the node.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(POLL_S, self._on_time, clock=steady)
+        steadily(self, POLL_S, self._on_time)
 
     def _now_ns(self) -> int:
         """Returns simulated time, or the system time at the start plus steady time [ns]."""
@@ -362,12 +360,9 @@ class RecordNode(QosWatch):
         self._log.command(command)
 
     def _message(self, twist: Array) -> Twist | TwistStamped:
-        message = conversions.twist_to_ros(twist)
-        if not self._order.stamped:
-            return message
-        stamped = TwistStamped(twist=message)
-        stamped.header.stamp = conversions.stamp_to_ros(self._now_ns())
-        return stamped
+        if self._order.stamped:
+            return conversions.stamped_to_ros(twist, self._now_ns(), "")
+        return conversions.twist_to_ros(twist)
 
     def stop(self) -> None:
         """Leaves the robot at rest, and saves what was recorded."""

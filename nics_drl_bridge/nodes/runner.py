@@ -23,6 +23,8 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
+from rclpy.timer import Timer
+from std_srvs.srv import Trigger
 
 from nics_drl_bridge.errors import BackendError, BridgeError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
@@ -208,6 +210,21 @@ def _lives(probe: Node, whole: str) -> bool:
         executor.shutdown(timeout_sec=1.0)
 
 
+def steadily(node: Node, period_s: float, call: Callable[[], Any]) -> Timer:
+    """Calls at a period of the steady clock, also while the time of the robot stands still."""
+    return node.create_timer(period_s, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def serve(node: Node, name: str, answer: Callable[[], tuple[bool, str]]) -> None:
+    """Offers a Trigger service whose answer is success and message."""
+
+    def reply(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = answer()
+        return response
+
+    node.create_service(Trigger, name, reply)
+
+
 def declare_model(node: Node) -> SimulatorModel:
     """Declares the parameter `model` and opens the model that it names."""
     return open_model(declare_model_name(node))
@@ -287,9 +304,7 @@ class Diagnostics:
         self._node, self._look = node, look
         self._name = f"{node.get_fully_qualified_name()}: {part}"
         self._topic = node.create_publisher(DiagnosticArray, "/diagnostics", qos.DIAGNOSTICS)
-        # Steady: diagnostics matter most when the robot's time stands still.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(DIAGNOSTICS_S, self._publish, clock=steady)
+        steadily(node, DIAGNOSTICS_S, self._publish)
 
     def _publish(self) -> None:
         found = self._look()

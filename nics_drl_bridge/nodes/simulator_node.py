@@ -6,26 +6,23 @@ import json
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.clock import Clock as SteadyClock
-from rclpy.clock import ClockType
 from rclpy.context import Context
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import SetBool
 
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Simulator
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
-from nics_drl_bridge.nodes import conversions, device_parameters, qos
+from nics_drl_bridge.nodes import conversions, device_parameters, qos, runner
 from nics_drl_bridge.nodes.device_parameters import RealTime, TopicPace, declare_device, number
 from nics_drl_bridge.nodes.device_robot import CommandInlet, Outbox, RobotPort, Transforms
 from nics_drl_bridge.nodes.qos import QosWatch, owner
-from nics_drl_bridge.nodes.runner import Condition, Diagnostics, declare, declare_model, run_node
 from nics_drl_bridge.sim.device import DeviceWorld
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World, load_world
@@ -54,7 +51,7 @@ class DeviceNode(QosWatch):
 
     def __init__(self, name: str, context: Context, make: MakeSimulator) -> None:
         super().__init__(name, context=context)
-        model = declare_model(self)
+        model = runner.declare_model(self)
         declare_device(self, model.lidar.frame)
         self._time = device_parameters.timing(self, model)
         self._names = device_parameters.namespaces(self)
@@ -90,16 +87,15 @@ class DeviceNode(QosWatch):
                 CommandInlet(self, space, model.robot, commands, take, self._too_old)
             )
         self._transforms.publish_fixed([port.mount() for port in self._ports])
-        self.create_service(Trigger, "~/reset", self._on_reset)
+        runner.serve(self, "~/reset", self._reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
-        self.create_service(Trigger, "~/repeat", self._on_repeat)
-        self.create_service(Trigger, "~/touched", self._on_touched)
-        Diagnostics(self, "simulator", self._look)
+        runner.serve(self, "~/repeat", self._repeat)
+        runner.serve(self, "~/touched", lambda: (True, json.dumps(self._world.touched)))
+        runner.Diagnostics(self, "simulator", self._look)
 
     def _start_time(self) -> None:
         # Steady: with use_sim_time the node's clock would wait for this very node.
-        steady = SteadyClock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(WATCH_S, self._watch, clock=steady)
+        runner.steadily(self, WATCH_S, self._watch)
         step_ns = self._time.step_ns
         self._odom_pace, self._scan_pace = (
             TopicPace(period_ns, step_ns) for period_ns in (self._time.odom_ns, self._time.scan_ns)
@@ -112,9 +108,9 @@ class DeviceNode(QosWatch):
             # A tick that divides the step, if data are published later than they are measured.
             late = any((*self._time.scan_late_ns, *self._time.odom_late_ns))
             ticks = max(1.0, np.ceil(period / LONGEST_TICK_S)) if late else 1.0
-            self._timer = self.create_timer(period / ticks, self._on_time, clock=steady)
+            self._timer = runner.steadily(self, period / ticks, self._on_time)
         elif not self._time.lockstep:
-            self.create_timer(0.0, self._on_free_time, clock=steady)
+            runner.steadily(self, 0.0, self._on_free_time)
 
     def _watch(self) -> None:
         """Warns once of commands of another type, and of other nodes that publish the time."""
@@ -129,7 +125,7 @@ class DeviceNode(QosWatch):
             )
         self._clocks |= names
 
-    def _look(self) -> Condition:
+    def _look(self) -> runner.Condition:
         facts = {
             "mode": self._time.mode,
             "rate": self._time.rate,
@@ -139,7 +135,7 @@ class DeviceNode(QosWatch):
             **self._identity,
         }
         message = "paused" if self._paused else "running"
-        return Condition(message, False, facts, self._hardware)
+        return runner.Condition(message, False, facts, self._hardware)
 
     def _timeout_ns(self) -> int:
         return int(number(self, "command_timeout") * NS_PER_S)
@@ -208,15 +204,12 @@ class DeviceNode(QosWatch):
         if self._timer is not None:
             self._timer.reset()
 
-    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reset(self) -> tuple[bool, str]:
         try:
             self._begin()
         except BridgeError as error:
-            response.success, response.message = False, str(error)
-            return response
-        answer: dict[str, Any] = {"stamp_ns": self._now_ns, **self._identity}
-        response.success, response.message = True, json.dumps(answer)
-        return response
+            return False, str(error)
+        return True, json.dumps({"stamp_ns": self._now_ns, **self._identity})
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._paused = bool(request.data)
@@ -225,18 +218,12 @@ class DeviceNode(QosWatch):
         response.success, response.message = True, "paused" if self._paused else "running"
         return response
 
-    def _on_repeat(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _repeat(self) -> tuple[bool, str]:
         """Publishes the present data again, if some were lost; in real time new ones follow."""
-        response.success = self._time.lockstep
-        if self._time.lockstep:
-            self._publish_data(odom_due=True, scan_due=True)
-        response.message = "" if self._time.lockstep else "data are repeated in lock-step alone"
-        return response
-
-    def _on_touched(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Reports which robots have truly touched something in this episode, as JSON."""
-        response.success, response.message = True, json.dumps(self._world.touched)
-        return response
+        if not self._time.lockstep:
+            return False, "data are repeated in lock-step alone"
+        self._publish_data(odom_due=True, scan_due=True)
+        return True, ""
 
     def _publish(self) -> None:
         """Publishes what is due at present."""
@@ -265,7 +252,7 @@ class DeviceNode(QosWatch):
 
 def fast_simulator(node: Node, model: SimulatorModel, world: World, robots: int) -> Simulator:
     """Makes the fast simulator, with the lidar that the parameter `renderer` names."""
-    declare(node, "renderer", "baked", "Lidar: baked or exact.", read_only=True)
+    runner.declare(node, "renderer", "baked", "Lidar: baked or exact.", read_only=True)
     renderer = cast(Renderer, device_parameters.choice(node, "renderer", RENDERERS))
     tell = node.get_logger().warning
     return FastSimulator(model, world, robots=robots, renderer=renderer, tell=tell)
@@ -278,7 +265,7 @@ def simulator_node(context: Context) -> DeviceNode:
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of the executable."""
-    run_node(simulator_node, args, "simulator_node")
+    runner.run_node(simulator_node, args, "simulator_node")
 
 
 if __name__ == "__main__":
