@@ -21,12 +21,12 @@ CONTROLS = {
 }
 LEAST_RULES = 30
 """There are more; a run that found fewer has lost a table."""
-TESTS, OTHER_TEST = "test/gate", "test/gate/test_settings.py"
+TESTS, OTHER_TEST = "test/gate", "test/gate/test_stopping.py"
 ROOT = Path(__file__).resolve().parents[1]
 TABLES = {
     "stop": (gate, "STOPS", lambda rule: rule.judge.__name__),
-    "refusal": (intake, "REFUSALS", lambda rule: rule.name),
-    "arming": (arming, "CHECKS", lambda check: check.__name__),
+    "refusal": (intake, "REFUSALS", lambda rule: rule[1].__name__),
+    "arming": (arming, "CHECKS", lambda check: check[0]),
     "shaping": (gate, "SHAPERS", lambda shaper: shaper.__name__),
     "evidence": (shield, "EVIDENCE", lambda evidence: evidence.__name__),
 }

@@ -102,8 +102,7 @@ def test_bad_input_ends_it_with_one_sentence(tmp_path, words, said):
 @needs_nodes
 def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monkeypatch):
     from nics_drl_bridge.commands import vehicle
-    from nics_drl_bridge.nodes.observer import Witness
-    from nics_drl_bridge.nodes.processes import NodeProcess
+    from nics_drl_bridge.nodes.processes import NodeProcess, Witness
 
     limits = {
         one.name: {"min": one.min, "max": one.max, "rate": 20.0, "jerk": 400.0}

@@ -186,8 +186,7 @@ def _watched(
     nodes: dict[str, dict[str, Any]], logs: Path, goal: list[float], near: float, say: Say
 ) -> tuple[bool, Any]:
     """Starts the nodes, arms the gate, waits; returns arrival and the robot's path (T, 3)."""
-    from nics_drl_bridge.nodes.observer import Witness
-    from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+    from nics_drl_bridge.nodes.processes import NodeProcess, Witness, free_domain_id
 
     domain_id = free_domain_id()
     with ExitStack() as stack:

@@ -80,7 +80,7 @@ def drive_in(place: str, trial: Trial, told: Told, say: Say = lambda _: None) ->
     check_place(place)
     if place == FAST:
         return drive(trial, "sim", {"estimator": True}, told)
-    from nics_drl_bridge.nodes.observer import Witness
+    from nics_drl_bridge.nodes.processes import Witness
 
     with _node(NODES[place], trial, say) as options, Witness(options["domain_id"]) as witness:
 

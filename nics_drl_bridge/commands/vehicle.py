@@ -169,7 +169,7 @@ def _placed(order: VehicleOrder, scene: Scene) -> str:
 def _arm(order: VehicleOrder, say: Say) -> None:
     if not order.arm:
         return
-    from nics_drl_bridge.nodes.observer import Witness
+    from nics_drl_bridge.nodes.processes import Witness
 
     gate = f"{order.namespace}/{GATE}" if order.namespace else GATE
     with Witness() as witness:

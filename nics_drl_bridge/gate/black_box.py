@@ -1,7 +1,4 @@
-"""The black box: the last half minute of the gate, written at each stop, for replay.
-
-Conversion of the gate's records to plain data for JSON and back, bit-identical.
-"""
+"""The black box: the last half minute of the gate, written at each stop, for replay."""
 
 from __future__ import annotations
 
@@ -9,10 +6,11 @@ import base64
 import hashlib
 import json
 from collections import deque
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from itertools import chain
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
@@ -35,16 +33,8 @@ MOST_INPUTS = 20_000
 """Greatest number of inputs that are decided on again; each takes some 30 us."""
 
 
-@dataclass(frozen=True)
-class Entry:
-    """One input of the gate.
-
-    Attributes:
-        now: steady time [s].
-        given: the input.
-        before: the state before the input.
-        decision: the gate's answer.
-    """
+class Entry(NamedTuple):
+    """One input of the gate, at a steady time [s], the state before it, and the answer."""
 
     now: float
     given: Input
@@ -53,12 +43,7 @@ class Entry:
 
 
 class BlackBox:
-    """Keeps the latest entries; their states share data, so memory stays small.
-
-    Args:
-        config: of the gate.
-        kept_s: time span that is kept [s].
-    """
+    """Keeps the latest entries over some time [s]; their states share data, so memory is small."""
 
     def __init__(self, config: GateConfig, kept_s: float = KEPT_S) -> None:
         self.config, self._kept_s = config, kept_s
@@ -77,22 +62,19 @@ class BlackBox:
 
 def write(config: GateConfig, entries: tuple[Entry, ...], path: str | Path) -> None:
     """Writes entries (at least one) to a file, completely or not at all."""
-    write_parts(path, _sealed(_records(config, entries)))
+    write_parts(path, _lines_of(config, entries))
 
 
-def _records(config: GateConfig, entries: tuple[Entry, ...]) -> Iterator[dict[str, Any]]:
-    """Yields the lines of a file one by one, so that the gate's memory does not grow at a stop."""
-    yield {"format": FORMAT, "config": to_plain(config), "state": to_plain(entries[0].before)}
-    for entry in entries:
-        parts = {"now": entry.now, "given": entry.given, "decision": entry.decision}
-        yield {key: to_plain(part) for key, part in parts.items()}
-
-
-def _sealed(records: Iterable[dict[str, Any]]) -> Iterator[bytes]:
-    """Yields the lines, and a last one with their checksum."""
+def _lines_of(config: GateConfig, entries: tuple[Entry, ...]) -> Iterator[bytes]:
+    """Yields the lines, the last with a checksum, one by one: memory must not grow at a stop."""
+    records: Iterator[dict[str, Any]] = (
+        {"now": entry.now, "given": entry.given, "decision": entry.decision} for entry in entries
+    )
+    head = {"format": FORMAT, "config": config, "state": entries[0].before}
     digest = hashlib.sha256()
-    for record in records:
-        line = (json.dumps(record) + "\n").encode()
+    for record in chain([head], records):
+        plain = {key: to_plain(part) for key, part in record.items()}
+        line = (json.dumps(plain) + "\n").encode()
         digest.update(line)
         yield line
     yield _seal(digest.hexdigest()).encode()
@@ -103,17 +85,11 @@ def _seal(digest: str) -> str:
     return json.dumps({"sha256": digest}) + "\n"
 
 
-@dataclass(frozen=True)
-class Replay:
-    """Content of a black box, and its difference from the decisions of the present gate.
-
-    Attributes:
-        entries: times and inputs, with the recorded decisions.
-        differing: indices of the entries that are now decided differently.
-    """
+class Replay(NamedTuple):
+    """Content of a black box, with the recorded decisions."""
 
     entries: tuple[Entry, ...]
-    differing: tuple[int, ...]
+    differing: tuple[int, ...]  # indices of the entries that are now decided differently
 
     @property
     def story(self) -> list[str]:
@@ -137,8 +113,7 @@ class Replay:
 def replay(path: str | Path) -> Replay:
     """Decides again on every input in a file.
 
-    Raises:
-        ConfigError: the file is missing, damaged, or not a black box.
+    Raises ConfigError if the file is missing, damaged, or not a black box.
     """
     head, *lines = _lines(path)
     try:
@@ -210,10 +185,7 @@ KINDS: dict[str, type] = {
 
 
 def to_plain(value: Any) -> Any:
-    """Returns a record of the gate as dictionaries, lists, numbers and text.
-
-    Arrays keep their bits; a float survives JSON unchanged.
-    """
+    """Returns a record of the gate as plain data for JSON; arrays and floats keep their bits."""
     if is_dataclass(value) and not isinstance(value, type):
         content = {each.name: to_plain(getattr(value, each.name)) for each in fields(value)}
         return {KIND: type(value).__name__, **content}

@@ -1,7 +1,5 @@
 """Data that arrive but are dead: repeated scans, jumps of odometry, no motion when commanded.
 
-Detection of old scans that a lidar shows again although the robot has moved.
-
 A lidar without noise may well show the same between two long walls, or in the middle of a round
 room. So an old scan is moved by the motion from odometry, and only those of its beams count whose
 length must have changed by now, whatever the error of the heading.
@@ -12,13 +10,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.gate.records import replace
-from nics_drl_bridge.gate.state import Cause, GateConfig, GateState, Push, Sameness
+from nics_drl_bridge.gate.state import Cause, GateConfig, GateState, Push, Sameness, replace
 from nics_drl_bridge.gate.stops import ODOM, SCAN
 from nics_drl_bridge.geometry import between, compose
 
 Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
+Flags = NDArray[np.bool_]
 IDENTICAL = 3
 """Least number of scans that show a frozen picture."""
 PICTURES = 16
@@ -41,16 +39,10 @@ NOISE = 3.0
 def look(
     config: GateConfig, seen: tuple[Sameness, ...], ranges: Ranges, pose: Array | None
 ) -> tuple[tuple[Sameness, ...], str]:
-    """Compares a scan with the last pictures, bit for bit. A scan without returns is ignored.
+    """Compares a scan (B,) with the last pictures, bit for bit; one without returns is ignored.
 
-    Args:
-        config: of the gate.
-        seen: pictures so far, newest last.
-        ranges: (B,) of the scan [m].
-        pose: (3,) present pose by odometry; None if there is none yet.
-
-    Returns:
-        The pictures, and the reason why the scan is an old one; empty if it may be new.
+    Returns the pictures, newest last, and the reason why the scan is an old one, which is empty if
+    it may be new. The pose (3,) is the present one by odometry, None before the first.
     """
     if not np.isfinite(ranges).any():
         return seen, ""
@@ -58,23 +50,21 @@ def look(
     if known is None:
         return (*seen[1 - PICTURES :], Sameness(ranges, 1, pose)), ""
     others = tuple(one for one in seen if one is not known)
-    known = replace(
-        known, count=known.count + 1, first=pose if known.first is None else known.first
-    )
-    if pose is None or known.first is None or known.count < IDENTICAL:
+    first = pose if known.first is None else known.first
+    known = replace(known, count=known.count + 1, first=first)
+    if pose is None or first is None or known.count < IDENTICAL:
         return (*others, known), ""
-    moved = between(known.first, pose)
+    moved = between(first, pose)
     path = max(float(np.hypot(moved[0], moved[1])), abs(float(moved[2])))
     if path <= config.frozen_distance:
         return (*others, known), ""
     if shown_again(config, known.ranges, ranges, moved):
-        return (*others, known), (
-            f"{known.count} scans are the same over a motion of {path:.2f} m or rad"
-        )
+        why = f"{known.count} scans are the same over a motion of {path:.2f} m or rad"
+        return (*others, known), why
     return (*others, Sameness(ranges, 1, pose)), ""  # the scene may really look the same
 
 
-def stands_still(config: GateConfig, twist: NDArray[np.float64]) -> bool:
+def stands_still(config: GateConfig, twist: Array) -> bool:
     """True if a body twist (3,) is that of a robot at rest, within the noise of odometry."""
     linear, turn = (NOISE * std for std in config.odom_std)
     slow = np.hypot(twist[0], twist[1]) < STILL_LINEAR + linear
@@ -149,37 +139,27 @@ LEAST_BEAMS = 3
 
 
 def same(one: Ranges, other: Ranges) -> bool:
-    """True if two scans (B,) are bit-identical, but for a few beams.
-
-    Only beams that return in at least one of them count.
-    """
+    """True if two scans (B,) are bit-identical, but for a few of the beams that return in one."""
     returned = np.isfinite(one) | np.isfinite(other)
-    count = int(np.count_nonzero(returned))
-    equal = int(np.count_nonzero((one == other) & returned))
-    return _but_for_one(equal, count, SAME_SHARE)
+    return _but_for_one((one == other) & returned, returned, SAME_SHARE)
 
 
 def shown_again(config: GateConfig, old: Ranges, ranges: Ranges, moved: Array) -> bool:
     """True if a scan (B,) repeats an old one (B,) although the robot has moved (3,) [m, m, rad]."""
     telling = must_differ(config, old, moved)
-    count = int(np.count_nonzero(telling))
-    equal = int(np.count_nonzero((old == ranges) & telling))
-    return count >= LEAST_BEAMS and _but_for_one(equal, count, TELLING_SHARE)
+    if np.count_nonzero(telling) < LEAST_BEAMS:
+        return False
+    return _but_for_one((old == ranges) & telling, telling, TELLING_SHARE)
 
 
-def _but_for_one(equal: int, count: int, share: float) -> bool:
-    """True if this share of the beams is equal, or all but one of them."""
+def _but_for_one(same: Flags, counted: Flags, share: float) -> bool:
+    """True if this share of the counted beams is the same, or all but one of them."""
+    equal, count = int(np.count_nonzero(same)), int(np.count_nonzero(counted))
     return equal > 0 and equal >= min(share * count, count - 1)
 
 
-def must_differ(config: GateConfig, ranges: Ranges, moved: Array) -> NDArray[np.bool_]:
-    """Returns which beams (B,) of a scan must have changed their length after a motion.
-
-    Args:
-        config: of the gate, for its lidar.
-        ranges: (B,) before the motion [m].
-        moved: (3,) relative pose of `base_link` since then [m, m, rad].
-    """
+def must_differ(config: GateConfig, ranges: Ranges, moved: Array) -> Flags:
+    """Returns which beams (B,) of a scan must have changed their length after a motion (3,)."""
     mount = np.array(config.mount)
     moved = between(mount, compose(moved, mount))
     open_ = np.isposinf(ranges)
@@ -195,21 +175,18 @@ def must_differ(config: GateConfig, ranges: Ranges, moved: Array) -> NDArray[np.
     return np.asarray(changed)
 
 
-def _changed(
-    angles: Array, ranges: Ranges, seen: Array, open_: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
+def _changed(angles: Array, ranges: Ranges, seen: Array, open_: Flags) -> Flags:
     """Returns which beams (B,) differ from the moved end points (K, 2 or more) of the old ones.
 
     An open beam only shows that nothing is nearer.
     """
     bearing = np.arctan2(seen[:, 1], seen[:, 0])
     order = np.argsort(bearing)
-    bearing, length = bearing[order], np.hypot(seen[order, 0], seen[order, 1])
-    turn = 2.0 * np.pi
-    bearing = np.concatenate([bearing[-1:] - turn, bearing, bearing[:1] + turn])
-    length = np.concatenate([length[-1:], length, length[:1]])
-    is_open = open_[order]
-    is_open = np.concatenate([is_open[-1:], is_open, is_open[:1]])
+    order = np.concatenate([order[-1:], order, order[:1]])  # the ends, once more around
+    bearing, is_open, turn = bearing[order], open_[order], 2.0 * np.pi
+    length = np.hypot(seen[order, 0], seen[order, 1])
+    bearing[0] -= turn
+    bearing[-1] += turn
     wrapped = np.mod(angles + np.pi, turn) - np.pi
     above = np.clip(np.searchsorted(bearing, wrapped), 1, len(bearing) - 1)
     below = above - 1

@@ -1,30 +1,24 @@
 """The gate: one pure function from (time, state, input) to (state, decision).
 
 It reads no clock, uses no random numbers and has no side effects, so that a recording of its
-inputs replays to bit-identical decisions.
-
-Tables of all rules; the gate does nothing that is not in them.
+inputs replays to bit-identical decisions. It does nothing that is not in the tables of rules.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.gate import arming, frozen, motion, stops
-from nics_drl_bridge.gate.frozen import watch_motion
+from nics_drl_bridge.gate import arming, frozen, limits, stops
 from nics_drl_bridge.gate.inputs import Arm, Input, Reset, Tick
 from nics_drl_bridge.gate.intake import take
-from nics_drl_bridge.gate.limits import LEAST_STEP_S
-from nics_drl_bridge.gate.motion import Motion
-from nics_drl_bridge.gate.records import replace
 from nics_drl_bridge.gate.shield import shield
-from nics_drl_bridge.gate.state import Cause, Decision, GateConfig, GateState
-from nics_drl_bridge.gate.stops import reset, settled, take_time
+from nics_drl_bridge.gate.state import Cause, Decision, GateConfig, GateState, Motion, replace
 
 Array = NDArray[np.float64]
 
@@ -32,78 +26,66 @@ Array = NDArray[np.float64]
 def decide(
     config: GateConfig, state: GateState, given: Input, now: float
 ) -> tuple[GateState, Decision]:
-    """Decides on an input.
+    """Decides on an input at a steady time [s]; returns the state after it, and the decision.
 
     Only a tick publishes a motion; a stop is published at the input that causes it, and at every
     tick while it lasts. A stop is an immediate zero: limits of rate and jerk apply to motion.
-
-    Args:
-        config: of the gate.
-        state: before the input.
-        given: the input.
-        now: steady time [s].
-
-    Returns:
-        The state after, and the decision.
     """
-    state = take_time(config, state, given, now)
+    state = stops.take_time(config, state, given, now)
     if state.clock_fault:
         now = state.now_s  # the last plausible time
     state, refused = take(config, state, given, now)
-    state, answer = _serve(config, state, given, now)
+    state, answer, granted = _serve(config, state, given, now)
     was_moving = bool(state.value.any())
     cause, latches = first_cause(config, state, now)
+    publish = shielded = False
     if cause is not None:
         if latches and state.armed:
             state = replace(state, latched=cause)
         publish = was_moving or isinstance(given, Tick)
         state = _stopped(config, state, now if publish else state.moved_s, disarm=latches)
-        return state, _decision(config, state, publish, cause, refused, answer)
-    if not isinstance(given, Tick) or now - state.moved_s < LEAST_STEP_S:
-        return state, _decision(config, state, False, None, refused, answer)
-    moved = _shaped(config, state, now)
-    if moved.fault:
-        cause = Cause("motion_unfit", "", moved.fault)
-        state = _stopped(config, replace(state, latched=cause), now, disarm=True)
-        return state, _decision(config, state, True, cause, refused, answer)
-    state = _move(config, state, moved, now)
-    decision = _decision(config, state, True, None, refused, answer)
-    return state, replace(decision, shielded=moved.shielded)
-
-
-@dataclass(frozen=True)
-class _Answer:
-    text: str = ""
-    granted: bool = False
+    elif isinstance(given, Tick) and not now - state.moved_s < limits.LEAST_STEP_S:
+        publish, motion = True, _wish(config, state)
+        for shape in SHAPERS:
+            motion = shape(config, state, motion, now)
+        if motion.fault:
+            cause = Cause("motion_unfit", "", motion.fault)
+            state = _stopped(config, replace(state, latched=cause), now, disarm=True)
+        else:
+            state, shielded = _moved(config, state, motion, now), motion.shielded
+    twist = np.zeros(3)
+    twist[list(config.fields)] = state.value
+    return state, Decision(twist, publish, cause, refused, answer, granted, shielded)
 
 
 def _serve(
     config: GateConfig, state: GateState, given: Input, now: float
-) -> tuple[GateState, _Answer]:
-    """Arms or resets, if requested."""
+) -> tuple[GateState, str, bool]:
+    """Arms or resets, if requested; returns also the answer, and whether it was granted."""
     if isinstance(given, Arm):
         failed = arming.failures(config, state, given, now)
         if failed:
-            return state, _Answer("; ".join(failed))
-        scans, odometries = settled(state.scans), settled(state.odometries)
+            return state, "; ".join(failed), False
+        scans, odometries = stops.settled(state.scans), stops.settled(state.odometries)
         state = replace(
             state, armed=True, scans=scans, odometries=odometries, seen=(), frozen="", push=None
         )
-        return state, _Answer("armed", granted=True)
+        return state, "armed", True
     if isinstance(given, Reset):
-        stop = reset(state.e_stop)
+        # The latch is cleared, unless the emergency stop is still pressed.
+        stop = replace(state.e_stop, latched=state.e_stop.held)
         state = replace(state, e_stop=stop, latched=None, armed=False)
         if stop.latched:
-            return state, _Answer("the e-stop is still pressed")
-        return state, _Answer("reset; call ~/arm to let commands pass", granted=True)
-    return state, _Answer()
+            return state, "the e-stop is still pressed", False
+        return state, "reset; call ~/arm to let commands pass", True
+    return state, "", False
 
 
 def _stopped(config: GateConfig, state: GateState, moved_s: float, disarm: bool) -> GateState:
-    zero, told = np.zeros_like(state.value), moved_s > state.moved_s
+    zero, published = np.zeros_like(state.value), moved_s > state.moved_s
     return replace(
         state, value=zero, slope=zero, moved_s=moved_s, push=None,
-        recent=_recent(config, state, zero, moved_s) if told else state.recent,
+        recent=_recent(config, state, zero, moved_s) if published else state.recent,
         armed=state.armed and not disarm,
     )  # fmt: skip
 
@@ -118,52 +100,23 @@ def _recent(
     if config.shield is None:
         return ()
     since = now - config.shield.latency_s - config.scan_age_s
-    told = (*state.recent, (now, value))
+    sent = (*state.recent, (now, value))
     # A command from before `since` was in force until the next one.
-    return tuple(one for one, after in pairwise((*told, told[-1])) if after[0] >= since)
+    return tuple(one for one, after in pairwise((*sent, sent[-1])) if after[0] >= since)
 
 
-def _shaped(config: GateConfig, state: GateState, now: float) -> motion.Motion:
-    """Returns the next motion towards the newest command."""
-    moved = motion.asked(config, state)
-    for shape in SHAPERS:
-        moved = shape(config, state, moved, now)
-    return moved
-
-
-def _move(config: GateConfig, state: GateState, moved: motion.Motion, now: float) -> GateState:
+def _moved(config: GateConfig, state: GateState, motion: Motion, now: float) -> GateState:
     """Returns the state after a motion is published."""
-    state = replace(
-        state, value=moved.value, slope=moved.slope, moved_s=now,
-        recent=_recent(config, state, moved.value, now),
-    )  # fmt: skip
-    return watch_motion(config, state, now)
+    recent = _recent(config, state, motion.value, now)
+    state = replace(state, value=motion.value, slope=motion.slope, moved_s=now, recent=recent)
+    return frozen.watch_motion(config, state, now)
 
 
-def _decision(
-    config: GateConfig,
-    state: GateState,
-    publish: bool,
-    cause: Cause | None,
-    refused: str,
-    answer: _Answer,
-) -> Decision:
-    twist = np.zeros(3)
-    twist[list(config.fields)] = state.value
-    return Decision(twist, publish, cause, refused, answer.text, answer.granted)
-
-
-@dataclass(frozen=True)
-class Rule:
-    """A reason to stop.
-
-    Attributes:
-        judge: returns the cause of a stop, or None; its name is that of the rule.
-        latches: whether the stop stays until a reset.
-    """
+class Rule(NamedTuple):
+    """A reason to stop; its name is that of the function that returns the cause, or None."""
 
     judge: Callable[[GateConfig, GateState, float], Cause | None]
-    latches: bool = False
+    latches: bool = False  # the stop stays until a reset
 
 
 def latched(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -196,10 +149,6 @@ STOPS: tuple[Rule, ...] = (
 )
 """In order of evaluation; the first rule that returns a cause names the stop."""
 
-Shaper = Callable[[GateConfig, GateState, Motion, float], Motion]
-SHAPERS: tuple[Shaper, ...] = (motion.saturate, motion.follow, shield, motion.bounded)
-"""Stages that a passing command goes through."""
-
 
 def first_cause(config: GateConfig, state: GateState, now: float) -> tuple[Cause | None, bool]:
     """Returns the first cause to stop the robot, and whether it latches."""
@@ -208,3 +157,41 @@ def first_cause(config: GateConfig, state: GateState, now: float) -> tuple[Cause
         if cause is not None:
             return cause, rule.latches
     return None, False
+
+
+def _wish(config: GateConfig, state: GateState) -> Motion:
+    """Returns the motion that the policy requests."""
+    size = len(config.fields)
+    wish = np.zeros(size) if state.command is None else state.command.twist[list(config.fields)]
+    return Motion(wish.astype(np.float64), np.zeros(size))
+
+
+def saturate(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
+    """Brings the value within its limits, see `limits.saturate`."""
+    if config.limits is None:
+        return Motion(np.zeros_like(motion.value), np.zeros_like(motion.slope))
+    return replace(motion, value=limits.saturate(motion.value, config.limits))
+
+
+def follow(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
+    """Limits rate and jerk, see `limits.follow`."""
+    if config.limits is None:
+        return motion
+    since = now - state.moved_s if math.isfinite(state.moved_s) else config.gap_s
+    value, slope = limits.follow(state.value, state.slope, motion.value, since, config.limits)
+    return replace(motion, value=value, slope=slope)
+
+
+def bounded(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
+    """Replaces a motion that is not finite or beyond its limits by zero, whatever came before."""
+    good = config.limits is None or limits.within(motion.value, config.limits)
+    if good and np.isfinite(motion.value).all() and np.isfinite(motion.slope).all():
+        return motion
+    zero = np.zeros_like(motion.value)
+    fault = f"a motion of {motion.value.tolist()} came out"
+    return replace(motion, value=zero, slope=zero, fault=fault)
+
+
+Shaper = Callable[[GateConfig, GateState, Motion, float], Motion]
+SHAPERS: tuple[Shaper, ...] = (saturate, follow, shield, bounded)
+"""Stages that a passing command goes through."""

@@ -12,58 +12,36 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Scan:
-    """A scan arrived.
+    """A scan arrived."""
 
-    Attributes:
-        stamp_ns: time stamp of its header [ns].
-        ranges: (B,) [m], float32, REP-117.
-        angles: angle_min and angle_increment of its header [rad].
-    """
-
-    stamp_ns: int
-    ranges: NDArray[np.float32]
-    angles: tuple[float, float]
+    stamp_ns: int  # of its header
+    ranges: NDArray[np.float32]  # (B,) [m], REP-117
+    angles: tuple[float, float]  # angle_min and angle_increment of its header [rad]
 
 
 @dataclass(frozen=True)
 class Odometry:
-    """An odometry arrived.
+    """An odometry arrived."""
 
-    Attributes:
-        stamp_ns: time stamp of its header [ns].
-        pose: (3,) x [m], y [m], heading [rad] in `odom`.
-        twist: (3,) vx [m/s], vy [m/s], wz [rad/s] in `base_link`.
-    """
-
-    stamp_ns: int
-    pose: Array
-    twist: Array
+    stamp_ns: int  # of its header
+    pose: Array  # (3,) x [m], y [m], heading [rad] in `odom`
+    twist: Array  # (3,) vx [m/s], vy [m/s], wz [rad/s] in `base_link`
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """An estimate of the middleware arrived.
+    """An estimate of the middleware arrived."""
 
-    Attributes:
-        twist: (3,) vx [m/s], vy [m/s], wz [rad/s].
-        std: (2,) standard deviation of position [m] and heading [rad].
-    """
-
-    twist: Array
-    std: Array
+    twist: Array  # (3,) vx [m/s], vy [m/s], wz [rad/s]
+    std: Array  # (2,) standard deviation of position [m] and heading [rad]
 
 
 @dataclass(frozen=True)
 class Command:
-    """A command of the policy arrived.
+    """A command of the policy arrived."""
 
-    Attributes:
-        stamp_ns: time stamp of the scan it was computed from [ns].
-        twist: (3,) linear.x, linear.y, angular.z of `cmd_vel`.
-    """
-
-    stamp_ns: int
-    twist: Array
+    stamp_ns: int  # of the scan it was computed from
+    twist: Array  # (3,) linear.x, linear.y, angular.z of `cmd_vel`
 
 
 @dataclass(frozen=True)
@@ -80,13 +58,9 @@ class Press:
 
 @dataclass(frozen=True)
 class Arm:
-    """A request to arm the gate.
+    """A request to arm the gate."""
 
-    Attributes:
-        publishers: number of publishers on `cmd_vel`, the gate included.
-    """
-
-    publishers: int
+    publishers: int  # number of publishers on `cmd_vel`, the gate included
 
 
 @dataclass(frozen=True)

@@ -34,18 +34,12 @@ SPEED, TURN = "m/s", "rad/s"
 
 
 class CommandLimit(Schema):
-    """Limits of one command, in its unit; an angle's rate is the steering rate.
-
-    Attributes:
-        min, max: bounds of its value; zero lies between them.
-        rate: greatest change per second, in both directions.
-        jerk: greatest change of the rate per second.
-    """
+    """Limits of one command, in its unit; an angle's rate is the steering rate."""
 
     min: float = Field(le=0.0)
     max: float = Field(ge=0.0)
-    rate: float = Field(gt=0.0)
-    jerk: float = Field(gt=0.0)
+    rate: float = Field(gt=0.0)  # greatest change per second, in both directions
+    jerk: float = Field(gt=0.0)  # greatest change of the rate per second
 
     @model_validator(mode="after")
     def _ordered(self) -> CommandLimit:
@@ -55,61 +49,36 @@ class CommandLimit(Schema):
 
 
 class Stopping(Schema):
-    """Stopping behaviour, for the shield: distance = v latency + v^2 / (2 deceleration).
+    """Stopping behaviour, for the shield: distance = v latency + v^2 / (2 deceleration)."""
 
-    Attributes:
-        latency: time from a command until the robot follows it, lags included [s].
-        deceleration: of the braking that follows [m/s^2].
-        margin: clearance kept around the footprint [m].
-        obstacle_speed: at which moving obstacles may approach; 0 treats all as static [m/s].
-    """
-
-    latency: float = Field(ge=0.0)
-    deceleration: float = Field(gt=0.0)
-    margin: float = Field(default=0.05, ge=0.0)
-    obstacle_speed: float = Field(default=1.0, ge=0.0)
+    latency: float = Field(ge=0.0)  # from a command until the robot follows it, with lags [s]
+    deceleration: float = Field(gt=0.0)  # of the braking that follows [m/s^2]
+    margin: float = Field(default=0.05, ge=0.0)  # clearance kept around the footprint [m]
+    obstacle_speed: float = Field(default=1.0, ge=0.0)  # of approaching ones; 0: static [m/s]
 
 
 class LimitsFile(Schema):
-    """A file of limits. Only `shield` may be left out; `stopping` then derives it from the model.
+    """A file of limits. Only `shield` may be left out; it is then derived from the model."""
 
-    Attributes:
-        robot: name of the robot it is for.
-        commands: limits by the name of the command in the RobotSpec.
-        shield: measured stopping behaviour.
-    """
-
-    robot: str
-    commands: dict[str, CommandLimit]
-    shield: Stopping | None = None
+    robot: str  # name of the robot it is for
+    commands: dict[str, CommandLimit]  # by the name of the command in the RobotSpec
+    shield: Stopping | None = None  # measured
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a robot's commands, in the order of the commands.
+    """Limits of a robot's commands (C,), in the order of the commands."""
 
-    Attributes:
-        low, high: (C,) least and greatest value.
-        rate: (C,) greatest change per second.
-        jerk: (C,) greatest change of the rate per second.
-        linear: (C,) True for a speed [m/s].
-        turn: (C,) True for a turn rate [rad/s]. The rest are angles.
-    """
-
-    low: Array
-    high: Array
-    rate: Array
-    jerk: Array
-    linear: NDArray[np.bool_]
-    turn: NDArray[np.bool_]
+    low: Array  # least value
+    high: Array  # greatest value
+    rate: Array  # greatest change per second
+    jerk: Array  # greatest change of the rate per second
+    linear: NDArray[np.bool_]  # True for a speed [m/s]
+    turn: NDArray[np.bool_]  # True for a turn rate [rad/s]; the rest are angles
 
 
 def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
-    """Reads the limits of a robot.
-
-    Args:
-        name: of a shipped file in `config/limits`, or path of a YAML file.
-        robot: whose commands are limited.
+    """Reads the limits of a robot from a shipped file in `config/limits`, or a YAML file.
 
     Raises:
         ConfigError: a key is missing or unknown; the file is for another robot; a limit exceeds
@@ -133,14 +102,9 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
         _check(f"{path}: key 'commands.{variable.name}", file.commands[variable.name], variable)
     each = [file.commands[wanted] for wanted in names]
     units = np.array([variable.unit for variable in robot.command])
-    limits = Limits(
-        low=np.array([limit.min for limit in each]),
-        high=np.array([limit.max for limit in each]),
-        rate=np.array([limit.rate for limit in each]),
-        jerk=np.array([limit.jerk for limit in each]),
-        linear=units == SPEED,
-        turn=units == TURN,
-    )
+    bounds = np.array([(limit.min, limit.max, limit.rate, limit.jerk) for limit in each])
+    low, high, rate, jerk = bounds.T.copy()
+    limits = Limits(low, high, rate, jerk, linear=units == SPEED, turn=units == TURN)
     if greatest(limits, limits.linear | limits.turn) < LEAST_MOTION:
         raise ConfigError(
             f"{path}: the robot could never move: none of its speeds and turn rates may reach "
@@ -152,34 +116,27 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
 def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
     """Raises ConfigError for limits beyond the robot or a period, or too low for any motion."""
     unit, low, high = variable.unit, min(variable.min, 0.0), max(variable.max, 0.0)
-    if limit.min < low:
-        raise ConfigError(
-            f"{key}.min': {limit.min:g} {unit} is beyond the robot's own limit; "
-            f"give at least {low:g}."
-        )
-    if limit.max > high:
-        raise ConfigError(
-            f"{key}.max': {limit.max:g} {unit} is beyond the robot's own limit; "
-            f"give at most {high:g}."
-        )
-    span, far = high - low, max(-limit.min, limit.max)
-    for name, slope, share, value in (
-        ("rate", f"{unit}/s", PERIOD_S, limit.rate),
-        ("jerk", f"{unit}/s^2", PERIOD_S**2, limit.jerk),
+    for name, value, beyond, bound in (
+        ("min", limit.min, limit.min < low, f"at least {low:g}"),
+        ("max", limit.max, limit.max > high, f"at most {high:g}"),
     ):
-        if value > span / share:
+        if beyond:
             raise ConfigError(
-                f"{key}.{name}': {value:g} {slope} crosses the robot's whole range within a period "
-                f"of the gate, {PERIOD_S:g} s, and limits nothing; give at most {span / share:g}."
+                f"{key}.{name}': {value:g} {unit} is beyond the robot's own limit; give {bound}."
             )
-    for name, reach in (
-        ("rate", limit.rate * LONGEST_START_S),
-        ("jerk", limit.jerk * LONGEST_START_S**2 / 2.0),
-    ):
+    span, far = high - low, max(-limit.min, limit.max)
+    for name, order, per in (("rate", 1, "/s"), ("jerk", 2, "/s^2")):
+        value, most = getattr(limit, name), span / PERIOD_S**order
+        reach = value * LONGEST_START_S**order / order
+        if value > most:
+            raise ConfigError(
+                f"{key}.{name}': {value:g} {unit}{per} crosses the robot's whole range within a "
+                f"period of the gate, {PERIOD_S:g} s, and limits nothing; give at most {most:g}."
+            )
         if reach < STARTED * far:
             raise ConfigError(
-                f"{key}.{name}': {getattr(limit, name):g} would never let it move: after "
-                f"{LONGEST_START_S:g} s it has come to {reach:.2g} of {far:g} {unit}; raise it."
+                f"{key}.{name}': {value:g} would never let it move: after {LONGEST_START_S:g} s it "
+                f"has come to {reach:.2g} of {far:g} {unit}; raise it."
             )
 
 
@@ -221,28 +178,17 @@ def follow(
 ) -> tuple[Array, Array]:
     """Moves a command towards its target as fast as rate and jerk allow.
 
-    The turn waits for the speed, so that an accelerating robot is on its path from the start.
-
-    Args:
-        value: (C,) last published command.
-        slope: (C,) its change per second over the previous interval.
-        target: (C,) target within the limits.
-        dt: time since the last command [s].
-        limits: of the robot.
-
-    Returns:
-        The next value (C,) and its slope (C,).
+    The turn waits for the speed, so that an accelerating robot is on its path from the start. The
+    last command (C,) has changed by its slope (C,) per second; the target (C,) lies within the
+    limits; `dt` is the time since the last command [s]. Returns the next value and its slope.
     """
     wanted, after, change = target.copy(), value.copy(), slope.copy()
     for turning in (False, True):
         if turning:
             wanted[limits.turn] *= _progress(after[limits.linear], target[limits.linear])
         for i in np.flatnonzero(limits.turn == turning):
-            low, high = float(limits.low[i]), float(limits.high[i])
-            after[i], change[i] = _follow_one(
-                float(value[i]), float(slope[i]), float(wanted[i]), dt, (low, high),
-                float(limits.rate[i]), float(limits.jerk[i]),
-            )  # fmt: skip
+            given = (value, slope, wanted, limits.low, limits.high, limits.rate, limits.jerk)
+            after[i], change[i] = _follow_one(dt, *(float(each[i]) for each in given))
     return after, change
 
 
@@ -256,14 +202,9 @@ def _progress(speed: Array, wanted: Array) -> float:
 
 
 def _follow_one(
-    value: float,
-    slope: float,
-    target: float,
-    dt: float,
-    bounds: tuple[float, float],
-    rate: float,
-    jerk: float,
-) -> tuple[float, float]:
+    dt: float, value: float, slope: float, target: float, least_value: float, most_value: float,
+    rate: float, jerk: float,
+) -> tuple[float, float]:  # fmt: skip
     """Moves one command; see `follow`.
 
     A slope a can be brought back to zero within a change of a^2 / (2 jerk) whatever the coming
@@ -273,8 +214,8 @@ def _follow_one(
     The calculation uses shares of the greatest value and steps of this interval. No slope then
     exceeds what one interval can do, the whole range, and no limit causes an overflow.
     """
-    scale = max(-bounds[0], bounds[1])
-    low, high = bounds[0] / scale, bounds[1] / scale
+    scale = max(-least_value, most_value)
+    low, high = least_value / scale, most_value / scale
     here, there = value / scale, target / scale
     step = min(dt / scale, GREATEST)  # per unit of slope
     least, most = -(high - low), high - low
@@ -288,7 +229,7 @@ def _follow_one(
     change = min(max(wanted / step if step > 0.0 else 0.0, -rate), rate)
     if abs(there - after) < SNAP:
         return target, change
-    return min(max(after * scale, bounds[0]), bounds[1]), change
+    return min(max(after * scale, least_value), most_value), change
 
 
 def _step_towards(gap: float, jerk: float) -> float:

@@ -6,20 +6,24 @@ react, and then to brake. A new command must also leave room to brake calmly, so
 ends slowly instead of in a series of full stops. The footprint is swept along the arcs of that
 whole family; a command is scaled down, on its path, until no obstacle in the scan lies in the swept
 area. The dynamic window of Fox, Burgard and Thrun (1997) tests the same for one arc.
+
+An obstacle may approach if it is where the robot saw free space a moment ago: the newest scan is
+compared with some older ones by odometry.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.gate import moving, shield_kernels
-from nics_drl_bridge.gate.motion import Motion
-from nics_drl_bridge.gate.state import GateConfig, GateState, ShieldConfig, View
+from nics_drl_bridge import geometry
+from nics_drl_bridge.gate import moving_kernels, shield_kernels
+from nics_drl_bridge.gate.inputs import Scan
+from nics_drl_bridge.gate.state import GateConfig, GateState, Motion, ShieldConfig, View, replace
 from nics_drl_bridge.gate.stops import age
+from nics_drl_bridge.interface import S_PER_NS
 
 Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
@@ -34,6 +38,47 @@ CALM = 0.5
 """Share of its deceleration with which the robot should stop when nothing is sudden."""
 STEP = 0.02
 """Distance between two checked places of the footprint on an arc [m]."""
+MEMORY_S, SPACING_S = 0.45, 0.09
+"""Greatest age of a scan that the newest is compared with, and least time between them [s]."""
+TOLERANCE_M, DEVIATIONS = 0.03, 3.0
+"""Margin before the end of an old beam [m], plus this many standard deviations of its range."""
+
+
+def remember(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ...]:
+    """Returns the earlier views that still count, oldest first, then that of a new scan."""
+    if config.shield is None or state.odometry is None:
+        return ()
+    late = np.clip((scan.stamp_ns - state.odometry.stamp_ns) * S_PER_NS, -MEMORY_S, MEMORY_S)
+    pose = geometry.compose(state.odometry.pose, geometry.exp(late * state.odometry.twist))
+    kept: list[View] = []
+    for view in state.views:
+        young = (scan.stamp_ns - view.stamp_ns) * S_PER_NS <= MEMORY_S
+        if young and (not kept or (view.stamp_ns - kept[-1].stamp_ns) * S_PER_NS >= SPACING_S):
+            kept.append(view)
+    return (*kept, View(scan.stamp_ns, pose, scan.ranges))
+
+
+def movers(config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]) -> Flags:
+    """Returns which beams (B,) of the newest view end on something that moves.
+
+    A single beam is noise: a neighbour has to agree.
+    """
+    newest, angles = views[-1], config.beam_angles
+    marked = np.zeros(len(newest.ranges), np.bool_)
+    if len(angles) < 2 or shield.obstacle_speed == 0.0:
+        return marked
+    lidar = (float(angles[0]), float(angles[1] - angles[0]), *config.mount)
+    noise, share = (DEVIATIONS * std for std in shield.range_noise)
+    for view in views[:-1]:
+        moved = geometry.between(view.pose, newest.pose)
+        moving_kernels.entered(
+            marked, newest.ranges, view.ranges, lidar, moved, shield.range_max,
+            (TOLERANCE_M + noise, share),
+        )  # fmt: skip
+    beside = np.zeros_like(marked)
+    beside[1:] |= marked[:-1]
+    beside[:-1] |= marked[1:]
+    return marked & beside
 
 
 def returns(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
@@ -54,17 +99,16 @@ def unknown(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Fla
 
     So the robot does not drive into what it can't see, but can drive away from it.
     """
-    grid = np.linspace(-np.pi, np.pi, len(ranges), endpoint=False)
+    blocked = np.linspace(-np.pi, np.pi, len(ranges), endpoint=False)
     angles = config.beam_angles[~np.isnan(ranges)] + config.mount[2]
     known = np.sort(np.mod(angles + np.pi, 2.0 * np.pi) - np.pi)
-    if len(known) == 0:
-        blocked = grid
-    else:
+    if len(known):
         around = np.concatenate([known - 2.0 * np.pi, known, known + 2.0 * np.pi])
         half = shield.unknown_width / 2.0
-        seen = np.searchsorted(around, grid + half) - np.searchsorted(around, grid - half)
+        seen = np.searchsorted(around, blocked + half) - np.searchsorted(around, blocked - half)
         spacing = config.beam_angles[1] - config.beam_angles[0] if len(ranges) > 1 else 2.0 * np.pi
-        blocked = grid[seen < (1.0 - shield.unknown_share) * shield.unknown_width / spacing]
+        least = (1.0 - shield.unknown_share) * shield.unknown_width / spacing
+        blocked = blocked[seen < least]
     wall = shield.footprint_radius * np.stack([np.cos(blocked), np.sin(blocked)])
     return np.stack([*wall, np.zeros_like(blocked)], axis=1)
 
@@ -81,27 +125,23 @@ def _ends(config: GateConfig, angles: Array, ranges: Array, speeds: Array | floa
 
 
 def obstacles(config: GateConfig, ranges: Ranges, views: tuple[View, ...]) -> Array | None:
-    """Returns all obstacles (P, 3) in a scan (B,), and how fast each may approach.
+    """Returns all obstacles (P, 3) in a scan (B,): x, y in `base_link` [m], greatest speed [m/s].
 
-    Args:
-        config: of the gate.
-        ranges: of the scan.
-        views: that of the scan and earlier ones, see `moving`; empty before the first odometry.
-
-    Returns:
-        x, y in `base_link` [m], speed [m/s]; None without shield.
+    The views are that of the scan and earlier ones, empty before the first odometry. None without
+    shield.
     """
     given = config.shield
     if given is None:
         return None
-    moves = moving.movers(config, given, views) if views else np.zeros(len(ranges), np.bool_)
+    moves = movers(config, given, views) if views else np.zeros(len(ranges), np.bool_)
     return np.concatenate([evidence(config, given, ranges, moves) for evidence in EVIDENCE])
 
 
 def rehearse() -> None:
     """Compiles what `shield` calls: that takes seconds, which a moving robot does not have."""
     shield_kernels.free(np.zeros((1, 3)), np.zeros((1, 3)), 0.0, 1.0, 0.0, STEP)
-    moving.rehearse()
+    lidar, scan = (0.0, 0.1, 0.0, 0.0, 0.0), np.ones(1, np.float32)
+    moving_kernels.entered(np.zeros(1, np.bool_), scan, scan, lidar, np.zeros(3), 1.0, (0.0, 0.0))
 
 
 def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
@@ -137,8 +177,8 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
     odometry = np.zeros(3) if state.odometry is None else state.odometry.twist
     old = max(0.0, age(state.scans, now))
     # Commands that the scan does not show yet: since it was taken, or within the latency before.
-    since, ends = now - old - given.latency_s, [told for told, _ in state.recent[1:]]
-    past = [told[1] for told, end in zip(state.recent, [*ends, now], strict=False) if end >= since]
+    since, ends = now - old - given.latency_s, [time for time, _ in state.recent[1:]]
+    past = [one[1] for one, end in zip(state.recent, [*ends, now], strict=False) if end >= since]
     react = given.hold_s + given.latency_s
     calm = 1.0 / config.scan_rate + react + given.latency_s
     hard = old + react
@@ -157,21 +197,23 @@ def _family(
     config: GateConfig, given: ShieldConfig, commands: Array, odometry: Array | None
 ) -> Array:
     """Returns body twists (K, 3) between those of commands (n, C) and of odometry (3,), if any."""
-    told = np.zeros((len(commands), 3))
-    told[:, list(config.fields)] = commands
+    twists = np.zeros((len(commands), 3))
+    twists[:, list(config.fields)] = commands
     if given.wheelbase > 0.0:
-        return _car_family(given.wheelbase, told, odometry)
+        return _car_family(given.wheelbase, twists, odometry)
     if odometry is not None:
-        told = np.concatenate([told, odometry[None]])
-    low, high = told.min(axis=0), told.max(axis=0)
-    axes = [np.linspace(low[i], high[i], SPEEDS if high[i] > low[i] else 1) for i in (0, 1)]
-    turns = np.linspace(low[2], high[2], TURNS if high[2] > low[2] else 1)
-    return np.stack(np.meshgrid(*axes, turns), axis=-1).reshape(-1, 3)
+        twists = np.concatenate([twists, odometry[None]])
+    low, high = twists.min(axis=0), twists.max(axis=0)
+    axes = [
+        np.linspace(low[i], high[i], most if high[i] > low[i] else 1)
+        for i, most in enumerate((SPEEDS, SPEEDS, TURNS))
+    ]
+    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
 
 
-def _car_family(wheelbase: float, told: Array, odometry: Array | None) -> Array:
+def _car_family(wheelbase: float, commands: Array, odometry: Array | None) -> Array:
     """Returns a car's twists: curvature does not depend on speed; braking steers it straight."""
-    bends, speeds = [0.0, *np.tan(told[:, 2]) / wheelbase], list(told[:, 0])
+    bends, speeds = [0.0, *np.tan(commands[:, 2]) / wheelbase], list(commands[:, 0])
     if odometry is not None:
         speeds.append(odometry[0])
         if abs(odometry[0]) > MOVING:

@@ -1,7 +1,4 @@
-"""Stopping behaviour of a robot: from its limits file, or derived with caution from its model.
-
-Check for settings with which the robot could never move, reported at the start.
-"""
+"""Stopping behaviour of a robot, and a check for settings with which it could never move."""
 
 from __future__ import annotations
 
@@ -25,7 +22,8 @@ SLOWEST_LAG_S = 5.0
 """Slower modes are not lags but combinations that no command moves [s]."""
 UNKNOWN_DECELERATION = 0.5
 """Deceleration of a robot whose limits are not known [m/s^2]."""
-HOLD_S = GateConfig.gap_s
+LEAST_DATA = 2
+"""Least number of data that must arrive while the gate settles, for their rate to be known."""
 
 
 def shield_config(
@@ -36,19 +34,15 @@ def shield_config(
 ) -> tuple[ShieldConfig, str]:
     """Returns a robot's shield configuration, and a sentence with its values and their source.
 
-    Args:
-        model: of the robot.
-        limits: of the robot, if any.
-        file: of the limits, as in `load_limits`; its `shield` gives the measured values.
-        given: values that override those of the file, by their names there.
+    The source is the `shield` of a file of limits, otherwise, with caution, model and limits; given
+    values, by their names in the file, override it.
 
     Raises:
         ConfigError: a value can't be used, or the shield does not know the robot's commands.
     """
     path = find_config(file, "limits") if file else None
-    told = None if path is None else load_yaml(path, LimitsFile).shield
-    values = told or _derived(model, limits)
-    values = values.model_copy(update=dict(given or {}))
+    measured = None if path is None else load_yaml(path, LimitsFile).shield
+    values = (measured or _derived(model, limits)).model_copy(update=dict(given or {}))
     for name, value in values.model_dump().items():
         least = "greater than 0" if name == "deceleration" else "at least 0"
         if not (np.isfinite(value) and value >= 0.0) or (value == 0.0 and name == "deceleration"):
@@ -58,18 +52,18 @@ def shield_config(
         latency_s=values.latency,
         deceleration=values.deceleration,
         margin=values.margin,
-        hold_s=HOLD_S,
+        hold_s=GateConfig.gap_s,
         footprint_radius=model.robot.footprint_radius,
         wheelbase=wheelbase(model.robot),
         obstacle_speed=values.obstacle_speed,
         range_max=lidar.range_max,
         range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
     )
-    source = f"by {path}" if told is not None else "derived from model and limits"
+    source = f"by {path}" if measured is not None else "derived from model and limits"
     if given:
         source += f", but {', '.join(sorted(given))} by parameter"
-    told_s = ", ".join(f"{name} {value:g}" for name, value in values.model_dump().items())
-    return config, f"the shield is on: {told_s} ({source})"
+    listed = ", ".join(f"{name} {value:g}" for name, value in values.model_dump().items())
+    return config, f"the shield is on: {listed} ({source})"
 
 
 def _derived(model: SimulatorModel, limits: Limits | None) -> Stopping:
@@ -100,8 +94,7 @@ def lag(kinematics: TaylorModel) -> float:
 def wheelbase(robot: RobotSpec) -> float:
     """Returns the wheelbase of a robot commanded by steering angle [m]; 0 for other robots.
 
-    Raises:
-        ConfigError: the robot's file lacks it, or a command is no speed, turn rate or angle.
+    Raises ConfigError if the robot's file lacks it, or a command is no speed, turn rate or angle.
     """
     for variable in robot.command:
         if variable.unit not in (SPEED, TURN, ANGLE):
@@ -119,16 +112,8 @@ def wheelbase(robot: RobotSpec) -> float:
     return robot.parameters["wheelbase"]
 
 
-LEAST_DATA = 2
-"""Least number of data that must arrive while the gate settles, for their rate to be known."""
-
-
 def require_possible(config: GateConfig) -> None:
-    """Checks that the gate can be armed with its settings.
-
-    Raises:
-        ConfigError: it can't be armed; names the parameter, its value and what it needs.
-    """
+    """Raises ConfigError, with the parameter, for settings with which the gate can't be armed."""
     for topic, rate, age in (
         ("scan", config.scan_rate, config.scan_age_s),
         ("odom", config.odom_rate, config.odom_age_s),
@@ -147,12 +132,7 @@ def require_possible(config: GateConfig) -> None:
 
 
 def doubtful(config: GateConfig, control_period_s: float) -> str:
-    """Returns a warning about a setting that only suits an unusual policy; empty if there is none.
-
-    Args:
-        config: of the gate.
-        control_period_s: of the model; by default a policy commands at this period [s].
-    """
+    """Returns a warning about an age limit that only suits a policy with a shorter period [s]."""
     if config.command_age_s > control_period_s:
         return ""
     return (

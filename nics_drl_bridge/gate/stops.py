@@ -1,16 +1,10 @@
-"""Age of data: from their arrival on the steady clock, and from their delay.
+"""Rules that stop the robot by the age of data, the gate's own clock, commands and e-stop.
 
-The lead of a stamp over the steady clock is the offset of the two clocks minus the delay of the
-datum; the greatest lead, the envelope, is that of the fastest data (the idea of one-way delay
-estimation by the lower envelope). It is found before the gate is armed and then fixed: it follows
-at most the drift of real clocks. So stamps that creep ahead, or fall behind, become neither the new
-present nor the new normal.
-
-The gate's own clock: time that jumps, freezes or was slept through stops the robot.
-
-Watchdogs of the policy's commands: presence, validity, and age of the scan behind them.
-
-The emergency stop: latched when pressed, and treated as pressed when silent.
+The age of a datum is the time since its arrival on the steady clock, plus its delay. The lead of
+its stamp over that clock is the offset of the two clocks minus the delay; the greatest lead, the
+envelope, is that of the fastest data (the idea of one-way delay estimation by the lower envelope).
+It is found before the gate is armed and then fixed: it follows at most the drift of real clocks. So
+stamps that creep ahead, or fall behind, become neither the new present nor the new normal.
 """
 
 from __future__ import annotations
@@ -18,11 +12,10 @@ from __future__ import annotations
 import math
 
 from nics_drl_bridge.gate.inputs import Input, Tick
-from nics_drl_bridge.gate.records import replace
-from nics_drl_bridge.gate.state import Arrivals, Cause, EStopState, GateConfig, GateState, Mark
+from nics_drl_bridge.gate.state import Arrivals, Cause, GateConfig, GateState, Mark, replace
 from nics_drl_bridge.interface import S_PER_NS
 
-SCAN, ODOM = "scan", "odom"
+SCAN, ODOM, RAW, E_STOP = "scan", "odom", "cmd_vel_raw", "e_stop"
 KEPT = 64
 """Number of remembered stamps; a command on an older scan is on an unknown one."""
 MARK_S = 0.05
@@ -33,23 +26,17 @@ SIMULATED_LAG = 0.2
 """Share of real time that a simulator may lose."""
 AHEAD_S = 0.1
 """Data of an armed gate whose lead exceeds the envelope by this are from the future [s]."""
+FROZEN_INPUTS = 20
+"""A running clock does not give this many inputs in a row the same time."""
 
 
 def arrived(
     config: GateConfig, arrivals: Arrivals, stamp_ns: int, now: float, gap_s: float, armed: bool
 ) -> tuple[Arrivals, str]:
-    """Accounts for a datum, or returns why it is not used.
+    """Accounts for a datum; if the gate is armed, the envelope is fixed.
 
-    Args:
-        config: of the gate.
-        arrivals: known so far.
-        stamp_ns: of the datum [ns].
-        now: steady time [s].
-        gap_s: longest gap between two of them [s].
-        armed: whether the envelope is fixed.
-
-    Returns:
-        The arrivals, and `repeated`, `jumped` or "". After a jump only the new datum counts.
+    Returns the arrivals, and why the datum is not used: `repeated`, `jumped` or "". After a jump
+    only the new datum counts.
     """
     fresh = Arrivals(
         (stamp_ns,), (now,), (0.0,), (stamp_ns, now), 1, 0.0, now, ((now, stamp_ns, 1, 0.0),)
@@ -61,7 +48,8 @@ def arrived(
         return fresh, "jumped"
     if step <= 0.0:
         return arrivals, "repeated"
-    lead = _lead(config, arrivals, stamp_ns, now)
+    first_ns, first_s = arrivals.origin
+    lead = (stamp_ns - first_ns) * S_PER_NS / config.clock_rate - (now - first_s)
     if lead - arrivals.envelope > (AHEAD_S if armed else config.clock_jump_s):
         return fresh, "jumped"
     marks = _marked(arrivals, stamp_ns, now, lead, config.settle_s)
@@ -71,7 +59,7 @@ def arrived(
         lowest, highest = arrivals.envelope - fall * passed, arrivals.envelope + DRIFT * passed
         envelope = min(max(lead, lowest), highest)
     else:
-        envelope = max(mark[3] for mark in marks)
+        envelope = _envelope(marks)
     return replace(
         arrivals,
         stamps_ns=(*arrivals.stamps_ns[1 - KEPT :], stamp_ns),
@@ -84,20 +72,13 @@ def arrived(
     ), ""
 
 
-def _lead(config: GateConfig, arrivals: Arrivals, stamp_ns: int, now: float) -> float:
-    first_ns, first_s = arrivals.origin
-    return (stamp_ns - first_ns) * S_PER_NS / config.clock_rate - (now - first_s)
-
-
 def _marked(
     arrivals: Arrivals, stamp_ns: int, now: float, lead: float, settle_s: float
 ) -> tuple[Mark, ...]:
     """Returns the marks, with a datum merged into the last of them or as a new one."""
     *before, (time, stamp, number, greatest) = arrivals.marks
     if now - time < MARK_S:
-        if lead <= greatest:
-            return arrivals.marks
-        return (*before, (time, stamp, number, lead))
+        return (*before, (time, stamp, number, max(lead, greatest)))
     oldest = now - settle_s - 2.0 * MARK_S
     kept = (mark for mark in arrivals.marks if mark[0] >= oldest)
     return (*kept, (now, stamp_ns, arrivals.count + 1, lead))
@@ -105,16 +86,16 @@ def _marked(
 
 def settled(arrivals: Arrivals) -> Arrivals:
     """Returns the arrivals with the envelope of the marked data alone, whatever it was before."""
-    if not arrivals.marks:
-        return arrivals
-    return replace(arrivals, envelope=max(mark[3] for mark in arrivals.marks))
+    return replace(arrivals, envelope=_envelope(arrivals.marks)) if arrivals.marks else arrivals
 
 
-def age(arrivals: Arrivals, now: float, index: int = -1) -> float:
-    """Returns the age of a datum (the newest) with its delay [s]; inf if there is none."""
-    if not arrivals.times:
-        return float("inf")
-    return now - arrivals.times[index] + arrivals.late[index]
+def _envelope(marks: tuple[Mark, ...]) -> float:
+    return max(mark[3] for mark in marks)
+
+
+def age(arrivals: Arrivals, now: float) -> float:
+    """Returns the age of the newest datum with its delay [s]; inf if there is none."""
+    return now - arrivals.times[-1] + arrivals.late[-1] if arrivals.times else math.inf
 
 
 def _silence(rule: str, topic: str, arrivals: Arrivals, now: float, limit: float) -> Cause | None:
@@ -154,7 +135,7 @@ def rate(arrivals: Arrivals, now: float, settle_s: float) -> tuple[float, float]
     count = arrivals.count - first[2]
     passed = arrivals.times[-1] - first[0]
     stamped = (arrivals.stamps_ns[-1] - first[1]) * S_PER_NS
-    return (count / passed if passed > 0.0 else float("inf")), count / stamped
+    return (count / passed if passed > 0.0 else math.inf), count / stamped
 
 
 def creep(arrivals: Arrivals) -> float:
@@ -163,11 +144,7 @@ def creep(arrivals: Arrivals) -> float:
     if half == 0:
         return 0.0
     early, late = arrivals.marks[:half], arrivals.marks[half:]
-    return max(mark[3] for mark in late) - max(mark[3] for mark in early)
-
-
-FROZEN_INPUTS = 20
-"""A running clock does not give this many inputs in a row the same time."""
+    return _envelope(late) - _envelope(early)
 
 
 def take_time(config: GateConfig, state: GateState, given: Input, now: float) -> GateState:
@@ -193,9 +170,6 @@ def take_time(config: GateConfig, state: GateState, given: Input, now: float) ->
 def own_clock(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The gate's clock is not to be trusted, or the gate was asleep."""
     return Cause("own_clock", "", state.clock_fault) if state.clock_fault else None
-
-
-RAW = "cmd_vel_raw"
 
 
 def command_malformed(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -224,9 +198,8 @@ def scan_behind_unknown(config: GateConfig, state: GateState, now: float) -> Cau
         return None
     if now - state.pending_s <= config.race_s and state.command is not None:
         return None
-    return Cause(
-        "scan_behind_unknown", RAW, f"the scan behind it ({state.pending.stamp_ns}) never arrived"
-    )
+    detail = f"the scan behind it ({state.pending.stamp_ns}) never arrived"
+    return Cause("scan_behind_unknown", RAW, detail)
 
 
 def scan_behind_old(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -239,24 +212,11 @@ def scan_behind_old(config: GateConfig, state: GateState, now: float) -> Cause |
     return Cause("scan_behind_old", SCAN, f"the scan behind {RAW} is old", old, limit)
 
 
-TOPIC = "e_stop"
-
-
-def hear(state: EStopState, pressed: bool, now: float) -> EStopState:
-    """Returns the state after a message on its topic."""
-    return EStopState(latched=state.latched or pressed, held=pressed, heard_s=now)
-
-
-def reset(state: EStopState) -> EStopState:
-    """Clears the latch, unless the emergency stop is still pressed."""
-    return replace(state, latched=state.held)
-
-
 def e_stop_pressed(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The emergency stop was pressed."""
     if not state.e_stop.latched:
         return None
-    return Cause("e_stop_pressed", TOPIC, "pressed" if state.e_stop.held else "was pressed")
+    return Cause("e_stop_pressed", E_STOP, "pressed" if state.e_stop.held else "was pressed")
 
 
 def e_stop_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -264,7 +224,7 @@ def e_stop_silent(config: GateConfig, state: GateState, now: float) -> Cause | N
     heard = state.e_stop.heard_s
     if heard is None and not config.e_stop_required:
         return None
-    old, limit = float("inf") if heard is None else now - heard, config.e_stop_silence_s
+    old, limit = math.inf if heard is None else now - heard, config.e_stop_silence_s
     if old <= limit:
         return None
-    return Cause("e_stop_silent", TOPIC, "its heartbeat is silent, as if pressed", old, limit)
+    return Cause("e_stop_silent", E_STOP, "its heartbeat is silent, as if pressed", old, limit)

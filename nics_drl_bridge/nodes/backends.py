@@ -1,99 +1,288 @@
-"""Backends over ROS 2, for lock-step and real time.
-
-FleetBackend: several robots of one simulator behind ROS 2 topics, each in its namespace.
-"""
+"""Backends over ROS 2: one robot or several in lock-step with a simulator behind topics."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from typing import Any, cast
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from typing import Any, TypeVar, cast
 
 import numpy as np
+from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
+from sensor_msgs.msg import LaserScan
 
-from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError, nearest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import Backend, BackendFacts, RobotView, Start, stacked
-from nics_drl_bridge.nodes.dds_backend import DdsBackend
+from nics_drl_bridge.interface import NS_PER_S, Backend, BackendFacts, RobotView, Start, stacked
+from nics_drl_bridge.lidar.spec import from_device
+from nics_drl_bridge.middleware.middleware import Middleware
+from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.device_parameters import default_namespaces
+from nics_drl_bridge.nodes.executor import HANDED_OVER
+from nics_drl_bridge.nodes.link import EpisodeServices, Link, halted_after_an_error
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
+from nics_drl_bridge.nodes.robot_topics import data_facts
 from nics_drl_bridge.sim.world import World
 
-MODES = {"lockstep": DdsBackend, "realtime": RealtimeBackend}
+Array = NDArray[np.float64]
+T = TypeVar("T")
+SCAN, ODOM, TRUTH = "scan", "odom", "ground_truth"
+AGAIN_S = 0.05
+"""Data that do not arrive within this time are requested again [s]."""
+ADVICE = "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and namespace."
 
 
-def dds_backend(
-    model: SimulatorModel,
-    world: World,
-    mode: str = "lockstep",
-    robots: int = 1,
-    estimator: bool = True,
-    randomisation: None = None,
-    **options: Any,
-) -> Backend:
-    """Returns the backend of a robot behind ROS 2 topics, or of a team in lock-step.
+class _Mailbox:
+    """The newest message of each topic, serialised, from the executor's thread to the caller's.
 
-    For a team it is a `FleetBackend`.
+    The caller is woken once, when all topics that it waits for are there: each wake-up costs a good
+    part of a step. Odometry that it waits for is given to `work`, with stamp and arrival [ns], by
+    the executor's thread, while the scan is still in transit.
+    """
 
-    Args:
-        model: of the robot.
-        world: of the robot.
-        mode: `lockstep` with a simulator node, see `DdsBackend`; or `realtime` with one or with a
-            vehicle, see `RealtimeBackend`.
-        robots: number of robots; their `namespaces` are robot1, robot2, ... unless given as an
-            option.
-        estimator: must be True.
-        randomisation: must be None.
-        options: of the chosen class.
+    def __init__(self, topics: tuple[str, ...], work: Callable[[int, int, bytes], None]) -> None:
+        self._topics, self._work = topics, work
+        self._messages: dict[str, bytes] = {}
+        self._stamps = dict.fromkeys(topics, -1)
+        self._arrivals: dict[str, int] = {}
+        self._lock, self._complete = threading.Lock(), threading.Event()
+        self._awaited_ns, self._worked_ns = -1, -1
+        self._failure: Exception | None = None
+
+    def put(self, topic: str, message: bytes) -> object:
+        """Takes a message; returns `HANDED_OVER` if the caller now continues."""
+        with self._lock:
+            try:
+                self._stamps[topic] = _read(topic, wire.stamp_of, message)
+                self._messages[topic], self._arrivals[topic] = message, time.monotonic_ns()
+                self._work_in()
+            except Exception as error:  # noqa: BLE001  (it is raised in the caller's thread)
+                self._failure = error
+            if self._awaited_ns >= 0 and (self._failure or self._late(self._awaited_ns) is None):
+                self._complete.set()
+                return HANDED_OVER
+        return None
+
+    def _work_in(self) -> None:
+        """Processes the awaited odometry, once."""
+        awaited = self._awaited_ns
+        if self._stamps[ODOM] == awaited != self._worked_ns:
+            self._worked_ns = awaited
+            self._work(awaited, self._arrivals[ODOM], self._messages[ODOM])
+
+    def _late(self, stamp_ns: int) -> str | None:
+        """Returns the first topic whose newest message is older than a stamp; None if none is."""
+        return next((topic for topic in self._topics if self._stamps[topic] < stamp_ns), None)
+
+    def stamp_ns(self, topic: str) -> int:
+        """Returns the stamp of the newest message [ns]; -1 if there is none."""
+        return self._stamps[topic]
+
+    def age_s(self, topic: str) -> float:
+        """Returns the seconds since the newest message arrived; inf if there is none."""
+        arrival_ns = self._arrivals.get(topic)
+        return math.inf if arrival_ns is None else (time.monotonic_ns() - arrival_ns) * 1e-9
+
+    def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, tuple[bytes, int]]:
+        """Returns message and arrival [ns] of each topic, once each is at least as new as a stamp.
+
+        Raises StaleDataError if a message does not arrive.
+        """
+        with self._lock:
+            self._awaited_ns, self._failure = stamp_ns, None
+            self._complete.clear()
+            self._work_in()
+            late = self._late(stamp_ns)
+        if late is not None:
+            self._complete.wait(timeout_s)
+        with self._lock:
+            self._awaited_ns = -1
+            if self._failure is not None:
+                raise self._failure
+            late = self._late(stamp_ns)
+            if late is not None:
+                raise StaleDataError(late, self.age_s(late), timeout_s)
+            return {t: (message, self._arrivals[t]) for t, message in self._messages.items()}
+
+
+def _worker(middleware: Middleware) -> Callable[[int, int, bytes], None]:
+    """Returns the callback for odometry, without a reference to the backend (it may be garbage)."""
+
+    def work(stamp_ns: int, arrival_ns: int, message: bytes) -> None:
+        middleware.odometry(stamp_ns, arrival_ns, *_read(ODOM, wire.odometry_of, message))
+
+    return work
+
+
+class DdsBackend:
+    """One robot behind `cmd_vel`, `scan` and `odom`, in lock-step with a simulator node.
+
+    Each step publishes one command and returns exactly the data that are stamped one control
+    period later. Its own node in its own context listens in one executor thread; nothing spins
+    inside `step`. `close`, an error in `step` and garbage collection leave a zero command behind,
+    see `Link`. A vehicle, or a simulator in real time, needs `RealtimeBackend`, selected by
+    `mode="realtime"` in `backend_options`.
+
+    Model and world must be those that the simulator node runs. `truth` waits for `ground_truth`
+    too, and puts the true pose into `info`; `timeout_s` bounds each wait for a peer or an answer.
 
     Raises:
-        ConfigError: there is no such mode, or not for a team; or it should not estimate, or
-            randomise.
-        BackendError: no peer is there.
+        BackendError: no simulator is there, it refuses or does not answer, another node moved it,
+            or it is not in lock-step.
+        ModelError: it runs another model or world.
+        StaleDataError: its data do not arrive.
     """
-    if not estimator or randomisation is not None:
-        raise ConfigError(
-            "backend 'dds' always estimates and is never randomised; leave out `estimator` and "
-            "`randomisation`."
-        )
-    if mode not in MODES:
-        raise ConfigError(f"backend_options: there is no mode {mode!r}; {nearest(mode, MODES)}")
-    if robots > 1:
-        return _team(model, world, mode, robots, options)
-    made: Backend = MODES[mode](model, world, **options)
-    return made
+
+    def __init__(
+        self,
+        model: SimulatorModel,
+        world: World,
+        namespace: str = "",
+        simulator: str = "simulator_node",
+        timeout_s: float = 30.0,
+        truth: bool = False,
+        domain_id: int | None = None,
+    ) -> None:
+        self._robot, self._lidar = model.robot, model.lidar
+        self._middleware = Middleware(model)
+        self._period_ns = round(model.control_period * NS_PER_S)
+        self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *((TRUTH,) if truth else ()))
+        self._now_ns, self._mail = 0, _Mailbox(self._topics, _worker(self._middleware))
+        self._known: BackendFacts = {}
+        self._link = Link(namespace, domain_id)
+        for topic in self._topics:
+            kind, put = LaserScan if topic == SCAN else Odometry, _putter(self._mail, topic)
+            self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
+        self._episodes = EpisodeServices(self._link, simulator, model, world)
+        self._link.begin()
+        try:
+            self._link.wait_for_peers(self._topics, self._episodes.clients, timeout_s, ADVICE)
+        except BaseException:
+            self.close()
+            raise
+
+    def reset(self, start: Start) -> RobotView:
+        """Begins the episode of a seed in the simulator; see `interface.Backend`."""
+        with halted_after_an_error(self._link):
+            self.choose(start)
+            return self.first(self.begin(), start.pose)
+
+    def choose(self, start: Start) -> None:
+        """The first part of a reset: chooses the episode for `begin`."""
+        self._link.check_open()
+        self._link.check_alone()
+        self._episodes.choose(start, self.timeout_s)
+
+    def begin(self) -> int:
+        """The second part: begins it, and returns the stamp of its first data [ns]."""
+        return self._episodes.begin(self.timeout_s)
+
+    def first(self, stamp_ns: int, pose: Array) -> RobotView:
+        """The last part: waits for the data of a stamp, of a robot that stands at a pose (3,)."""
+        self._now_ns = stamp_ns
+        self._middleware.reset(stamp_ns, pose)
+        return self._measure()[0]
+
+    def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
+        """Publishes a command and waits for the data after it; see `interface.Backend`."""
+        self.send(command)
+        return self.receive()
+
+    def send(self, command: Array) -> None:
+        """The first half of a step: checks and publishes a command (C,)."""
+        self._link.check_open()
+        with halted_after_an_error(self._link):
+            # Data that arrived before the command would be taken for its answer.
+            self._check_stamps()
+            twist = self._robot.to_cmd_vel(command)
+            self._link.send(twist)
+            # Checked while the simulator is at work.
+            self._link.check_alone()
+            self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
+            self._now_ns += self._period_ns
+            self._middleware.foresee(self._now_ns)
+
+    def receive(self) -> tuple[RobotView, dict[str, Any]]:
+        """The second half: waits for the data after the command; returns the view and `info`."""
+        with halted_after_an_error(self._link):
+            return self._measure()
+
+    def _check_stamps(self) -> None:
+        """Raises BackendError if a newest datum is not stamped with the present step."""
+        for topic in self._topics:
+            off_ns = self._mail.stamp_ns(topic) - self._now_ns
+            if off_ns:
+                self._link.check_alone()
+                raise BackendError(
+                    f"topic {topic!r}: stamped {off_ns / NS_PER_S:+.3f} s off the step; start "
+                    "the simulator with mode:=lockstep, and move it from here alone."
+                )
+
+    def _measure(self) -> tuple[RobotView, dict[str, Any]]:
+        """Returns the view at the present stamp. Raises BackendError if the data have another."""
+        now = self._now_ns
+        messages = self._await(now)
+        self._check_stamps()
+        message, arrival = messages[SCAN]
+        ranges = from_device(_read(SCAN, wire.ranges_of, message), self._lidar)
+        self._middleware.scan(now, arrival, ranges)
+        facts = {"stamp_ns": now, **data_facts(self._middleware, time.monotonic_ns())}
+        if TRUTH in self._topics:
+            facts["true_pose"] = _read(TRUTH, wire.odometry_of, messages[TRUTH][0])[0]
+            self._known = {"true_pose": facts["true_pose"]}
+        return self._middleware.view(now), facts
+
+    def _await(self, stamp_ns: int) -> dict[str, tuple[bytes, int]]:
+        """Returns the mailbox's data for a stamp; what does not arrive is requested again.
+
+        Data may be lost, and those sent before the simulator discovered a subscription always are.
+        """
+        deadline = time.monotonic() + self.timeout_s
+        while True:
+            try:
+                left_s = max(0.0, deadline - time.monotonic())
+                return self._mail.wait(stamp_ns, min(AGAIN_S, left_s))
+            except StaleDataError as error:
+                if left_s <= AGAIN_S:
+                    raise StaleDataError(error.topic, error.age_s, self.timeout_s) from None
+                self._episodes.repeat()
+
+    def facts(self) -> BackendFacts:
+        """Returns the newest true pose, if it was asked for."""
+        return self._known
+
+    def halt(self) -> None:
+        """Publishes a zero command; the episode is over."""
+        self._link.halt()
+
+    def close(self) -> None:
+        """Publishes a zero command and ends the node."""
+        self._link.close()
 
 
-def _team(
-    model: SimulatorModel, world: World, mode: str, robots: int, options: dict[str, Any]
-) -> Backend:
-    names = options.pop("namespaces", default_namespaces(robots))
-    if mode != "lockstep" or len(names) != robots:
-        raise ConfigError(
-            f"backend_options: a team of {robots} robots is driven in mode 'lockstep' alone, with "
-            f"{robots} namespaces, not in {mode!r} with {list(names)!r}."
-        )
-    return FleetBackend(model, world, names, **options)
+def _read(topic: str, read: Callable[[bytes], T], message: bytes) -> T:
+    """Returns the content of a message. Raises BackendError if it is not of that type."""
+    try:
+        return read(message)
+    except wire.UNREADABLE as error:
+        raise BackendError(
+            f"topic {topic!r}: a message can't be read ({error}); look at who publishes it."
+        ) from None
 
 
-Array = NDArray[np.float64]
+def _putter(mail: _Mailbox, topic: str) -> Callable[[bytes], object]:
+    return lambda message: mail.put(topic, message)
 
 
 class FleetBackend:
     """M robots in lock-step with one simulator node, which moves when all have their commands.
 
-    Views and commands have a leading (M,). Each robot has its own `DdsBackend`.
-
-    Args:
-        model: of every robot; must be the one that the simulator node runs.
-        world: likewise.
-        namespaces: of the robots, in the order of its parameter `robots`.
-        simulator: full name of the simulator's node.
-        options: further options of each DdsBackend.
-
-    Raises:
-        BackendError: no simulator is there, or a robot is missing.
+    Views and commands have a leading (M,). Each robot has its own `DdsBackend`, which takes the
+    options, in a namespace, in the order of the simulator's parameter `robots`. The simulator is
+    named in full. Raises BackendError if no simulator is there, or a robot is missing.
     """
 
     def __init__(
@@ -120,7 +309,7 @@ class FleetBackend:
     def reset(self, start: Start) -> RobotView:
         """Begins one episode for all robots, at poses (M, 3); see `DdsBackend.reset`."""
         leader = self._robots[0]
-        with self._zero_after_an_error():
+        with halted_after_an_error(self):
             leader.choose(start)
             stamp_ns = leader.begin()
             both = zip(self._robots, start.pose, strict=True)
@@ -128,7 +317,7 @@ class FleetBackend:
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Publishes all commands (M, C) and waits for all data after them."""
-        with self._zero_after_an_error():
+        with halted_after_an_error(self):
             for robot, one in zip(self._robots, command, strict=True):
                 robot.send(one)
             views, facts = zip(*(robot.receive() for robot in self._robots), strict=True)
@@ -137,14 +326,6 @@ class FleetBackend:
     def facts(self) -> BackendFacts:
         """Returns what is known of all robots, stacked."""
         return cast("BackendFacts", together([robot.facts() for robot in self._robots]))
-
-    @contextmanager
-    def _zero_after_an_error(self) -> Iterator[None]:
-        try:
-            yield
-        except BaseException:
-            self.halt()
-            raise
 
     def halt(self) -> None:
         """Publishes a zero command for each robot, even if one of them raises."""
@@ -167,3 +348,45 @@ def together(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         else np.stack([each[name] for each in facts])
         for name, value in facts[0].items()
     }
+
+
+MODES = {"lockstep": DdsBackend, "realtime": RealtimeBackend}
+
+
+def dds_backend(
+    model: SimulatorModel,
+    world: World,
+    mode: str = "lockstep",
+    robots: int = 1,
+    estimator: bool = True,
+    randomisation: None = None,
+    **options: Any,
+) -> Backend:
+    """Returns the backend of a robot behind ROS 2 topics, or of a team in lock-step.
+
+    In mode `lockstep` it is a `DdsBackend`, or for a team a `FleetBackend` with the option
+    `namespaces` (robot1, robot2, ... by default); in mode `realtime` a `RealtimeBackend`, with a
+    simulator or a vehicle. It always estimates and is never randomised.
+
+    Raises:
+        ConfigError: there is no such mode, or not for a team; or it should not estimate, or
+            should randomise.
+        BackendError: no peer is there.
+    """
+    if not estimator or randomisation is not None:
+        raise ConfigError(
+            "backend 'dds' always estimates and is never randomised; leave out `estimator` and "
+            "`randomisation`."
+        )
+    if mode not in MODES:
+        raise ConfigError(f"backend_options: there is no mode {mode!r}; {nearest(mode, MODES)}")
+    if robots > 1:
+        names = options.pop("namespaces", default_namespaces(robots))
+        if mode != "lockstep" or len(names) != robots:
+            raise ConfigError(
+                f"backend_options: a team of {robots} robots is driven in mode 'lockstep' alone, "
+                f"with {robots} namespaces, not in {mode!r} with {list(names)!r}."
+            )
+        return FleetBackend(model, world, names, **options)
+    made: Backend = MODES[mode](model, world, **options)
+    return made

@@ -1,240 +1,52 @@
 """command_gate: passes the policy's commands on while they can be trusted.
 
-Inputs of the gate, read from serialised messages (`wire`) into records of `safety`.
-
-rclpy would first make a Python object of each field, which at 50 Hz costs the gate more than
-deciding.
-
-Real-time priority of a process, if the system allows it.
+Messages are read from their bytes (`wire`): rclpy would first make a Python object of each field,
+which at 50 Hz costs the gate more than deciding.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
-from nav_msgs.msg import Odometry as OdometryMessage
-from rclpy.clock import Clock, ClockType
+from nav_msgs.msg import Odometry
 from rclpy.context import Context
+from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
-from std_srvs.srv import Trigger
 
-from nics_drl_bridge.gate import shield
+from nics_drl_bridge.gate import inputs, shield
 from nics_drl_bridge.gate.black_box import Entry
 from nics_drl_bridge.gate.gate import decide
-from nics_drl_bridge.gate.inputs import (
-    Arm,
-    Command,
-    Estimate,
-    EStop,
-    Input,
-    Odometry,
-    Press,
-    Reset,
-    Scan,
-    Tick,
-)
-from nics_drl_bridge.gate.limits import PERIOD_S
-from nics_drl_bridge.gate.state import Decision, begin
+from nics_drl_bridge.gate.limits import PERIOD_S, Limits, load_limits
+from nics_drl_bridge.gate.state import Decision, GateConfig, ShieldConfig, begin
+from nics_drl_bridge.gate.stopping import doubtful, require_possible, shield_config
+from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
-from nics_drl_bridge.nodes import qos, wire
+from nics_drl_bridge.nodes import qos, runner, wire
 from nics_drl_bridge.nodes.conversions import is_rotation
-from nics_drl_bridge.nodes.diagnostics import Condition, Diagnostics
 from nics_drl_bridge.nodes.gate_log import GateLog
-from nics_drl_bridge.nodes.gate_parameters import declare_gate
 from nics_drl_bridge.nodes.qos import QosWatch
-from nics_drl_bridge.nodes.runner import declare, last_word, run_node
+from nics_drl_bridge.nodes.runner import declare
 from nics_drl_bridge.nodes.wire import UNREADABLE, TwistWriter
 
 STALE_S = 0.05
 """A motion that was decided on longer ago than this is decided on again [s]."""
-
-
-class CommandGate(QosWatch):
-    """Stands between `cmd_vel_raw` and `cmd_vel`, in its own process.
-
-    It starts disarmed. `~/arm` lets commands pass if all checks succeed, `~/e_stop` presses the
-    emergency stop, `~/reset` clears a latched stop and leaves the gate disarmed. All decisions are
-    made in `safety`, on the steady clock.
-
-    Args:
-        context: of the node.
-    """
-
-    def __init__(self, context: Context) -> None:
-        super().__init__("command_gate", context=context)
-        parameters = declare_gate(self)
-        self._config, self._lidar = parameters.config, parameters.lidar
-        self._state = begin(self._config)
-        self._log = GateLog(parameters, self.get_logger())
-        if not self._config.e_stop_required:
-            self.get_logger().warning(
-                "e_stop_required is false: an e_stop that was never heard does not stop the robot. "
-                "That is for simulations; set it on a vehicle."
-            )
-        if self._config.shield is not None:
-            self.get_logger().info(parameters.shield_said)
-            shield.rehearse()
-        else:
-            self.get_logger().warning(parameters.shield_said)
-        self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
-        self._twists = TwistWriter()
-        self._zero = self._twists.write(np.zeros(3))
-        self._listen()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(PERIOD_S, lambda: self._decide(Tick()), clock=steady)
-        Diagnostics(self, "gate", self._look)
-        about = "Real-time priority (SCHED_FIFO) of its process, 1 to 99; 0 for none."
-        priority = declare(self, "priority", 0, about, low=0, high=HIGHEST, read_only=True)
-        refused = take_priority(priority)  # once all threads exist
-        if refused:
-            self.get_logger().warning(refused)
-
-    def _listen(self) -> None:
-        for kind, topic, read, profile in (
-            (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),
-            (OdometryMessage, "odom", odometry, qos.SENSOR),
-            (OdometryMessage, "odometry/filtered", estimate, qos.SENSOR),
-            (TwistStamped, "cmd_vel_raw", command, qos.COMMAND),
-            (Bool, "e_stop", e_stop, qos.EVERY_COMMAND),
-        ):
-            taker = partial(self._take, topic, read)
-            self.create_subscription(kind, topic, taker, profile, raw=True)
-        self.create_service(Trigger, "~/arm", self._on_arm)
-        self.create_service(Trigger, "~/reset", self._on_reset)
-        self.create_service(Trigger, "~/e_stop", self._on_e_stop_call)
-
-    def _take(self, topic: str, read: Callable[[bytes], Input], content: bytes) -> None:
-        try:
-            given = read(content)
-        except UNREADABLE as error:  # of a middleware with another encoding
-            self._log.refuse(f"{topic}: {error}")
-            return
-        self._decide(given)
-
-    def _on_arm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._answer(Arm(self.count_publishers(self._out.topic_name)), response)
-
-    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._answer(Reset(), response)
-
-    def _on_e_stop_call(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._decide(Press())
-        response.success, response.message = True, "the e-stop is pressed; ~/reset releases it"
-        return response
-
-    def _answer(self, given: Input, response: Trigger.Response) -> Trigger.Response:
-        decision = self._decide(given)
-        response.success, response.message = decision.granted, decision.answer
-        self.get_logger().info(f"{type(given).__name__.lower()}: {decision.answer}")
-        return response
-
-    def _decide(self, given: Input) -> Decision:
-        now, before = time.monotonic(), self._state
-        self._state, decision = decide(self._config, before, given, now)
-        # Publish first: the rest may take its time.
-        instead = self._say(decision, now) if decision.publish else None
-        self._log.note(Entry(now, given, before, decision))
-        if instead is not None and not isinstance(given, Press):
-            self._decide(instead)
-        return decision
-
-    def _say(self, decision: Decision, now: float) -> Input | None:
-        """Publishes a decision; the only path to the robot except `stop`.
-
-        Returns:
-            An input to decide on instead, or None. What is not finite is sent as zero and presses
-            the e-stop. A motion that was decided on too long ago, in a process frozen since, is not
-            sent at all; so the clock is read immediately before.
-        """
-        finite, content = (
-            bool(np.isfinite(decision.twist).all()),
-            self._twists.write(decision.twist),
-        )
-        if not finite:
-            self._out.publish(self._zero)
-            self._log.no_number(decision.twist.tolist())
-            return Press()
-        if decision.cause is None and time.monotonic() - now > STALE_S:
-            return Tick()
-        self._out.publish(content)
-        return None
-
-    def _look(self) -> Condition:
-        """Returns the finding for `/diagnostics`; other publishers are reported, not prevented."""
-        found = self._log.finding(self._state)
-        others = self.count_publishers(self._out.topic_name) - 1
-        if others < 1:
-            return found
-        told = f"others publish on cmd_vel, too ({others}), and move the robot past this gate"
-        self.get_logger().warning(told, throttle_duration_sec=10.0)
-        return found._replace(message=f"{found.message}; {told}", warns=True)
-
-    def stop(self) -> None:
-        """Leaves a zero command behind."""
-        last_word(self._out, self._zero)
-        self._log.close()
-
-
-def main(args: list[str] | None = None) -> None:
-    """Entry point of the executable."""
-    run_node(CommandGate, args, "command_gate")
-    sys.stdout.flush()
-    sys.stderr.flush()
-    # Everything is closed. Tearing down the interpreter as well takes half a second of a core, and
-    # several where others need it too.
-    os._exit(0)
-
-
-if __name__ == "__main__":
-    main()
-
-
+SCAN_PERIODS = 1.75
+"""For a slow lidar, the default age limit of a command's scan, in periods of the lidar."""
 ROTATION = slice(3, 7)
 """Position of an odometry's quaternion among its numbers."""
-VARIANCES = wire.POSE_COVARIANCE, wire.POSE_COVARIANCE + 7, wire.POSE_COVARIANCE + 35
+VARIANCES = [wire.POSE_COVARIANCE, wire.POSE_COVARIANCE + 7, wire.POSE_COVARIANCE + 35]
 """Positions of the variances of x, y and heading."""
-
-
-def scan(lidar: LidarSpec, content: bytes) -> Scan:
-    """Reads a serialised LaserScan. Raises `wire.UNREADABLE`."""
-    ranges = from_device(wire.ranges_of(content), lidar)
-    return Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
-
-
-def odometry(content: bytes) -> Odometry:
-    """Reads a serialised Odometry; without a rotation its pose is NaN. Raises `wire.UNREADABLE`."""
-    pose, twist = wire.odometry_of(content)
-    if not is_rotation(*wire.numbers_of(content)[ROTATION].tolist()):
-        pose = np.full(3, np.nan)
-    return Odometry(wire.stamp_of(content), pose, twist)
-
-
-def estimate(content: bytes) -> Estimate:
-    """Reads a serialised Odometry of an estimator. Raises `wire.UNREADABLE`."""
-    x, y, heading = (wire.numbers_of(content)[place] for place in VARIANCES)
-    with np.errstate(invalid="ignore"):  # a negative variance gives NaN, too
-        std = np.sqrt([np.maximum(x, y), heading])
-    return Estimate(wire.odometry_of(content)[1], std)
-
-
-def command(content: bytes) -> Command:
-    """Reads a serialised TwistStamped. Raises `wire.UNREADABLE`."""
-    return Command(wire.stamp_of(content), np.array(wire.stamped_twist_of(content)))
-
-
-def e_stop(content: bytes) -> EStop:
-    """Reads a serialised Bool. Raises `wire.UNREADABLE`."""
-    return EStop(wire.truth_of(content))
-
-
 HIGHEST = 99
 REFUSED = (
     "parameter 'priority': the system does not allow a real-time priority of {priority} ({error}); "
@@ -243,17 +55,130 @@ REFUSED = (
 )
 
 
+def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
+    """Declares the parameters of a gate, reads them, and logs doubts about them.
+
+    Raises ConfigError if a value can't be used, or would never let the robot move.
+    """
+    lidar, robot = model.lidar, model.robot
+    about = "Limits of the robot: a shipped file, or a YAML file; no default."
+    file = str(declare(node, "limits", "", about, read_only=True))
+    limits = load_limits(file, robot) if file else None
+    config = GateConfig(
+        fields=tuple(int(i) for i in np.flatnonzero(robot.to_cmd_vel(np.ones(len(robot.command))))),
+        limits=limits,
+        beam_angles=lidar.angles,
+        mount=lidar.mount,
+        range_min=lidar.range_min,
+        range_max=lidar.range_max,
+        scan_rate=lidar.rate,
+        simulated=bool(node.get_parameter("use_sim_time").value),
+        odom_std=model.noise.odometry,
+        shield=_declare_shield(node, model, limits, file),
+        **_declare_rules(node, model),
+    )
+    require_possible(config)
+    doubt = doubtful(config, model.control_period)
+    if doubt:
+        node.get_logger().warning(doubt)
+    return config
+
+
+def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
+    """Declares the parameters of the rules; returns their values by the field of the config."""
+    scan_age = max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate)
+    heard = "Whether e_stop must have been heard before arming; false in simulations alone."
+    default, seconds = GateConfig, (0.01, 10.0)
+    rows: tuple[tuple[str, float | bool, str, tuple[float, float] | None], ...] = (
+        ("odom_rate", 1.0 / model.control_period, "Of odom [Hz].", (0.1, 1e4)),
+        ("scan_age_s", scan_age, "Oldest scan, and behind a command [s].", seconds),
+        ("odom_age_s", default.odom_age_s, "Oldest odometry [s].", seconds),
+        ("command_age_s", default.command_age_s, "Oldest command [s].", seconds),
+        ("rate_tolerance", default.rate_tolerance, "Of both rates.", (0.01, 0.9)),
+        ("clock_rate", 1.0, "Of stamps: simulated seconds per second.", (0.01, 100.0)),
+        ("e_stop_required", True, heard, None),
+        ("e_stop_silence_s", default.e_stop_silence_s, "Silence of e_stop [s].", seconds),
+        ("estimate_required", True, "Whether arming needs odometry/filtered.", None),
+        ("estimate_std", default.estimate_std, "Greatest [m, rad].", (1e-3, 1e3)),
+    )
+    return {
+        field: declare(node, field.removesuffix("_s"), value, about, span, read_only=True)
+        for field, value, about, span in rows
+    }
+
+
+def declare_black_box(node: Node) -> Path:
+    """Declares the folder of the recordings of stops, and returns that of the node's namespace."""
+    about = "Where a stop's last 30 s are written, by namespace; ~/.ros/black_box if empty."
+    given = str(declare(node, "black_box", "", about, read_only=True))
+    home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
+    # So that no gate of another namespace removes its files.
+    namespace = str(node.get_namespace()).strip("/")
+    return (Path(given) if given else home / "black_box") / namespace
+
+
+def _declare_shield(
+    node: Node, model: SimulatorModel, limits: Limits | None, file: str
+) -> ShieldConfig | None:
+    """Returns the shield, None if it is off, and logs a sentence about it."""
+    on = declare(node, "shield", True, "Whether to stop before obstacles.", read_only=True)
+    values = {}
+    for name, about in (
+        ("latency", "Until the robot has taken up a command, measured [s]"),
+        ("deceleration", "Of the robot, measured [m/s^2]"),
+        ("margin", "Kept free around the footprint [m]"),
+        ("obstacle_speed", "At which what moves may come on [m/s]"),
+    ):
+        about = f"{about}; .nan: by the limits' file, or derived from the model."
+        value = float(declare(node, f"shield_{name}", math.nan, about, read_only=True))
+        if not math.isnan(value):
+            values[name] = value
+    if not on:
+        node.get_logger().warning("the shield is off: obstacles do not stop the robot")
+        return None
+    config, sentence = shield_config(model, limits, file, values)
+    node.get_logger().info(sentence)
+    return config
+
+
+def scan(lidar: LidarSpec, content: bytes) -> inputs.Scan:
+    """Reads a serialised LaserScan; raises `wire.UNREADABLE`, as the next four."""
+    ranges = from_device(wire.ranges_of(content), lidar)
+    return inputs.Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
+
+
+def odometry(content: bytes) -> inputs.Odometry:
+    """Reads a serialised Odometry; without a rotation its pose is NaN."""
+    pose, twist = wire.odometry_of(content)
+    if not is_rotation(*wire.numbers_of(content)[ROTATION].tolist()):
+        pose = np.full(3, np.nan)
+    return inputs.Odometry(wire.stamp_of(content), pose, twist)
+
+
+def estimate(content: bytes) -> inputs.Estimate:
+    """Reads a serialised Odometry of an estimator."""
+    x, y, heading = wire.numbers_of(content)[VARIANCES]
+    with np.errstate(invalid="ignore"):  # a negative variance gives NaN, too
+        std = np.sqrt([np.maximum(x, y), heading])
+    return inputs.Estimate(wire.odometry_of(content)[1], std)
+
+
+def command(content: bytes) -> inputs.Command:
+    """Reads a serialised TwistStamped."""
+    return inputs.Command(wire.stamp_of(content), np.array(wire.stamped_twist_of(content)))
+
+
+def e_stop(content: bytes) -> inputs.EStop:
+    """Reads a serialised Bool."""
+    return inputs.EStop(wire.truth_of(content))
+
+
 def take_priority(priority: int) -> str:
-    """Gives all threads of this process priority over every ordinary one (SCHED_FIFO).
+    """Gives all threads of this process priority over every ordinary one (SCHED_FIFO), if not 0.
 
     This includes the threads of the middleware: a gate that waits for them gains nothing by its own
-    priority alone. Threads created later have the priority of their creator.
-
-    Args:
-        priority: 1 to 99; 0 leaves everything as it is.
-
-    Returns:
-        A sentence with the reason and the fix if it fails; empty otherwise.
+    priority alone. Threads created later have the priority of their creator. Returns a sentence
+    with the reason and the fix if it fails, otherwise an empty one.
     """
     if priority == 0:
         return ""
@@ -266,3 +191,127 @@ def take_priority(priority: int) -> str:
         reason = str(getattr(error, "strerror", None) or "it has none").lower()
         return REFUSED.format(priority=priority, error=reason)
     return ""
+
+
+class CommandGate(QosWatch):
+    """Stands between `cmd_vel_raw` and `cmd_vel`, in its own process.
+
+    It starts disarmed. `~/arm` lets commands pass if all checks succeed, `~/e_stop` presses the
+    emergency stop, `~/reset` clears a latched stop and leaves the gate disarmed. All decisions are
+    made by `gate.gate.decide`, on the steady clock.
+    """
+
+    def __init__(self, context: Context) -> None:
+        super().__init__("command_gate", context=context)
+        model, logger = runner.declare_model(self), self.get_logger()
+        self._lidar, self._config = model.lidar, declare_gate(self, model)
+        self._state = begin(self._config)
+        self._log = GateLog(self._config, declare_black_box(self), model.robot.name, logger)
+        if not self._config.e_stop_required:
+            logger.warning(
+                "e_stop_required is false: an e_stop that was never heard does not stop the robot. "
+                "That is for simulations; set it on a vehicle."
+            )
+        if self._config.shield is not None:
+            shield.rehearse()
+        self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
+        self._twists = TwistWriter()
+        self._zero = self._twists.write(np.zeros(3))
+        self._listen()
+        runner.steadily(self, PERIOD_S, lambda: self._decide(inputs.Tick()))
+        runner.Diagnostics(self, "gate", self._look)
+        about = "Real-time priority (SCHED_FIFO) of its process, 1 to 99; 0 for none."
+        priority = declare(self, "priority", 0, about, (0, HIGHEST), read_only=True)
+        refused = take_priority(priority)  # once all threads exist
+        if refused:
+            logger.warning(refused)
+
+    def _listen(self) -> None:
+        for kind, topic, read, profile in (
+            (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),
+            (Odometry, "odom", odometry, qos.SENSOR),
+            (Odometry, "odometry/filtered", estimate, qos.SENSOR),
+            (TwistStamped, "cmd_vel_raw", command, qos.COMMAND),
+            (Bool, "e_stop", e_stop, qos.EVERY_COMMAND),
+        ):
+            taker = partial(self._take, topic, read)
+            self.create_subscription(kind, topic, taker, profile, raw=True)
+        runner.serve(self, "~/arm", self._arm)
+        runner.serve(self, "~/reset", lambda: self._answer(inputs.Reset()))
+        runner.serve(self, "~/e_stop", self._press)
+
+    def _take(self, topic: str, read: Callable[[bytes], inputs.Input], content: bytes) -> None:
+        try:
+            given = read(content)
+        except UNREADABLE as error:  # of a middleware with another encoding
+            self._log.refuse(f"{topic}: {error}")
+            return
+        self._decide(given)
+
+    def _arm(self) -> tuple[bool, str]:
+        return self._answer(inputs.Arm(self.count_publishers(self._out.topic_name)))
+
+    def _press(self) -> tuple[bool, str]:
+        self._decide(inputs.Press())
+        return True, "the e-stop is pressed; ~/reset releases it"
+
+    def _answer(self, given: inputs.Input) -> tuple[bool, str]:
+        decision = self._decide(given)
+        self.get_logger().info(f"{type(given).__name__.lower()}: {decision.answer}")
+        return decision.granted, decision.answer
+
+    def _decide(self, given: inputs.Input) -> Decision:
+        now, before = time.monotonic(), self._state
+        self._state, decision = decide(self._config, before, given, now)
+        # Publish first: the rest may take its time.
+        instead = self._say(decision, now) if decision.publish else None
+        self._log.note(Entry(now, given, before, decision))
+        if instead is not None and not isinstance(given, inputs.Press):
+            self._decide(instead)
+        return decision
+
+    def _say(self, decision: Decision, now: float) -> inputs.Input | None:
+        """Publishes a decision; the only path to the robot except `stop`.
+
+        Returns an input to decide on instead, or None. What is not finite is sent as zero and
+        presses the e-stop. A motion that was decided on too long ago, in a process frozen since, is
+        not sent at all; so the clock is read immediately before.
+        """
+        content = self._twists.write(decision.twist)
+        if not np.isfinite(decision.twist).all():
+            self._out.publish(self._zero)
+            self._log.no_number(decision.twist.tolist())
+            return inputs.Press()
+        if decision.cause is None and time.monotonic() - now > STALE_S:
+            return inputs.Tick()
+        self._out.publish(content)
+        return None
+
+    def _look(self) -> runner.Condition:
+        """Returns the finding for `/diagnostics`; other publishers are reported, not prevented."""
+        found = self._log.finding(self._state)
+        others = self.count_publishers(self._out.topic_name) - 1
+        if others < 1:
+            return found
+        warning = f"others publish on cmd_vel, too ({others}), and move the robot past this gate"
+        self.get_logger().warning(warning, throttle_duration_sec=10.0)
+        return found._replace(message=f"{found.message}; {warning}", warns=True)
+
+    def stop(self) -> None:
+        """Leaves a zero command behind."""
+        runner.last_word(self._out, self._zero)
+        self._log.close()
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point of the executable."""
+    runner.run_node(CommandGate, args, "command_gate")
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # Everything is closed. Tearing down the interpreter as well takes half a second of a core, and
+    # several where others need it too.
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,13 +1,26 @@
-"""Conversion of messages to data and back, in pairs: `x_to_ros` and `x_from_ros`."""
+"""Conversion of messages to data and back, in pairs: `x_to_ros`, `x_from_ros`; types by name."""
 
 from __future__ import annotations
 
 import array
 import math
+import re
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion, Twist
+from geometry_msgs.msg import (
+    Pose,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Quaternion,
+    Twist,
+    TwistStamped,
+)
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
 from sensor_msgs.msg import Imu, JointState, LaserScan
@@ -21,6 +34,12 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Array = NDArray[np.float64]
 QUATERNION_TOLERANCE = 0.1
 """Tolerance of the squared length of a quaternion about 1."""
+PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
+"""Indices of x, y and heading in the 6 x 6 covariance of a message."""
+UNUSED_VARIANCE = 1e6
+"""Variance of z, roll and pitch, which a planar robot does not measure."""
+FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")
+"""The type at the start of a line of a `.msg` file."""
 
 
 def stamp_to_ros(time_ns: int) -> Time:
@@ -61,16 +80,20 @@ def twist_to_ros(twist: ArrayLike) -> Twist:
     return message
 
 
+def stamped_to_ros(twist: ArrayLike, time_ns: int, frame: str) -> TwistStamped:
+    """Returns linear.x, linear.y, angular.z (3,) as a TwistStamped."""
+    message = TwistStamped(twist=twist_to_ros(twist))
+    message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
+    return message
+
+
 def twist_from_ros(message: Twist) -> Array:
     """Returns linear.x, linear.y, angular.z (3,) of a Twist."""
     return np.array([message.linear.x, message.linear.y, message.angular.z])
 
 
 def scan_to_ros(
-    spec: LidarSpec,
-    ranges: NDArray[np.float32],
-    time_ns: int,
-    frame: str,
+    spec: LidarSpec, ranges: NDArray[np.float32], time_ns: int, frame: str
 ) -> LaserScan:
     """Returns ranges (B,) as the device's LaserScan; every header field follows from the spec.
 
@@ -90,15 +113,9 @@ def scan_from_ros(spec: LidarSpec, message: LaserScan) -> NDArray[np.float32]:
 
 
 def reader_from_ros(message: LaserScan, like: LidarSpec, upside_down: bool = False) -> Reader:
-    """Returns the lidar of a LaserScan and the order of its beams.
+    """Returns the lidar of a header (the expected one if it agrees) and the order of its beams.
 
-    Args:
-        message: whose header describes it.
-        like: expected lidar; it is returned if the header agrees.
-        upside_down: whether the device is mounted with its z axis down.
-
-    Raises:
-        ConfigError: the header describes no lidar.
+    Raises ConfigError if the header describes no lidar.
     """
     header = ScanHeader(*(float(getattr(message, name)) for name in ScanHeader._fields))
     return reader_beside(header, len(message.ranges), like, upside_down)
@@ -108,17 +125,12 @@ def odometry_to_ros(
     pose: ArrayLike,
     twist: ArrayLike,
     time_ns: int,
-    frames: tuple[str, str],
+    frames: Sequence[str],
     variance: tuple[float, float, float, float],
 ) -> Odometry:
-    """Returns pose (3,) and body twist (3,) as an Odometry message.
+    """Returns pose (3,) and body twist (3,), in a fixed and a body frame, as an Odometry message.
 
-    Args:
-        pose: x [m], y [m], heading [rad] in the first frame.
-        twist: vx, vy [m/s], wz [rad/s] in the second.
-        time_ns: stamp.
-        frames: fixed frame and body frame.
-        variance: of position [m^2], heading [rad^2], linear [m^2/s^2], angular [rad^2/s^2].
+    The variances are of position [m^2], heading [rad^2], linear [m^2/s^2], angular [rad^2/s^2].
     """
     x, y, heading = (float(value) for value in np.asarray(pose))
     message = Odometry()
@@ -127,25 +139,18 @@ def odometry_to_ros(
     message.pose.pose.position.x, message.pose.pose.position.y = x, y
     message.pose.pose.orientation = heading_to_ros(heading)
     message.twist.twist = twist_to_ros(twist)
-    message.pose.covariance = _diagonal(variance[0], variance[1])
-    message.twist.covariance = _diagonal(variance[2], variance[3])
+    for part, linear, angular in ((message.pose, *variance[:2]), (message.twist, *variance[2:])):
+        part.covariance = covariance_to_ros(np.diag([linear, linear, angular]))
     return message
 
 
 def odometry_from_ros(message: Odometry) -> tuple[Array, Array]:
     """Returns pose (3,) and body twist (3,) of an Odometry message."""
-    pose = message.pose.pose
-    heading = heading_from_ros(pose.orientation)
-    return np.array([pose.position.x, pose.position.y, heading]), twist_from_ros(
-        message.twist.twist
-    )
+    return _planar(message.pose.pose), twist_from_ros(message.twist.twist)
 
 
-PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
-"""Indices of x, y and heading in the 6 x 6 covariance of a message."""
-
-UNUSED_VARIANCE = 1e6
-"""Variance of z, roll and pitch, which a planar robot does not measure."""
+def _planar(pose: Pose) -> Array:
+    return np.array([pose.position.x, pose.position.y, heading_from_ros(pose.orientation)])
 
 
 def covariance_to_ros(planar: Array) -> Array:
@@ -159,11 +164,9 @@ def pose_from_ros(
     message: PoseStamped | PoseWithCovarianceStamped,
 ) -> tuple[Array, Array | None]:
     """Returns the pose (3,) of a message and its covariance (3, 3); None if it carries none."""
-    pose, covariance = message.pose, None
     if isinstance(message, PoseWithCovarianceStamped):
-        pose, covariance = pose.pose, np.reshape(pose.covariance, (6, 6))[PLANAR]
-    heading = heading_from_ros(pose.orientation)
-    return np.array([pose.position.x, pose.position.y, heading]), covariance
+        return _planar(message.pose.pose), np.reshape(message.pose.covariance, (6, 6))[PLANAR]
+    return _planar(message.pose), None
 
 
 def imu_from_ros(message: Imu) -> tuple[float, float] | None:
@@ -186,5 +189,43 @@ def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState
     return message
 
 
-def _diagonal(linear: float, angular: float) -> Array:
-    return covariance_to_ros(np.diag([linear, linear, angular]))
+def message_type(kind: str) -> Any | None:
+    """Returns the class of a type like `nav_msgs/msg/Odometry`; None if it is not installed."""
+    parts = kind.split("/")
+    if len(parts) != 3:
+        return None
+    try:
+        return getattr(import_module(f"{parts[0]}.{parts[1]}"), parts[2], None)
+    except ImportError:
+        return None
+
+
+def message_texts(kind: str) -> dict[str, str]:
+    """Returns the `.msg` texts of a type and of all types in it, as far as they are installed."""
+    texts: dict[str, str] = {}
+    waiting = [kind]
+    while waiting:
+        each = waiting.pop()
+        file = _message_file(each)
+        if each in texts or file is None:
+            continue
+        texts[each] = file.read_text(encoding="utf-8")
+        package = each.split("/")[0]
+        for line in texts[each].splitlines():
+            found = FIELD.match(line.partition("#")[0])
+            if found is not None and ("/" in found[1] or found[1][0].isupper()):
+                inner = found[1].split("/")
+                waiting.append(f"{inner[0] if len(inner) > 1 else package}/msg/{inner[-1]}")
+    return texts
+
+
+def _message_file(kind: str) -> Path | None:
+    from ament_index_python.search_paths import get_search_paths
+
+    package, _, name = kind.split("/")
+    try:
+        prefixes = [*get_search_paths(), sys.prefix]
+    except OSError:  # if ROS 2 comes from wheels, the variable is not set
+        prefixes = [sys.prefix]
+    files = (Path(prefix) / "share" / package / "msg" / f"{name}.msg" for prefix in prefixes)
+    return next((file for file in files if file.is_file()), None)

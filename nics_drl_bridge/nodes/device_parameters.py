@@ -1,15 +1,12 @@
-"""Parameters of a device node: simulated devices, timing, frames and episodes.
-
-Pacing of a device's topics while its world moves in its own steps.
-"""
+"""Parameters of a device node: devices, frames, episodes, and the pace of world and topics."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
@@ -27,29 +24,21 @@ MODES = ("realtime", LOCKSTEP, "as_fast_as_possible")
 MODELS_OWN = -1.0
 GREATEST_FLEET = 256
 NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
+SLACK = 0.1
+"""A step may be early by this share of it, because timers are no more precise."""
+PATIENCE_NS = NS_PER_S // 2
+"""Steps missed for longer than this are not made up for [ns]."""
 
 
-@dataclass(frozen=True)
-class DeviceTiming:
-    """Timing of a device; lock-step is exact, without any of the delays.
+class DeviceTiming(NamedTuple):
+    """Timing of a device; lock-step is exact, without any of the delays."""
 
-    Attributes:
-        mode: one of `MODES`.
-        rate: simulated seconds per second in realtime.
-        step_ns: step of the world.
-        odom_ns: between two odometries.
-        scan_ns: between two scans.
-        scan_late_ns: least delay from a scan's measurement to its publication, and greatest
-            additional delay.
-        odom_late_ns: the same for odometry.
-    """
-
-    mode: str
-    rate: float
-    step_ns: int
-    odom_ns: int
-    scan_ns: int
-    scan_late_ns: tuple[int, int]
+    mode: str  # one of `MODES`
+    rate: float  # simulated seconds per second in realtime
+    step_ns: int  # of the world
+    odom_ns: int  # between two odometries
+    scan_ns: int  # between two scans
+    scan_late_ns: tuple[int, int]  # least delay to publication, and greatest additional one
     odom_late_ns: tuple[int, int]
 
     @property
@@ -57,14 +46,8 @@ class DeviceTiming:
         """True if the world waits for commands."""
         return self.mode == LOCKSTEP
 
-    @property
-    def late(self) -> bool:
-        """True if anything is published later than it was measured."""
-        return any((*self.scan_late_ns, *self.odom_late_ns))
 
-
-@dataclass(frozen=True)
-class Frames:
+class Frames(NamedTuple):
     """Frame ids of one robot, and of the map that all share."""
 
     map: str
@@ -77,24 +60,40 @@ def declare_device(node: Node, laser_frame: str) -> None:
     """Declares all but the parameters of one kind of simulator, and checks later changes."""
     # First, so that it also checks the values that the node is started with.
     node.add_on_set_parameters_callback(_check_episode)
-    world = "World file, or the name of a shipped world."
-    declare(node, "world", "arena", world, read_only=True)
     about = "How many robots, named robot1, robot2, ..., or their namespaces; 1 has none."
     fleet = ParameterDescriptor(description=about, read_only=True, dynamic_typing=True)
     node.declare_parameter("robots", 1, fleet)
-    _declare_time(node)
-    stamped = "Whether cmd_vel is a TwistStamped; a Twist otherwise."
-    declare(node, "enable_stamped_cmd_vel", False, stamped, read_only=True)
-    silence = "Stops after this silence on cmd_vel [simulated s]; not in lockstep."
-    declare(node, "command_timeout", 0.5, silence, low=0.0, high=3600.0)
-    prefix = "Put before the frames of the robot; in a fleet before its namespace there."
-    declare(node, "frame_prefix", "", prefix, read_only=True)
-    for frame, default in (
-        ("map", "map"), ("odom", "odom"), ("base", "base_link"), ("laser", laser_frame),
+    for name, fixed, about in (
+        ("world", "arena", "World file, or the name of a shipped world."),
+        ("mode", "realtime", f"How time runs: {', '.join(MODES)}."),
+        ("enable_stamped_cmd_vel", False, "Whether cmd_vel is a TwistStamped; a Twist otherwise."),
+        ("frame_prefix", "",
+         "Put before the frames of the robot; in a fleet before its namespace there."),
+        ("map_frame", "map", "Frame id of map."),
+        ("odom_frame", "odom", "Frame id of odom."),
+        ("base_frame", "base_link", "Frame id of base_link."),
+        ("laser_frame", laser_frame, f"Frame id of {laser_frame}."),
+        ("publish_map_to_odom", False,
+         "Whether to publish the true map -> odom on /tf, in place of a localiser."),
     ):  # fmt: skip
-        declare(node, f"{frame}_frame", default, f"Frame id of {default}.", read_only=True)
-    truth = "Whether to publish the true map -> odom on /tf, in place of a localiser."
-    declare(node, "publish_map_to_odom", False, truth, read_only=True)
+        declare(node, name, fixed, about, read_only=True)
+    own = MODELS_OWN
+    for name, value, low, high, about in (
+        ("rate", 1.0, 0.01, 1000.0, "Simulated seconds per second in realtime."),
+        ("odom_rate", 0.0, 0.0, 1000.0, "Of odom [Hz]; 0 for one per control period."),
+        ("scan_rate", 0.0, 0.0, 1000.0, "Of scan [Hz]; 0 for the lidar's own."),
+        ("scan_latency", own, own, 10.0,
+         "From the end of a scan to its publication [s]; -1 for the measured one of the model."),
+        ("odom_latency", own, own, 10.0,
+         "From the stamp of odom to its publication [s]; -1 for the measured one of the model."),
+        ("latency_jitter", own, own, 10.0,
+         "Greatest further delay of both, drawn evenly [s]; -1 for the measured ones."),
+        ("command_latency", own, own, 10.0,
+         "From a command to its effect [s]; -1 for the measured one of the model."),
+    ):  # fmt: skip
+        declare(node, name, value, about, (low, high), read_only=True)
+    silence = "Stops after this silence on cmd_vel [simulated s]; not in lockstep."
+    declare(node, "command_timeout", 0.5, silence, span=(0.0, 3600.0))
     declare(node, "episode_seed", 0, "Seed of the episode that ~/reset begins.")
     start = "Start x, y, heading of that episode, of each robot."
     declare(node, "episode_start", [0.0, 0.0, 0.0], start)
@@ -102,62 +101,40 @@ def declare_device(node: Node, laser_frame: str) -> None:
     declare(node, "episode_start_given", False, given)
 
 
-def _declare_time(node: Node) -> None:
-    declare(node, "mode", "realtime", f"How time runs: {', '.join(MODES)}.", read_only=True)
-    for name, default, low, high, about in (
-        ("rate", 1.0, 0.01, 1000.0, "Simulated seconds per second in realtime."),
-        ("odom_rate", 0.0, 0.0, 1000.0, "Of odom [Hz]; 0 for one per control period."),
-        ("scan_rate", 0.0, 0.0, 1000.0, "Of scan [Hz]; 0 for the lidar's own."),
-        ("scan_latency", MODELS_OWN, MODELS_OWN, 10.0,
-         "From the end of a scan to its publication [s]; -1 for the measured one of the model."),
-        ("odom_latency", MODELS_OWN, MODELS_OWN, 10.0,
-         "From the stamp of odom to its publication [s]; -1 for the measured one of the model."),
-        ("latency_jitter", MODELS_OWN, MODELS_OWN, 10.0,
-         "Greatest further delay of both, drawn evenly [s]; -1 for the measured ones."),
-        ("command_latency", MODELS_OWN, MODELS_OWN, 10.0,
-         "From a command to its effect [s]; -1 for the measured one of the model."),
-    ):  # fmt: skip
-        declare(node, name, default, about, low=low, high=high, read_only=True)
+def number(node: Node, name: str) -> float:
+    """Returns the value of a numeric parameter."""
+    return float(node.get_parameter(name).value or 0.0)
 
 
 def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     """Returns the timing given by the parameters; in lock-step, by the model alone."""
     mode = choice(node, "mode", MODES)
-    value = {
-        name: float(node.get_parameter(name).value or 0.0)
-        for name in ("rate", "odom_rate", "scan_rate")
-    }
     if mode == LOCKSTEP:
         period = round(model.control_period * NS_PER_S)
         return DeviceTiming(mode, 1.0, period, period, period, (0, 0), (0, 0))
-    odom = 1.0 / value["odom_rate"] if value["odom_rate"] else model.control_period
-    scan = 1.0 / (value["scan_rate"] or model.lidar.rate)
+    rate = number(node, "odom_rate")
+    odom = 1.0 / rate if rate else model.control_period
+    scan = 1.0 / (number(node, "scan_rate") or model.lidar.rate)
     dt = model.timing[0]
     step = common_step(dt, (odom, scan)) * dt
     step_ns, odom_ns, scan_ns = (round(seconds * NS_PER_S) for seconds in (step, odom, scan))
     late = [_late_ns(node, topic, model) for topic in ("scan", "odom")]
-    return DeviceTiming(mode, value["rate"], step_ns, odom_ns, scan_ns, *late)
+    return DeviceTiming(mode, number(node, "rate"), step_ns, odom_ns, scan_ns, *late)
 
 
 def _late_ns(node: Node, topic: str, model: SimulatorModel) -> tuple[int, int]:
     """Returns least delay and jitter of a topic [ns]: as requested, otherwise as in the model."""
     own = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
-    asked = (
-        float(node.get_parameter(name).value or 0.0)
-        for name in (f"{topic}_latency", "latency_jitter")
-    )
-    least, jitter = (
-        given if given >= 0.0 else measured
-        for given, measured in zip(asked, (own.least, own.jitter), strict=True)
-    )
+    least, jitter = number(node, f"{topic}_latency"), number(node, "latency_jitter")
+    least, jitter = (least if least >= 0.0 else own.least, jitter if jitter >= 0.0 else own.jitter)
     return round(least * NS_PER_S), round(jitter * NS_PER_S)
 
 
 def timed_model(node: Node, model: SimulatorModel, time: DeviceTiming) -> SimulatorModel:
     """Returns the model with the step of the world and the requested latency."""
-    latency = float(node.get_parameter("command_latency").value or 0.0)
     if time.lockstep:
         return model
+    latency = number(node, "command_latency")
     if latency >= 0.0:
         calibration = replace(model.calibration, command_latency_s=latency)
         model = replace(model, calibration=calibration)
@@ -177,8 +154,7 @@ def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
 def namespaces(node: Node) -> tuple[str, ...]:
     """Returns the namespace of each robot below the node's own; one empty name for a single robot.
 
-    Raises:
-        ConfigError: `robots` is neither a count nor a list of different names.
+    Raises ConfigError if `robots` is neither a count nor a list of different names.
     """
     value: Any = node.get_parameter("robots").value
     if isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= GREATEST_FLEET:
@@ -201,11 +177,8 @@ def default_namespaces(robots: int) -> tuple[str, ...]:
 def frames(node: Node, namespace: str) -> Frames:
     """Returns the frames of a robot; those of a fleet begin with its namespace, except the map."""
     prefix = str(node.get_parameter("frame_prefix").value) + (f"{namespace}/" if namespace else "")
-    name = {
-        each: str(node.get_parameter(f"{each}_frame").value)
-        for each in ("map", "odom", "base", "laser")
-    }
-    return Frames(name["map"], prefix + name["odom"], prefix + name["base"], prefix + name["laser"])
+    world, *own = (str(node.get_parameter(f"{each}_frame").value) for each in Frames._fields)
+    return Frames(world, *(prefix + name for name in own))
 
 
 def _check_episode(parameters: list[Parameter]) -> SetParametersResult:
@@ -222,18 +195,10 @@ def _check_episode(parameters: list[Parameter]) -> SetParametersResult:
     return SetParametersResult(successful=True)
 
 
-SLACK = 0.1
-"""A step may be early by this share of it, because timers are no more precise."""
-PATIENCE_NS = NS_PER_S // 2
-"""Steps missed for longer than this are not made up for [ns]."""
-
-
 class TopicPace:
     """Decides when a topic is due, so that its mean rate is the requested one with any step.
 
-    Args:
-        period_ns: between two messages.
-        step_ns: between two calls of `due`; if it divides the period, the messages are regular.
+    If the step between two calls of `due` divides the period, the messages are regular.
     """
 
     def __init__(self, period_ns: int, step_ns: int) -> None:
@@ -253,25 +218,15 @@ class TopicPace:
 
 
 def common_step(dt: float, periods: tuple[float, ...]) -> int:
-    """Returns the longest step, in steps of the model, that suits all periods as well as possible.
+    """Returns the longest step, in steps of the model [s], that suits all periods [s] best.
 
-    Args:
-        dt: step of the model [s].
-        periods: of the published topics [s].
-
-    Returns:
-        Steps of the model: a divisor of all periods if `dt` divides them.
+    It is a divisor of all periods if `dt` divides them.
     """
     return math.gcd(*(max(1, round(period / dt)) for period in periods))
 
 
 class RealTime:
-    """Tracks by how many steps the world is behind the steady clock.
-
-    Args:
-        step_ns: step of the world.
-        rate: simulated seconds per second.
-    """
+    """Tracks by how many steps the world is behind the steady clock."""
 
     def __init__(self, step_ns: int, rate: float) -> None:
         self._step_ns, self._rate = step_ns, rate

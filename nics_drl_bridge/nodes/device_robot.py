@@ -1,11 +1,4 @@
-"""RobotPort: the data of one simulated robot, written into prepared messages.
-
-CommandInlet: the commands of one robot, in any supported message.
-
-Outbox: messages that a device publishes later than it measured them.
-
-Transforms of a device: `/tf` and `/tf_static`, if the message package is installed.
-"""
+"""Topics of one simulated robot: its data, its commands, its transforms, and their latencies."""
 
 from __future__ import annotations
 
@@ -13,7 +6,6 @@ import heapq
 import itertools
 import math
 from collections.abc import Callable
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -37,21 +29,19 @@ from nics_drl_bridge.nodes.qos import owner
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, Sensed, variances
 
+Array = NDArray[np.float64]
 PLANAR = np.array([0, 1, 5])
 DIAGONAL = np.arange(0, 36, 7)
+TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+SWITCH = {STAMPED: "enable_stamped_cmd_vel:=false", TWIST: "enable_stamped_cmd_vel:=true"}
+"""By the expected type: the setting that selects the other type."""
+QUIET_S = 5.0
 
 
 class RobotPort:
     """Publishes `scan`, `odom`, `joint_states` and `ground_truth` of one robot.
 
-    The last two cost nothing without subscribers.
-
-    Args:
-        node: that publishes.
-        namespace: of the robot below the node's, empty or with a slash at its end.
-        model: of the robot.
-        frames: of the robot.
-        time: timing of the device.
+    The last two cost nothing without subscribers. The namespace is empty or ends with a slash.
     """
 
     def __init__(
@@ -63,13 +53,18 @@ class RobotPort:
         self._odoms = node.create_publisher(Odometry, f"{namespace}odom", quality)
         self._truths = node.create_publisher(Odometry, f"{namespace}ground_truth", quality)
         self._joints = node.create_publisher(JointState, f"{namespace}joint_states", quality)
-        scan, odom = scan_message(model, frames.laser, time), odometry_message(frames)
+        free = np.full(model.lidar.beams, np.inf, np.float32)
+        scan = conversions.scan_to_ros(model.lidar, free, 0, frames.laser)
+        scan.scan_time = time.scan_ns / NS_PER_S
         # Beam 0 of a device that turns counter-clockwise was measured first.
         sweep_s = max(0.0, scan.time_increment) * (model.lidar.beams - 1)
         self._sweep_ns = 0 if time.lockstep else round(sweep_s * NS_PER_S)
+        odom, truth = (planar_message(parent, frames.base) for parent in (frames.odom, frames.map))
         odom.twist.covariance[DIAGONAL[PLANAR]] = variances(model.noise.odometry)
+        truth.pose.covariance[DIAGONAL[PLANAR]] = LEAST_VARIANCE
+        truth.twist.covariance[DIAGONAL[PLANAR]] = LEAST_VARIANCE
         self._scan, self._odom = wire.ScanWriter(scan), wire.OdometryWriter(odom)
-        self._truth = wire.OdometryWriter(truth_message(frames))
+        self._truth = wire.OdometryWriter(truth)
         self._moving = [transform_message(frames.odom, frames.base)]
         if node.get_parameter("publish_map_to_odom").value:
             self._moving.append(transform_message(frames.map, frames.odom))
@@ -88,7 +83,7 @@ class RobotPort:
             fill(message, geometry.compose(sensed.pose, home), now)
         return self._moving
 
-    def tell_odometry(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
+    def publish_odometry(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
         """Publishes odometry, and joints and true pose if they have subscribers."""
         late_ns = self._time.odom_late_ns
         odometry = self._odom.write(now_ns, sensed.odom, sensed.twist, sensed.covariance)
@@ -99,35 +94,15 @@ class RobotPort:
         if self._truths.get_subscription_count():
             self._truths.publish(self._truth.write(now_ns, sensed.pose, sensed.true_twist))
 
-    def tell_scan(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
+    def publish_scan(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
         """Publishes the robot's scan, stamped with the time of beam 0."""
         ranges = to_device(sensed.ranges, self._model.lidar)
         message = self._scan.write(now_ns - self._sweep_ns, ranges)
         outbox.send(self._scans, message, now_ns, self._time.scan_late_ns)
 
 
-def scan_message(model: SimulatorModel, frame: str, time: DeviceTiming) -> LaserScan:
-    """Returns a scan whose ranges and stamp are still to be filled in."""
-    free = np.full(model.lidar.beams, np.inf, np.float32)
-    message = conversions.scan_to_ros(model.lidar, free, 0, frame)
-    message.scan_time = time.scan_ns / NS_PER_S
-    return message
-
-
-def odometry_message(frames: Frames) -> Odometry:
+def planar_message(parent: str, child: str) -> Odometry:
     """Returns an odometry to be filled in; its out-of-plane values are marked as unknown."""
-    return _planar_message(frames.odom, frames.base)
-
-
-def truth_message(frames: Frames) -> Odometry:
-    """Returns the same for the exact pose and twist."""
-    message = _planar_message(frames.map, frames.base)
-    for covariance in (message.pose.covariance, message.twist.covariance):
-        covariance[DIAGONAL[PLANAR]] = LEAST_VARIANCE
-    return message
-
-
-def _planar_message(parent: str, child: str) -> Odometry:
     message = Odometry(child_frame_id=child)
     message.header.frame_id = parent
     for covariance in (message.pose.covariance, message.twist.covariance):
@@ -135,26 +110,13 @@ def _planar_message(parent: str, child: str) -> Odometry:
     return message
 
 
-Array = NDArray[np.float64]
-TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
-SWITCH = {STAMPED: "enable_stamped_cmd_vel:=false", TWIST: "enable_stamped_cmd_vel:=true"}
-"""By the expected type: the setting that selects the other type."""
-QUIET_S = 5.0
-
-
 class CommandInlet:
     """Listens to `cmd_vel`, and to `ackermann_cmd` if the robot steers and the message exists.
 
-    A stamped command is treated as by ros2_control's drive controllers: a stamp of zero counts as
-    now, and a command older than the command timeout is ignored.
-
-    Args:
-        node: that listens; its parameter `enable_stamped_cmd_vel` selects the type.
-        namespace: of the robot below the node's, empty or with a slash at its end.
-        robot: defines the commands.
-        quality: of the subscriptions.
-        take: called with each command (C,).
-        too_old: returns whether a stamp [ns] is too old to be obeyed.
+    The node's parameter `enable_stamped_cmd_vel` selects the type. A stamped command is treated as
+    by ros2_control's drive controllers: a stamp of zero counts as now, and a command older than the
+    command timeout is ignored. `take` is called with each command (C,) whose stamp [ns] is not
+    `too_old`.
     """
 
     def __init__(
@@ -174,15 +136,10 @@ class CommandInlet:
             kind, f"{namespace}cmd_vel", hear, quality, raw=not stamped
         ).topic_name
         self._warned: set[str] = set()
-        if robot.steers:
-            self._listen_to_ackermann(f"{namespace}ackermann_cmd", quality)
-
-    def _listen_to_ackermann(self, topic: str, quality: QoSProfile) -> None:
-        try:
-            kind = import_module("ackermann_msgs.msg").AckermannDriveStamped
-        except ModuleNotFoundError:
-            return  # an optional package
-        self._node.create_subscription(kind, topic, self._on_ackermann, quality)
+        kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
+        if robot.steers and kind is not None:  # its package is optional
+            topic = f"{namespace}ackermann_cmd"
+            node.create_subscription(kind, topic, self._on_ackermann, quality)
 
     def _on_bytes(self, content: bytes) -> None:
         try:
@@ -237,13 +194,10 @@ class Outbox:
 
     Without either, a message is published at once. Otherwise its bytes are kept, so that the
     caller may reuse it.
-
-    Args:
-        seed: of the random jitter.
     """
 
-    def __init__(self, seed: int = 0) -> None:
-        self._random = np.random.default_rng(seed)
+    def __init__(self) -> None:
+        self._random = np.random.default_rng(0)
         self._waiting: list[tuple[int, int, Publisher, bytes]] = []
         self._latest: dict[Publisher, int] = {}
         self._numbers = itertools.count()
@@ -251,13 +205,9 @@ class Outbox:
     def send(
         self, publisher: Publisher, message: Any, now_ns: int, late_ns: tuple[int, int]
     ) -> None:
-        """Publishes a message now, or schedules it.
+        """Publishes a message, or its bytes, now, or schedules it.
 
-        Args:
-            publisher: to publish with.
-            message: to publish, or its bytes.
-            now_ns: present time.
-            late_ns: least delay, and greatest additional one, drawn uniformly for each message.
+        `late_ns` is the least delay, and the greatest additional one, drawn uniformly for each.
         """
         delay, jitter = late_ns
         if jitter:
@@ -282,12 +232,6 @@ class Outbox:
         self._latest.clear()
 
 
-MISSING = (
-    "the message package tf2_msgs is not installed, so that neither /tf nor /tf_static is "
-    "published; install it with your ROS 2 distribution."
-)
-
-
 def transform_message(parent: str, child: str) -> TransformStamped:
     """Returns a transform between two frames that is still to be filled in."""
     message = TransformStamped(child_frame_id=child)
@@ -305,41 +249,29 @@ def fill(message: TransformStamped, pose: ArrayLike, stamp: Any) -> TransformSta
 
 
 class Transforms:
-    """Publishes transforms; if it can't, it logs the reason once.
-
-    Args:
-        node: that publishes.
-    """
+    """Publishes transforms; if tf2_msgs is not installed, it logs that once."""
 
     def __init__(self, node: Node) -> None:
-        self._moving: Any = None
-        try:
-            self._kind = import_module("tf2_msgs.msg").TFMessage
-        except ModuleNotFoundError:
-            node.get_logger().warning(MISSING)
+        kind = conversions.message_type("tf2_msgs/msg/TFMessage")
+        self.published = kind is not None
+        if kind is None:
+            node.get_logger().warning(
+                "the message package tf2_msgs is not installed, so that neither /tf nor /tf_static "
+                "is published; install it with your ROS 2 distribution."
+            )
             return
-        self._message = self._kind()
-        self._moving = node.create_publisher(self._kind, "/tf", qos.TRANSFORMS)
-        self._fixed = node.create_publisher(self._kind, "/tf_static", qos.FIXED_TRANSFORMS)
+        self._kind, self._message = kind, kind()
+        self._moving = node.create_publisher(kind, "/tf", qos.TRANSFORMS)
+        self._fixed = node.create_publisher(kind, "/tf_static", qos.FIXED_TRANSFORMS)
 
-    @property
-    def published(self) -> bool:
-        """True if transforms are published."""
-        return self._moving is not None
-
-    def tell_fixed(self, transforms: list[TransformStamped]) -> None:
+    def publish_fixed(self, transforms: list[TransformStamped]) -> None:
         """Publishes once what never changes; late joiners get it, too."""
         if self.published:
             self._fixed.publish(self._kind(transforms=transforms))
 
-    def tell(
-        self,
-        transforms: list[TransformStamped],
-        outbox: Outbox,
-        now_ns: int,
-        late_ns: tuple[int, int],
+    def publish(
+        self, moving: list[TransformStamped], outbox: Outbox, now_ns: int, late_ns: tuple[int, int]
     ) -> None:
         """Publishes what changes, with the delay of the odometry that it comes from."""
-        if self.published:
-            self._message.transforms = transforms
-            outbox.send(self._moving, self._message, now_ns, late_ns)
+        self._message.transforms = moving
+        outbox.send(self._moving, self._message, now_ns, late_ns)

@@ -1,19 +1,24 @@
-"""Reports of `command_gate`: log lines, counters, and the black box."""
+"""Reports of `command_gate`: log lines, counters, and the black box. It never waits for a disk."""
 
 from __future__ import annotations
 
+import contextlib
+import gc
+import os
+import signal
+import sys
 import time
+import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple, NoReturn
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
 from nics_drl_bridge.gate.black_box import BlackBox, Entry, write
-from nics_drl_bridge.gate.state import Cause, GateState
-from nics_drl_bridge.nodes.box_writer import BoxWriter
-from nics_drl_bridge.nodes.diagnostics import Condition
-from nics_drl_bridge.nodes.gate_parameters import GateParameters
+from nics_drl_bridge.gate.state import Cause, GateConfig, GateState
+from nics_drl_bridge.nodes.runner import Condition
 
 FILES_KEPT = 20
 BURST_S = 3.0
@@ -22,6 +27,17 @@ LINE_S = 2.0
 """Time between two log lines of a kind [s]; those in between are counted."""
 CLOSING_S = 0.7
 """Longest wait at the end for files that are being written [s]."""
+MOST_AT_WORK = 3
+"""Greatest number of writers at work; each keeps a copy of this process's memory."""
+PATIENCE_S = 20.0
+"""A writer that takes longer gives up [s]."""
+OVERDUE_S = PATIENCE_S + 5.0
+"""A writer that still runs after this never gives up [s]: another thread may have held a lock
+during the fork, or the disk blocks it."""
+GRACE_S, POLL_S = 0.5, 0.005
+NICENESS = 5
+MOST_TOLD = 500
+ENDING = (signal.SIGTERM, signal.SIGALRM)
 
 
 class _Lines:
@@ -32,7 +48,6 @@ class _Lines:
         self._kept: Counter[str] = Counter()
 
     def count(self, kind: str) -> None:
-        """Counts one more line of a kind."""
         self._kept[kind] += 1
 
     def due(self, kind: str, now: float) -> str | None:
@@ -48,16 +63,12 @@ class GateLog:
 
     Stops in quick succession are a burst. The first stop of each rule in a burst is written, as it
     was at that moment; the others are counted.
-
-    Args:
-        parameters: of the gate.
-        logger: for the lines.
     """
 
-    def __init__(self, parameters: GateParameters, logger: RcutilsLogger) -> None:
+    def __init__(self, config: GateConfig, folder: Path, robot: str, logger: RcutilsLogger) -> None:
         self.counters: Counter[str] = Counter()
-        self._box, self._logger = BlackBox(parameters.config), logger
-        self._folder, self._hardware = parameters.black_box, parameters.robot
+        self._box, self._logger = BlackBox(config), logger
+        self._folder, self._hardware = folder, robot
         self._cause: Cause | None = None
         self._now = self._since = float("-inf")
         self._rule: str | None = None
@@ -89,23 +100,22 @@ class GateLog:
     def refuse(self, reason: str) -> None:
         """Counts an unused input, by the part of the reason before the colon, and logs it."""
         kind = f"refused, {reason.partition(':')[0]}"
-        self.counters[kind] += 1
-        self._lines.count(kind)
-        more = self._lines.due(kind, self._now)
-        if more is not None:
+        if (more := self._counted(kind)) is not None:
             self._logger.warning(f"refused: {reason}{more}")
 
     def no_number(self, twist: Sequence[float]) -> None:
         """Counts and logs a decision that is not finite, which must never happen."""
-        kind = "not finite, sent as zero"
-        self.counters[kind] += 1
-        self._lines.count(kind)
-        more = self._lines.due(kind, self._now)
-        if more is not None:
+        if (more := self._counted("not finite, sent as zero")) is not None:
             self._logger.error(
                 f"decided on {list(twist)}, which is not finite: zero is sent, and the e-stop is "
                 f"pressed{more}"
             )
+
+    def _counted(self, kind: str) -> str | None:
+        """Counts an event; returns what to append to its line, or None if it is not logged now."""
+        self.counters[kind] += 1
+        self._lines.count(kind)
+        return self._lines.due(kind, self._now)
 
     def _changed(self, rule: str) -> None:
         """Handles a change of the rule that stops the robot."""
@@ -143,12 +153,10 @@ class GateLog:
             prune(self._folder, self._names)
 
         try:
-            begun = self._writer.begin(work)
+            if not self._writer.begin(work):
+                self._failed("the files before it are still being written")
         except OSError as error:
             self._failed(str(error))
-            return
-        if not begun:
-            self._failed("the files before it are still being written")
 
     def _failed(self, reason: str) -> None:
         self.counters["not written"] += 1
@@ -175,12 +183,158 @@ class GateLog:
 def prune(folder: Path, own: Sequence[str]) -> None:
     """Removes the files of stops beyond `FILES_KEPT`, oldest first.
 
-    Args:
-        folder: of the black box.
-        own: names of this gate's files, oldest first. They count as the newest: the names of the
-            others may come from a clock that has been set back since.
+    This gate's own, by name, oldest first, count as the newest: the names of the others may come
+    from a clock that has been set back since.
     """
     place = {name: i for i, name in enumerate(own, 1)}
     files = sorted(folder.glob("*.jsonl"), key=lambda file: (place.get(file.name, 0), file.name))
     for old in files[:-FILES_KEPT]:
         old.unlink(missing_ok=True)
+
+
+class _Writer(NamedTuple):
+    pid: int
+    told: int  # pipe with the reason of a failure
+    begun_s: float
+
+
+class BoxWriter:
+    """Writes files, each in its own process, which starts as a copy of this one.
+
+    The copy (`fork`, which shares memory until it is modified) is the snapshot: it takes this
+    process some milliseconds, however much there is to write, and later changes here are not in
+    it. A disk that hangs blocks the copy and nothing else, not even the end of this process, as a
+    waiting thread would. The copy has no other thread, closes all sockets, and runs at ordinary
+    priority.
+    """
+
+    def __init__(self) -> None:
+        self._writers: list[_Writer] = []
+        self._failed: list[str] = []
+
+    def begin(self, write: Callable[[], object]) -> bool:
+        """Starts a copy of this process that writes; returns False if too many are at work.
+
+        If an exception ends `write`, it has to clean up after itself. Raises OSError if the system
+        can't make another process.
+        """
+        self._look()
+        if len(self._writers) >= MOST_AT_WORK:
+            return False
+        heard, told = os.pipe()
+        os.set_blocking(heard, False)
+        try:
+            with _no_signals(), warnings.catch_warnings():
+                # Of Python 3.12: locks that other threads hold stay locked in the copy. It needs
+                # none of theirs, and a copy that hangs nevertheless gives up.
+                warnings.simplefilter("ignore", DeprecationWarning)
+                pid = os.fork()
+                if pid == 0:
+                    _live(write, told)
+        except OSError:
+            os.close(heard)
+            raise
+        finally:
+            os.close(told)
+        self._writers.append(_Writer(pid, heard, time.monotonic()))
+        return True
+
+    def failures(self) -> list[str]:
+        """Returns the failures of the writers that have ended since the last call."""
+        self._look()
+        failed, self._failed = self._failed, []
+        return failed
+
+    def _look(self) -> None:
+        """Removes the writers that have ended, and kills those that are overdue."""
+        for writer in tuple(self._writers):
+            status = _ended(writer.pid)
+            if status is None:
+                if time.monotonic() - writer.begun_s > OVERDUE_S:
+                    os.kill(writer.pid, signal.SIGKILL)
+                continue
+            self._writers.remove(writer)
+            if status != 0:
+                self._failed.append(_read(writer.told) or f"its writer ended with {status}")
+            os.close(writer.told)
+
+    def close(self, seconds: float) -> list[str]:
+        """Waits for the writers, and makes those give up that take longer; returns the failures."""
+        failed = self._wait(seconds)
+        for writer in self._writers:
+            os.kill(writer.pid, signal.SIGTERM)
+        failed += self._wait(GRACE_S)
+        for writer in self._writers:  # blocked by the disk; it ends when that releases it
+            os.kill(writer.pid, signal.SIGKILL)
+            failed.append("the disk does not answer")
+        return failed
+
+    def _wait(self, seconds: float) -> list[str]:
+        failed, deadline = self.failures(), time.monotonic() + seconds
+        while self._writers and time.monotonic() < deadline:
+            time.sleep(POLL_S)
+            failed += self.failures()
+        return failed
+
+
+@contextlib.contextmanager
+def _no_signals() -> Iterator[None]:
+    """Defers signals, so that the copy does not run the handlers of the original."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, *ENDING))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _ended(pid: int) -> int | None:
+    """Returns the exit status of a writer; None while it runs."""
+    try:
+        ended, status = os.waitpid(pid, os.WNOHANG)
+    except ChildProcessError:  # if SIGCHLD is ignored, no status is kept
+        return 0
+    return status if ended else None
+
+
+def _live(write: Callable[[], object], told: int) -> NoReturn:
+    """Runs in the copy; never returns to the code that it was copied from."""
+    code = 1
+    try:
+        gc.disable()  # which would touch, and so copy, all memory
+        _let_go(told)
+        write()
+        code = 0
+    finally:  # on any exception, also from a signal
+        error = sys.exc_info()[1]
+        if error is not None:
+            os.write(told, (str(error) or type(error).__name__).encode()[:MOST_TOLD])
+        os._exit(code)
+
+
+def _let_go(told: int) -> None:
+    """Releases sockets, files, priority and signals that belong to the original."""
+    for number in [int(name) for name in os.listdir("/proc/self/fd")]:
+        if number != told:
+            with contextlib.suppress(OSError):
+                os.close(number)
+    for _ in range(3):
+        os.open(os.devnull, os.O_RDWR)
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.nice(NICENESS)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the original decides
+    for number in ENDING:
+        signal.signal(number, _give_up)
+    signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, *ENDING))
+
+
+def _give_up(*_: object) -> NoReturn:
+    raise TimeoutError("it took too long")
+
+
+def _read(told: int) -> str:
+    try:
+        return os.read(told, MOST_TOLD).decode(errors="replace")
+    except BlockingIOError:
+        return ""

@@ -26,12 +26,8 @@ class ManagedNode(QosWatch, LifecycleNode):
     With the parameter `autostart`, which is the default, it configures and activates itself. A
     subclass declares its parameters in its constructor, so that they can be set while it is
     unconfigured, and implements the transitions: `configure` reads the parameters, makes what they
-    request, subscribes, and puts the clean-up of each on the stack `undo`; `activate` starts to
-    act; `deactivate` leaves the robot at rest.
-
-    Args:
-        name: of the node.
-        context: of the node.
+    request, subscribes, and puts the clean-up of each on the stack `undo`; `deactivate` leaves the
+    robot at rest. `state` is the last primary state: `unconfigured`, `inactive` or `active`.
     """
 
     def __init__(self, name: str, context: Context) -> None:
@@ -40,7 +36,7 @@ class ManagedNode(QosWatch, LifecycleNode):
         self.undo = ExitStack()
         about = "Whether it configures and activates itself, without a lifecycle manager."
         self._autostart = bool(declare(self, "autostart", True, about, read_only=True))
-        self._state, self._starting = UNCONFIGURED, False
+        self.state, self._starting = UNCONFIGURED, False
         self._failure: Exception | None = None
         self.add_on_set_parameters_callback(self._check_fixed)
 
@@ -50,29 +46,13 @@ class ManagedNode(QosWatch, LifecycleNode):
         return super().create_lifecycle_publisher(kind, topic, qos, event_callbacks=events)
 
     def configure(self) -> None:
-        """Makes what the parameters request.
-
-        Raises:
-            BridgeError: a parameter can't be used.
-        """
-
-    def activate(self) -> None:
-        """Starts to act."""
+        """Makes what the parameters request. Raises BridgeError if one can't be used."""
 
     def deactivate(self) -> None:
         """Leaves the robot at rest; publishes nothing afterwards."""
 
-    @property
-    def state(self) -> str:
-        """Last primary state: `unconfigured`, `inactive` or `active`."""
-        return self._state
-
     def start(self) -> None:
-        """Configures and activates the node, if `autostart` is set.
-
-        Raises:
-            BridgeError: a parameter can't be used.
-        """
+        """Configures and activates the node, if `autostart` is set. Raises BridgeError."""
         if not self._autostart:
             self.get_logger().info("unconfigured: waits for `ros2 lifecycle set` (autostart false)")
             return
@@ -84,13 +64,13 @@ class ManagedNode(QosWatch, LifecycleNode):
 
     def stop(self) -> None:
         """Leaves the robot at rest, from any state."""
-        if self._state == ACTIVE:
+        if self.state == ACTIVE:
             self.deactivate()
 
     def _check_fixed(self, parameters: list[Parameter]) -> SetParametersResult:
         """Refuses changes that would no longer be read."""
         late = sorted(self.fixed & {parameter.name for parameter in parameters})
-        if not late or self._state == UNCONFIGURED:
+        if not late or self.state == UNCONFIGURED:
             return SetParametersResult(successful=True)
         reason = (
             f"parameter {late[0]!r} is read when the node is configured; lead it to unconfigured "
@@ -100,7 +80,7 @@ class ManagedNode(QosWatch, LifecycleNode):
         return SetParametersResult(successful=False, reason=reason)
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Transition of the state machine; a failure leaves it unconfigured."""
+        """Configures; a failure leaves it unconfigured."""
         done = self._attempt(self.configure, INACTIVE)
         if done == FAILURE:
             self.undo.close()
@@ -109,7 +89,7 @@ class ManagedNode(QosWatch, LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Transition of the state machine."""
         super().on_activate(state)  # the publishers
-        return self._attempt(self.activate, ACTIVE)
+        return self._attempt(lambda: None, ACTIVE)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Transition of the state machine."""
@@ -122,14 +102,14 @@ class ManagedNode(QosWatch, LifecycleNode):
         return self._attempt(self.undo.close, UNCONFIGURED)
 
     def on_shutdown(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Transition of the state machine, from any state; the process continues."""
+        """Leaves the robot at rest, from any state, also after a transition that raised.
+
+        The process continues, and after an error the node can be configured again.
+        """
         self.stop()
         return self._attempt(self.undo.close, UNCONFIGURED)
 
-    def on_error(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Handles a transition that raised; afterwards the node can be configured again."""
-        self.stop()
-        return self._attempt(self.undo.close, UNCONFIGURED)
+    on_error = on_shutdown
 
     def _attempt(self, do: Callable[[], None], reached: str) -> TransitionCallbackReturn:
         """Does the work of a transition; rclpy itself would not report why one failed."""
@@ -140,11 +120,10 @@ class ManagedNode(QosWatch, LifecycleNode):
             self._failure = error
             expected = isinstance(error, BridgeError)
             if not self._starting:
-                self.get_logger().error(
-                    str(error) if expected else f"{type(error).__name__}: {error}"
-                )
+                said = str(error) if expected else f"{type(error).__name__}: {error}"
+                self.get_logger().error(said)
             if not expected:
                 raise
             return FAILURE
-        self._state = reached
+        self.state = reached
         return SUCCESS

@@ -1,55 +1,62 @@
-"""Link: a process's own rclpy entities for a robot, which never leave the robot moving.
-
-CommandTimeout: publishes a zero when commands stop coming.
-"""
+"""Link: a process's own rclpy entities for a robot, which never leave the robot moving."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import signal
 import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from numpy.typing import NDArray
+from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
+from std_srvs.srv import Trigger
 
 from nics_drl_bridge.env.guard import uninterrupted
-from nics_drl_bridge.errors import BackendError
+from nics_drl_bridge.errors import BackendError, ModelError
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.qos import QosWatch, owner
 from nics_drl_bridge.nodes.runner import last_word, open_context
 from nics_drl_bridge.nodes.wire import TwistWriter
+from nics_drl_bridge.sim.world import World
 
-SPIN_S = 0.2
-POLL_S = 0.002
+SPIN_S, POLL_S = 0.2, 0.002
+LOST_S = 1.0
+"""A request to repeat data that stays unanswered for longer was itself lost [s]."""
+
+
+@contextlib.contextmanager
+def halted_after_an_error(robot: Any) -> Iterator[None]:
+    """Calls a robot's `halt`, which publishes a zero command, if the body ends by any exception."""
+    try:
+        yield
+    except BaseException:
+        robot.halt()
+        raise
 
 
 class Link:
     """A node in its own context, one executor thread, and the command topic.
 
-    `close`, an error inside `zero_after_an_error`, garbage collection and the end of the process,
+    `close`, an error inside `halted_after_an_error`, garbage collection and the end of the process,
     SIGTERM included, leave a zero command behind. SIGKILL can't be handled: `command_gate` and the
-    base's own timeout are for that.
-
-    Args:
-        namespace: of the robot.
-        domain_id: DDS domain; the environment's by default.
-        command_topic: of the commands.
-        stamped: whether they are TwistStamped.
-        parameters: of the node.
-        command_timeout_s: a command without a successor within this time is followed by a zero
-            [s]; inf for never.
+    base's own timeout are for that. Commands are TwistStamped if `stamped`; one without a successor
+    within the timeout [s] is followed by a zero.
     """
 
     def __init__(
@@ -88,8 +95,7 @@ class Link:
     def send(self, twist: NDArray[np.float64], stamp_ns: int = 0) -> None:
         """Publishes linear.x, linear.y, angular.z (3,), stamped if the topic is.
 
-        Raises:
-            BackendError: it is not finite; a zero is published instead.
+        Raises BackendError if it is not finite, and publishes a zero instead.
         """
         if not all(map(math.isfinite, twist)):
             self.halt()
@@ -100,26 +106,14 @@ class Link:
         self._timeout.begin(moving=True)
         if self._kind is Twist:
             self.commands.publish(self._twists.write(twist))
-            return
-        message = TwistStamped(twist=conversions.twist_to_ros(twist))
-        message.header.stamp = conversions.stamp_to_ros(stamp_ns)
-        message.header.frame_id = "base_link"
-        self.commands.publish(message)
+        else:
+            self.commands.publish(conversions.stamped_to_ros(twist, stamp_ns, "base_link"))
 
     def halt(self) -> None:
         """Publishes a zero command."""
         if self._context.ok():
             self._timeout.begin(moving=False)
             self.commands.publish(self._kind())
-
-    @contextlib.contextmanager
-    def zero_after_an_error(self) -> Iterator[None]:
-        """Publishes a zero command if the body ends by any exception."""
-        try:
-            yield
-        except BaseException:
-            self.halt()
-            raise
 
     def check_open(self) -> None:
         """Raises BackendError if the link is closed."""
@@ -157,22 +151,19 @@ class Link:
             names.remove(self.node.get_fully_qualified_name())
         raise BackendError(f"{', '.join(names) or 'somebody'} publishes {topic} too; stop it.")
 
-    def wait_for_peers(self, topics: Sequence[str], clients: Sequence[Any], patience_s: float,
-                       advice: str) -> None:  # fmt: skip
+    def wait_for_peers(
+        self, topics: Sequence[str], clients: Sequence[Any], patience_s: float, advice: str
+    ) -> None:
         """Waits until all peers are matched. Raises BackendError with what is missing."""
-        resolve, service = self.node.resolve_topic_name, self.node.resolve_service_name
-        needed: dict[str, Callable[[], bool]] = {
-            f"subscriber of {self.commands.topic_name}": lambda: (
-                self.commands.get_subscription_count() > 0
-            )
+        node, commands = self.node, self.commands
+        needed: dict[str, Callable[[], Any]] = {
+            f"subscriber of {commands.topic_name}": commands.get_subscription_count
         }
-        for topic in topics:
-            name = resolve(topic)
-            needed[f"publisher of {name}"] = lambda name=name: (  # type: ignore[misc]
-                self.node.count_publishers(name) > 0
-            )
+        for name in map(node.resolve_topic_name, topics):
+            needed[f"publisher of {name}"] = partial(node.count_publishers, name)
         for client in clients:
-            needed[f"service {service(client.srv_name)}"] = client.service_is_ready
+            service = node.resolve_service_name(client.srv_name)
+            needed[f"service {service}"] = client.service_is_ready
         deadline = time.monotonic() + patience_s
         while missing := [name for name, there in needed.items() if not there()]:
             if time.monotonic() > deadline:
@@ -231,15 +222,10 @@ def _end(number: int, _: Any) -> None:
 
 
 class CommandTimeout:
-    """Ends a command whose sender has been silent for a while.
+    """Ends a command whose sender has been silent for longer than a limit [s].
 
     The caller of `step` may have failed where the env does not see it: a policy that raised, a
     wrapper, a loop that hangs. No reference to the link is kept, because it may be garbage.
-
-    Args:
-        publisher: of the commands.
-        kind: type of the messages.
-        limit_s: time for which a command is valid [s]; inf for no limit.
     """
 
     def __init__(self, publisher: Publisher, kind: Any, limit_s: float) -> None:
@@ -260,3 +246,64 @@ class CommandTimeout:
     def end(self) -> None:
         """Publishes the last zero, and waits for its delivery."""
         last_word(self._publisher, self._kind())
+
+
+class EpisodeServices:
+    """The services of a simulator node that begin an episode of a model in a world."""
+
+    def __init__(self, link: Link, simulator: str, model: SimulatorModel, world: World) -> None:
+        self._link = link
+        self._identity = {"model": model.fingerprint, "world": world.fingerprint}
+        self._parameters = link.node.create_client(
+            SetParametersAtomically, f"{simulator}/set_parameters_atomically"
+        )
+        self._reset = link.node.create_client(Trigger, f"{simulator}/reset")
+        self._repeat = link.node.create_client(Trigger, f"{simulator}/repeat")
+        self._repeating: Any = None
+        self._asked_s = 0.0
+        self.clients = [self._reset, self._parameters]
+
+    @property
+    def there(self) -> bool:
+        """True if a simulator offers them."""
+        return all(client.service_is_ready() for client in self.clients)
+
+    def choose(self, start: Start, timeout_s: float) -> None:
+        """Chooses the episode for the next `begin`. Raises BackendError if it is refused."""
+        request = SetParametersAtomically.Request()
+        request.parameters = [
+            Parameter("episode_seed", value=int(start.seed)).to_parameter_msg(),
+            Parameter("episode_start", value=start.pose.ravel().tolist()).to_parameter_msg(),
+            Parameter("episode_start_given", value=True).to_parameter_msg(),
+        ]
+        result = self._link.call(self._parameters, request, timeout_s).result
+        if not result.successful:
+            raise BackendError(f"the simulator refused the episode: {result.reason}")
+
+    def repeat(self) -> None:
+        """Requests the present data again, without waiting, unless such a request is pending."""
+        now, asked = time.monotonic(), self._repeating
+        if asked is not None and not asked.done():
+            if now - self._asked_s < LOST_S:
+                return
+            self._repeat.remove_pending_request(asked)
+        if self._repeat.service_is_ready():
+            self._repeating, self._asked_s = self._repeat.call_async(Trigger.Request()), now
+
+    def begin(self, timeout_s: float) -> int:
+        """Begins the chosen episode; returns the stamp of its first data [ns].
+
+        Raises BackendError if the simulator refuses or does not answer, ModelError if it runs
+        another model or world.
+        """
+        response = self._link.call(self._reset, Trigger.Request(), timeout_s)
+        if not response.success:
+            raise BackendError(f"the simulator could not reset: {response.message}")
+        answer: dict[str, Any] = json.loads(response.message)
+        for key, mine in self._identity.items():
+            if answer.get(key) != mine:
+                raise ModelError(
+                    f"the simulator runs the {key} {answer.get(key)!r}, this env {mine!r}; start "
+                    f"both with the same {key}."
+                )
+        return int(answer["stamp_ns"])

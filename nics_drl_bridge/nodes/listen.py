@@ -10,7 +10,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from nics_drl_bridge.nodes.message_types import message_type
+from nics_drl_bridge.nodes.conversions import message_type
 from nics_drl_bridge.nodes.qos import offer_of
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.report.doctor_facts import KINDS, Endpoints, Facts, names_in
@@ -30,10 +30,7 @@ ANY_PUBLISHER = QoSProfile(
 def listen(seconds: float, namespace: str = "", domain_id: int | None = None) -> Facts:
     """Listens to a robot without sending anything.
 
-    Args:
-        seconds: duration from the first message on, which is awaited for at most 10 s.
-        namespace: of the robot.
-        domain_id: DDS domain; the environment's by default.
+    The seconds count from the first message on, which is awaited for at most 10 s.
     """
     context = open_context([], domain_id)
     node = Node(NAME, context=context, start_parameter_services=False)

@@ -7,16 +7,13 @@ from collections.abc import Sequence
 
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
-from std_srvs.srv import Trigger
 
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.middleware.measurement import Health
 from nics_drl_bridge.middleware.middleware import rehearse
-from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.diagnostics import Condition, Diagnostics
+from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
-from nics_drl_bridge.nodes.runner import declare, declare_model_name, run_node
 
 SILENCE_S = 5.0
 """Diagnostics warn of a topic that has been silent for this long [s]."""
@@ -28,19 +25,16 @@ class MiddlewareNode(ManagedNode):
     `RobotTopics` describes these topics, `docs/middleware.md` their use. `~/reset` clears all
     state, so that the next odometry fixes `map` anew. It listens when configured and publishes the
     estimate when active; diagnostics are published in every state.
-
-    Args:
-        context: of the node.
     """
 
     def __init__(self, context: Context) -> None:
         super().__init__("middleware_node", context)
-        declare_model_name(self)
+        runner.declare_model_name(self)
         declare_sensors(self)
-        declare(self, "map_frame", "map", "Frame id of the estimate.")
-        declare(self, "base_frame", "base_link", "Frame id of the robot.")
-        self.create_service(Trigger, "~/reset", self._on_reset)
-        Diagnostics(self, "topics", self._look)
+        runner.declare(self, "map_frame", "map", "Frame id of the estimate.")
+        runner.declare(self, "base_frame", "base_link", "Frame id of the robot.")
+        runner.serve(self, "~/reset", self._reset)
+        runner.Diagnostics(self, "topics", self._look)
 
     def configure(self) -> None:
         """Opens the model and subscribes."""
@@ -61,30 +55,25 @@ class MiddlewareNode(ManagedNode):
         # A pose or a yaw rate may have been newer.
         stamp_ns = max(stamp_ns, estimator.time_ns)
         view = self._topics.middleware.view(stamp_ns)
-        frames = (
-            str(self.get_parameter("map_frame").value),
-            str(self.get_parameter("base_frame").value),
-        )
+        frames = [str(self.get_parameter(f"{name}_frame").value) for name in ("map", "base")]
         message = conversions.odometry_to_ros(view.pose, view.twist, stamp_ns, frames, (0.0,) * 4)
         message.pose.covariance = conversions.covariance_to_ros(estimator.covariance[:3, :3])
         message.twist.covariance = conversions.covariance_to_ros(estimator.twist_covariance)
         self._filtered.publish(message)
 
-    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reset(self) -> tuple[bool, str]:
         if self.state == UNCONFIGURED:
-            response.success, response.message = False, "it is not configured, so knows nothing"
-            return response
+            return False, "it is not configured, so knows nothing"
         self._topics.restart()
-        response.success, response.message = True, "the next odometry fixes the map frame"
-        return response
+        return True, "the next odometry fixes the map frame"
 
-    def _look(self) -> Condition:
+    def _look(self) -> runner.Condition:
         if self.state == UNCONFIGURED:
-            return Condition(self.state, warns=False, facts={})
+            return runner.Condition(self.state, warns=False, facts={})
         health = self._topics.middleware.health(self._topics.now_ns())
         trouble = silence(health, self._topics.expected)
         message = trouble or ("receiving" if self.state == ACTIVE else self.state)
-        return Condition(message, bool(trouble), facts(health), self._hardware)
+        return runner.Condition(message, bool(trouble), facts(health), self._hardware)
 
 
 def silence(health: Health, expected: Sequence[str]) -> str:
@@ -98,21 +87,21 @@ def silence(health: Health, expected: Sequence[str]) -> str:
 
 def facts(health: Health) -> dict[str, str]:
     """Returns the health as keys and values for people."""
-    told = {}
+    found = {}
     for topic, each in health.topics.items():
-        told[f"{topic} received"] = str(each.received)
-        told[f"{topic} rate [Hz]"] = f"{each.rate_hz:.3g}"
-        told[f"{topic} age [s]"] = f"{each.age_s:.3f}"
+        found[f"{topic} received"] = str(each.received)
+        found[f"{topic} rate [Hz]"] = f"{each.rate_hz:.3g}"
+        found[f"{topic} age [s]"] = f"{each.age_s:.3f}"
         if not math.isnan(each.innovation):
-            told[f"{topic} innovation"] = f"{each.innovation:.3g}"
-    told |= {f"rejected, {reason}": str(count) for reason, count in health.rejected.items()}
-    told |= {f"noticed, {reason}": str(count) for reason, count in health.noticed.items()}
-    return told | {"late and put in place": str(health.replayed)}
+            found[f"{topic} innovation"] = f"{each.innovation:.3g}"
+    found |= {f"rejected, {reason}": str(count) for reason, count in health.rejected.items()}
+    found |= {f"noticed, {reason}": str(count) for reason, count in health.noticed.items()}
+    return found | {"late and put in place": str(health.replayed)}
 
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of the executable."""
-    run_node(MiddlewareNode, args, "middleware_node")
+    runner.run_node(MiddlewareNode, args, "middleware_node")
 
 
 if __name__ == "__main__":

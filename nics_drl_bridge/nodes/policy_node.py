@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import time
 import traceback
 from dataclasses import replace
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 
 from nics_drl_bridge.errors import BridgeError, ConfigError, shortened
@@ -19,16 +18,15 @@ from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
-from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.lifecycle import ACTIVE, ManagedNode
+from nics_drl_bridge.nodes import conversions, qos, runner
+from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
-from nics_drl_bridge.nodes.runner import declare, declare_model_name, last_word, run_node
+from nics_drl_bridge.nodes.runner import declare
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
 
 POLLS = 0.1
 """Time between two checks whether to act, as a share of the control period."""
-DIAGNOSTICS_PERIOD_S = 1.0
 LONGEST_REASON = 300
 """Greatest length of a policy's error text, in characters."""
 
@@ -41,31 +39,30 @@ class PolicyNode(ManagedNode):
     dropped; after several in a row it commands zero. The goal, in `map`, is a parameter at the
     start and the topic `goal_pose` afterwards. It listens when configured and commands when active;
     its last command before deactivation is zero.
-
-    Args:
-        context: of the node.
     """
 
     def __init__(self, context: Context) -> None:
         super().__init__("policy_node", context)
-        declare_model_name(self)
+        runner.declare_model_name(self)
         declare_sensors(self)
-        about = "A policy file (*.onnx), or the name of a shipped one or of a baseline."
-        declare(self, "policy", "dynamic_window", about, read_only=True)
         declare(self, "base_frame", "base_link", "Frame id of the robot.")
-        about = "x, y in map [m]; NaN waits for goal_pose."
-        declare(self, "goal", [float("nan")] * 2, about, read_only=True)
-        about = (
+        rate = (
             "Actions per second of the steady clock; NaN: of the control period; 0: one for each "
             "scan, for a simulator that is not in real time."
         )
-        declare(self, "rate", float("nan"), about, read_only=True)
-        about = "Longest time of an inference [s]; NaN: half the control period."
-        declare(self, "deadline", float("nan"), about, read_only=True)
+        policy = "A policy file (*.onnx), or the name of a shipped one or of a baseline."
+        deadline = "Longest time of an inference [s]; NaN: half the control period."
+        for name, default, about in (
+            ("policy", "dynamic_window", policy),
+            ("goal", [math.nan] * 2, "x, y in map [m]; NaN waits for goal_pose."),
+            ("rate", math.nan, rate),
+            ("deadline", math.nan, deadline),
+        ):
+            declare(self, name, default, about, read_only=True)
         about = "So many late inferences in a row command zero."
-        declare(self, "late_limit", 3, about, low=1, high=1000, read_only=True)
+        declare(self, "late_limit", 3, about, span=(1, 1000), read_only=True)
         self._acted_ns = 0
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        runner.Diagnostics(self, "policy", self._look)
 
     def configure(self) -> None:
         """Opens model and policy, and subscribes."""
@@ -82,16 +79,12 @@ class PolicyNode(ManagedNode):
             self, model, on_odometry=self._act, on_scan=self._act, on_lidar=self._on_lidar
         )
         self.undo.callback(self._topics.close)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        for period, tick in (
-            (POLLS * model.control_period, self._act),
-            (DIAGNOSTICS_PERIOD_S, self._diagnose),
-        ):
-            self.undo.callback(self.destroy_timer, self.create_timer(period, tick, clock=steady))
+        timer = runner.steadily(self, POLLS * model.control_period, self._act)
+        self.undo.callback(self.destroy_timer, timer)
 
     def deactivate(self) -> None:
         """Leaves a zero command behind."""
-        last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
+        runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
 
     def _declared_pace(self, control_period: float) -> tuple[ActionPace, Deadline]:
         rate, limit, patience = (
@@ -119,10 +112,9 @@ class PolicyNode(ManagedNode):
         """Switches to another lidar. Raises ConfigError if that is not possible."""
         self._open_policy(replace(self._model, lidar=lidar))
         begin, end = np.degrees([lidar.angles[0], lidar.angles[-1]])
+        done = "used" if self._task.scan is None else "resampled"
         self.get_logger().info(
-            f"scans of {lidar.beams} beams from {begin:.4g} to {end:.4g} deg are resampled"
-            if self._task.scan is not None
-            else f"scans of {lidar.beams} beams from {begin:.4g} to {end:.4g} deg are used"
+            f"scans of {lidar.beams} beams from {begin:.4g} to {end:.4g} deg are {done}"
         )
 
     def _declared_goal(self) -> NDArray[np.float64]:
@@ -160,20 +152,13 @@ class PolicyNode(ManagedNode):
             sent = twist if answer is Answer.SEND and np.isfinite(twist).all() else np.zeros(3)
             self._raw.publish(self._message(sent, scan_ns))
 
-    def _diagnose(self) -> None:
-        deadline = self._deadline
-        status = DiagnosticStatus(name=f"{self.get_fully_qualified_name()}: policy")
-        status.level = DiagnosticStatus.WARN if deadline.late else DiagnosticStatus.OK
-        status.message = f"{self.state}; {deadline.late} late inferences"
-        told = {
-            "answered": str(deadline.answered),
-            "late": str(deadline.late),
-            "longest inference [ms]": f"{1e3 * deadline.longest_s:.2f}",
-        }
-        status.values = [KeyValue(key=key, value=value) for key, value in told.items()]
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
+    def _look(self) -> runner.Condition:
+        if self.state == UNCONFIGURED:
+            return runner.Condition(self.state, warns=False, facts={})
+        late, longest = self._deadline.late, f"{1e3 * self._deadline.longest_s:.2f}"
+        answered = self._deadline.answered
+        facts = {"answered": answered, "late": late, "longest inference [ms]": longest}
+        return runner.Condition(f"{self.state}; {late} late inferences", late > 0, facts)
 
     def _twist(self) -> NDArray[np.float64]:
         """Returns the command (3,) for the present view; zero without a goal, at it, or on contact.
@@ -194,7 +179,8 @@ class PolicyNode(ManagedNode):
     def _asked(self, view: RobotView, goal: NDArray[np.float64]) -> NDArray[np.float64]:
         """Returns the policy's command (3,). Its errors become BridgeError, which ends the node."""
         try:
-            return self._command(view, goal)
+            action = self._policy.act(self._task.observation(view, {"goal": goal}))
+            return self._task.robot.to_cmd_vel(self._task.command(action))
         except BridgeError:
             raise
         except Exception as error:
@@ -206,21 +192,14 @@ class PolicyNode(ManagedNode):
                 f"line {place.lineno}); the robot is stopped, mend the policy."
             ) from error
 
-    def _command(self, view: RobotView, goal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the policy's command (3,)."""
-        action = self._policy.act(self._task.observation(view, {"goal": goal}))
-        return self._task.robot.to_cmd_vel(self._task.command(action))
-
     def _message(self, twist: NDArray[np.float64], stamp_ns: int) -> TwistStamped:
-        message = TwistStamped(twist=conversions.twist_to_ros(twist))
-        message.header.stamp = conversions.stamp_to_ros(stamp_ns)
-        message.header.frame_id = str(self.get_parameter("base_frame").value)
-        return message
+        frame = str(self.get_parameter("base_frame").value)
+        return conversions.stamped_to_ros(twist, stamp_ns, frame)
 
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of the executable."""
-    run_node(PolicyNode, args, "policy_node")
+    runner.run_node(PolicyNode, args, "policy_node")
 
 
 if __name__ == "__main__":

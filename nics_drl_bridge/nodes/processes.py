@@ -1,20 +1,31 @@
-"""Operating-system processes for the package's nodes, with a reliable end."""
+"""Processes for the package's nodes, with a reliable end, and a witness of what they do."""
 
 from __future__ import annotations
 
 import ctypes
+import json
 import os
 import random
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from nav_msgs.msg import Odometry
+from numpy.typing import ArrayLike, NDArray
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.runner import open_context, spin
 from nics_drl_bridge.nodes.transport import domains_in_use
 
 LAST_DOMAIN_ID, GREATEST_DOMAIN_ID = 101, 232
@@ -23,15 +34,13 @@ are none."""
 PR_SET_PDEATHSIG = 1
 PATIENCE_S = 5.0
 LOG_LINES = 5
+ASK_AGAIN_S, ANSWER_S = 0.2, 2.0
 
 
 def free_domain_id() -> int:
-    """Returns the domain id of the environment, or a random one, so that runs keep apart.
+    """Returns the domain id of the environment, or a random one that this machine does not use.
 
-    A random one is drawn from those that are not in use on this machine.
-
-    Raises:
-        ConfigError: the environment's value is not a domain id.
+    Raises ConfigError if the environment's value is not a domain id.
     """
     given = os.environ.get("ROS_DOMAIN_ID")
     if not given:
@@ -66,16 +75,8 @@ def _dies_with_parent() -> Callable[[], None] | None:
 class NodeProcess(AbstractContextManager["NodeProcess", None]):
     """One node in its own process; a context manager that ends it.
 
-    On Linux the node also ends when the thread that started it does.
-
-    Args:
-        node: name of its executable.
-        folder: for its log and its parameter file.
-        parameters: of the node.
-        domain_id: DDS domain.
-        namespace: of the node.
-        remap: names, from -> to.
-        discovery: range of its discovery: LOCALHOST or SUBNET.
+    The folder gets its log and its parameter file; `remap` maps names; `discovery` is LOCALHOST or
+    SUBNET. On Linux the node also ends when the thread that started it does.
     """
 
     def __init__(
@@ -107,14 +108,9 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
             # Its own session: Ctrl-C in the terminal reaches the parent alone, which then ends its
             # children in order.
             self._process = subprocess.Popen(
-                command,
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-                preexec_fn=_dies_with_parent(),
-            )
+                command, env=environment, stdin=subprocess.DEVNULL, stdout=log,
+                stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=_dies_with_parent(),
+            )  # fmt: skip
 
     @property
     def pid(self) -> int:
@@ -143,3 +139,87 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+class Witness(AbstractContextManager["Witness", None]):
+    """Observes the true motion of a simulated robot, in its own thread; a context manager."""
+
+    def __init__(self, domain_id: int | None = None, topic: str = "ground_truth") -> None:
+        self._poses: list[NDArray[np.float64]] = []
+        self._changed = threading.Condition()
+        self._context = open_context(domain_id=domain_id)
+        self._node = Node("witness", context=self._context, start_parameter_services=False)
+        self._node.create_subscription(Odometry, topic, self._take, qos.SENSOR_RELIABLE)
+        self._thread = threading.Thread(
+            target=spin, args=(self._node, threading.Event()), daemon=True, name="witness"
+        )
+        self._thread.start()
+
+    def _take(self, message: Odometry) -> None:
+        with self._changed:
+            self._poses.append(conversions.odometry_from_ros(message)[0])
+            self._changed.notify_all()
+
+    @property
+    def path(self) -> NDArray[np.float64]:
+        """All poses so far (T, 3)."""
+        with self._changed:
+            return np.array(self._poses).reshape(-1, 3)
+
+    def sees(self, timeout_s: float) -> bool:
+        """Waits for a first pose; False after the time [s]."""
+        with self._changed:
+            return self._changed.wait_for(lambda: bool(self._poses), timeout_s)
+
+    def arrives(self, goal: ArrayLike, radius: float, timeout_s: float) -> bool:
+        """Waits until the robot is within `radius` of a goal (2,); False after the time [s]."""
+        deadline = time.monotonic() + timeout_s
+        goal = np.asarray(goal)
+        with self._changed:
+            while True:
+                if self._poses and np.linalg.norm(self._poses[-1][:2] - goal) < radius:
+                    return True
+                if time.monotonic() > deadline:
+                    return False
+                self._changed.wait(0.2)
+
+    def arms(self, gate: str, timeout_s: float) -> str:
+        """Requests a gate to let commands pass, repeatedly until it does.
+
+        Returns an empty string, or after the time [s] the gate's last reason to refuse.
+        """
+        answer = self._asked(f"{gate}/arm", timeout_s)
+        return "" if answer.success else str(answer.message)
+
+    def touched(self, simulator: str, timeout_s: float) -> bool:
+        """True if a simulator says that its robot has touched something in this episode.
+
+        Raises BackendError if it does not answer within the time [s].
+        """
+        answer = self._asked(f"{simulator}/touched", timeout_s)
+        if not answer.success:
+            raise BackendError(f"the episode can't be judged: {answer.message}.")
+        return bool(np.any(json.loads(answer.message)))
+
+    def _asked(self, service: str, timeout_s: float) -> Trigger.Response:
+        """Returns the first successful answer, otherwise the last one."""
+        client = self._node.create_client(Trigger, service)
+        answer = Trigger.Response(success=False, message=f"{service} does not answer")
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            if client.wait_for_service(timeout_sec=ASK_AGAIN_S):
+                answered = threading.Event()
+                future = client.call_async(Trigger.Request())
+                future.add_done_callback(lambda _, answered=answered: answered.set())
+                if answered.wait(ANSWER_S):
+                    answer = future.result()
+                    if answer.success:
+                        break
+            time.sleep(ASK_AGAIN_S)
+        self._node.destroy_client(client)
+        return answer
+
+    def __exit__(self, *_: object) -> None:
+        self._context.try_shutdown()
+        self._thread.join(timeout=2.0)
+        self._node.destroy_node()

@@ -4,10 +4,6 @@ A reliable publisher matches subscribers of both kinds, a best-effort one only b
 this package publishes reliably, and subscribes best effort wherever a lost message does no harm.
 So RViz, `ros2 topic echo`, Nav2 and drivers of every kind match it without changes. Nothing is kept
 for late joiners (volatile): a robot's old data mislead.
-
-Warnings about peers with an incompatible quality of service, and the remedy.
-
-Owners of publishers and subscriptions in the ROS graph.
 """
 
 from __future__ import annotations
@@ -20,26 +16,39 @@ from rclpy.publisher import Publisher
 from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
+    QoSCompatibility,
     QoSProfile,
     ReliabilityPolicy,
     qos_check_compatible,
     qos_policy_name_from_kind,
 )
-from rclpy.qos import QoSCompatibility as Compatibility
 from rclpy.subscription import Subscription
 
 from nics_drl_bridge.recording.messages import Offer
 
+try:
+    from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+except ModuleNotFoundError:  # Humble
+    from rclpy.qos_event import PublisherEventCallbacks, SubscriptionEventCallbacks
+
 
 def profile_of(offer: Offer) -> QoSProfile:
     """Returns an offer, or a request, as a profile."""
+    reliability, durability = ReliabilityPolicy, DurabilityPolicy
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=offer.depth,
-        reliability=ReliabilityPolicy.RELIABLE if offer.reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL
-        if offer.transient_local
-        else DurabilityPolicy.VOLATILE,
+        reliability=reliability.RELIABLE if offer.reliable else reliability.BEST_EFFORT,
+        durability=durability.TRANSIENT_LOCAL if offer.transient_local else durability.VOLATILE,
+    )
+
+
+def offer_of(profile: QoSProfile) -> Offer:
+    """Returns what a publisher offers, or a subscriber requests."""
+    return Offer(
+        max(profile.depth, 1),
+        profile.reliability != ReliabilityPolicy.BEST_EFFORT,
+        profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
     )
 
 
@@ -68,18 +77,7 @@ DIAGNOSTICS = profile_of(Offer(10))
 """`/diagnostics`: rare and small, and each message may concern something else; as the diagnostic
 aggregator expects it."""
 
-
-try:
-    from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-except ModuleNotFoundError:  # Humble
-    from rclpy.qos_event import PublisherEventCallbacks, SubscriptionEventCallbacks
-
-
-MOMENT_S = 0.5
-SENTENCE = (
-    "{topic}: no message passes between this node and {peer}: the {policy} that the publisher "
-    "offers ({offered}) is less than what the subscription asks for ({asked}); let {cure}."
-)
+MOMENT_S, UNKNOWN = 0.5, "_UNKNOWN_"
 
 
 class QosWatch(Node):
@@ -122,24 +120,27 @@ class QosWatch(Node):
         ours = qos if isinstance(qos, QoSProfile) else QoSProfile(depth=qos)
         name, theirs = self._misfit(topic, ours, publishing)
         own, other = (_value(profile, policy) for profile in (ours, theirs))
-        offered, asked = (own, other) if publishing else (other, own)
-        cure = (
-            f"{name} ask for {own}" if publishing else f"{name} offer {own}, or put a relay between"
+        offered, asked, cure = (
+            (own, other, f"{name} ask for {own}")
+            if publishing
+            else (other, own, f"{name} offer {own}, or put a relay between")
         )
-        return SENTENCE.format(
-            topic=topic, peer=name, policy=policy.lower(), offered=offered, asked=asked, cure=cure
+        return (
+            f"{topic}: no message passes between this node and {name}: the {policy.lower()} that "
+            f"the publisher offers ({offered}) is less than what the subscription asks for "
+            f"({asked}); let {cure}."
         )
 
     def _misfit(self, topic: str, ours: QoSProfile, publishing: bool) -> tuple[str, Any]:
         """Returns name and profile of the last peer that does not fit, as far as known."""
-        look = (
-            self.get_subscriptions_info_by_topic
+        peers = (
+            self.get_subscriptions_info_by_topic(topic)
             if publishing
-            else (self.get_publishers_info_by_topic)
+            else self.get_publishers_info_by_topic(topic)
         )
-        for peer in reversed(look(topic)):
+        for peer in reversed(peers):
             pair = (ours, peer.qos_profile) if publishing else (peer.qos_profile, ours)
-            if qos_check_compatible(*pair)[0] == Compatibility.ERROR:
+            if qos_check_compatible(*pair)[0] == QoSCompatibility.ERROR:
                 return owner(peer) or "a peer", peer.qos_profile
         return "a peer", None
 
@@ -150,9 +151,6 @@ def _value(profile: Any, policy: str) -> str:
     return str(getattr(value, "name", value) or "unknown").lower().replace("_", " ")
 
 
-UNKNOWN = "_UNKNOWN_"
-
-
 def owner(end: Any) -> str | None:
     """Returns the full name of the node of a `TopicEndpointInfo`; None while it is unknown.
 
@@ -160,12 +158,3 @@ def owner(end: Any) -> str | None:
     """
     name = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
     return None if UNKNOWN in name else name
-
-
-def offer_of(profile: QoSProfile) -> Offer:
-    """Returns what a publisher offers, or a subscriber requests."""
-    return Offer(
-        max(profile.depth, 1),
-        profile.reliability != ReliabilityPolicy.BEST_EFFORT,
-        profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
-    )

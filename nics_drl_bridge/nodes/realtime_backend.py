@@ -1,7 +1,4 @@
-"""RealtimeBackend: a vehicle, or a simulator on the wall clock, as the same synchronous backend.
-
-Options of a backend in real time.
-"""
+"""RealtimeBackend: a vehicle, or a simulator on the wall clock, as the same synchronous backend."""
 
 from __future__ import annotations
 
@@ -21,14 +18,13 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, BackendFacts, RobotView, Start
 from nics_drl_bridge.middleware.measurement import SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
-from nics_drl_bridge.nodes.link import Link
-from nics_drl_bridge.nodes.observer import EpisodeServices
+from nics_drl_bridge.nodes.link import EpisodeServices, Link, halted_after_an_error
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_sensors
 from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
-POLL_S = 0.01
-SAY_EVERY_S = 2.0
+RAW = "cmd_vel_raw"
+POLL_S, SAY_EVERY_S = 0.01, 2.0
 SERVICES_S = 0.5
 """A peer that shows no services this long after its topics is a vehicle [s]."""
 COMMAND_S, PERIODS = 0.5, 2
@@ -41,6 +37,40 @@ ADVICE = (
 )
 
 
+class RealtimeOptions(Schema):
+    """Options of `RealtimeBackend`."""
+
+    namespace: str = ""  # of the robot
+    simulator: str = "simulator_node"  # name of its node in that namespace
+    domain_id: int | None = Field(None, ge=0, le=232)  # the environment's by default
+    timeout_s: float = Field(30.0, gt=0.0)  # longest wait for a peer or an answer
+    vehicle: bool | None = None  # a vehicle has no services; None: detected
+    period_s: float | None = Field(None, gt=0.0)  # of a step; the model's control period by default
+    stale_after_s: float = Field(0.5, gt=0.0)  # age from which data are too old for a view
+    # An episode on a vehicle waits until it stands at the requested pose, or takes the present one.
+    start: Literal["wait", "present"] = "wait"
+    tolerance: tuple[float, float] = (0.1, 0.1)  # of the pose at the start [m, rad]
+    start_timeout_s: float = Field(300.0, gt=0.0)  # longest wait for that
+    say: Callable[[str], None] | None = None  # told what is missing; the node's logger by default
+    # `cmd_vel_raw` leads through `command_gate`: then each command is a TwistStamped with the stamp
+    # of the scan that it answers.
+    command_topic: str = Field("cmd_vel", min_length=1)
+    stamped: bool = False  # `cmd_vel` is a TwistStamped
+    pose_type: str = "none"  # of `pose`, a pose sensor in `map`
+    use_imu: bool = False  # the yaw rate of `imu`
+
+    @model_validator(mode="after")
+    def _check(self) -> RealtimeOptions:
+        if not all(value > 0.0 for value in self.tolerance):
+            raise ValueError("tolerance must be above 0: metres and radians.")
+        return self
+
+    @property
+    def gated(self) -> bool:
+        """True if commands pass a `command_gate`."""
+        return self.command_topic.rsplit("/", 1)[-1] == RAW
+
+
 class RealtimeBackend:
     """One robot behind its topics, stepped at a fixed period of the steady clock.
 
@@ -49,14 +79,12 @@ class RealtimeBackend:
     ends on the grid of periods. Data feed the middleware as they arrive, in one executor thread;
     late and unordered ones are put in their place there.
 
-    Args:
-        model: of the robot; a simulator must run the same.
-        world: likewise.
-        options: see `RealtimeOptions`.
-
     Raises:
         ConfigError: an option can't be used.
-        BackendError: no peer is there.
+        BackendError: no peer is there, a simulator refuses, or a vehicle does not come to rest at
+            its start.
+        ModelError: a simulator runs another model or world.
+        StaleDataError: the newest datum of a topic is older than `stale_after_s`.
     """
 
     def __init__(self, model: SimulatorModel, world: World, **options: Any) -> None:
@@ -75,7 +103,9 @@ class RealtimeBackend:
                 "enable_stamped_cmd_vel": chosen.stamped,
             },
             # A gate has its own timeout.
-            command_timeout_s=math.inf if chosen.gated else self._command_timeout_s(),
+            command_timeout_s=math.inf
+            if chosen.gated
+            else max(COMMAND_S, PERIODS * self._period_ns / NS_PER_S),
         )  # fmt: skip
         try:
             declare_sensors(self._link.node)
@@ -92,18 +122,10 @@ class RealtimeBackend:
             self.close()
             raise
 
-    def _command_timeout_s(self) -> float:
-        return max(COMMAND_S, PERIODS * self._period_ns / NS_PER_S)
-
     def reset(self, start: Start) -> RobotView:
-        """Begins an episode: by a simulator's service, or when a vehicle stands at the start.
-
-        Raises:
-            BackendError: the simulator refuses, or the vehicle does not come to rest there.
-            StaleDataError: its data do not arrive.
-        """
+        """Begins an episode: by a simulator's service, or when a vehicle stands at the start."""
         self._link.check_open()
-        with self._link.zero_after_an_error():
+        with halted_after_an_error(self._link):
             self._link.halt()
             if self._is_vehicle():
                 self._await_start(start)
@@ -194,27 +216,14 @@ class RealtimeBackend:
         return oldest, ages[oldest]
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
-        """Publishes a command, waits for the end of the period; see `interface.Backend`.
-
-        Raises:
-            StaleDataError: the newest datum of a topic is older than `stale_after_s`.
-        """
-        self.send(command)
-        return self.receive()
-
-    def send(self, command: Array) -> None:
-        """The first half of a step: publishes a command (C,)."""
+        """Publishes a command, waits for the end of the period; see `interface.Backend`."""
         self._link.check_open()
-        with self._link.zero_after_an_error():
+        with halted_after_an_error(self._link):
             stamp_ns = 0
             if self._options.stamped or self._options.gated:
                 with self._topics.lock:
                     stamp_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
             self._link.send(self._robot.to_cmd_vel(command), stamp_ns)
-
-    def receive(self) -> tuple[RobotView, dict[str, Any]]:
-        """The second half: waits for the end of the period, and returns the newest view."""
-        with self._link.zero_after_an_error():
             late_ns = time.monotonic_ns() - self._deadline_ns
             if late_ns > 0:
                 missed = late_ns // self._period_ns + 1
@@ -246,57 +255,3 @@ class RealtimeBackend:
     def close(self) -> None:
         """Publishes a zero command and ends the node."""
         self._link.close()
-
-
-RAW = "cmd_vel_raw"
-
-
-class RealtimeOptions(Schema):
-    """Options of `RealtimeBackend`.
-
-    Attributes:
-        namespace: of the robot.
-        simulator: name of the simulator's node in that namespace.
-        domain_id: DDS domain; the environment's by default.
-        timeout_s: longest wait for a peer or an answer [s].
-        vehicle: whether the robot is a vehicle, which has no services. None: detected.
-        period_s: duration of a step on the steady clock [s]; the model's control period by default.
-        stale_after_s: age from which data are too old for a view [s].
-        start: of an episode on a vehicle: `wait` until it stands at the requested pose, or take the
-            `present` one.
-        tolerance: of the pose at the start [m, rad].
-        start_timeout_s: longest wait for that [s].
-        say: called with what is still missing; the node's logger by default.
-        command_topic: of the commands. `cmd_vel_raw` leads through `command_gate`: then each
-            command is a TwistStamped with the stamp of the scan that it answers.
-        stamped: whether `cmd_vel` is a TwistStamped.
-        pose_type: type of `pose`, a pose sensor in `map`, or `none`.
-        use_imu: whether to use the yaw rate of `imu`.
-    """
-
-    namespace: str = ""
-    simulator: str = "simulator_node"
-    domain_id: int | None = Field(None, ge=0, le=232)
-    timeout_s: float = Field(30.0, gt=0.0)
-    vehicle: bool | None = None
-    period_s: float | None = Field(None, gt=0.0)
-    stale_after_s: float = Field(0.5, gt=0.0)
-    start: Literal["wait", "present"] = "wait"
-    tolerance: tuple[float, float] = (0.1, 0.1)
-    start_timeout_s: float = Field(300.0, gt=0.0)
-    say: Callable[[str], None] | None = None
-    command_topic: str = Field("cmd_vel", min_length=1)
-    stamped: bool = False
-    pose_type: str = "none"
-    use_imu: bool = False
-
-    @model_validator(mode="after")
-    def _check(self) -> RealtimeOptions:
-        if not all(value > 0.0 for value in self.tolerance):
-            raise ValueError("tolerance must be above 0: metres and radians.")
-        return self
-
-    @property
-    def gated(self) -> bool:
-        """True if commands pass a `command_gate`."""
-        return self.command_topic.rsplit("/", 1)[-1] == RAW

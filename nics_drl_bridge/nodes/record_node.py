@@ -1,13 +1,10 @@
-"""record_node: drives a robot so that it shows its whole motion, and records it.
-
-Parameters of `record_node`.
-"""
+"""record_node: drives a robot so that it shows its whole motion, and records it."""
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,25 +14,26 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Imu, JointState
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import BackendError, BridgeError
+from nics_drl_bridge.errors import BackendError, BridgeError, RecordingError
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.drive_log import DriveLog
 from nics_drl_bridge.nodes.qos import QosWatch
-from nics_drl_bridge.nodes.runner import EXIT_BAD_INPUT, declare, last_word, run_node
+from nics_drl_bridge.nodes.runner import EXIT_BAD_INPUT, declare, last_word, run_node, steadily
 from nics_drl_bridge.recording.drive_plan import DrivePlan
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S
+from nics_drl_bridge.recording.joints import JointMessage, gather, state_of, wheels_of
+from nics_drl_bridge.recording.messages import imu_row, pose_row, stamp, twist_row
 from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.recording.stamping import TopicData, streams
 from nics_drl_bridge.recording.topic_roles import TopicRoles, topic_roles
 from nics_drl_bridge.recording.write import check_out, write_drive
-from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 Array = NDArray[np.float64]
 PATIENCE_S = 10.0
@@ -43,23 +41,196 @@ POLL_S = 0.01
 HALT_S = 0.5
 """Zero is repeated for this long [s]: a best-effort subscriber may miss one."""
 PERIOD_NS = round(PERIOD_S * NS_PER_S)
+PLACE = "recording"
+FEWEST = 2
+SAME_PACE = (0.8, 1.25)
+"""Limits of the stamps' rate relative to receipt; beyond them it is another kind of time."""
+
+
+@dataclass(frozen=True)
+class DriveParameters:
+    """Values of the parameters of `record_node`."""
+
+    plan: DrivePlan
+    out: Path  # of the recording
+    odom_timeout: float  # silence of odometry that stops the robot [s]
+    stamped: bool  # `cmd_vel` is a TwistStamped
+    roles: TopicRoles  # may name the joints of state and wheels
+
+
+def declare_drive(node: Node) -> DriveParameters:
+    """Declares the parameters of a drive, and reads them. Raises ConfigError."""
+    get = partial(declare, node, read_only=True)
+    robot = load_robot(get("robot", "ackermann", "A shipped robot, or its YAML file."))
+    about = "File *.npz of the recording, or folder of a rosbag2."
+    out = check_out(Path(get("out", "drive.npz", about)))
+    plan = DrivePlan(
+        robot,
+        bound=get("bound", 2.0, "Radius of the circle around the start to keep within [m]."),
+        duration=get("duration", 60.0, "Of the drive [s]."),
+        speed=get("speed", 1.0, "Share of the greatest speeds to use."),
+        seed=get("seed", 0, "Of the pattern."),
+    )
+    topics = get("topics", "", "YAML file that names joints; none if empty.")
+    silence = "Stops after this silence of odom [s]."
+    return DriveParameters(
+        plan,
+        out,
+        odom_timeout=get("odom_timeout", 0.5, silence, span=(0.05, 10.0)),
+        stamped=get("stamped", False, "Whether cmd_vel is a TwistStamped."),
+        roles=topic_roles(Path(topics) if topics else None),
+    )
+
+
+class _Rows:
+    """The messages of one topic, in the order of their stamps."""
+
+    def __init__(self, topic: str) -> None:
+        self._topic = topic
+        self._receive: list[int] = []
+        self._header: list[int] = []
+        self._values: list[Array] = []
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def add(self, receive_ns: int, header_ns: int, values: Array) -> bool:
+        """Adds a message; returns False if it is not finite, or not newer than the last."""
+        stale = header_ns != 0 and len(self._header) > 0 and header_ns <= self._header[-1]
+        if stale or not np.isfinite(values).all():
+            return False
+        self._receive.append(receive_ns)
+        self._header.append(header_ns)
+        self._values.append(values)
+        return True
+
+    @property
+    def spans(self) -> tuple[int, int]:
+        """Time from the first message to the last, by receipt and by stamp [ns]."""
+        if not self._values:
+            return 0, 0
+        return self._receive[-1] - self._receive[0], self._header[-1] - self._header[0]
+
+    @property
+    def pace(self) -> float:
+        """Seconds by stamp per second of receipt; 1 if it can't be determined.
+
+        It is determined by the least delayed message of each half, because delays vary.
+        """
+        heard, stamped = self.spans
+        if heard <= 0 or stamped <= 0:
+            return 1.0
+        delay = np.array(self._receive, np.int64) - np.array(self._header, np.int64)
+        half = len(delay) // 2
+        apart = heard * half / (len(delay) - 1)
+        return 1.0 - float(delay[half:].min() - delay[:half].min()) / apart
+
+    def data(self) -> TopicData:
+        receive, header = (np.array(ns, dtype=np.int64) for ns in (self._receive, self._header))
+        return TopicData(self._topic, receive, header, np.array(self._values))
+
+
+class DriveLog:
+    """Keeps a drive in memory; `now` is the clock of receipt [ns], that of the stamps."""
+
+    def __init__(self, spec: RobotSpec, roles: TopicRoles, now: Callable[[], int]) -> None:
+        self._spec, self._roles, self._now = spec, roles, now
+        self._commands, self._odom, self._twist = _Rows("cmd_vel"), _Rows("odom"), _Rows("odom")
+        self._pose, self._imu = _Rows("pose"), _Rows("imu")
+        self._joints: list[JointMessage] = []
+
+    @property
+    def seconds(self) -> float:
+        """Time over which commands were sent [s]."""
+        return self._commands.spans[0] / NS_PER_S
+
+    def command(self, command: Array) -> None:
+        """Records a command (C,) that is sent now."""
+        self._commands.add(self._now(), 0, command)
+
+    def odometry(self, message: Odometry) -> Array | None:
+        """Records an odometry; returns its pose (3,), or None if it is old, NaN or inf."""
+        now, header, pose = self._now(), stamp(message), np.array(pose_row(message))
+        if not self._odom.add(now, header, pose):
+            return None
+        self._twist.add(now, header, np.array(twist_row(message)))
+        return pose
+
+    def pose(self, message: Any) -> None:
+        """Records a pose from motion capture or localisation."""
+        self._pose.add(self._now(), stamp(message), np.array(pose_row(message)))
+
+    def imu(self, message: Any) -> None:
+        """Records accelerations and yaw rate."""
+        self._imu.add(self._now(), stamp(message), np.array(imu_row(message)))
+
+    def joints(self, message: JointState) -> None:
+        """Records the data of the joints."""
+        values = list(message.position), list(message.velocity)
+        self._joints.append(JointMessage(self._now(), stamp(message), message.name, *values))
+
+    def check(self) -> None:
+        """Checks, before the robot moves, that the recording will be usable.
+
+        Raises BackendError or RecordingError if a state that has to be measured is not, or stamps
+        run at another rate than the time of receipt.
+        """
+        measured = [v.name for v in self._spec.state if v.follows is None]
+        if self._joints:
+            state_of(gather("joint_states", self._joints), self._spec, self._roles, PLACE)
+        elif measured or self._roles.state:
+            raise BackendError(
+                f"topic 'joint_states': nothing has arrived, but {(measured or ['the state'])[0]} "
+                f"of robot {self._spec.name!r} has to be measured; start the joints' publisher, "
+                "or remap the topic."
+            )
+        pace, heard = self._odom.pace, self._odom.spans[0] / NS_PER_S
+        if not SAME_PACE[0] <= pace <= SAME_PACE[1]:
+            raise BackendError(
+                f"topic 'odom': its stamps went on by {pace * heard:.2f} s within "
+                f"{heard:.2f} s; where a simulator is the robot, take its time: "
+                "--use-sim-time, or -p use_sim_time:=true."
+            )
+
+    def recording(self) -> Recording:
+        """Returns all streams on their clocks; the pose is that of `pose` if that topic was heard.
+
+        In addition to such a pose, the twist of the odometry is kept, to determine its noise.
+        Raises RecordingError if too little was received.
+        """
+        pose = self._pose if len(self._pose) >= FEWEST else self._odom
+        if len(pose) < FEWEST or len(self._commands) < FEWEST:
+            raise RecordingError("recording: nothing was received that could be saved.")
+        commands = self._commands.data()
+        data = {
+            "command": TopicData(commands.topic, commands.receive_ns, None, commands.values),
+            "pose": pose.data(),
+        }
+        if pose is self._pose and len(self._twist) >= FEWEST:
+            data["odometry"] = self._twist.data()
+        if len(self._imu) >= FEWEST:
+            data["imu"] = self._imu.data()
+        if len(self._joints) >= FEWEST:
+            table = gather("joint_states", self._joints)
+            state = state_of(table, self._spec, self._roles, PLACE)
+            wheels = wheels_of(table, self._roles, PLACE)
+            data |= {n: d for n, d in (("state", state), ("wheels", wheels)) if d is not None}
+        try:
+            found: dict[str, Any] = dict(streams(data, self._roles.stamps, PLACE))
+        except RecordingError:
+            # Poorer stamps are better than no recording of a drive that is over.
+            found = dict(streams(data, "receive", PLACE))
+        return Recording(**found, source=PLACE, variables=self._spec.variable_names)
 
 
 @dataclass(frozen=True)
 class DriveResult:
-    """Result of a drive.
-
-    Attributes:
-        complete: whether it was completed.
-        failure: the reason if it was not; None if it was, or if it was interrupted.
-        recording: what was saved; None if nothing was.
-        line: one sentence about it.
-    """
+    """Result of a drive."""
 
     complete: bool
-    failure: BridgeError | None
-    recording: Recording | None
-    line: str
+    failure: BridgeError | None  # why not; None also if it was interrupted
+    recording: Recording | None  # saved
+    line: str  # one sentence about it
 
 
 class RecordNode(QosWatch):
@@ -69,11 +240,7 @@ class RecordNode(QosWatch):
     from the robot's position by odometry. The drive ends with zero commands, also on a signal, on
     an error, when odometry is silent, and when the robot leaves the circle; what was recorded
     until then is saved. If this process is killed, only the robot's own timeout on `cmd_vel` stops
-    it.
-
-    Args:
-        context: of the node.
-        given: parameters that override those of the command line.
+    it. Given parameters override those of the command line.
     """
 
     def __init__(self, context: Context, given: Mapping[str, Any] | None = None) -> None:
@@ -92,13 +259,11 @@ class RecordNode(QosWatch):
         self.create_subscription(JointState, "joint_states", self._log.joints, qos.SENSOR)
         self.create_subscription(Imu, "imu", self._log.imu, qos.SENSOR)
         self._began, self._heard = time.monotonic(), -np.inf
-        self._ticks, self._origin_ns = 0, 0
-        self._stamp_ns = 0
+        self._ticks = self._origin_ns = self._stamp_ns = 0
         self._pose: Array | None = None
         self._start: Array = np.zeros(3)
         # Steady: the robot's guard must not depend on the time source of the node.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(POLL_S, self._on_time, clock=steady)
+        steadily(self, POLL_S, self._on_time)
 
     def _now_ns(self) -> int:
         """Returns simulated time, or the system time at the start plus steady time [ns]."""
@@ -195,12 +360,9 @@ class RecordNode(QosWatch):
         self._log.command(command)
 
     def _message(self, twist: Array) -> Twist | TwistStamped:
-        message = conversions.twist_to_ros(twist)
-        if not self._order.stamped:
-            return message
-        stamped = TwistStamped(twist=message)
-        stamped.header.stamp = conversions.stamp_to_ros(self._now_ns())
-        return stamped
+        if self._order.stamped:
+            return conversions.stamped_to_ros(twist, self._now_ns(), "")
+        return conversions.twist_to_ros(twist)
 
     def stop(self) -> None:
         """Leaves the robot at rest, and saves what was recorded."""
@@ -243,12 +405,7 @@ def record(
 ) -> DriveResult:
     """Drives and records until the end, an error, SIGINT or SIGTERM.
 
-    Args:
-        given: parameters that override those of the command line.
-        args: the command line, `sys.argv` by default.
-
-    Returns:
-        The result of the drive.
+    Given parameters override those of the command line, `sys.argv` by default.
     """
     nodes: list[RecordNode] = []
 
@@ -270,51 +427,3 @@ def main(args: list[str] | None = None) -> None:
 
 if __name__ == "__main__":
     main()
-
-
-@dataclass(frozen=True)
-class DriveParameters:
-    """Values of the parameters of `record_node`.
-
-    Attributes:
-        plan: plan of the drive.
-        out: path of the recording.
-        odom_timeout: silence of odometry that stops the robot [s].
-        stamped: whether `cmd_vel` is a TwistStamped.
-        roles: may name the joints of state and wheels.
-    """
-
-    plan: DrivePlan
-    out: Path
-    odom_timeout: float
-    stamped: bool
-    roles: TopicRoles
-
-
-def declare_drive(node: Node) -> DriveParameters:
-    """Declares the parameters of a drive, and reads them.
-
-    Raises:
-        ConfigError: a value can't be used.
-    """
-    get = partial(declare, node, read_only=True)
-    robot = load_robot(get("robot", "ackermann", "A shipped robot, or its YAML file."))
-    out = check_out(
-        Path(get("out", "drive.npz", "File *.npz of the recording, or folder of a rosbag2."))
-    )
-    plan = DrivePlan(
-        robot,
-        bound=get("bound", 2.0, "Radius of the circle around the start to keep within [m]."),
-        duration=get("duration", 60.0, "Of the drive [s]."),
-        speed=get("speed", 1.0, "Share of the greatest speeds to use."),
-        seed=get("seed", 0, "Of the pattern."),
-    )
-    topics = get("topics", "", "YAML file that names joints; none if empty.")
-    silence = "Stops after this silence of odom [s]."
-    return DriveParameters(
-        plan,
-        out,
-        odom_timeout=get("odom_timeout", 0.5, silence, low=0.05, high=10.0),
-        stamped=get("stamped", False, "Whether cmd_vel is a TwistStamped."),
-        roles=topic_roles(Path(topics) if topics else None),
-    )

@@ -23,60 +23,35 @@ from nics_drl_bridge.report.pictures import drive_picture
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 NODE = "nics_drl_bridge.nodes.record_node"
+ARGUMENTS = ("namespace", "remap")
+"""Options that are no parameters of the node."""
 
 
 @dataclass(frozen=True)
 class RecordOrder:
-    """Options of `nics record`.
+    """Options of `nics record`."""
 
-    Attributes:
-        robot: name or YAML file of the robot.
-        out: `.npz` file, or folder of a rosbag2, to write.
-        bound: radius of the circle around the start to keep within [m].
-        duration: of the drive [s].
-        speed: share of the greatest speeds and rates to use.
-        seed: of the pattern.
-        namespace: of the robot's topics.
-        remap: rules `NAME:=OTHER` for topics.
-        topics: YAML file that names joints.
-        stamped: whether `cmd_vel` is a TwistStamped.
-        use_sim_time: whether time comes from `/clock`.
-    """
-
-    robot: str
-    out: Path
-    bound: float = 2.0
-    duration: float = 60.0
-    speed: float = 1.0
-    seed: int = 0
-    namespace: str = ""
-    remap: tuple[str, ...] = ()
-    topics: Path | None = None
-    stamped: bool = False
-    use_sim_time: bool = False
+    robot: str  # name or YAML file
+    out: Path  # `.npz` file, or folder of a rosbag2
+    bound: float = 2.0  # radius of the circle around the start to keep within [m]
+    duration: float = 60.0  # of the drive [s]
+    speed: float = 1.0  # share of the greatest speeds and rates to use
+    seed: int = 0  # of the pattern
+    namespace: str = ""  # of the robot's topics
+    remap: tuple[str, ...] = ()  # rules `NAME:=OTHER` for topics
+    topics: Path | None = None  # YAML file that names joints
+    stamped: bool = False  # `cmd_vel` is a TwistStamped
+    use_sim_time: bool = False  # time comes from `/clock`
 
     @property
     def parameters(self) -> dict[str, Any]:
         """Parameters for `record_node`."""
-        return {
-            "robot": self.robot,
-            "out": str(self.out),
-            "bound": self.bound,
-            "duration": self.duration,
-            "speed": self.speed,
-            "seed": self.seed,
-            "topics": str(self.topics or ""),
-            "stamped": self.stamped,
-            "use_sim_time": self.use_sim_time,
-        }
+        given = {name: value for name, value in vars(self).items() if name not in ARGUMENTS}
+        return given | {"out": str(self.out), "topics": str(self.topics or "")}
 
     @property
     def arguments(self) -> list[str]:
-        """Command line for `record_node`.
-
-        Raises:
-            ConfigError: a remapping rule is malformed.
-        """
+        """Command line for `record_node`. Raises ConfigError for a malformed remapping rule."""
         rules = [f"__ns:=/{self.namespace.strip('/')}"] if self.namespace.strip("/") else []
         for rule in self.remap:
             if not all(rule.partition(":=")):
@@ -89,11 +64,7 @@ class RecordOrder:
 
 
 def require_ros() -> None:
-    """Imports ROS 2.
-
-    Raises:
-        ConfigError: it is not installed.
-    """
+    """Imports ROS 2. Raises ConfigError if it is not installed."""
     try:
         import_module(NODE)
     except ModuleNotFoundError as error:
@@ -103,13 +74,9 @@ def require_ros() -> None:
 
 
 def preview(order: RecordOrder) -> tuple[str, ...]:
-    """Draws the expected drive next to the recording.
+    """Draws the expected drive next to the recording; returns lines for people.
 
-    Returns:
-        Lines for people.
-
-    Raises:
-        ConfigError: the order can't be carried out.
+    Raises ConfigError if the order can't be carried out.
     """
     robot, out = load_robot(order.robot), check_out(order.out)
     topic_roles(order.topics)  # reports a wrong file before the robot moves
@@ -121,13 +88,9 @@ def preview(order: RecordOrder) -> tuple[str, ...]:
 
 
 def drive(order: RecordOrder) -> tuple[tuple[str, ...], bool]:
-    """Drives the robot and records it.
+    """Drives the robot and records it; returns lines for people, and False if it was interrupted.
 
-    Returns:
-        Lines for people, and whether the drive was completed; otherwise it was interrupted.
-
-    Raises:
-        BridgeError: the drive failed; with the reason, and what was saved.
+    Raises BridgeError if the drive failed, with the reason and what was saved.
     """
     outcome = import_module(NODE).record(order.parameters, order.arguments)
     if outcome.failure is not None:

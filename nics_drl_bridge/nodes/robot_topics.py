@@ -32,13 +32,15 @@ POSE_TYPES = {
 
 def declare_sensors(node: Node) -> None:
     """Declares the sensors that a robot has in addition to scan and odometry."""
-    about = f"Type of `{POSE}`, in the map frame: {NO_POSE}, {', '.join(POSE_TYPES)}."
-    declare(node, "pose_type", NO_POSE, about, read_only=True)
-    about = "Whether the lidar hangs with its z axis down, so that its beams come clockwise."
-    declare(node, "lidar_upside_down", False, about, read_only=True)
-    declare(node, "use_imu", False, "Whether to use the yaw rate of `imu`.", read_only=True)
-    stamped = f"Whether `{CMD_VEL}` is a TwistStamped."
-    declare(node, "enable_stamped_cmd_vel", False, stamped, read_only=True)
+    pose_types = f"Type of `{POSE}`, in the map frame: {NO_POSE}, {', '.join(POSE_TYPES)}."
+    upside_down = "Whether the lidar hangs with its z axis down, so that its beams come clockwise."
+    for name, default, about in (
+        ("pose_type", NO_POSE, pose_types),
+        ("lidar_upside_down", False, upside_down),
+        ("use_imu", False, "Whether to use the yaw rate of `imu`."),
+        ("enable_stamped_cmd_vel", False, f"Whether `{CMD_VEL}` is a TwistStamped."),
+    ):
+        declare(node, name, default, about, read_only=True)
 
 
 class RobotTopics:
@@ -51,18 +53,11 @@ class RobotTopics:
     before it. The first odometry fixes `map`, unless there is a pose sensor: then the first pose
     does.
 
-    Args:
-        node: that subscribes.
-        model: of the robot.
-        on_odometry: called with the stamp [ns] after each odometry that is the newest.
-        on_scan: called with the stamp [ns] after each scan that was used.
-        on_lidar: called with the lidar of scans whose header is not that of the model's; raises
-            ConfigError if it can't be used, and its scans are then rejected. Without it the header
-            is not compared, and only scans with another number of beams are rejected.
-        now_ns: clock of arrivals [ns]; the node's by default.
-
-    Raises:
-        ConfigError: `pose_type` is unknown.
+    `on_odometry` and `on_scan` are called with the stamp [ns] after each odometry that is the
+    newest, and each scan that was used. `on_lidar` is called with the lidar of scans with a header
+    other than the model's; if it raises ConfigError, they are rejected. Without it only scans
+    with another number of beams are rejected. `now_ns` is the clock of arrivals, the node's by
+    default. Raises ConfigError if `pose_type` is unknown.
     """
 
     def __init__(
@@ -82,21 +77,11 @@ class RobotTopics:
         self._on_odometry, self._on_scan, self._on_lidar = on_odometry, on_scan, on_lidar
         self._reader: Reader | None = Reader(model.lidar, backwards=False)
         self._header, self._told = b"", ""
+        self._subscriptions: list[Any] = []
         stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
         command = (TwistStamped, self._take_stamped) if stamped else (Twist, self._take_command)
-        self._subscriptions = [
-            node.create_subscription(kind, topic, self._guarded(take), quality)
-            for kind, topic, take, quality in (
-                (LaserScan, SCAN, self._take_scan, qos.SENSOR),
-                (Odometry, ODOM, self._take_odometry, qos.SENSOR),
-                (command[0], CMD_VEL, command[1], qos.COMMAND),
-            )
-        ]
-        self.expected = (SCAN, ODOM, *self._subscribe_optional())
-
-    def _subscribe_optional(self) -> list[str]:
-        """Subscribes to the topics that the parameters request; returns their names."""
-        node, asked = self._node, {}
+        self._subscribe(CMD_VEL, *command, qos.COMMAND)
+        sensors = {SCAN: (LaserScan, self._take_scan), ODOM: (Odometry, self._take_odometry)}
         pose_type = str(node.get_parameter("pose_type").value)
         self._posed = pose_type != NO_POSE
         if self._posed:
@@ -105,21 +90,19 @@ class RobotTopics:
                     f"parameter 'pose_type': there is no {pose_type!r}; "
                     f"{nearest(pose_type, (NO_POSE, *POSE_TYPES))}"
                 )
-            asked[POSE] = (POSE_TYPES[pose_type], self._take_pose)
+            sensors[POSE] = (POSE_TYPES[pose_type], self._take_pose)
         if node.get_parameter("use_imu").value:
-            asked[IMU] = (Imu, self._take_imu)
-        for topic, (kind, take) in asked.items():
-            self._subscriptions.append(
-                node.create_subscription(kind, topic, self._guarded(take), qos.SENSOR)
-            )
-        return list(asked)
+            sensors[IMU] = (Imu, self._take_imu)
+        for topic, (kind, take) in sensors.items():
+            self._subscribe(topic, kind, take, qos.SENSOR)
+        self.expected = tuple(sensors)
 
-    def _guarded(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
+    def _subscribe(self, topic: str, kind: Any, take: Callable[[Any], None], quality: Any) -> None:
         def locked(message: Any) -> None:
             with self.lock:
                 take(message)
 
-        return locked
+        self._subscriptions.append(self._node.create_subscription(kind, topic, locked, quality))
 
     def close(self) -> None:
         """Ends the subscriptions."""
@@ -197,20 +180,12 @@ class RobotTopics:
         stamp = conversions.stamp_from_ros(message.header.stamp)
         pose, twist = conversions.odometry_from_ros(message)
         if not self._started and np.isfinite(pose).all():
-            self._begin(stamp, pose)
+            self.middleware.reset(stamp, pose, *((ANYWHERE,) if self._posed else ()))
+            self._started = True
         used = self.middleware.odometry(stamp, self.now_ns(), pose, twist)
-        if used and self._on_odometry is not None and self._is_newest(stamp):
+        newest = self.middleware.cache.newest
+        if used and self._on_odometry is not None and newest[ODOM].stamp_ns == stamp:
             self._on_odometry(stamp)
-
-    def _begin(self, stamp_ns: int, pose: conversions.Array) -> None:
-        if self._posed:
-            self.middleware.reset(stamp_ns, pose, ANYWHERE)
-        else:
-            self.middleware.reset(stamp_ns, pose)
-        self._started = True
-
-    def _is_newest(self, stamp_ns: int) -> bool:
-        return self.middleware.cache.newest[ODOM].stamp_ns == stamp_ns
 
     def _take_pose(self, message: PoseStamped | PoseWithCovarianceStamped) -> None:
         stamp = conversions.stamp_from_ros(message.header.stamp)

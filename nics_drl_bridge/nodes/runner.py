@@ -1,39 +1,52 @@
-"""Start, spinning and end of every node of the package.
-
-Initial parameter values of a node, from the command line and from YAML files.
-"""
+"""All that every node needs: parameters, start, end, a single instance, and diagnostics."""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import signal
+import socket
 import sys
 import threading
-from collections.abc import Callable, Sequence
-from typing import Any
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.srv import GetParameters
+from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
+from rclpy.timer import Timer
+from std_srvs.srv import Trigger
 
 from nics_drl_bridge.errors import BackendError, BridgeError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
+from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.executor import StandingExecutor
-from nics_drl_bridge.nodes.single_instance import sole
 from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
 
 SPIN_S = 0.1
 DELIVERY_S = 0.5
 EXIT_BAD_INPUT = 2
+SETTLE_S, POLL_S = 0.3, 0.02
+"""Time until the graph shows all nodes [s]."""
+ANSWER_S = 1.5
+"""A node that does not answer within this time is dead; the graph shows it for some 20 s more."""
+DIAGNOSTICS_S = 1.0
 RANGES = {
     int: (IntegerRange, "integer_range"),
     float: (FloatingPointRange, "floating_point_range"),
 }
+QOS, SHARED = "qos_overrides.", "model"
+"""Names of parameters that rclpy reads itself, if a publisher or subscription requests it; and one
+that a file sets for all nodes at once, including those that have no model."""
 
 
 def open_context(args: Sequence[str] | None = None, domain_id: int | None = None) -> Context:
@@ -42,10 +55,6 @@ def open_context(args: Sequence[str] | None = None, domain_id: int | None = None
     A robot that others should see sets `ROS_AUTOMATIC_DISCOVERY_RANGE` (on Humble
     `ROS_LOCALHOST_ONLY=0`); by default a simulator in a lab can't move another robot. Fast DDS
     sends by UDP, unless the environment chooses otherwise (`transport`).
-
-    Args:
-        args: ROS arguments.
-        domain_id: DDS domain; the environment's by default.
 
     Raises:
         BackendError: the arguments are wrong, no ROS 2 middleware is there, or discovery should
@@ -76,12 +85,7 @@ def run_node(
 
     A node's `start()`, if any, is called before it spins, and its `stop()` while it can still
     publish, to leave its robot at rest. A user's error becomes one sentence on standard error and
-    exit code 2.
-
-    Args:
-        make: makes the node in its own context.
-        args: the command line, `sys.argv` by default.
-        sole_name: of the node, if only a single instance may run in a namespace.
+    exit code 2. With a `sole_name` only a single instance runs in a namespace.
     """
     stopping, starting = threading.Event(), threading.Event()
     starting.set()
@@ -102,9 +106,10 @@ def run_node(
         node = make(context)
         if hasattr(node, "start"):
             node.start()
-        warn_of_unknown(node)
+        for sentence in unknown(node):  # rclpy ignores them silently
+            node.get_logger().warning(sentence)
         starting.clear()
-        _spin(node, stopping)
+        spin(node, stopping)
     except (BridgeError, ParameterException) as error:
         sys.stderr.write(f"{' '.join(str(error).split())}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
@@ -123,7 +128,7 @@ def run_node(
         alone.close()
 
 
-def _spin(node: Node, stopping: threading.Event) -> None:
+def spin(node: Node, stopping: threading.Event) -> None:
     """Spins a node until it is to stop, or its context has been shut down."""
     executor = StandingExecutor(node.context)
     executor.add_node(node)
@@ -131,6 +136,93 @@ def _spin(node: Node, stopping: threading.Event) -> None:
         while node.context.ok() and not stopping.is_set():
             executor.spin_once(timeout_sec=SPIN_S)
     executor.shutdown(timeout_sec=1.0)
+
+
+@contextlib.contextmanager
+def sole(context: Context, name: str) -> Iterator[None]:
+    """Ensures a single instance while a node runs: if its name is taken, it does not start.
+
+    Two that start at the same moment on one machine are told apart by the name of a socket, which
+    only one of them gets, and which ends with its process. Others, and nodes of other packages, are
+    found in the graph and asked whether they are alive. The arguments of the context may set
+    another name or a namespace. Raises BackendError if another instance is running.
+    """
+    probe = Node(
+        name, context=context, start_parameter_services=False, enable_rosout=False
+    )  # resolves its name as the node will
+    claim = None
+    try:
+        whole = probe.get_fully_qualified_name()
+        claim = _claimed(f"{context.get_domain_id()} {whole}")
+        if claim is None or (_seen(probe, whole) and _lives(probe, whole)):
+            raise BackendError(
+                f"a node {whole!r} runs already in ROS domain {context.get_domain_id()}; end it, "
+                "or give this one another namespace: `--ros-args -r __ns:=/robot_2`."
+            )
+    except BaseException:
+        if claim is not None:
+            claim.close()
+        raise
+    finally:
+        probe.destroy_node()
+    with claim:
+        yield
+
+
+def _claimed(key: str) -> socket.socket | None:
+    """Returns what only one process per machine (and network namespace) can have, or None."""
+    claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    if sys.platform != "linux":
+        return claim
+    try:
+        claim.bind(b"\0nics_drl_bridge " + hashlib.sha256(key.encode()).hexdigest().encode())
+    except OSError:
+        claim.close()
+        return None
+    return claim
+
+
+def _seen(probe: Node, whole: str) -> bool:
+    """True if the graph shows another node of the probe's name within `SETTLE_S`."""
+    deadline = time.monotonic() + SETTLE_S
+    while True:
+        nodes = probe.get_node_names_and_namespaces()
+        if [f"{space.rstrip('/')}/{name}" for name, space in nodes].count(whole) > 1:
+            return True
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(POLL_S)
+
+
+def _lives(probe: Node, whole: str) -> bool:
+    """True if the other node answers."""
+    client = probe.create_client(GetParameters, f"{whole}/get_parameters")
+    executor = SingleThreadedExecutor(context=probe.context)
+    executor.add_node(probe)
+    deadline = time.monotonic() + ANSWER_S
+    try:
+        while not client.service_is_ready() and time.monotonic() < deadline:
+            time.sleep(POLL_S)
+        answer = client.call_async(GetParameters.Request())
+        executor.spin_until_future_complete(answer, max(0.1, deadline - time.monotonic()))
+        return bool(answer.done())
+    finally:
+        executor.shutdown(timeout_sec=1.0)
+
+
+def steadily(node: Node, period_s: float, call: Callable[[], Any]) -> Timer:
+    """Calls at a period of the steady clock, also while the time of the robot stands still."""
+    return node.create_timer(period_s, call, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def serve(node: Node, name: str, answer: Callable[[], tuple[bool, str]]) -> None:
+    """Offers a Trigger service whose answer is success and message."""
+
+    def reply(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = answer()
+        return response
+
+    node.create_service(Trigger, name, reply)
 
 
 def declare_model(node: Node) -> SimulatorModel:
@@ -144,61 +236,36 @@ def declare_model_name(node: Node) -> str:
     return str(declare(node, "model", "ackermann", about, read_only=True))
 
 
-def declare(node: Node, name: str, default: Any, description: str, **limits: Any) -> Any:
-    """Declares a parameter and returns its value.
+def declare(
+    node: Node,
+    name: str,
+    default: Any,
+    description: str,
+    span: tuple[float, float] | None = None,
+    read_only: bool = False,
+) -> Any:
+    """Declares a parameter of the default's type, and returns its value, which lies in a span.
 
-    Args:
-        node: that gets the parameter.
-        name: of the parameter.
-        default: also determines the type.
-        description: for `ros2 param describe`.
-        limits: `low` and `high` of a number; `read_only`, which in a managed node applies from
-            configure to cleanup.
+    In a managed node `read_only` applies from configure to cleanup. `rate:=2` may be given for a
+    floating-point parameter: rclpy itself refuses an integer.
     """
-    fixed = limits.get("read_only", False)
-    if fixed and hasattr(node, "fixed"):  # a managed node reads it at each configure
+    if read_only and hasattr(node, "fixed"):  # a managed node reads it at each configure
         node.fixed.add(name)
-        fixed = False
-    descriptor = ParameterDescriptor(description=description, read_only=fixed)
-    if "low" in limits:
+        read_only = False
+    descriptor = ParameterDescriptor(description=description, read_only=read_only)
+    if span is not None:
         kind, field = RANGES[type(default)]
-        span = kind(from_value=limits["low"], to_value=limits["high"])
-        setattr(descriptor, field, [span])
-    widen(node, name, default)
+        setattr(descriptor, field, [kind(from_value=span[0], to_value=span[1])])
+    given, many = _given_values(node), isinstance(default, list)
+    if name in given and isinstance(default[0] if many else default, float):
+        types, value = Parameter.Type, given[name].value
+        if given[name].type_ == (types.INTEGER_ARRAY if many else types.INTEGER):
+            value = [float(each) for each in value] if many else float(value)
+            given[name] = Parameter(name, types.DOUBLE_ARRAY if many else types.DOUBLE, value)
     return node.declare_parameter(name, default, descriptor).value
 
 
-WIDENED: dict[Parameter.Type, tuple[Parameter.Type, Callable[[Any], Any]]] = {
-    Parameter.Type.INTEGER: (Parameter.Type.DOUBLE, float),
-    Parameter.Type.INTEGER_ARRAY: (
-        Parameter.Type.DOUBLE_ARRAY,
-        lambda values: list(map(float, values)),
-    ),
-}
-QOS = "qos_overrides."
-"""Names that rclpy reads itself, if a publisher or subscription requests it."""
-
-SHARED = "model"
-"""A file sets it for all nodes at once, including those that have no model."""
-
-
-def widen(node: Node, name: str, default: Any) -> None:
-    """Lets `rate:=2` be given for a floating-point parameter: rclpy itself refuses an integer.
-
-    Args:
-        node: that gets the parameter; it is not yet declared.
-        name: of the parameter.
-        default: a float or a list of floats; other types are left alone.
-    """
-    given = given_values(node)
-    first = default[0] if isinstance(default, list) and default else default
-    parameter = given.get(name)
-    if isinstance(first, float) and parameter is not None and parameter.type_ in WIDENED:
-        kind, convert = WIDENED[parameter.type_]
-        given[name] = Parameter(name, kind, convert(parameter.value))
-
-
-def given_values(node: Node) -> dict[str, Parameter]:
+def _given_values(node: Node) -> dict[str, Parameter]:
     """Returns the initial values given to the node, by name; the node's own dictionary.
 
     The only public access in rclpy is to accept undeclared parameters, which would accept misspelt
@@ -213,12 +280,38 @@ def unknown(node: Node) -> list[str]:
     known = [name for name in node._parameters if not name.startswith(QOS)]
     return [
         f"there is no parameter {name!r}, its value is ignored; {nearest(name, known)}"
-        for name in sorted(given_values(node))
+        for name in sorted(_given_values(node))
         if name not in (*known, SHARED) and not name.startswith(QOS)
     ]
 
 
-def warn_of_unknown(node: Node) -> None:
-    """Warns of values for parameters that the node does not have; rclpy ignores them silently."""
-    for sentence in unknown(node):
-        node.get_logger().warning(sentence)
+class Condition(NamedTuple):
+    """Condition of a node."""
+
+    message: str  # one line
+    warns: bool  # it needs attention
+    facts: Mapping[str, object]  # further ones, for people
+    hardware: str = ""  # concerned, such as the robot's name
+
+
+class Diagnostics:
+    """Publishes a node's finding about itself once a second, in the format of the aggregator.
+
+    The name of the status is that of the node, with a part; `look` returns the finding.
+    """
+
+    def __init__(self, node: Node, part: str, look: Callable[[], Condition]) -> None:
+        self._node, self._look = node, look
+        self._name = f"{node.get_fully_qualified_name()}: {part}"
+        self._topic = node.create_publisher(DiagnosticArray, "/diagnostics", qos.DIAGNOSTICS)
+        steadily(node, DIAGNOSTICS_S, self._publish)
+
+    def _publish(self) -> None:
+        found = self._look()
+        status = DiagnosticStatus(name=self._name, message=found.message)
+        status.level = DiagnosticStatus.WARN if found.warns else DiagnosticStatus.OK
+        status.hardware_id = found.hardware
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in found.facts.items()]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._topic.publish(message)

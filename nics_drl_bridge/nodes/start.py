@@ -20,12 +20,7 @@ EXIT_BAD_INPUT = 2
 
 
 def start(node: str, args: list[str] | None = None) -> None:
-    """Runs a node by its name until it ends; a missing library is one sentence and exit code 2.
-
-    Args:
-        node: name of the executable.
-        args: of ROS 2; those of the process by default.
-    """
+    """Runs a node by its name until it ends; a missing library is one sentence and exit code 2."""
     for number in (signal.SIGINT, signal.SIGTERM):  # to import takes seconds
         signal.signal(number, lambda *_: sys.exit(0))
     try:

@@ -12,8 +12,6 @@ result is checked; the environment is restored. A node that other code creates i
 afterwards does not listen to multicast, and may have shared memory.
 
 If discovery goes further, an environment variable is enough. It is read with each node and stays.
-
-Bound ports of UDP over IPv4, as reported by Linux; empty on other systems.
 """
 
 from __future__ import annotations
@@ -49,6 +47,9 @@ FAST_DDS_2, FAST_DDS_2_DISTRIBUTIONS = b"libfastrtps.so", (OLDEST_DISTRIBUTION, 
 PEERS = ("ROS_DISCOVERY_SERVER", "ROS_STATIC_PEERS")
 """With one of these set, discovery also looks elsewhere, which the profile does not."""
 SEGMENTS = (b"shm/fastdds_", b"shm/fastrtps_")
+TABLE = Path("/proc/net/udp")
+FIRST_PORT, PORTS_OF_A_DOMAIN = 7400, 250
+"""RTPS: the first port of a domain is that of its multicast."""
 
 
 def stays_here(environment: Mapping[str, str]) -> bool:
@@ -82,11 +83,7 @@ class Transport:
     def open(self, make: Callable[[], Context]) -> Context:
         """Returns a context over UDP, or ROS 2's default if the user chose or UDP is unavailable.
 
-        Args:
-            make: makes a context in the environment of this process.
-
-        Raises:
-            BackendError: discovery should reach further than that of an earlier context.
+        Raises BackendError if discovery should reach further than that of an earlier context.
         """
         with self._lock:
             stay_on_this_machine(os.environ)
@@ -109,7 +106,8 @@ class Transport:
     def _open_here(self, make: Callable[[], Context]) -> Context:
         words = {RANGE: SELF_MADE}
         if self._in_force is None:
-            words[_profiles_variable(os.environ.get("ROS_DISTRO"))] = str(PROFILE)
+            old = os.environ.get("ROS_DISTRO") in FAST_DDS_2_DISTRIBUTIONS or FAST_DDS_2 in _maps()
+            words[PROFILES[old]] = str(PROFILE)
         with _changed(os.environ, words):
             context = make()
             if self._in_force is None:
@@ -149,11 +147,6 @@ def _is_fast_dds() -> bool:
     return sys.platform == "linux" and name.startswith("rmw_fast")
 
 
-def _profiles_variable(distribution: str | None) -> str:
-    """Returns the name of the variable of the profiles' file in this process."""
-    return PROFILES[distribution in FAST_DDS_2_DISTRIBUTIONS or FAST_DDS_2 in _maps()]
-
-
 def _maps() -> bytes:
     return Path("/proc/self/maps").read_bytes()
 
@@ -162,13 +155,10 @@ def _is_in_force(context: Context) -> bool:
     """True if a node in a context has neither shared memory nor the multicast of its domain."""
     try:
         node = Node(
-            "transport_probe",
-            context=context,
-            use_global_arguments=False,
-            start_parameter_services=False,
-            enable_rosout=False,
+            "transport_probe", context=context, use_global_arguments=False,
+            start_parameter_services=False, enable_rosout=False,
             parameter_overrides=[Parameter("start_type_description_service", value=False)],
-        )
+        )  # fmt: skip
     except BaseException:
         context.try_shutdown()
         raise
@@ -182,18 +172,13 @@ def _is_in_force(context: Context) -> bool:
 OF_THIS_PROCESS = Transport()
 
 
-TABLE = Path("/proc/net/udp")
-FIRST_PORT, PORTS_OF_A_DOMAIN = 7400, 250
-"""RTPS: the first port of a domain is that of its multicast."""
-
-
 def multicast_port(domain_id: int) -> int:
     """Returns the port that participants bind to discover others beyond this machine."""
     return FIRST_PORT + PORTS_OF_A_DOMAIN * domain_id
 
 
 def ports_of(process: int | str = "self") -> set[int]:
-    """Returns the ports that a process has bound."""
+    """Returns the UDP ports over IPv4 that a process has bound, on Linux."""
     names = set()
     for file in Path(f"/proc/{process}/fd").iterdir():
         with contextlib.suppress(OSError):  # another thread has closed it
@@ -208,7 +193,7 @@ def domains_in_use() -> set[int]:
 
 
 def _sockets() -> list[tuple[str, int]]:
-    """Returns inode and port of each socket."""
+    """Returns inode and port of each UDP socket; empty where Linux does not report them."""
     try:
         lines = TABLE.read_text(encoding="ascii").splitlines()[1:]
     except OSError:

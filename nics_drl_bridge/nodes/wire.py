@@ -26,17 +26,14 @@ Array = NDArray[np.float64]
 Bytes = bytes | bytearray
 HEAD = 4
 """Bytes of the header, which do not count for alignment; the second one gives the byte order."""
-STAMP = 4
-"""Offset of the stamp of a header."""
-FRAME = 12
-"""Offset of its frame."""
+STAMP, FRAME = 4, 12
+"""Offsets of stamp and frame of a message's header."""
 UNREADABLE = (ValueError, struct.error)
-"""Raised for bytes that are not a message of the type."""
+"""Raised by all readers for bytes that are not a message of the type."""
 PLAIN = (0, 1)
 """Big-endian and little-endian plain CDR."""
-DOUBLES = 7 + 36 + 6 + 36
-"""Numbers of an odometry: pose, its covariance, twist, its covariance."""
-POSE_COVARIANCE, TWIST = 7, 7 + 36
+POSE_COVARIANCE, TWIST, DOUBLES = 7, 7 + 36, 7 + 36 + 6 + 36
+"""Numbers of an odometry before each: pose, its covariance, twist, its covariance."""
 SCAN_FIELDS = 7
 """Floats of a scan between its header and its ranges."""
 
@@ -65,54 +62,54 @@ def _doubles(content: Bytes, order: str) -> int:
     return _aligned(_after_text(content, _after_text(content, FRAME, order), order), 8)
 
 
+def _floats(content: Bytes, order: str) -> int:
+    """Returns the offset of the floats of a scan."""
+    return _aligned(_after_text(content, FRAME, order), 4)
+
+
 def stamp_of(content: Bytes) -> int:
-    """Returns the stamp of a message that begins with a header [ns]. Raises `UNREADABLE`."""
+    """Returns the stamp of a message that begins with a header [ns]."""
     seconds, nanoseconds = struct.unpack_from(f"{_order(content)}iI", content, STAMP)
     return int(seconds) * NS_PER_S + int(nanoseconds)
 
 
 def numbers_of(content: Bytes) -> Array:
-    """Returns all numbers (85,) of a serialised Odometry, in order. Raises `UNREADABLE`."""
+    """Returns all numbers (85,) of a serialised Odometry, in order."""
     order = _order(content)
     return np.frombuffer(content, f"{order}f8", DOUBLES, _doubles(content, order))
 
 
 def odometry_of(content: Bytes) -> tuple[Array, Array]:
-    """Returns pose (3,) and body twist (3,) of a serialised Odometry. Raises `UNREADABLE`."""
+    """Returns pose (3,) and body twist (3,) of a serialised Odometry."""
     values = numbers_of(content)
     x, y, _, qx, qy, qz, qw = values[:7].tolist()
     vx, vy, wz = values[TWIST], values[TWIST + 1], values[TWIST + 5]
     return np.array([x, y, heading_of(qx, qy, qz, qw)]), np.array([vx, vy, wz])
 
 
-def _scan(content: Bytes, order: str) -> int:
-    """Returns the offset of the floats of a scan."""
-    return _aligned(_after_text(content, FRAME, order), 4)
-
-
 def ranges_of(content: Bytes) -> NDArray[np.float32]:
-    """Returns the device's ranges (B,) of a serialised LaserScan. Raises `UNREADABLE`."""
+    """Returns the device's ranges (B,) of a serialised LaserScan."""
     order = _order(content)
-    place = _scan(content, order) + 4 * SCAN_FIELDS
+    place = _floats(content, order) + 4 * SCAN_FIELDS
     (beams,) = struct.unpack_from(f"{order}I", content, place)
     return np.frombuffer(content, f"{order}f4", beams, place + 4)
 
 
 def angles_of(content: Bytes) -> tuple[float, float]:
-    """Returns angle_min, angle_increment [rad] of a serialised LaserScan. Raises `UNREADABLE`."""
+    """Returns angle_min, angle_increment [rad] of a serialised LaserScan."""
     order = _order(content)
-    first, _, step = struct.unpack_from(f"{order}3f", content, _scan(content, order))
+    first, _, step = struct.unpack_from(f"{order}3f", content, _floats(content, order))
     return first, step
 
 
 def twist_of(content: Bytes) -> tuple[float, float, float]:
-    """Returns linear.x, linear.y, angular.z of a serialised Twist. Raises `UNREADABLE`."""
+    """Returns linear.x, linear.y, angular.z of a serialised Twist."""
     x, y, _, _, _, w = struct.unpack_from(f"{_order(content)}6d", content, HEAD)
     return x, y, w
 
 
 def stamped_twist_of(content: Bytes) -> tuple[float, float, float]:
-    """Returns linear.x, linear.y, angular.z of a serialised TwistStamped. Raises `UNREADABLE`."""
+    """Returns linear.x, linear.y, angular.z of a serialised TwistStamped."""
     order = _order(content)
     place = _aligned(_after_text(content, FRAME, order), 8)
     x, y, _, _, _, w = struct.unpack_from(f"{order}6d", content, place)
@@ -120,17 +117,13 @@ def stamped_twist_of(content: Bytes) -> tuple[float, float, float]:
 
 
 def truth_of(content: Bytes) -> bool:
-    """Returns the value of a serialised Bool. Raises `UNREADABLE`."""
+    """Returns the value of a serialised Bool."""
     _order(content)
     return bool(struct.unpack_from("B", content, HEAD)[0])
 
 
 class OdometryWriter:
-    """Serialises the odometries of one robot.
-
-    Args:
-        message: with its frames and everything else that stays the same.
-    """
+    """Serialises the odometries of one robot, whose frames and all else are those of a message."""
 
     def __init__(self, message: Odometry) -> None:
         self._content = bytearray(serialize_message(message))
@@ -163,11 +156,7 @@ class OdometryWriter:
 
 
 class ScanWriter:
-    """Serialises the scans of one lidar.
-
-    Args:
-        message: with its header, its ranges (B,), and everything else that stays the same.
-    """
+    """Serialises the scans (B,) of one lidar, whose header and all else are those of a message."""
 
     def __init__(self, message: LaserScan) -> None:
         self._content = bytearray(serialize_message(message))

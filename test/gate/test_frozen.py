@@ -146,6 +146,7 @@ def test_a_frozen_scan_of_a_corner_is_frozen_for_a_robot_that_turns():
     stopped_by_scan(rig)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", ["corridor", "arena", "doorway", "room"])
 @pytest.mark.parametrize("quantum", [0.0, 0.01])
 def test_no_drive_in_the_simulator_looks_frozen(world, quantum):
@@ -181,7 +182,7 @@ def told(rig, speed):
     rig.wish = np.array([speed, 0.0, 0.0])
 
 
-@pytest.mark.parametrize("phase", range(0, 50, 7))
+@pytest.mark.parametrize("phase", range(0, 50, 17))
 @pytest.mark.parametrize("speed", [1.0, 0.3, 0.1])
 def test_a_robot_that_stops_following_is_stopped_within_a_second_at_any_phase(phase, speed):
     rig = Rig()
@@ -206,14 +207,14 @@ def test_a_robot_that_never_starts_is_stopped_a_second_after_it_was_told_to():
         assert rig.now - began < 1.1
 
 
-@pytest.mark.parametrize("lag_s", [0.3, 0.6, 0.7])
+@pytest.mark.parametrize("lag_s", [0.3, 0.7])
 def test_a_robot_that_follows_late_is_not_taken_for_stuck(lag_s):
     rig = Rig(config("mecanum"))
     rig.wish = np.array([0.5, 0.0, 0.0])
     rig.run(1.5)
     assert rig.arm().granted
     late, rng = [0.0] * round(lag_s / TICK_S), np.random.default_rng(0)
-    for k in range(1500):
+    for k in range(800):
         if k % 40 == 0:
             rig.wish = np.array([rng.choice([-0.5, 0.0, 0.2, 0.5]), 0.0, 0.0])
         rig.run(TICK_S)

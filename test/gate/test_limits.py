@@ -48,7 +48,7 @@ def test_a_command_within_the_limits_stays_as_it_is(robot):
     assert not implausible(command, limits)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     robot=st.sampled_from(ROBOTS),
     steps=st.lists(st.tuples(WISH, WISH, WISH, st.floats(1e-3, 0.2)), min_size=5, max_size=60),
@@ -194,7 +194,7 @@ def absurd_limits(draw):
     return Limits(-low, high, rate, jerk, *kinds)
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(
     limits=absurd_limits(),
     steps=st.lists(st.tuples(TWIST, TWIST, ABSURD | st.floats(1e-3, 0.2)), min_size=1, max_size=8),
@@ -210,7 +210,7 @@ def test_whatever_the_limits_the_wish_and_the_interval_what_follows_is_a_number_
             assert np.isfinite(slope).all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(limits=absurd_limits(), wish=st.tuples(TWIST, TWIST), dt=st.floats(1e-3, 0.2))
 def test_a_gate_with_absurd_limits_publishes_numbers_within_them(limits, wish, dt):
     rig = Rig(config("differential", limits=limits))

@@ -65,13 +65,9 @@ def module_domain_id(domains: ExitStack) -> int:
     return domains.enter_context(claimed_domain())
 
 
-@pytest.fixture(scope="module")
-def launch(
-    domains: ExitStack, model_folder: str, tmp_path_factory: pytest.TempPathFactory
+def starter(
+    kind: Any, model_folder: str, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Callable[..., Any]]:
-    """Starts nodes, `launch(node, domain_id, **parameters)`; they end with the module."""
-    from nics_drl_bridge.nodes.processes import NodeProcess
-
     numbers = itertools.count()
     with ExitStack() as started:
 
@@ -81,15 +77,34 @@ def launch(
             namespace: str = "",
             remap: dict[str, str] | None = None,
             **parameters: Any,
-        ) -> NodeProcess:
+        ) -> Any:
             folder: Path = tmp_path_factory.mktemp(f"{node}_{next(numbers)}")
             parameters = {"model": model_folder} | parameters
-            process = NodeProcess(node, folder, parameters, domain_id, namespace, remap)
-            LAUNCHED.append(process)
-            return started.enter_context(process)
+            LAUNCHED.append(kind(node, folder, parameters, domain_id, namespace, remap))
+            return started.enter_context(LAUNCHED[-1])
 
         yield start
         LAUNCHED.clear()
+
+
+@pytest.fixture(scope="module")
+def launch(
+    domains: ExitStack, model_folder: str, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Callable[..., Any]]:
+    """Starts nodes in threads, `launch(node, domain_id, **parameters)`, until the module ends."""
+    from nodes.in_process import NodeThread
+
+    yield from starter(NodeThread, model_folder, tmp_path_factory)
+
+
+@pytest.fixture(scope="module")
+def launch_process(
+    domains: ExitStack, model_folder: str, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Callable[..., Any]]:
+    """The same in processes, for what only a process can show."""
+    from nics_drl_bridge.nodes.processes import NodeProcess
+
+    yield from starter(NodeProcess, model_folder, tmp_path_factory)
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.recording.bag_file import opened
 from nodes.peer import stamp_ns
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.ros, pytest.mark.process, pytest.mark.timeout(240)]
 
 ENDS_S = 60.0
 
@@ -125,6 +125,7 @@ def test_of_a_recorder_that_is_killed_the_drive_is_salvaged(meet, domain_id, tmp
     assert (topic.topic, topic.count > 10) == ("/odom", True)
 
 
+@pytest.mark.campaign
 def test_nothing_heard_is_one_sentence_and_no_bag(domain_id, tmp_path):
     _, err, code = ended(nics(domain_id, "bag", "record", tmp_path / "drive", "--duration", "1"))
     assert code == 2

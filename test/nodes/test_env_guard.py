@@ -19,7 +19,7 @@ from nics_drl_bridge.env.registry import COOPERATIVE_REACHING, NAVIGATION
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import link, qos
-from nics_drl_bridge.nodes.dds_backend import DdsBackend
+from nics_drl_bridge.nodes.backends import DdsBackend
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.sim.world import load_world
 
@@ -187,8 +187,12 @@ def test_a_command_that_no_other_one_follows_is_followed_by_a_zero(driving):
 
 
 def test_the_death_of_the_thread_that_listens_leaves_a_zero_behind(driving, monkeypatch):
-    def dies(*_, **__):
-        raise MemoryError("in the executor")
+    spin_once = link.StandingExecutor.spin_once
+
+    def dies(*given, **options):
+        if threading.current_thread().name == "dds_backend":
+            raise MemoryError("in the executor")
+        return spin_once(*given, **options)
 
     monkeypatch.setattr(threading, "excepthook", lambda *_: None)
     env, peer, heard = driving("realtime")

@@ -42,7 +42,7 @@ def spin_until(executor, done, what):
     raise AssertionError(f"never: {what}")
 
 
-def test_ends_that_come_and_go_are_noticed(node, executor):
+def test_entities_that_come_and_go_are_noticed(node, executor):
     publisher, one, two = node.create_publisher(Int32, "count", 10), [], []
     first = node.create_subscription(Int32, "count", one.append, 10)
     spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched")
@@ -107,7 +107,7 @@ def test_it_rests_too_when_the_message_that_counts_came_while_another_was_handle
 ):
     rests, late = [], [(lambda _: HANDED_OVER, (Int32(),))]
     monkeypatch.setattr(executor_module.time, "sleep", rests.append)
-    monkeypatch.setattr(executor, "_come_since", lambda: late)
+    monkeypatch.setattr(executor_module._Entities, "come", lambda _: late)
     publisher, heard = node.create_publisher(Int32, "count", 10), []
     node.create_subscription(Int32, "count", heard.append, 10)
     spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched")
@@ -137,7 +137,7 @@ def test_it_rests_after_a_callback_that_woke_another_thread_and_after_no_other(
         rests.clear()
 
 
-@pytest.mark.parametrize("part", ["take_message", "wait set", "ends"])
+@pytest.mark.parametrize("part", ["take_message", "wait set", "entities"])
 def test_with_an_rclpy_that_lacks_a_part_it_is_rclpys_own(node, executor, part, monkeypatch, capfd):
     class Lacking:
         def __getattr__(self, name):
@@ -148,12 +148,12 @@ def test_with_an_rclpy_that_lacks_a_part_it_is_rclpys_own(node, executor, part, 
     node.create_timer(0.01, lambda: ticks.append(1))
     spin_until(executor, lambda: publisher.get_subscription_count() == 1, "matched")
     if part == "take_message":
-        monkeypatch.setattr(executor_module._Ends, "taken", lambda _: Lacking().take_message)
+        monkeypatch.setattr(executor_module._Entities, "taken", lambda _: Lacking().take_message)
     elif part == "wait set":
         monkeypatch.setattr(executor_module, "rclpy_implementation", Lacking())
-        node.create_timer(0.01, lambda: None)  # another end, so that a new wait set is made
+        node.create_timer(0.01, lambda: None)  # another entity, so that a new wait set is made
     else:
-        monkeypatch.setattr(executor_module, "_all_ends", lambda nodes: Lacking().guards)
+        monkeypatch.setattr(executor_module, "_entities_of", lambda nodes: Lacking().guards)
         node.create_timer(0.01, lambda: None)
     publisher.publish(Int32(data=1))
     spin_until(executor, lambda: heard and len(ticks) > 3, "served by rclpy's")

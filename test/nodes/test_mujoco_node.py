@@ -17,7 +17,7 @@ from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
 from nics_drl_bridge.generator import builtin_model, save_model
 from nics_drl_bridge.interface import Start
-from nics_drl_bridge.nodes.dds_backend import DdsBackend
+from nics_drl_bridge.nodes.backends import DdsBackend
 from nics_drl_bridge.policy.evaluation import drive_all
 from nics_drl_bridge.policy.policies import make_policy
 from nics_drl_bridge.sim.world import load_world
@@ -88,6 +88,7 @@ def test_it_refuses_to_be_taken_for_another_model(node, robot):
         backend.close()
 
 
+@pytest.mark.process
 def test_without_mujoco_the_node_ends_with_one_sentence():
     code = (
         "import sys; sys.modules['mujoco'] = None; sys.argv = ['mujoco_node']\n"

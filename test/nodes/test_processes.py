@@ -18,9 +18,10 @@ from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import processes
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
-pytestmark = pytest.mark.ros
+pytestmark = [pytest.mark.ros, pytest.mark.process]
 
 NODES = ("simulator_node", "middleware_node", "policy_node", "command_gate")
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 ENDED_S = 5.0
 PARENT = """
 import sys, time
@@ -41,24 +42,27 @@ def alive(pid):
     return state != "Z"
 
 
-@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
-def test_every_node_ends_in_order_at_a_signal(launch, meet, domain_id, ending):
+@pytest.mark.parametrize("first", [0, pytest.param(1, marks=pytest.mark.campaign)])
+def test_every_node_starts_and_ends_in_order_at_a_signal(launch_process, meet, domain_id, first):
+    """At SIGINT and SIGTERM in turn; and its names can be remapped."""
     peer = meet(domain_id)
-    started = {node: launch(node, domain_id, namespace="robot") for node in NODES}
+    scans = peer.listen(LaserScan, "robot/lidar/front")
+    remap = {"scan": "lidar/front"}
+    started = {node: launch_process(node, domain_id, "robot", remap) for node in NODES}
 
     def running():
         names = dict(peer.node.get_node_names_and_namespaces())
-        return all(names.get(node) == "/robot" for node in NODES)
+        return scans and all(names.get(node) == "/robot" for node in NODES)
 
     peer.until(running, "all nodes")
     began = time.monotonic()
-    for process in started.values():
-        process._process.send_signal(ending)
+    for number, process in enumerate(started.values(), first):
+        process._process.send_signal(SIGNALS[number % 2])
     for node, process in started.items():
         assert process._process.wait(ENDED_S) == 0, node
         log = process.log.read_text(encoding="utf-8")
         assert "Traceback" not in log, log
-    print(f"all ended {time.monotonic() - began:.2f} s after the {ending.name}")
+    print(f"all ended {time.monotonic() - began:.2f} s after their signals")
 
 
 def test_a_node_dies_with_its_parent_however_that_dies(tmp_path, domain_id, meet):
@@ -105,14 +109,6 @@ def test_a_node_that_ended_by_itself_is_named_with_its_code_and_log(tmp_path, do
         )
         with pytest.raises(BackendError, match=f"^{re.escape(expected)}$"):
             node.check()
-
-
-def test_names_can_be_remapped(tmp_path, domain_id, meet):
-    peer = meet(domain_id)
-    scans = peer.listen(LaserScan, "lidar/front")
-    remap = {"scan": "lidar/front"}
-    with NodeProcess("simulator_node", tmp_path, {}, domain_id, remap=remap):
-        peer.until(lambda: scans, "a scan")
 
 
 def test_the_domain_id_is_the_environments_or_drawn(monkeypatch):

@@ -19,7 +19,7 @@ from nics_drl_bridge.env.registry import NAVIGATION
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import conversions, qos, realtime_backend
-from nics_drl_bridge.nodes.observer import EpisodeServices
+from nics_drl_bridge.nodes.link import EpisodeServices
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.sim.world import load_world
 
@@ -104,24 +104,31 @@ def test_silence_of_a_topic_is_named_with_its_age_and_a_reset_goes_on(connect, s
     backend = connect(stale_after_s=2.0)
     backend.reset(START)
     backend.step(FORWARD)
-    _, process = simulator
-    process._process.send_signal(signal.SIGSTOP)
-    try:
-        with pytest.raises(StaleDataError, match=r"no fresh data within 2.000 s") as caught:
-            drive_on(backend)
-    finally:
-        process._process.send_signal(signal.SIGCONT)
+    peer = meet(simulator[0])
+    peer.call(SetBool, "simulator_node/pause", SetBool.Request(data=True))
+    with pytest.raises(StaleDataError, match=r"no fresh data within 2.000 s") as caught:
+        drive_on(backend)
+    peer.call(SetBool, "simulator_node/pause", SetBool.Request(data=False))
     assert caught.value.topic in ("scan", "odom")
     assert caught.value.age_s > 2.0
     assert backend.reset(START).pose == pytest.approx(START.pose, abs=0.2)
     backend.step(FORWARD)
 
-    peer = meet(simulator[0])
-    peer.call(SetBool, "simulator_node/pause", SetBool.Request(data=True))
-    with pytest.raises(StaleDataError):
-        drive_on(backend)
-    peer.call(SetBool, "simulator_node/pause", SetBool.Request(data=False))
+
+@pytest.mark.process
+@pytest.mark.campaign
+def test_a_simulator_that_hangs_is_silent_until_it_wakes(connect, launch_process, domain_id):
+    simulator = launch_process("simulator_node", domain_id, mode="realtime")
+    backend = connect(stale_after_s=2.0, domain_id=domain_id)
     backend.reset(START)
+    simulator._process.send_signal(signal.SIGSTOP)
+    try:
+        with pytest.raises(StaleDataError, match=r"no fresh data within 2.000 s"):
+            drive_on(backend)
+    finally:
+        simulator._process.send_signal(signal.SIGCONT)
+    assert backend.reset(START).pose == pytest.approx(START.pose, abs=0.2)
+    backend.step(FORWARD)
 
 
 def test_a_simulator_whose_services_are_found_late_is_no_vehicle(connect, monkeypatch):

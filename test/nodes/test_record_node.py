@@ -78,9 +78,12 @@ def seconds(path):
     return float(np.ptp(recorded(path).command.t))
 
 
-def test_ctrl_c_leaves_a_zero_command_and_a_whole_recording(launch, meet, domain_id, tmp_path):
+@pytest.mark.process
+def test_ctrl_c_leaves_a_zero_command_and_a_whole_recording(
+    launch_process, meet, domain_id, tmp_path
+):
     robot, out = FakeRobot(meet(domain_id)), tmp_path / "drive.npz"
-    node = launch("record_node", domain_id, out=str(out))
+    node = launch_process("record_node", domain_id, out=str(out))
     robot.until(lambda: robot.driven, "it drives")
     node._process.send_signal(signal.SIGINT)
     robot.until(lambda: code_of(node) is not None, "it ends")
@@ -216,6 +219,7 @@ def nics(tmp_path, domain_id):
         each.process.wait()
 
 
+@pytest.mark.process
 def test_ctrl_c_on_the_command_line_saves_a_bag_and_tells_what_it_holds(
     nics, meet, domain_id, tmp_path
 ):
@@ -234,12 +238,13 @@ def test_ctrl_c_on_the_command_line_saves_a_bag_and_tells_what_it_holds(
     assert seconds(tmp_path / "drive") > 0.5
 
 
+@pytest.mark.process
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize(
     ("name", "rate", "options"),
     [
-        ("ackermann", 1.0, ("--duration", 20)),
         ("differential", 3.0, ("--duration", 40, "--use-sim-time", "--namespace", "bot")),
+        pytest.param("ackermann", 1.0, ("--duration", 20), marks=pytest.mark.campaign),
     ],
 )
 def test_a_recorded_drive_of_a_simulator_generates_it_again(

@@ -3,9 +3,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import os
-import subprocess
-import sys
 import time
 from dataclasses import replace
 
@@ -394,29 +391,21 @@ REFUSED = {
 
 
 @pytest.fixture(scope="module")
-def refusals():
+def refusals(tmp_path_factory):
     """What each of the wrong parameters leads to: exit code and standard error."""
+    from nodes.in_process import NodeThread
+
     with claimed_domain() as domain_id:
-        command = [sys.executable, "-m", "nics_drl_bridge.nodes.simulator_node", "--ros-args", "-p"]
         started = {
-            parameter: subprocess.Popen(
-                # In namespaces apart: a second node of the same name would be refused for that.
-                [*command, parameter, "-r", f"__ns:=/refused_{number}"],
-                env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
+            # In namespaces apart: a second node of the same name would be refused for that.
+            parameter: NodeThread(
+                "simulator_node", tmp_path_factory.mktemp("refused"), {}, domain_id,
+                f"refused_{number}", words=["-p", parameter],
             )
             for number, parameter in enumerate(REFUSED)
-        }
-        try:
-            yield {
-                parameter: (process.communicate(timeout=90.0)[1], process.returncode)
-                for parameter, process in started.items()
-            }
-        finally:
-            for process in started.values():
-                process.kill()
+        }  # fmt: skip
+        codes = {each: node.wait() for each, node in started.items()}
+        yield {each: (node.read_text(), codes[each]) for each, node in started.items()}
 
 
 @pytest.mark.parametrize(("parameter", "sentence"), REFUSED.items())

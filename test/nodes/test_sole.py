@@ -20,8 +20,8 @@ from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.errors import BackendError
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.device_node import WATCH_S
-from nics_drl_bridge.nodes.single_instance import sole
+from nics_drl_bridge.nodes.runner import sole
+from nics_drl_bridge.nodes.simulator_node import WATCH_S
 from nodes.peer import DEADLINE_S
 
 pytestmark = pytest.mark.ros
@@ -55,8 +55,11 @@ def test_a_second_node_in_the_same_namespace_refuses_to_start(launch, meet, doma
     other.check()
 
 
-def test_a_node_that_was_just_killed_does_not_keep_the_next_from_starting(launch, meet, domain_id):
-    first, peer = launch("command_gate", domain_id), meet(domain_id)
+@pytest.mark.process
+def test_a_node_that_was_just_killed_does_not_keep_the_next_from_starting(
+    launch, launch_process, meet, domain_id
+):
+    first, peer = launch_process("command_gate", domain_id), meet(domain_id)
 
     def gates():
         return peer.node.get_node_names().count("command_gate")

@@ -27,7 +27,12 @@ from nics_drl_bridge.nodes.transport import (
 
 pytestmark = pytest.mark.ros
 
-NODES = ("simulator_node", "command_gate", "policy_node", "middleware_node")
+
+def many(given):
+    return pytest.param(given, marks=pytest.mark.campaign)
+
+
+NODES = ("command_gate", *map(many, ("simulator_node", "policy_node", "middleware_node")))
 WARNING = "Fast DDS did not take on "
 
 
@@ -95,8 +100,9 @@ def is_apart(process: NodeProcess, domain_id: int) -> bool:
 
 
 @pytest.mark.parametrize("node", NODES)
-def test_nodes_have_udp_on_this_machine_alone(launch, meet, domain_id, node):
-    process, peer = launch(node, domain_id), meet(domain_id)
+@pytest.mark.process
+def test_nodes_have_udp_on_this_machine_alone(launch_process, meet, domain_id, node):
+    process, peer = launch_process(node, domain_id), meet(domain_id)
     peer.be_known_to(f"/{node}")
     assert is_apart(process, domain_id)
 
@@ -141,8 +147,9 @@ with open("/proc/self/maps", "rb") as maps:
 """
 
 
-def test_a_driver_that_has_shared_memory_is_heard_and_hears(launch, domain_id, tmp_path):
-    process = launch("simulator_node", domain_id, mode="lockstep")
+@pytest.mark.process
+def test_a_driver_that_has_shared_memory_is_heard_and_hears(launch_process, domain_id, tmp_path):
+    process = launch_process("simulator_node", domain_id, mode="lockstep")
     run(DRIVER, domain_id, tmp_path, **{RANGE: LOCAL})
     assert is_apart(process, domain_id)
 
@@ -179,6 +186,7 @@ def multicast():
 """
 
 
+@pytest.mark.process
 def test_the_environment_is_left_as_it_was_found(domain_id, tmp_path):
     code = "before = dict(os.environ)\nends = [ours(), ours()]\n"
     code += f"assert os.environ == before | {{'{RANGE}': '{LOCAL}'}}\n"
@@ -186,6 +194,7 @@ def test_the_environment_is_left_as_it_was_found(domain_id, tmp_path):
     assert WARNING not in run(IN_ORDER + code, domain_id, tmp_path)
 
 
+@pytest.mark.process
 def test_the_environment_is_left_as_it_was_found_by_arguments_that_are_wrong(domain_id, tmp_path):
     code = "before = dict(os.environ)\ntry:\n    open_context(['node', '--ros-args', '-r', 'x'])\n"
     code += "except BackendError:\n    assert os.environ == before\n"
@@ -193,8 +202,9 @@ def test_the_environment_is_left_as_it_was_found_by_arguments_that_are_wrong(dom
     run(IN_ORDER + code, domain_id, tmp_path, **{RANGE: LOCAL})
 
 
-@pytest.mark.parametrize("ended", ["", "end(other)"])
-@pytest.mark.parametrize("transports", ["", UDP])
+@pytest.mark.process
+@pytest.mark.parametrize("ended", ["", many("end(other)")])
+@pytest.mark.parametrize("transports", ["", many(UDP)])
 def test_after_a_node_of_somebody_else_discovery_stays_here_with_a_warning(
     domain_id, tmp_path, ended, transports
 ):
@@ -203,13 +213,15 @@ def test_after_a_node_of_somebody_else_discovery_stays_here_with_a_warning(
     assert said.count(WARNING) == 1
 
 
+@pytest.mark.process
 def test_after_a_subnet_discovery_stays_here_with_a_warning(domain_id, tmp_path):
     code = "first = ours('SUBNET')\nassert multicast() and not shared()\n"
     code += f"end(first)\nsecond = ours('{LOCAL}')\nassert not multicast()"
     assert run(IN_ORDER + code, domain_id, tmp_path).count(WARNING) == 1
 
 
-@pytest.mark.parametrize("transports", ["", UDP, "DEFAULT"])
+@pytest.mark.process
+@pytest.mark.parametrize("transports", ["", many(UDP), many("DEFAULT")])
 def test_discovery_does_not_silently_stay_here_where_a_subnet_is_asked_for(
     domain_id, tmp_path, transports
 ):
@@ -220,18 +232,21 @@ def test_discovery_does_not_silently_stay_here_where_a_subnet_is_asked_for(
     run(IN_ORDER + code, domain_id, tmp_path)
 
 
-@pytest.mark.parametrize("distribution", ["", "humble"])
+@pytest.mark.process
+@pytest.mark.parametrize("distribution", ["", many("humble")])
 def test_the_older_word_for_this_machine_is_heeded(domain_id, tmp_path, distribution):
     code = "first = ours()\nassert not multicast() and not shared()"
     words = {ONLY_LOCAL: "1", "ROS_DISTRO": distribution}
     run(IN_ORDER + code, domain_id, tmp_path, **words)
 
 
+@pytest.mark.process
 def test_who_chooses_shared_memory_gets_it(domain_id, tmp_path):
     code = "first = ours()\nassert shared() and not multicast()"
     run(IN_ORDER + code, domain_id, tmp_path, **{TRANSPORTS: "DEFAULT"})
 
 
+@pytest.mark.process
 def test_the_probe_offers_nothing_that_rights_would_have_to_allow(domain_id, tmp_path):
     code = (
         "import nics_drl_bridge.nodes.transport as transport\n"

@@ -18,7 +18,7 @@ from rosgraph_msgs.msg import Clock
 
 from nics_drl_bridge.errors import BackendError, RecordingError, nearest
 from nics_drl_bridge.nodes import conversions
-from nics_drl_bridge.nodes.message_types import message_type
+from nics_drl_bridge.nodes.conversions import message_type
 from nics_drl_bridge.nodes.qos import profile_of
 from nics_drl_bridge.nodes.runner import DELIVERY_S, open_context
 from nics_drl_bridge.recording.bag_file import BagFile, opened

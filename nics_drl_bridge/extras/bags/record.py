@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 from rclpy.subscription import Subscription
 
 from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.nodes.message_types import message_texts, message_type
+from nics_drl_bridge.nodes.conversions import message_texts, message_type
 from nics_drl_bridge.nodes.qos import QosWatch, offer_of, profile_of
 from nics_drl_bridge.nodes.runner import run_node
 from nics_drl_bridge.recording.messages import Offer

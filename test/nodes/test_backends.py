@@ -20,11 +20,11 @@ from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.sim_backend import SimBackend
-from nics_drl_bridge.errors import BackendError, ModelError, StaleDataError
+from nics_drl_bridge.errors import BackendError, ConfigError, ModelError, StaleDataError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import qos
-from nics_drl_bridge.nodes.dds_backend import DdsBackend, _Mailbox
+from nics_drl_bridge.nodes.backends import DdsBackend, _Mailbox, dds_backend
 from nics_drl_bridge.nodes.executor import HANDED_OVER
 from nics_drl_bridge.sim.world import load_world
 
@@ -65,9 +65,9 @@ def connect(simulator, model, arena):
 
 
 @pytest.fixture
-def own_simulator(launch, domain_id, model, arena):
+def own_simulator(launch_process, domain_id, model, arena):
     """A backend on a simulator that the test may harm, in a namespace."""
-    process = launch("simulator_node", domain_id, namespace=NAMESPACE, mode="lockstep")
+    process = launch_process("simulator_node", domain_id, namespace=NAMESPACE, mode="lockstep")
     backend = DdsBackend(
         model, arena, namespace=NAMESPACE, domain_id=domain_id, timeout_s=TIMEOUT_S
     )
@@ -194,20 +194,6 @@ def test_what_is_lost_on_the_way_is_asked_for_again_and_counts_once(connect, mon
     assert holed[1][f"{topic}_stamp_ns"] == holed[1]["stamp_ns"]
 
 
-@pytest.mark.skipif(
-    not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2,
-    reason="needs two cores and a system that lets threads choose",
-)
-def test_the_executor_shares_a_core_with_whoever_steps_who_stays_free_to_run_anywhere(connect):
-    backend, free = connect(), os.sched_getaffinity(0)
-    backend.reset(START)
-    (helper,) = {t.native_id for t in threading.enumerate() if t.name == "dds_backend"}
-    for _ in range(20):
-        backend.step(np.array([0.5, 0.1]))
-        assert os.sched_getaffinity(0) == free
-    assert len(os.sched_getaffinity(helper)) == 1
-
-
 def test_a_lost_asking_is_made_again(connect, monkeypatch):
     backend = connect()
     drive(backend)
@@ -225,7 +211,7 @@ def test_a_lost_asking_is_made_again(connect, monkeypatch):
             return Future()
         return ask(request)
 
-    monkeypatch.setattr("nics_drl_bridge.nodes.observer.LOST_S", 0.1)
+    monkeypatch.setattr("nics_drl_bridge.nodes.link.LOST_S", 0.1)
     monkeypatch.setattr(backend._mail, "put", lossy)
     monkeypatch.setattr(backend._episodes._repeat, "call_async", deaf)
     view, facts = backend.step(np.array([0.5, 0.1]))
@@ -256,7 +242,6 @@ def test_the_executor_rests_only_for_a_caller_that_waits_and_now_has_all():
 
     worked, got = [], []
     mail = _Mailbox(("odom", "scan"), lambda stamp, *_: worked.append(stamp))
-    mail._core.help = lambda: None  # this thread is not to be kept on one core
     assert mail.put("odom", stamped(1)) is mail.put("scan", stamped(1)) is None
     caller = threading.Thread(target=lambda: got.append(mail.wait(2 * NS_PER_S, TIMEOUT_S)))
     caller.start()
@@ -376,6 +361,7 @@ def test_somebody_else_who_moves_the_simulator_is_found_out(connect, commands_he
     drive(backend)
 
 
+@pytest.mark.process
 def test_in_a_namespace_it_notices_the_death_of_its_simulator(own_simulator):
     backend, process, _ = own_simulator
     drive(backend)
@@ -389,6 +375,7 @@ def test_in_a_namespace_it_notices_the_death_of_its_simulator(own_simulator):
         backend.reset(START)
 
 
+@pytest.mark.process
 def test_a_simulator_that_hangs_is_noticed_and_serves_again_when_it_wakes(own_simulator):
     backend, process, _ = own_simulator
     drive(backend)
@@ -418,3 +405,35 @@ def test_two_backends_in_two_domains_do_not_hear_each_other(
     here, there, expected = (b.step(np.zeros(2))[0] for b in (one, two, alone))
     assert here.pose.tolist() == expected.pose.tolist()
     assert np.abs(there.pose - expected.pose).max() > 0.1
+
+
+TEAM = {"task": "cooperative_reaching", "task_options": {"robots": 2}}
+
+
+def test_a_team_over_dds_sees_what_a_team_in_process_sees(launch, model, domain_id):
+    launch("simulator_node", domain_id, mode="lockstep", robots=["a", "b"])
+    options = {"domain_id": domain_id, "namespaces": ["a", "b"]}
+    here = BridgeEnv(model=model, estimator=True, **TEAM)
+    there = BridgeEnv(model=model, backend="dds", backend_options=options, **TEAM)
+    try:
+        for seed in (3, 4):
+            assert (here.reset(seed=seed)[0] == there.reset(seed=seed)[0]).all()
+            for k in range(5):
+                action = np.full(here.action_space.shape, 0.1 * k, np.float32)
+                mine, theirs = here.step(action), there.step(action)
+                assert (mine[0] == theirs[0]).all()
+                assert mine[1] == theirs[1]
+    finally:
+        there.close()
+
+
+@pytest.mark.parametrize("wish", [{"estimator": False}, {"randomisation": "mild"}])
+def test_what_topics_can_not_give_is_refused(model, wish):
+    with pytest.raises(ConfigError, match="'dds' always estimates and is never randomised"):
+        BridgeEnv("dds", model, **wish)
+
+
+@pytest.mark.parametrize("options", [{"mode": "realtime"}, {"namespaces": ["a"]}])
+def test_a_team_is_driven_in_lockstep_in_a_namespace_each(model, options):
+    with pytest.raises(ConfigError, match="a team of 2 robots is driven in mode 'lockstep'"):
+        dds_backend(model, load_world("arena"), robots=2, **options)

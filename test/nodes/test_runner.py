@@ -7,7 +7,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
-from nics_drl_bridge.nodes.runner import declare, open_context, warn_of_unknown
+from nics_drl_bridge.nodes.runner import declare, open_context, unknown
 
 pytestmark = pytest.mark.ros
 
@@ -31,7 +31,7 @@ def started(monkeypatch, domain_id):
 
 def test_a_whole_number_is_taken_for_a_floating_point_parameter(started):
     node = started("rate:=2", "start:=[1, 2, 3]", "count:=3")
-    assert declare(node, "rate", 1.0, "Of time.", low=0.1, high=10.0) == 2.0
+    assert declare(node, "rate", 1.0, "Of time.", span=(0.1, 10.0)) == 2.0
     assert isinstance(node.get_parameter("rate").value, float)
     assert list(declare(node, "start", [0.0, 0.0, 0.0], "Pose.")) == [1.0, 2.0, 3.0]
     assert declare(node, "count", 1, "Of robots.") == 3
@@ -41,28 +41,27 @@ def test_a_whole_number_is_taken_for_a_floating_point_parameter(started):
 def test_a_value_that_can_not_be_used_is_refused_with_the_parameters_name(started, value):
     node = started(f"rate:={value}")
     with pytest.raises(ParameterException, match="rate"):
-        declare(node, "rate", 1.0, "Of time.", low=0.1, high=10.0)
+        declare(node, "rate", 1.0, "Of time.", span=(0.1, 10.0))
 
 
 def test_whole_numbers_have_ranges_too(started):
     node = started("robots:=0")
     with pytest.raises(ParameterException, match=r"robots.*1"):
-        declare(node, "robots", 1, "How many.", low=1, high=100)
+        declare(node, "robots", 1, "How many.", span=(1, 100))
 
 
 def test_a_description_and_a_range_are_told_to_ros2_param_describe(started):
     node = started()
-    declare(node, "rate", 1.0, "Of time.", low=0.1, high=10.0, read_only=True)
+    declare(node, "rate", 1.0, "Of time.", span=(0.1, 10.0), read_only=True)
     told = node.describe_parameter("rate")
     assert (told.description, told.read_only) == ("Of time.", True)
     (span,) = told.floating_point_range
     assert (span.from_value, span.to_value) == (0.1, 10.0)
 
 
-def test_a_misspelt_parameter_is_warned_of_with_the_nearest_name(started, capfd):
+def test_a_misspelt_parameter_is_named_with_the_nearest_one(started):
     node = started("command_timout:=2.0", "qos_overrides./scan.publisher.depth:=3")
     declare(node, "command_timeout", 0.5, "Silence.")
-    warn_of_unknown(node)
-    (line,) = capfd.readouterr().err.splitlines()
+    (line,) = unknown(node)
     assert "'command_timout'" in line
     assert "did you mean 'command_timeout'?" in line

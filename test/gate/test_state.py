@@ -5,8 +5,7 @@ import dataclasses
 import pytest
 
 from gate.rig import driving
-from nics_drl_bridge.gate.records import replace
-from nics_drl_bridge.gate.state import Cause, EStopState
+from nics_drl_bridge.gate.state import Cause, EStopState, replace
 
 
 def test_a_changed_record_is_what_the_standard_library_makes_of_it():

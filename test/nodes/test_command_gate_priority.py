@@ -34,6 +34,7 @@ def asked(priority):
     return done.stdout.splitlines()
 
 
+@pytest.mark.process
 def test_all_threads_of_the_process_get_the_priority_where_the_system_allows_it():
     scheduled, refused = asked(7)
     if "does not allow" in refused:
@@ -42,6 +43,7 @@ def test_all_threads_of_the_process_get_the_priority_where_the_system_allows_it(
     assert refused == ""
 
 
+@pytest.mark.process
 def test_none_is_asked_for_by_default():
     assert asked(0) == [f"{ {os.SCHED_OTHER} } { {0} }", ""]
 

@@ -14,8 +14,8 @@ from rclpy.node import Node
 from nics_drl_bridge.config import dump_yaml, find_config
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.nodes import gate_parameters
-from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.command_gate import declare_black_box, declare_gate
+from nics_drl_bridge.nodes.runner import declare_model, open_context
 
 pytestmark = pytest.mark.ros
 
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.ros
 def declared(domain_id, tmp_path):
     """Declares the gate's parameters as given, over those of files."""
 
-    def declare(given=(), files=()):
+    def declare(given=(), files=(), model=None):
         path = tmp_path / "given.yaml"
         # By the node's full name, as launch_ros writes what a launch file gives a node.
         own = {"/command_gate": {"ros__parameters": dict(given)}}
@@ -36,7 +36,7 @@ def declared(domain_id, tmp_path):
         try:
             node = Node("command_gate", context=context)
             try:
-                return gate_parameters.declare_gate(node).config
+                return declare_gate(node, model or declare_model(node))
             finally:
                 node.destroy_node()
         finally:
@@ -99,11 +99,10 @@ def test_a_typo_in_the_limits_is_one_sentence(declared, tmp_path):
 
 
 @pytest.mark.parametrize(("rate", "age"), [(10.0, 0.3), (5.0, 0.35), (4.0, 0.4375), (40.0, 0.3)])
-def test_scans_of_a_slow_lidar_may_get_older(declared, monkeypatch, rate, age):
+def test_scans_of_a_slow_lidar_may_get_older(declared, rate, age):
     model = builtin_model("ackermann")
     slow = replace(model, lidar=model.lidar.model_copy(update={"rate": rate}))
-    monkeypatch.setattr(gate_parameters, "declare_model", lambda _: slow)
-    assert declared({"odom_rate": 10.0}).scan_age_s == pytest.approx(age)
+    assert declared({"odom_rate": 10.0}, model=slow).scan_age_s == pytest.approx(age)
 
 
 def test_each_namespace_has_a_black_box_of_its_own(domain_id, tmp_path):
@@ -113,7 +112,7 @@ def test_each_namespace_has_a_black_box_of_its_own(domain_id, tmp_path):
         try:
             node = Node("command_gate", context=context)
             try:
-                return gate_parameters.declare_gate(node).black_box
+                return declare_black_box(node)
             finally:
                 node.destroy_node()
         finally:

@@ -57,7 +57,7 @@ def test_stamps_of_one_topic_that_run_ahead_are_named(topic):
     assert (rig.rule, rig.state.latched.topic) == ("stamps_jumped", topic)
 
 
-@pytest.mark.parametrize("pace", [0.9, 0.5, 0.99])
+@pytest.mark.parametrize("pace", [0.9, 0.5, pytest.param(0.99, marks=pytest.mark.campaign)])
 def test_data_whose_stamps_fall_behind_get_older_and_stop_the_robot_for_good(pace):
     rig = driven(pace)
     began, known = rig.now, len(rig.published)
@@ -67,10 +67,11 @@ def test_data_whose_stamps_fall_behind_get_older_and_stop_the_robot_for_good(pac
     assert rig.rule in ("scan_silent", "scan_behind_old", "odom_silent")
 
 
-@pytest.mark.parametrize("pace", [1.0 + 5e-4, 1.0 - 5e-4])
+@pytest.mark.slow
+@pytest.mark.parametrize("pace", [1.0 + 5e-4, pytest.param(1.0 - 5e-4, marks=pytest.mark.campaign)])
 def test_clocks_that_drift_as_real_ones_do_are_followed(pace):
     rig = driven(pace)
-    for _ in range(30):
+    for _ in range(22):  # by more than what an armed gate takes for the future
         rig.run(10.0)
         assert rig.decision.cause is None
     assert rig.state.scans.late[-1] < 1e-3
@@ -89,7 +90,7 @@ def test_a_delay_that_comes_and_stays_is_not_taken_for_the_new_normal():
 
 def test_jitter_does_not_stop_the_robot():
     rng, rig = np.random.default_rng(0), driven()
-    for _ in range(300):
+    for _ in range(100):
         rig.delay_s = float(rng.uniform(0.0, 0.08))
         assert rig.run(PERIOD_S).cause is None
 

@@ -14,7 +14,7 @@ from sensor_msgs.msg import Imu
 
 from nics_drl_bridge.errors import BackendError, RecordingError
 from nics_drl_bridge.nodes import conversions
-from nics_drl_bridge.nodes.drive_log import DriveLog
+from nics_drl_bridge.nodes.record_node import DriveLog
 from nics_drl_bridge.recording.recording import check
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
