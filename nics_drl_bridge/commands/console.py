@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError
+from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError, nearest
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -35,7 +35,6 @@ TopicOption = Annotated[
 
 def roles_of(options: Sequence[str]) -> dict[str, str]:
     """Parses options ROLE=TOPIC for playing a bag into role -> topic. Raises ConfigError."""
-    from nics_drl_bridge.errors import nearest
     from nics_drl_bridge.middleware.playback import TYPES
 
     roles = {}

@@ -1,22 +1,19 @@
-"""The demo's report: one page with all results."""
+"""The demo's results, and its report: one page with all of them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
-from nics_drl_bridge.commands.demo_plan import DemoPlan
-from nics_drl_bridge.commands.demo_policy import Learned, Live
+from nics_drl_bridge.commands.demo import DemoPlan
 from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.policy.evaluation import Episode, deviation, successes
-from nics_drl_bridge.policy.evaluation_batch import Summary
-from nics_drl_bridge.policy.statistics import ConfidenceInterval
+from nics_drl_bridge.policy.evaluation import Episode, Summary, deviation, successes
 from nics_drl_bridge.report.calibration_pictures import CAPTIONS, calibration_pictures
 from nics_drl_bridge.report.fit_pictures import accuracy
 from nics_drl_bridge.report.page import Block, Code, Picture, Table, page
-from nics_drl_bridge.report.pictures import training_curve, trajectories
+from nics_drl_bridge.report.pictures import Point, training_curve, trajectories
 from nics_drl_bridge.sim.world import load_world
 
 IN_PROCESS, OVER_DDS = LABELS[FAST], LABELS[DDS]
@@ -25,15 +22,29 @@ PANELS = 9
 
 
 @dataclass(frozen=True)
-class Shown:
+class Learned:
+    """The policy of the demo by file or name, its origin in a sentence, and its training curve."""
+
+    policy: str
+    how: str
+    curve: Sequence[Point] = ()
+
+
+@dataclass(frozen=True)
+class Live:
+    """A drive of the deployed nodes, with its path; `arrived` is True if it reached the goal."""
+
+    arrived: bool
+    path: Episode
+
+
+@dataclass(frozen=True)
+class DemoResults:
     """All results of the demo.
 
     Attributes:
-        model, identified: the generated model, and the identification that it is based on.
-        learned: the policy.
         summary: of the policy's many episodes in the fast simulator.
         here, there: the same episodes in process and over DDS.
-        live: drive of the deployed nodes.
         took: part of the demo -> wall time [s].
     """
 
@@ -47,66 +58,57 @@ class Shown:
     took: dict[str, float]
 
 
-def report(plan: DemoPlan, shown: Shown) -> str:
+def report(plan: DemoPlan, results: DemoResults) -> str:
     """Builds the page, as HTML."""
+    took = {**results.took, "all": sum(results.took.values())}
+    times = [(part, f"{seconds:.0f}") for part, seconds in took.items()]
     sections: list[tuple[str, Sequence[Block]]] = [
-        ("The model", _model(plan, shown)),
-        ("The policy", _policy(plan, shown)),
-        ("The same episodes, in process and over DDS", _episodes(plan, shown)),
-        ("Deployed", _deployed(plan, shown)),
-        ("Time", [Table(("part", "wall time [s]"), _times(shown.took))]),
+        ("The model", _model(plan, results)),
+        ("The policy", _policy(plan, results)),
+        ("The same episodes, in process and over DDS", _episodes(plan, results)),
+        ("Deployed", _deployed(plan, results)),
+        ("Time", [Table(("part", "wall time [s]"), times)]),
     ]
-    policy = shown.learned.policy
-    lead = f"Robot {shown.model.robot.name!r} in the world {plan.world!r}, policy {policy!r}."
+    policy = results.learned.policy
+    lead = f"Robot {results.model.robot.name!r} in the world {plan.world!r}, policy {policy!r}."
     return page("nics_drl_bridge: demo", lead, sections)
 
 
-def _model(plan: DemoPlan, shown: Shown) -> list[Block]:
-    calibrated = calibration_pictures(shown.model.robot, shown.identified)
+def _model(plan: DemoPlan, results: DemoResults) -> list[Block]:
+    calibrated = calibration_pictures(results.model.robot, results.identified)
     return [
-        "Generated from " + str(plan.recording or "a textbook drive") + ".",
-        Code(shown.model.report),
+        f"Generated from {plan.recording or 'a textbook drive'}.",
+        Code(results.model.report),
         Picture(
-            accuracy(shown.identified),
+            accuracy(results.identified),
             "What each further term is worth; circles mark how many are kept.",
         ),
         *(Picture(picture, CAPTIONS[name]) for name, picture in calibrated.items()),
     ]
 
 
-def _policy(plan: DemoPlan, shown: Shown) -> list[Block]:
-    blocks: list[Block] = [shown.learned.how]
-    if shown.learned.curve:
+def _policy(plan: DemoPlan, results: DemoResults) -> list[Block]:
+    blocks: list[Block] = [results.learned.how]
+    if results.learned.curve:
         caption = "Success and collisions while it explores; all episodes are new ones."
-        blocks.append(Picture(training_curve(shown.learned.curve), caption))
-    summary = shown.summary
+        blocks.append(Picture(training_curve(results.learned.curve), caption))
+    summary = results.summary
+    shares = (summary.success, summary.collision, summary.time_out)
     rows = [
-        *(
-            (name, *(f"{100 * value:.1f} %" for value in _ends(share)))
-            for name, share in (
-                ("success", summary.success),
-                ("collision", summary.collision),
-                ("time-out", summary.time_out),
-            )
-        ),
-        *(
-            (name, *(f"{value:.2f}" for value in _ends(amount)))
-            for name, amount in (("path [m]", summary.length), ("time [s]", summary.time))
-        ),
+        (name, *(f"{100 * value:.1f} %" for value in astuple(share)))
+        for name, share in zip(("success", "collision", "time-out"), shares, strict=True)
     ]
-    told = (
+    for name, amount in (("path [m]", summary.length), ("time [s]", summary.time)):
+        rows.append((name, *(f"{value:.2f}" for value in astuple(amount))))
+    text = (
         f"{summary.episodes} unseen episodes in the world {plan.world!r}, side by side in the fast "
         "simulator, the policy at its best; path and time are means of the successful ones."
     )
-    return [*blocks, told, Table(("", "value", "95 % from", "to"), rows)]
+    return [*blocks, text, Table(("", "value", "95 % from", "to"), rows)]
 
 
-def _ends(estimate: ConfidenceInterval) -> tuple[float, float, float]:
-    return estimate.value, estimate.low, estimate.high
-
-
-def _episodes(plan: DemoPlan, shown: Shown) -> list[Block]:
-    here, there = shown.here, shown.there
+def _episodes(plan: DemoPlan, results: DemoResults) -> list[Block]:
+    here, there = results.here, results.there
     rows = [
         (
             str(a.seed), a.result, f"{a.steps}", f"{a.length:.2f}", b.result, f"{b.steps}",
@@ -116,7 +118,7 @@ def _episodes(plan: DemoPlan, shown: Shown) -> list[Block]:
     ]  # fmt: skip
     head = ("seed", IN_PROCESS, "steps", "path [m]", OVER_DDS, "steps", "path [m]", "deviation [m]")
     runs = {IN_PROCESS: here[:PANELS], OVER_DDS: there[:PANELS]}
-    both = trajectories(runs, load_world(plan.world), shown.model.robot.footprint_radius)
+    both = trajectories(runs, load_world(plan.world), results.model.robot.footprint_radius)
     return [
         f"{successes(here)} of {len(here)} episodes reached the goal in process, "
         f"{successes(there)} of {len(there)} over DDS in lock-step. Deviation is the "
@@ -126,22 +128,14 @@ def _episodes(plan: DemoPlan, shown: Shown) -> list[Block]:
     ]
 
 
-def _deployed(plan: DemoPlan, shown: Shown) -> list[Block]:
-    live = shown.live
-    beside = [episode for episode in shown.here if episode.seed == live.path.seed]
-    drawn = trajectories(
-        {IN_PROCESS: beside, "deployed": [live.path]},
-        load_world(plan.world),
-        shown.model.robot.footprint_radius,
-    )
+def _deployed(plan: DemoPlan, results: DemoResults) -> list[Block]:
+    live = results.live
+    beside = [episode for episode in results.here if episode.seed == live.path.seed]
+    runs = {IN_PROCESS: beside, "deployed": [live.path]}
+    drawn = trajectories(runs, load_world(plan.world), results.model.robot.footprint_radius)
     return [
         "simulator_node in real time, middleware_node, policy_node and command_gate ran as "
         "processes of their own; nobody stepped them. The robot "
         f"{'reached' if live.arrived else 'did not reach'} its goal.",
         Picture(drawn, "The true path of the deployed robot beside the lock-step one."),
     ]
-
-
-def _times(took: dict[str, float]) -> list[tuple[str, str]]:
-    total = ("all", f"{sum(took.values()):.0f}")
-    return [*((part, f"{seconds:.0f}") for part, seconds in took.items()), total]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.policy.evaluation import Episode
-from nics_drl_bridge.policy.statistics import record_of, tallies
+from nics_drl_bridge.policy.evaluation import tallies
 
 
 def episode(seed, result, points):
@@ -50,12 +50,12 @@ def test_what_the_robot_took_for_a_success_is_told_beside_what_was_one():
     lied = replace(episode(0, "elsewhere", line(2.0)), believed="success")
     told = tallies({"fast": [lied, episode(1, "success", line(1.0))]}, 0.1)["fast"]
     assert (told.success.value, told.believed.value, told.time_out.value) == (0.5, 1.0, 0.5)
-    assert record_of(lied)["believed"] == "success"
-    assert record_of(lied)["goal_distance_m"] == pytest.approx(2.0)
+    assert lied.plain()["believed"] == "success"
+    assert lied.plain()["goal_distance_m"] == pytest.approx(2.0)
 
 
 def test_an_episode_as_plain_data_keeps_its_path():
-    told = json.loads(json.dumps(record_of(RUNS["dds"][0])))
+    told = json.loads(json.dumps(RUNS["dds"][0].plain()))
     assert told["seed"] == 0
     assert told["steps"] == 10
     assert np.allclose(told["path"], RUNS["dds"][0].path)

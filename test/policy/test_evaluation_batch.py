@@ -9,7 +9,7 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.env.vector_rows import VectorFacts
 from nics_drl_bridge.policy.evaluation import drive
-from nics_drl_bridge.policy.evaluation_batch import Outcomes, drive_worlds, summarise
+from nics_drl_bridge.policy.evaluation import Outcomes, drive_worlds, summarise
 from nics_drl_bridge.policy.policies import make_policy
 
 LIMIT = 40

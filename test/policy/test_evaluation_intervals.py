@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from nics_drl_bridge.policy.statistics import mean, rate
+from nics_drl_bridge.policy.evaluation import mean, rate
 
 
 @pytest.mark.parametrize(("hits", "trials"), [(0, 10), (1, 3), (7, 10), (480, 500), (500, 500)])

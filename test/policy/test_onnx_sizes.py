@@ -9,7 +9,7 @@ import onnx
 import pytest
 
 from nics_drl_bridge.errors import PolicyError
-from nics_drl_bridge.policy import onnx_graph, onnx_sizes, policy_file
+from nics_drl_bridge.policy import onnx_graph, policy_file
 from nics_drl_bridge.policy.policy_file import load_policy
 from policy.policy_rig import SECTORS, bytes_of, contract_in, export, signed, with_contract
 
@@ -126,7 +126,7 @@ REFUSED = {
     "a square": (outer, "graph", "grows faster"),
     "work": (heavy, "graph", "multiplications"),
     "broadcasting": (broadcast, "graph", "numbers"),
-    "sizes by value": (by_value, "graph.node", "can't be told"),
+    "sizes by value": (by_value, "graph.node", "can't be known"),
     "a huge kernel": (padded, "graph.node.kernel_shape", "beyond"),
     "shapes that do not fit": (mismatched, "graph", "do not fit"),
     "sparse weights": (sparse, "graph.node", "sparse"),
@@ -183,7 +183,7 @@ def test_what_fails_only_when_it_runs_is_a_policy_error(file, tmp_path):
 
 def test_more_observations_than_fit_at_once_are_run_in_parts(file, monkeypatch):
     whole = load_policy(file)
-    monkeypatch.setattr(onnx_sizes, "MOST_AT_ONCE", 3 * 30)
+    monkeypatch.setattr(onnx_graph, "MOST_AT_ONCE", 3 * 30)
     policy = load_policy(file)
     rows = np.random.default_rng(0).uniform(0.0, 1.0, (10, SECTORS + 6)).astype(np.float32)
     assert policy._rows_at_once < len(rows)

@@ -17,14 +17,14 @@ from nics_drl_bridge.report.doctor_facts import (
     Endpoints,
     Expected,
     Facts,
-    expected_of_model,
+    expected_of,
     facts_of_bag,
     names_in,
 )
 
 SECONDS = 8.0
 RELIABLE, BEST_EFFORT = Offer(), Offer(reliable=False)
-EXPECTED = expected_of_model(builtin_model("ackermann"))
+EXPECTED = expected_of(builtin_model("ackermann"))
 LIDAR = EXPECTED.lidar
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 

@@ -1,9 +1,4 @@
-"""Rig: one machine within a MuJoCo model.
-
-MujocoRobot: one robot on an infinite floor, moved only by its motors and by contact.
-
-Records a drive of a robot in MuJoCo.
-"""
+"""One machine within a MuJoCo model, a robot on an infinite floor, and a recorded drive of it."""
 
 from __future__ import annotations
 
@@ -15,8 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.extras.mujoco.machine import Machine, Physics, load_mujoco
-from nics_drl_bridge.extras.mujoco.machines import build_machine
+from nics_drl_bridge.extras.mujoco.machines import (
+    Machine,
+    Physics,
+    build_machine,
+    load_mujoco,
+)
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -24,34 +23,23 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Array = NDArray[np.float64]
 
 LARGEST_TILT_RAD = 0.5
+SETTLING_S = 0.5
 
 
 @dataclass(frozen=True)
 class Reading:
-    """State of a robot at one time.
+    """State of a robot at one time."""
 
-    Attributes:
-        time: since the reset [s].
-        pose: (3,) of `base_link`: x [m], y [m], heading [rad].
-        twist: (3,) vx [m/s], vy [m/s], wz [rad/s] in `base_link`.
-        state: (S,) by the encoders, in the order of the RobotSpec.
-    """
-
-    time: float
-    pose: Array
-    twist: Array
-    state: Array
+    time: float  # since the reset [s]
+    pose: Array  # (3,) of `base_link`: x [m], y [m], heading [rad]
+    twist: Array  # (3,) vx [m/s], vy [m/s], wz [rad/s] in `base_link`
+    state: Array  # (S,) by the encoders, in the order of the RobotSpec
 
 
 class Rig:
     """Access to one machine in the arrays of a MuJoCo model.
 
-    Args:
-        spec: the robot.
-        machine: its masses, motors and wheels.
-        model: the MuJoCo model that contains the machine.
-        prefix: of the names of the machine's parts in it.
-        number: number of machines of this kind before it.
+    `prefix` is that of the names of its parts, `number` that of machines of its kind before it.
     """
 
     def __init__(
@@ -68,13 +56,7 @@ class Rig:
         self._controls = slice(number * count, (number + 1) * count)
 
     def put(self, data: Any, rest: Array, pose: ArrayLike) -> None:
-        """Places the robot, at rest.
-
-        Args:
-            data: MuJoCo's MjData.
-            rest: (nq,) positions of a single machine of this kind at rest on the floor.
-            pose: (3,) of `base_link`.
-        """
+        """Places the robot at a pose (3,), with its parts as at rest (nq,) on the floor."""
         x, y, heading = np.asarray(pose, dtype=np.float64)
         own = data.qpos[self._place : self._place + len(rest)]
         own[:] = rest
@@ -82,24 +64,20 @@ class Rig:
         own[3:7] = np.cos(0.5 * heading), 0.0, 0.0, np.sin(0.5 * heading)
 
     def command(self, data: Any, command: ArrayLike) -> None:
-        """Gives the motors a command (C,), clipped to its limits.
-
-        Raises:
-            BackendError: the command contains NaN, or has a wrong size.
-        """
-        command = np.asarray(command, dtype=np.float64)
-        if command.shape != (len(self.spec.command),) or not np.isfinite(command).all():
-            raise BackendError(
-                f"command {command.tolist()} must be {len(self.spec.command)} finite numbers, as "
-                f"robot {self.spec.name!r} takes them."
-            )
+        """Gives the motors a command (C,), clipped to its limits. Raises BackendError for NaN."""
+        command, count = np.asarray(command, dtype=np.float64), len(self.spec.command)
+        if command.shape != (count,) or not np.isfinite(command).all():
+            reason = f"must be {count} finite numbers, as robot {self.spec.name!r} takes them."
+            raise BackendError(f"command {command.tolist()} {reason}")
         wanted = self._target(np.clip(command, self.spec.command_low, self.spec.command_high))
         data.ctrl[self._controls] = self.machine.controls(wanted)
 
     def read(self, data: Any) -> Reading:
         """Returns the current reading."""
         place, velocity = data.qpos[self._place :], data.qvel[self._drift :]
-        heading = _heading(place[3:7])
+        w, x, y, z = place[3:7]
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        heading = float(geometry.wrap_angle(yaw))
         ahead, aside = geometry.rotate(velocity[:2], -heading)
         return Reading(
             time=float(data.time),
@@ -116,45 +94,27 @@ class Rig:
         """Mean state (S,) between two encoder readings (J,), `duration` [s] apart."""
         return self.machine.state(0.5 * (before + after), (after - before) / duration)
 
-    def upright(self, data: Any) -> bool:
-        """True while the robot stands on its wheels."""
-        x, y = data.qpos[self._place + 4 : self._place + 6]
-        return bool(1.0 - 2.0 * (x * x + y * y) > np.cos(LARGEST_TILT_RAD))
-
     def require_upright(self, data: Any) -> None:
         """Raises BackendError if the robot has fallen over."""
-        if not self.upright(data):
+        x, y = data.qpos[self._place + 4 : self._place + 6]
+        if not 1.0 - 2.0 * (x * x + y * y) > np.cos(LARGEST_TILT_RAD):
             raise BackendError(
                 f"robot {self.spec.name!r} has fallen over at {data.time:.2f} s; lower the "
                 "acceleration of its Physics, or its command limits."
             )
 
 
-def _heading(quaternion: Array) -> float:
-    """Yaw [rad] of a unit quaternion (4,): w, x, y, z."""
-    w, x, y, z = quaternion
-    return float(geometry.wrap_angle(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))))
-
-
-SETTLING_S = 0.5
-
-
 class MujocoRobot:
-    """A robot in MuJoCo.
+    """A robot on an infinite floor, moved only by its motors and by contact.
 
     Attributes:
-        spec: the robot.
-        machine: its masses, motors and wheels in MuJoCo's form.
-        timestep: of MuJoCo [s].
         rest: (nq,) positions in MuJoCo at rest at the origin.
+
+    Raises:
+        ConfigError: MuJoCo is not installed, or the spec lacks a parameter of the machine.
     """
 
     def __init__(self, spec: RobotSpec, physics: Physics | None = None) -> None:
-        """Builds the robot and sets it on the floor.
-
-        Raises:
-            ConfigError: MuJoCo is not installed, or the spec lacks a parameter of the machine.
-        """
         self._mujoco = load_mujoco()
         self.spec = spec
         self.machine: Machine = build_machine(spec, physics)
@@ -174,14 +134,7 @@ class MujocoRobot:
         return self.read()
 
     def step(self, command: ArrayLike, duration: float) -> Reading:
-        """Drives with a constant command.
-
-        Args:
-            command: (C,) in the order of the RobotSpec; clipped to its limits.
-            duration: a whole number of time steps [s].
-
-        Returns:
-            The reading at the end.
+        """Drives with a command (C,), clipped to its limits, for a whole number of time steps [s].
 
         Raises:
             BackendError: the robot has fallen over, or the command contains NaN.
@@ -209,15 +162,8 @@ def record(
 ) -> Recording:
     """Drives at random and records, as `textbook.record` does with the textbook kinematics.
 
-    Args:
-        robot: the robot, which is reset to the origin first.
-        rng: draws new commands, uniform within their limits, every `hold` seconds.
-        duration: of the drive [s].
-        dt: sample period, a whole number of the robot's time steps [s].
-        hold: duration of a command [s].
-
-    Returns:
-        Command, pose and state on one clock.
+    The robot is reset to the origin first. New commands are drawn, uniform within their limits,
+    every `hold` seconds; the sample period `dt` [s] is a whole number of the robot's time steps.
 
     Raises:
         BackendError: the robot fell over.

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.extras.mujoco import scenery
-from nics_drl_bridge.extras.mujoco.machine import Physics, load_mujoco
+from nics_drl_bridge.extras.mujoco.machines import Physics, load_mujoco
 from nics_drl_bridge.extras.mujoco.rig import MujocoRobot, Rig
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.lidar.scanner import Renderer
@@ -35,18 +35,9 @@ class MujocoSimulator:
     integrates the turns of the wheels, so it drifts if they slip. A command acts at once, on motors
     with their own lag: the model's latency is not added.
 
-    Args:
-        model: the robot, whose textbook kinematics select the machine; lidar, noise and control
-            period. The fitted kinematics are not used.
-        world: the field and its obstacles.
-        robots: M. They see and touch each other.
-        renderer: of the lidar, see `FastSimulator`.
-        physics: parameters that the RobotSpec does not have; the time step is shortened so that a
-            control period is a whole number of steps.
-
-    Attributes:
-        model: as given.
-        world: as given.
+    The textbook kinematics of the model's robot select the machine; the fitted ones are not used.
+    The M robots see and touch each other. The time step of `physics` is shortened so that a control
+    period is a whole number of steps.
 
     Raises:
         ConfigError: MuJoCo is not installed, the robot names no textbook kinematics or lacks a
@@ -94,9 +85,7 @@ class MujocoSimulator:
     def reset(self, seeds: ArrayLike, starts: ArrayLike | None = None) -> Scenes:
         """Begins an episode, the same one as in a FastSimulator of this model and world.
 
-        Args:
-            seeds: (1,).
-            starts: (1, M, 3) start poses instead of the scene's.
+        Takes one seed (1,), and start poses (1, M, 3) instead of the scene's.
 
         Raises:
             ConfigError: see `FastSimulator.reset`.
@@ -114,14 +103,6 @@ class MujocoSimulator:
             self._mujoco, self._machine, footprint, robots, place, self._physics
         )
         self._data = self._mujoco.MjData(self._simulation)
-        self._find_parts(robots, moving & (bodies[:, 5] > 0.0))
-        for rig, pose in zip(self._rigs, self.data.pose[0], strict=True):
-            rig.put(self._data, self._rest, pose)
-        self._mujoco.mj_forward(self._simulation, self._data)
-        return scenes
-
-    def _find_parts(self, robots: int, moving: NDArray[np.bool_]) -> None:
-        """Looks up robots, bumpers and moving obstacles in the compiled scene."""
         compiled = self._simulation
         self._rigs = [
             Rig(self.model.robot, self._machine, compiled, scenery.prefix_of(m), m)
@@ -129,15 +110,16 @@ class MujocoSimulator:
         ]
         self._mocap = [
             (k, int(compiled.body(scenery.obstacle_name(k)).mocapid[0]))
-            for k in np.flatnonzero(moving).tolist()
+            for k in np.flatnonzero(moving & (bodies[:, 5] > 0.0)).tolist()
         ]
         self._bumper_of = scenery.bumpers(compiled, robots)
+        for rig, pose in zip(self._rigs, self.data.pose[0], strict=True):
+            rig.put(self._data, self._rest, pose)
+        self._mujoco.mj_forward(self._simulation, self._data)
+        return scenes
 
     def step(self, commands: ArrayLike) -> None:
-        """Moves the world by one control period; the results are in `data`.
-
-        Args:
-            commands: (1, M, C) in the units and the order of the RobotSpec; clipped to its limits.
+        """Moves the world by one control period; commands (1, M, C) are clipped to their limits.
 
         Raises:
             ConfigError: the commands have a wrong shape.
@@ -162,7 +144,8 @@ class MujocoSimulator:
         for part in range(self._parts):
             self._place_obstacles((part + 1) * part_s)
             self._mujoco.mj_step(self._simulation, data, nstep=self._steps)
-            touched[self._touching()] = True
+            bumped = self._bumper_of[data.contact.geom.ravel()]
+            touched[bumped[bumped >= 0]] = True
             before, turned = turned, [rig.encoders(data) for rig in rigs]
             means = [
                 rig.mean_state(first, last, part_s)
@@ -183,11 +166,6 @@ class MujocoSimulator:
             self._data.mocap_pos[mocap, :2] = bodies[k, :2]
             self._data.mocap_quat[mocap] = scenery.quaternion(bodies[k, 2])
 
-    def _touching(self) -> NDArray[np.int64]:
-        """Indices of the robots whose bumpers touch something now."""
-        found = self._bumper_of[self._data.contact.geom.ravel()]
-        return np.asarray(found[found >= 0])
-
     def _require_sane(self) -> None:
         """Raises BackendError for a robot that fell over without a collision, or for divergence."""
         for rig, collided in zip(self._rigs, self.data.collided[0], strict=True):
@@ -201,14 +179,9 @@ class MujocoSimulator:
 
 
 def divide(period: float, longest: float) -> tuple[int, int, float]:
-    """Divides a control period into time steps.
+    """Divides a control period [s] into time steps of at most `longest` [s].
 
-    Args:
-        period: control period [s].
-        longest: maximum time step of MuJoCo [s].
-
-    Returns:
-        Number of parts of about `ENCODER_PERIOD_S`, time steps per part, and the time step [s].
+    Returns the number of parts of about `ENCODER_PERIOD_S`, time steps per part, and the step [s].
     """
     parts = max(1, round(period / ENCODER_PERIOD_S))
     steps = max(1, math.ceil(period / parts / longest - 1e-6))

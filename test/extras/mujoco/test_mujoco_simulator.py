@@ -11,7 +11,7 @@ pytest.importorskip("mujoco", reason="needs MuJoCo: the extra `mujoco`")
 import mujoco
 
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.extras.mujoco.machine import Physics
+from nics_drl_bridge.extras.mujoco.machines import Physics
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator, divide
 from nics_drl_bridge.generator import SimulatorModel, builtin_model
 from nics_drl_bridge.lidar.shapes import X, Y
