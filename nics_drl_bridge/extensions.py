@@ -32,11 +32,7 @@ def known(group: str) -> dict[str, EntryPoint]:
 
 
 def load(group: str, name: str) -> Any:
-    """An extension by its name.
-
-    Args:
-        group: `backends`, `commands`, `engines`, `kinds`, `nodes` or `salvage`.
-        name: as it is registered.
+    """An extension by its group and its name.
 
     Raises:
         ConfigError: there is none of that name, or a library that it needs is missing.

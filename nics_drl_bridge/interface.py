@@ -16,16 +16,13 @@ NS_PER_S, S_PER_NS = 1_000_000_000, 1e-9
 class RobotView:
     """All that a task or a policy may know about a robot, or about a batch of robots.
 
-    The leading dimensions `...` are empty for one robot and (N, M) in a vector simulator.
+    The leading dimensions `...` are empty for one robot and (N, M) in a vector simulator. The time
+    stamp is that of the newest data, the ages are those at the time of the view.
 
     Attributes:
         pose: (..., 3) estimate of x [m], y [m], heading [rad] of `base_link` in `map`.
         twist: (..., 3) estimate of vx [m/s], vy [m/s], wz [rad/s] in `base_link`.
-        ranges: (..., B) scan [m], float32, REP-117: `inf` no return, `-inf` too close,
-            NaN unknown.
-        stamp_s: time stamp of the newest data [s].
-        scan_age_s: age of the scan at the time of the view [s].
-        odom_age_s: age of the newest odometry at the time of the view [s].
+        ranges: (..., B) scan [m], REP-117: `inf` no return, `-inf` too close, NaN unknown.
     """
 
     pose: NDArray[np.float64]
@@ -50,34 +47,23 @@ def stacked(views: Sequence[RobotView]) -> RobotView:
 
 @dataclass(frozen=True)
 class Start:
-    """Start of an episode.
-
-    Attributes:
-        seed: identifies the episode; a simulator draws scene and noise from it.
-        pose: (3,) of the robot: x [m], y [m], heading [rad] in `map`; (M, 3) for a team.
-    """
+    """Start of an episode, whose scene and noise a simulator draws from its seed."""
 
     seed: int
-    pose: NDArray[np.float64]
+    pose: NDArray[np.float64]  # (3,) x [m], y [m], heading [rad] in `map`; (M, 3) for a team
 
 
 class BackendFacts(TypedDict, total=False):
-    """Facts that a backend alone knows; those that it does not know are left out.
+    """Facts that a backend alone knows; those that it does not know are left out."""
 
-    Attributes:
-        true_pose: (3,) x [m], y [m], heading [rad] in `map` now; (M, 3) of a team.
-        true_collision: True once the robot has touched something; (M,) of a team.
-        bodies: (K, 7) the obstacles where they are now, see `sim.scenes.Scene`.
-        randomisation: name -> value that was drawn for the episode, where any was.
-        scenes: gives the scenes of episodes for their seeds (n,), where these are not those of the
-            world alone.
-    """
-
-    true_pose: NDArray[np.float64]
-    true_collision: bool | NDArray[np.bool_]
-    bodies: NDArray[np.float64]
-    randomisation: dict[str, Any]
+    true_pose: NDArray[
+        np.float64
+    ]  # (3,) x [m], y [m], heading [rad] in `map` now; (M, 3) of a team
+    true_collision: bool | NDArray[np.bool_]  # True after a contact; (M,) of a team
+    bodies: NDArray[np.float64]  # (K, 7) obstacles where they are now, see `sim.scenes.Scene`
+    randomisation: dict[str, Any]  # name -> value that was drawn for the episode, where any was
     scenes: Callable[[ArrayLike], Any]
+    """Gives the scenes of episodes for their seeds (n,), where the world alone does not."""
 
 
 @runtime_checkable
@@ -89,14 +75,10 @@ class Backend(Protocol):
         ...
 
     def step(self, command: NDArray[np.float64]) -> tuple[RobotView, dict[str, Any]]:
-        """Applies a command for one control period.
+        """Applies a command (C,), in the units and the order of the RobotSpec, for one period.
 
-        Args:
-            command: (C,) in the units and the order of the RobotSpec.
-
-        Returns:
-            The view at the end of the period, and facts for `info` (stamps, sequence
-            numbers, and the true pose where a simulator knows it).
+        Returns the view at the end of the period, and facts for `info` (stamps, sequence numbers,
+        and the true pose where a simulator knows it).
         """
         ...
 

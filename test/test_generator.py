@@ -278,7 +278,7 @@ def test_kinematics_that_lack_a_degree_of_freedom_are_refused(saved, dof):
 
 def test_kinematics_of_another_robot_are_refused():
     car, mecanum = builtin_model("ackermann"), builtin_model("mecanum")
-    with pytest.raises(ModelError, match="the robot 'ackermann' has"):
+    with pytest.raises(ModelError, match="the robot 'ackermann' needs"):
         replace(car, kinematics=mecanum.kinematics)
 
 

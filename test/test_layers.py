@@ -18,7 +18,7 @@ PACKAGE = "nics_drl_bridge"
 # From the bottom up. What stands on one line does not import each other.
 LAYERS = (
     ("errors", "geometry", "interface", "kernels"),
-    ("extensions", "random_kernels", "seeds", "strict_yaml"),
+    ("extensions", "random_kernels", "seeds"),
     ("config", "files", "threads"),
     ("robot",),
     ("recording",),
@@ -49,7 +49,7 @@ HOMES = {
     "ament_index_python": ("nodes/*", "extras/*"),
     "filterpy": ("middleware/ekf.py",),
     "matplotlib": ("report/*", "env/rendering.py"),
-    "yaml": ("strict_yaml.py",),
+    "yaml": ("config.py",),
     "typer": ("commands/*", "extras/*"),
     "gymnasium": ("env/*", "policy/*", "commands/*", "extras/*"),
     "numba": ("*kernels.py",),
@@ -141,8 +141,7 @@ def package(tmp_path):
     for name, text in {
         "__init__.py": "",
         "errors.py": "import numpy",
-        "strict_yaml.py": "import yaml\nfrom nics_drl_bridge.errors import E",
-        "config.py": "from nics_drl_bridge.strict_yaml import parse_yaml",
+        "config.py": "import yaml\nfrom nics_drl_bridge.errors import E",
         "robot/spec.py": "from nics_drl_bridge import config\nfrom . import model",
         "robot/taylor.py": "",
         "robot/kernels.py": "from numba import njit",

@@ -139,7 +139,7 @@ class PolicyFile:
             "scan": None if task.scan is None else task.scan.model_dump(mode="json"),
             "observation": observation_entry(task),
         }
-        names = {"task": {"name"}, "actions": True, "scan": True, "observation": True}
+        names: dict[str, Any] = {"task": {"name"}, "actions": True, "scan": True, "observation": True}
         ours = self.contract.model_dump(mode="json", include=names)
         self._compare({name: ours[name] for name in theirs}, theirs)
 

@@ -12,10 +12,8 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.policy.evaluation import drive_all, successes
-from nics_drl_bridge.policy.evaluation import drive_worlds
-from nics_drl_bridge.policy.policies import DynamicWindow
-from nics_drl_bridge.policy.policies import POLICIES, make_policy
+from nics_drl_bridge.policy.evaluation import drive_all, drive_worlds, successes
+from nics_drl_bridge.policy.policies import POLICIES, DynamicWindow, make_policy
 from nics_drl_bridge.robot.kinds import steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 

@@ -4,9 +4,9 @@ from importlib.util import find_spec
 
 import pytest
 
-from nics_drl_bridge.commands import demo_policy as learning
-from nics_drl_bridge.commands.demo_plan import DemoPlan
-from nics_drl_bridge.commands.demo_policy import learn, settings_of
+from nics_drl_bridge.commands import demo_run as learning
+from nics_drl_bridge.commands.demo import DemoPlan
+from nics_drl_bridge.commands.demo_run import learn, settings_of
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
