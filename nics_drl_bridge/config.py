@@ -25,8 +25,7 @@ from nics_drl_bridge.errors import ConfigError, nearest, shortened
 
 PACKAGE = "nics_drl_bridge"
 MAX_DEPTH = 32
-MAX_BYTES = 2**20
-"""Maximum size of a YAML file."""
+MAX_BYTES = 2**20  # maximum size of a YAML file
 MAX_VALUES = 50_000
 """Maximum number of keys, values and lists; an alias counts as everything it stands for."""
 _LONGEST_PROBLEM = 200

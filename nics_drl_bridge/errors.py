@@ -13,10 +13,8 @@ MISSING_ROS = (
     "needs the module {module!r}; source your ROS 2 installation, or "
     "pip install 'nics_drl_bridge[ros]'."
 )
-LONGEST = 800
-"""Maximum length of a sentence [characters]; a longer one loses its middle."""
-LONGEST_NAME = 100
-"""Characters of a name that are compared with the known names."""
+LONGEST = 800  # maximum length of a sentence [characters]; a longer one loses its middle
+LONGEST_NAME = 100  # characters of a name that are compared with the known names
 
 
 def shortened(text: str, most: int) -> str:

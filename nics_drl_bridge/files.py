@@ -145,8 +145,7 @@ def sync_folder(folder: Path) -> None:
         _fsync(file)
 
 
-SUMS = "SHA256SUMS"
-"""Manifest of a folder, which `sha256sum -c SHA256SUMS` checks as well."""
+SUMS = "SHA256SUMS"  # manifest of a folder, which `sha256sum -c SHA256SUMS` checks as well
 MOST_BYTES = 256 * 2**20
 """Greatest size of a file of arrays: a day of driving, or the table of a thousand shapes."""
 _SEAL = b"sha256 "

@@ -1,49 +1,13 @@
-"""`nics demo`, and its plan."""
+"""`nics demo`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from nics_drl_bridge.commands.console import WorldOption, one_sentence
-
-Say = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class DemoPlan:
-    """Plan of a demo.
-
-    Attributes:
-        out: output folder.
-        robot, world: names or YAML files.
-        recording: of a drive; None makes one with the robot's textbook kinematics.
-        episodes: number of episodes, in process and again over DDS.
-        policy: a policy file or a name, to drive with instead of training one.
-        train_steps: environment steps of the training; None uses those of `demo.yaml`.
-    """
-
-    out: Path
-    robot: str = "differential"
-    world: str = "arena"
-    recording: Path | None = None
-    episodes: int = 5
-    policy: str | None = None
-    train_steps: int | None = None
-
-    @property
-    def model(self) -> Path:
-        """Folder of the generated simulator."""
-        return self.out / "model"
-
-    @property
-    def policy_file(self) -> Path:
-        """Path of the trained policy."""
-        return self.out / "policy.onnx"
 
 
 def demo(
@@ -74,6 +38,7 @@ def demo(
 ) -> None:
     """Goes the whole road once: generate, train, evaluate, drive over DDS, deploy, report."""
     with one_sentence():
+        from nics_drl_bridge.commands.demo_report import DemoPlan
         from nics_drl_bridge.commands.demo_run import run
 
         robot = robot or ("ackermann" if recording else "differential")

@@ -1,11 +1,11 @@
-"""The demo's results, and its report: one page with all of them."""
+"""The demo's plan, its results, and its report: one page with all of them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
+from pathlib import Path
 
-from nics_drl_bridge.commands.demo import DemoPlan
 from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.identify.identify import Identified
@@ -17,8 +17,39 @@ from nics_drl_bridge.report.pictures import Point, training_curve, trajectories
 from nics_drl_bridge.sim.world import load_world
 
 IN_PROCESS, OVER_DDS = LABELS[FAST], LABELS[DDS]
-PANELS = 9
-"""Maximum number of episodes that are drawn."""
+PANELS = 9  # maximum number of episodes that are drawn
+
+
+@dataclass(frozen=True)
+class DemoPlan:
+    """Plan of a demo.
+
+    Attributes:
+        out: output folder.
+        robot, world: names or YAML files.
+        recording: of a drive; None makes one with the robot's textbook kinematics.
+        episodes: number of episodes, in process and again over DDS.
+        policy: a policy file or a name, to drive with instead of training one.
+        train_steps: environment steps of the training; None uses those of `demo.yaml`.
+    """
+
+    out: Path
+    robot: str = "differential"
+    world: str = "arena"
+    recording: Path | None = None
+    episodes: int = 5
+    policy: str | None = None
+    train_steps: int | None = None
+
+    @property
+    def model(self) -> Path:
+        """Folder of the generated simulator."""
+        return self.out / "model"
+
+    @property
+    def policy_file(self) -> Path:
+        """Path of the trained policy."""
+        return self.out / "policy.onnx"
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from nics_drl_bridge.commands.demo import DemoPlan, Say
-from nics_drl_bridge.commands.demo_report import DemoResults, Learned, Live, report
-from nics_drl_bridge.commands.episodes import DDS, FAST, Trial, drive_in
+from nics_drl_bridge.commands.demo_report import DemoPlan, DemoResults, Learned, Live, report
+from nics_drl_bridge.commands.episodes import DDS, FAST, Say, Trial, drive_in
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -41,14 +40,11 @@ from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import load_world
 
 RECORDING_SEED, TRAINING_SEED = 1, 0
-MANY = 500
-"""Episodes of the evaluation in the fast simulator."""
+MANY = 500  # episodes of the evaluation in the fast simulator
 NEEDED = ("torch", "stable_baselines3", "tensorboard", "onnx", "onnxruntime")
 BASELINE = "dynamic_window"
-LINES = 10
-"""Number of progress reports of a training."""
-START_S, ARRIVE_S = 60.0, 40.0
-"""Time that a node may take to start, and the robot to arrive."""
+LINES = 10  # number of progress reports of a training
+START_S, ARRIVE_S = 60.0, 40.0  # time that a node may take to start, and the robot to arrive
 FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05
 """Limits of the demo's gate: time from zero to the maximum command, and to its maximum rate."""
 

@@ -43,8 +43,7 @@ LABELS = {
     VEHICLE: "on the vehicle",
 }
 DEFAULT_ROBOT = "ackermann"
-START_S = 180.0
-"""Time that a node may take to start [s]; its kernels may have to be compiled."""
+START_S = 180.0  # time that a node may take to start [s]; its kernels may have to be compiled
 PANELS = 6
 HEADS = (
     "policy", "world", "success", "95 %", "believed", "collision", "time-out", "path [m]",

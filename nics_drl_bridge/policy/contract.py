@@ -28,8 +28,7 @@ FORMAT = "nics_drl_bridge/policy/1"
 SUFFIX = ".onnx"
 GOLDEN = 16
 MOST_ENTRIES = 20_000
-CHECKSUM = 8
-"""Hexadecimal digits of a field's checksum, which detects mistakes but is no signature."""
+CHECKSUM = 8  # hexadecimal digits of a field's checksum, which detects mistakes but is no signature
 Rows = NDArray[np.float32]
 
 

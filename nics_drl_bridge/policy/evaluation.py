@@ -25,10 +25,8 @@ Flags = NDArray[np.bool_]
 Act = Callable[[NDArray[np.float32]], NDArray[Any]]
 """Actions (N, C) for observations (N, O)."""
 
-FIRST_SEED = 1_000_000
-"""First seed of an evaluation, far from the seeds of any training."""
-DRIFT_M = 0.1
-"""A robot stops where it believes its goal is; odometry may have drifted by this much."""
+FIRST_SEED = 1_000_000  # first seed of an evaluation, far from the seeds of any training
+DRIFT_M = 0.1  # a robot stops where it believes its goal is; odometry may have drifted by this much
 ELSEWHERE = "elsewhere"
 CONFIDENCE = 0.95
 

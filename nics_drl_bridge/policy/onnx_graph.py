@@ -19,37 +19,26 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from nics_drl_bridge.errors import PolicyError
 from nics_drl_bridge.files import sha256
 
-KEY = "nics_drl_bridge"
-"""Key of the metadata entry with the contract."""
-SEAL = "sha256"
-"""Key of the metadata entry at the file's end: the checksum of everything before it."""
+KEY = "nics_drl_bridge"  # key of the metadata entry with the contract
+SEAL = "sha256"  # key of the metadata entry at the file's end: the checksum of everything before it
 SIZE_LIMIT = 32 * 2**20
-MOST_PARTS = 50_000
-"""Maximum number of fields of all messages; each array of weights is one part."""
-MOST_NESTED = 16
-"""Maximum nesting of messages; an exported graph needs six levels."""
+MOST_PARTS = 50_000  # maximum number of fields of all messages; each array of weights is one part
+MOST_NESTED = 16  # maximum nesting of messages; an exported graph needs six levels
 MOST_PACKED = 2**20
 """Maximum size of packed integers in one part, such as an array's shape [bytes]; not weights."""
-MOST_NODES = 1000
-"""Maximum number of nodes; an exported network has some dozens."""
-MOST_DIMENSIONS = 8
-"""Maximum number of dimensions of an array of weights."""
+MOST_NODES = 1000  # maximum number of nodes; an exported network has some dozens
+MOST_DIMENSIONS = 8  # maximum number of dimensions of an array of weights
 CONTRACT_LIMIT = 4 * 2**20
 """Maximum size of the contract [bytes], most of which are golden observations."""
-MOST_NUMBERS = 1_000_000
-"""Maximum output of all nodes together for one observation."""
+MOST_NUMBERS = 1_000_000  # maximum output of all nodes together for one observation
 MOST_WORK = 20_000_000
 """Maximum number of multiplications, or of numbers read and written, for one observation."""
 MOST_AT_ONCE = 64 * MOST_NUMBERS
 """Maximum output of all nodes together in one run, so at most 256 MB of float32."""
-ROWS = 16
-"""Observations for which the sizes are computed, as many as there are golden ones."""
-SMALL = 1024
-"""Maximum length of an integer array that may be a shape, an axis or an index."""
-GREATEST_SETTING = 65_536
-"""Maximum size, stride, padding or dilation of a kernel."""
-MOST_AXES = 256
-"""Axes that all nodes together may add to their arrays; each makes inference longer."""
+ROWS = 16  # observations for which the sizes are computed, as many as there are golden ones
+SMALL = 1024  # maximum length of an integer array that may be a shape, an axis or an index
+GREATEST_SETTING = 65_536  # maximum size, stride, padding or dilation of a kernel
+MOST_AXES = 256  # axes that all nodes together may add to their arrays; each makes inference longer
 INPUT, ACTION, COMMAND = "observation", "action", "command"
 OPERATORS = frozenset({
     "Abs", "Add", "ArgMax", "AveragePool", "Cast", "Clip", "Concat", "Constant", "Conv", "Div",

@@ -22,8 +22,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 
-FULL_TURN_RAD = 0.8
-"""Bearing of the goal from which a robot turns as fast as it can."""
+FULL_TURN_RAD = 0.8  # bearing of the goal from which a robot turns as fast as it can
 CREEP = 0.3
 """Share of the maximum speed for a robot that can't turn on the spot and has its goal behind."""
 
@@ -33,7 +32,6 @@ class Policy(Protocol):
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Returns the action (C,) in [-1, 1] for an observation (O,); or (N, C) for (N, O)."""
-        ...
 
 
 def _actions(robot: RobotSpec, commands: Array) -> Array:

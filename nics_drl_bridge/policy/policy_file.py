@@ -139,8 +139,8 @@ class PolicyFile:
             "scan": None if task.scan is None else task.scan.model_dump(mode="json"),
             "observation": observation_entry(task),
         }
-        names: dict[str, Any] = {"task": {"name"}, "actions": True, "scan": True, "observation": True}
-        ours = self.contract.model_dump(mode="json", include=names)
+        ours = self.contract.model_dump(mode="json", include=set(theirs))
+        ours["task"] = {"name": ours["task"]["name"]}
         self._compare({name: ours[name] for name in theirs}, theirs)
 
     def _compare(self, ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> None:

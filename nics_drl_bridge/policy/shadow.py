@@ -21,12 +21,9 @@ from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.messages import command_row
 
 Array = NDArray[np.float64]
-JITTER = 0.25
-"""Permitted earliness of a scan, in control periods."""
-HELD_S = 1.0
-"""Age from which a command no longer applies to the robot."""
-DEAD_BAND = 0.05
-"""Commands below this share of their maximum have no sign."""
+JITTER = 0.25  # permitted earliness of a scan, in control periods
+HELD_S = 1.0  # age from which a command no longer applies to the robot
+DEAD_BAND = 0.05  # commands below this share of their maximum have no sign
 PERCENTILES = (50, 90, 99)
 
 

@@ -21,15 +21,12 @@ from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
 Array = NDArray[np.float64]
-RECENT = 1000
-"""Number of episodes over which the progress reports its rates."""
-LEAST_RATE = 0.02
-"""Share of PPO's learning rate that is left at the end."""
+RECENT = 1000  # number of episodes over which the progress reports its rates
+LEAST_RATE = 0.02  # share of PPO's learning rate that is left at the end
 LEAST_STD, LIMIT = 0.05, 5.0
 OBSERVED_STEPS = 64
 GAIN = 2.0**0.5
-ACTION_GAIN = 0.01
-"""Initial gain of an actor's last layer: all its actions are near zero."""
+ACTION_GAIN = 0.01  # initial gain of an actor's last layer: all its actions are near zero
 
 
 def make_algorithm(

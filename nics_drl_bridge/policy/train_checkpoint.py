@@ -32,8 +32,7 @@ from nics_drl_bridge.policy.train_algorithms import RECENT
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 
 FORMAT = "nics_drl_bridge/checkpoint/2"
-MOST_BYTES = 4 * 2**30
-"""Maximum size of a file, which contains all of SAC's buffer."""
+MOST_BYTES = 4 * 2**30  # maximum size of a file, which contains all of SAC's buffer
 COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
 LAST = ("_last_obs", "_last_episode_starts")
 REPLAYED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -168,8 +167,7 @@ def _set_random_state(algorithm: BaseAlgorithm, content: dict[str, Any]) -> None
     algorithm.action_space.np_random.bit_generator.state = json.loads(content["actions"])
 
 
-TOLD_S = 0.2
-"""Minimum time between two reports of the progress [s]."""
+TOLD_S = 0.2  # minimum time between two reports of the progress [s]
 
 
 @dataclass(frozen=True)

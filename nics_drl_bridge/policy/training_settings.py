@@ -11,8 +11,7 @@ from nics_drl_bridge.config import Schema, find_config, load_yaml, share_folder,
 
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1, le=10**12)]
-MOST_WORLDS = 65_536
-"""Maximum number of copies of all worlds together."""
+MOST_WORLDS = 65_536  # maximum number of copies of all worlds together
 MOST_LAYERS, MOST_WIDE = 16, 8_192
 MOST_KEPT = 2**26
 """Maximum number of stored transitions: of a roll-out in all worlds, or of SAC's buffer."""

@@ -30,10 +30,8 @@ Array = NDArray[np.float64]
 BURSTS_SHOWN = 12
 MOST_POINTS = 3000
 BINS = 60
-REACH = 5.0
-"""Histograms end at this many standard deviations."""
-REACH_S, POINTS = 0.5, 81
-"""Largest shift in time of a curve, and number of its points."""
+REACH = 5.0  # histograms end at this many standard deviations
+REACH_S, POINTS = 0.5, 81  # largest shift in time of a curve, and number of its points
 CAPTIONS = {
     "timing": "What each shift in time leaves unexplained; the estimate lies at the least.",
     "bursts": "Poses that arrive in bursts, and the times that they were taken to be of.",

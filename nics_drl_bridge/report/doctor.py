@@ -36,8 +36,7 @@ Fault = tuple[str, str, bool]
 
 LEAST_PATH_M, LEAST_TURN_RAD = 0.3, 0.3
 """A drive with less motion than this does not determine scales."""
-TOLERANCE = 1.4
-"""Differences of the pose and the twist must agree within this factor."""
+TOLERANCE = 1.4  # differences of the pose and the twist must agree within this factor
 ALIKE, LEAST_ALIKE = 0.8, 0.3
 """Below this correlation a ratio of pose and twist is meaningless; the same for commands, which the
 robot follows with delay and within its limits."""
@@ -53,8 +52,7 @@ much before it; and so far before it that the clocks must differ."""
 STALE_CLOCK_S = 1.0
 BODY_FRAMES = ("base_link", "base_footprint")
 LAYOUT = "beam layout"
-ANGLE_TOLERANCE = 0.5
-"""Tolerance of a beam's direction, in increments."""
+ANGLE_TOLERANCE = 0.5  # tolerance of a beam's direction, in increments
 ODD_SHARE = 0.01
 """A value in more than this share of the beams is taken to be intended by the lidar."""
 

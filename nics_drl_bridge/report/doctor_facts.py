@@ -28,8 +28,7 @@ SCAN, ODOM, CMD_VEL, CLOCK = "scan", "odom", "cmd_vel", "/clock"
 SCAN_TYPE, ODOM_TYPE = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 TWIST_TYPE, TWIST_STAMPED_TYPE = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
-MOST_SCANS = 200
-"""Maximum number of scans whose ranges are kept; of the others only the times are."""
+MOST_SCANS = 200  # maximum number of scans whose ranges are kept; of the others only the times are
 MOST_RAD = 7.0
 
 

@@ -5,7 +5,7 @@ from importlib.util import find_spec
 import pytest
 
 from nics_drl_bridge.commands import demo_run as learning
-from nics_drl_bridge.commands.demo import DemoPlan
+from nics_drl_bridge.commands.demo_report import DemoPlan
 from nics_drl_bridge.commands.demo_run import learn, settings_of
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import ConfigError

@@ -26,14 +26,10 @@ Parameters = dict[str, float]
 
 TORQUE_RESERVE = 1.5
 """Torque limit of a motor, as a multiple of the torque for the maximum acceleration."""
-SERVO_LAG_S = 0.005
-"""Lag of a motor behind its set point."""
-STEERING_STIFFNESS = 1.0
-"""Torque of a steering servo per error [N m/rad]."""
-STEERING_TORQUE = 1.0
-"""Torque limit of a steering servo [N m], that of a small hobby servo."""
-THICKNESS = 0.25
-"""Radius of a roller at its middle, relative to the radius of the wheel."""
+SERVO_LAG_S = 0.005  # lag of a motor behind its set point
+STEERING_STIFFNESS = 1.0  # torque of a steering servo per error [N m/rad]
+STEERING_TORQUE = 1.0  # torque limit of a steering servo [N m], that of a small hobby servo
+THICKNESS = 0.25  # radius of a roller at its middle, relative to the radius of the wheel
 ROLLER_MASS = 0.005
 
 

@@ -28,16 +28,12 @@ from nics_drl_bridge.lidar.shapes import (
 
 Array = NDArray[np.float64]
 
-HEIGHT = 0.5
-"""Height of walls and obstacles [m]."""
-THICKNESS = 0.002
-"""Thickness of walls, which have none for the lidar [m]."""
-BUMPER = 4
-"""Bit of MuJoCo's `contype` and `conaffinity` for contacts of bumpers."""
+HEIGHT = 0.5  # height of walls and obstacles [m]
+THICKNESS = 0.002  # thickness of walls, which have none for the lidar [m]
+BUMPER = 4  # bit of MuJoCo's `contype` and `conaffinity` for contacts of bumpers
 BUMPER_FRICTION = 0.3
 BUMPER_NAME = "bumper_"
-SLIVER = 1e-9
-"""Triangles of less area, relative to the square of the outline's size, are omitted."""
+SLIVER = 1e-9  # triangles of less area, relative to the square of the outline's size, are omitted
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
 
-ENCODER_PERIOD_S = 0.01
-"""Approximate period of encoder readings and of updates of moving obstacles."""
+ENCODER_PERIOD_S = 0.01  # approximate period of encoder readings and of updates of moving obstacles
 
 
 class MujocoSimulator:

@@ -55,14 +55,11 @@ from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]
 FORMAT = "nics_drl_bridge/ray_checkpoint/1"
-VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5
-"""Parameters of the loss, as in Stable-Baselines3."""
+VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5  # parameters of the loss, as in Stable-Baselines3
 SILENCE_S = 600.0
 """A run ends after this time without a step from any env runner [s]; it can be resumed."""
-TRIED_S = 5.0
-"""Timeout of an attempt to connect to an address [s]."""
-PROBE_S = 1.0
-"""Time that a roll-out waits for a lost env runner [s]; later ones try again."""
+TRIED_S = 5.0  # timeout of an attempt to connect to an address [s]
+PROBE_S = 1.0  # time that a roll-out waits for a lost env runner [s]; later ones try again
 
 
 @contextmanager
