@@ -154,6 +154,7 @@ def test_a_drive_is_a_recording_of_this_robot(robots, name):
     assert len(recording.pose.t) == len(recording.state.t) == len(recording.command.t) == 500
 
 
+@pytest.mark.slow
 @needs_mujoco
 def test_a_model_is_identified_from_a_drive(robots):
     from nics_drl_bridge.identify.identify import identify

@@ -19,8 +19,15 @@ from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World, load_world
 
-NAMES = ("ackermann", "differential", "mecanum")
-WORLDS = ("arena", "clutter", "doorway", "crowd", "room")
+NAMES = [
+    "differential",
+    *(pytest.param(name, marks=pytest.mark.campaign) for name in ("ackermann", "mecanum")),
+]
+WORLDS = [
+    "crowd", "room",
+    *(pytest.param(name, marks=pytest.mark.campaign) for name in ("arena", "clutter", "doorway")),
+]  # fmt: skip
+pytestmark = pytest.mark.slow
 EYE_HEIGHT = 0.3
 ICE = replace(Physics(), friction=0.1)
 
@@ -47,7 +54,7 @@ def with_footprint(model: SimulatorModel, corners: list[list[float]]) -> Simulat
 def test_an_episode_begins_as_in_the_fast_simulator(name):
     model, world = builtin_model("differential"), load_world(name)
     ours, theirs = MujocoSimulator(model, world), FastSimulator(model, world)
-    for seed in (0, 7):
+    for seed in (7,):
         ours.reset([seed])
         theirs.reset([seed])
         for known in ("pose", "bodies", "ranges", "odom", "steps"):
