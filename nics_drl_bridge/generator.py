@@ -36,17 +36,6 @@ from nics_drl_bridge.robot.noise import Latency, Noise
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
 
-__all__ = [
-    "Noise",
-    "SimulatorModel",
-    "builtin_model",
-    "check_place",
-    "generate",
-    "load_model",
-    "open_model",
-    "save_model",
-]
-
 FORMAT = "nics_drl_bridge/simulator_model/4"
 MODEL_FILE, TABLE_FOLDER, REPORT_FILE = "model.yaml", "lidar_table", "report.txt"
 MODEL_FILES = (

@@ -6,34 +6,31 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from nics_drl_bridge.commands.console import WorldOption, one_sentence
 
 
 def demo(
     recording: Annotated[
-        Path | None, typer.Option(help="A drive; by default one of the textbook robot.")
+        Path | None, Option(help="A drive; by default one of the textbook robot.")
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for everything the demo writes.")] = Path(
-        "runs/demo"
-    ),
+    out: Annotated[Path, Option(help="Folder for everything the demo writes.")] = Path("runs/demo"),
     robot: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="A shipped robot or a YAML file; by default differential, and the car, ackermann, "
             "for a recording."
         ),
     ] = None,
     world: WorldOption = "arena",
-    episodes: Annotated[
-        int, typer.Option(min=1, help="How many, in process and again over DDS.")
-    ] = 5,
+    episodes: Annotated[int, Option(min=1, help="How many, in process and again over DDS.")] = 5,
     policy: Annotated[
         str | None,
-        typer.Option(help="Train none; drive with a policy file, a shipped one or a baseline."),
+        Option(help="Train none; drive with a policy file, a shipped one or a baseline."),
     ] = None,
     train_steps: Annotated[
-        int | None, typer.Option(min=1, help="Environment steps of the training.")
+        int | None, Option(min=1, help="Environment steps of the training.")
     ] = None,
 ) -> None:
     """Goes the whole road once: generate, train, evaluate, drive over DDS, deploy, report."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from nics_drl_bridge.commands.console import needs_ros, one_sentence, table
 
@@ -20,23 +21,21 @@ DEFAULT = "ackermann"
 
 def doctor(
     bag: Annotated[
-        Path | None, typer.Argument(help="A bag to look at; the live robot when left out.")
+        Path | None, Argument(help="A bag to look at; the live robot when left out.")
     ] = None,
     model: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="What the robot must fit: folder of a model, or a shipped robot; ackermann if "
             "neither it nor a policy is given."
         ),
     ] = None,
-    policy: Annotated[
-        str | None, typer.Option(help="What it must fit instead: a policy file.")
-    ] = None,
-    namespace: Annotated[str, typer.Option(help="Namespace of the robot's topics.")] = "",
+    policy: Annotated[str | None, Option(help="What it must fit instead: a policy file.")] = None,
+    namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
     duration: Annotated[
-        float, typer.Option(min=1.0, help="How long to listen to a live robot [s].")
+        float, Option(min=1.0, help="How long to listen to a live robot [s].")
     ] = 5.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Tells what of a robot or a bag does not fit a model or a policy; it sends nothing."""
     with one_sentence():
@@ -79,7 +78,7 @@ def _expected(model: str | None, policy: str | None) -> Expected:
 
 
 def replay(
-    file: Annotated[Path, typer.Argument(help="What command_gate wrote at a stop, *.jsonl.")],
+    file: Annotated[Path, Argument(help="What command_gate wrote at a stop, *.jsonl.")],
 ) -> None:
     """Decides anew on what led to a stop of the gate, and tells the stops in it."""
     with one_sentence():

@@ -36,12 +36,7 @@ from nics_drl_bridge.sim.world import load_world
 FAST, DDS, MUJOCO, VEHICLE = "fast", "dds", "mujoco_dds", "vehicle"
 NODES = {DDS: "simulator_node", MUJOCO: "mujoco_node"}
 PLACES = (FAST, *NODES)
-LABELS = {
-    FAST: "in process",
-    DDS: "over DDS",
-    MUJOCO: "MuJoCo over DDS",
-    VEHICLE: "on the vehicle",
-}
+LABELS = {FAST: "in process", DDS: "over DDS", MUJOCO: "MuJoCo over DDS", VEHICLE: "on the vehicle"}
 DEFAULT_ROBOT = "ackermann"
 START_S = 180.0  # time that a node may take to start [s]; its kernels may have to be compiled
 PANELS = 6

@@ -7,21 +7,16 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import (
-    needs_ros,
-    one_sentence,
-    progress_bar,
-    roles_of,
-    table,
-)
+from nics_drl_bridge.commands.console import needs_ros, one_sentence, progress_bar, roles_of, table
 from nics_drl_bridge.errors import ConfigError
 
 
 def evaluate(
     policies: Annotated[
         list[str],
-        typer.Argument(
+        Argument(
             metavar="POLICY...",
             help="Policy files, shipped policies (differential), or baselines (dynamic_window, "
             "straight, random).",
@@ -29,57 +24,57 @@ def evaluate(
     ],
     model: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--model", "--robot",
             help="Folder of a model, or a shipped robot; the policy's own by default.",
         ),
     ] = None,
     world: Annotated[
-        str, typer.Option("--world", "--scene", help="A shipped world (circles) or a YAML file.")
+        str, Option("--world", "--scene", help="A shipped world (circles) or a YAML file.")
     ] = "circles",
     places: Annotated[
         list[str] | None,
-        typer.Option("--in", help="fast, dds or mujoco_dds; several times; all by default."),
+        Option("--in", help="fast, dds or mujoco_dds; several times; all by default."),
     ] = None,
     episodes: Annotated[
-        int | None, typer.Option(min=1, help="How many; 20, or 1 on a vehicle.")
+        int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the first episode.")] = 1_000_000,
-    out: Annotated[Path, typer.Option(help="Folder for everything that is written.")] = Path(
+    seed: Annotated[int, Option(min=0, help="Of the first episode.")] = 1_000_000,
+    out: Annotated[Path, Option(help="Folder for everything that is written.")] = Path(
         "runs/evaluate"
     ),
     shadow: Annotated[
-        Path | None, typer.Option(help="A bag: compare the policy with what was driven in it.")
+        Path | None, Option(help="A bag: compare the policy with what was driven in it.")
     ] = None,
     topic: Annotated[
         list[str] | None,
-        typer.Option(metavar="ROLE=TOPIC", help="For --shadow: as scan=/front/scan."),
+        Option(metavar="ROLE=TOPIC", help="For --shadow: as scan=/front/scan."),
     ] = None,
     ahead: Annotated[
         float,
-        typer.Option(help="For --shadow without --goal: the goal is where it was so much later."),
+        Option(help="For --shadow without --goal: the goal is where it was so much later."),
     ] = 4.0,
     backend: Annotated[
-        str | None, typer.Option(help="dds, with --hardware.", metavar="dds")
+        str | None, Option(help="dds, with --hardware.", metavar="dds")
     ] = None,
     hardware: Annotated[
-        bool, typer.Option("--hardware", help="Drive the vehicle, through command_gate.")
+        bool, Option("--hardware", help="Drive the vehicle, through command_gate.")
     ] = False,
     start: Annotated[
-        str, typer.Option(help="For --hardware: wait until it stands there, or take the present.")
+        str, Option(help="For --hardware: wait until it stands there, or take the present.")
     ] = "wait",
     goal: Annotated[
-        str | None, typer.Option(metavar="X,Y", help="In map [m]; else that of the world.")
+        str | None, Option(metavar="X,Y", help="In map [m]; else that of the world.")
     ] = None,
-    namespace: Annotated[str, typer.Option(help="For --hardware: of the vehicle's topics.")] = "",
+    namespace: Annotated[str, Option(help="For --hardware: of the vehicle's topics.")] = "",
     pose_type: Annotated[
-        str, typer.Option(help="For --hardware: type of `pose`, a pose sensor in map.")
+        str, Option(help="For --hardware: type of `pose`, a pose sensor in map.")
     ] = "none",
     yes: Annotated[
-        bool, typer.Option("--yes", help="For --hardware: ask nothing before an episode.")
+        bool, Option("--yes", help="For --hardware: ask nothing before an episode.")
     ] = False,
     arm: Annotated[
-        bool, typer.Option("--arm", help="For --hardware: arm command_gate before an episode.")
+        bool, Option("--arm", help="For --hardware: arm command_gate before an episode.")
     ] = False,
 ) -> None:  # fmt: skip
     """Drives policies through the same episodes in several worlds, and compares."""

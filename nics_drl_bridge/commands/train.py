@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.console import one_sentence, progress_bar
@@ -22,39 +23,37 @@ policy = typer.Typer(help="Policy files.", no_args_is_help=True)
 
 
 def train(
-    more_seeds: Annotated[list[int] | None, typer.Argument(hidden=True)] = None,
-    task: Annotated[str, typer.Option(help="A task, or path/to/file.py:ClassName.")] = "navigation",
+    more_seeds: Annotated[list[int] | None, Argument(hidden=True)] = None,
+    task: Annotated[str, Option(help="A task, or path/to/file.py:ClassName.")] = "navigation",
     robot: Annotated[
-        str | None,
-        typer.Option(help="A shipped robot (differential), or the folder of a model."),
+        str | None, Option(help="A shipped robot (differential), or the folder of a model.")
     ] = None,
     settings: Annotated[
-        str | None,
-        typer.Option(help="Shipped settings (navigation_differential), or a YAML file."),
+        str | None, Option(help="Shipped settings (navigation_differential), or a YAML file.")
     ] = None,
     world: Annotated[
         list[str] | None,
-        typer.Option(help="Train in this world only; given several times, in all of them."),
+        Option(help="Train in this world only; given several times, in all of them."),
     ] = None,
-    algorithm: Annotated[str | None, typer.Option(help="ppo or sac.")] = None,
-    seeds: Annotated[list[int] | None, typer.Option(help="One or more, as --seeds 0 1 2.")] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Environment steps.")] = None,
-    episodes: Annotated[int, typer.Option(min=1, help="Of the evaluation, in each world.")] = 500,
-    out: Annotated[Path | None, typer.Option(help="Folder of the run.")] = None,
-    resume: Annotated[bool, typer.Option(help="Go on where --out was interrupted.")] = False,
+    algorithm: Annotated[str | None, Option(help="ppo or sac.")] = None,
+    seeds: Annotated[list[int] | None, Option(help="One or more, as --seeds 0 1 2.")] = None,
+    steps: Annotated[int | None, Option(min=1, help="Environment steps.")] = None,
+    episodes: Annotated[int, Option(min=1, help="Of the evaluation, in each world.")] = 500,
+    out: Annotated[Path | None, Option(help="Folder of the run.")] = None,
+    resume: Annotated[bool, Option(help="Go on where --out was interrupted.")] = False,
     engine: Annotated[
-        str, typer.Option(help="sb3 (Stable-Baselines3, this process) or ray (RLlib, a cluster).")
+        str, Option(help="sb3 (Stable-Baselines3, this process) or ray (RLlib, a cluster).")
     ] = "sb3",
     address: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Of the Ray cluster: auto (the one this machine is part of) or HOST:PORT; by "
             "default one is started here."
         ),
     ] = None,
     env_runners: Annotated[
         int | None,
-        typer.Option(min=1, help="Processes on Ray that share the worlds; by default one per CPU."),
+        Option(min=1, help="Processes on Ray that share the worlds; by default one per CPU."),
     ] = None,
 ) -> None:
     """Trains policies in the fast simulator, and evaluates them."""
@@ -131,8 +130,8 @@ def _group() -> None:
 
 @policy.command()
 def info(
-    file: Annotated[str, typer.Argument(help="A policy file, or the name of a shipped one.")],
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object instead.")] = False,
+    file: Annotated[str, Argument(help="A policy file, or the name of a shipped one.")],
+    as_json: Annotated[bool, Option("--json", help="One JSON object instead.")] = False,
 ) -> None:
     """Checks a policy file and tells what it was trained on and needs."""
     with one_sentence():

@@ -20,13 +20,7 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, shortened
 from nics_drl_bridge.files import write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.policy.evaluation import (
-    FIRST_SEED,
-    Outcomes,
-    Summary,
-    drive_worlds,
-    summarise,
-)
+from nics_drl_bridge.policy.evaluation import FIRST_SEED, Outcomes, Summary, drive_worlds, summarise
 from nics_drl_bridge.policy.train_algorithms import Actor, act_of, make_algorithm, observed
 from nics_drl_bridge.policy.train_checkpoint import (
     Companion,

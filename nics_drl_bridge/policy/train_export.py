@@ -20,12 +20,7 @@ from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import onnx_graph
 from nics_drl_bridge.policy.contract import GOLDEN, SUFFIX, contract_of
-from nics_drl_bridge.policy.policy_file import (
-    GOLDEN_TOLERANCE,
-    PolicyFile,
-    open_session,
-    policy_of,
-)
+from nics_drl_bridge.policy.policy_file import GOLDEN_TOLERANCE, PolicyFile, open_session, policy_of
 
 Rows = NDArray[np.float32]
 Normaliser = tuple[ArrayLike, ArrayLike, float]

@@ -10,12 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.extras.mujoco.machines import (
-    Machine,
-    Physics,
-    build_machine,
-    load_mujoco,
-)
+from nics_drl_bridge.extras.mujoco.machines import Machine, Physics, build_machine, load_mujoco
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec
