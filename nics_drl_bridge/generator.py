@@ -51,27 +51,17 @@ BUILTIN_SEED = 0
 
 @dataclass(frozen=True)
 class SimulatorModel:
-    """All that a fast simulator needs to know about a robot.
-
-    Attributes:
-        kinematics: the fitted, pruned Taylor model.
-        calibration: clock offset, latency, sensor frames, noise of the recording.
-        table: baked ranges of the obstacles' shapes and of the robot itself.
-        noise: of sensors and motion.
-        control_period: time between commands [s]; a whole number of `kinematics.dt`.
-        report: how the model was made, as readable text.
-        latency: of scan and odometry, where the recording showed it.
-    """
+    """All that a fast simulator needs to know about a robot."""
 
     robot: RobotSpec
-    kinematics: TaylorModel
-    calibration: Calibration
+    kinematics: TaylorModel  # the fitted, pruned Taylor model
+    calibration: Calibration  # clock offset, latency, sensor frames, noise of the recording
     lidar: LidarSpec
-    table: LidarTable
-    noise: Noise = field(default_factory=Noise)
-    control_period: float = CONTROL_PERIOD_S
-    report: str = ""
-    latency: Latency = field(default_factory=Latency)
+    table: LidarTable  # baked ranges of the obstacles' shapes and of the robot itself
+    noise: Noise = field(default_factory=Noise)  # of sensors and motion
+    control_period: float = CONTROL_PERIOD_S  # between commands; a whole number of `kinematics.dt`
+    report: str = ""  # how the model was made, as readable text
+    latency: Latency = field(default_factory=Latency)  # of scan and odometry, where it was shown
 
     def __post_init__(self) -> None:
         robot, kinematics = self.robot, self.kinematics

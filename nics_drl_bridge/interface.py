@@ -18,17 +18,13 @@ class RobotView:
     """All that a task or a policy may know about a robot, or about a batch of robots.
 
     The leading dimensions `...` are empty for one robot and (N, M) in a vector simulator. The time
-    stamp is that of the newest data, the ages are those at the time of the view.
-
-    Attributes:
-        pose: (..., 3) estimate of x [m], y [m], heading [rad] of `base_link` in `map`.
-        twist: (..., 3) estimate of vx [m/s], vy [m/s], wz [rad/s] in `base_link`.
-        ranges: (..., B) scan [m], REP-117: `inf` no return, `-inf` too close, NaN unknown.
+    stamp is that of the newest data, the ages are those at the time of the view. A range of NaN is
+    unknown.
     """
 
-    pose: Array
-    twist: Array
-    ranges: NDArray[np.float32]
+    pose: Array  # (..., 3) estimate of x [m], y [m], heading [rad] of `base_link` in `map`
+    twist: Array  # (..., 3) estimate of vx [m/s], vy [m/s], wz [rad/s] in `base_link`
+    ranges: NDArray[np.float32]  # (..., B) [m], REP-117: `inf` no return, `-inf` too close
     stamp_s: float
     scan_age_s: float
     odom_age_s: float

@@ -22,24 +22,15 @@ PANELS = 9  # maximum number of episodes that are drawn
 
 @dataclass(frozen=True)
 class DemoPlan:
-    """Plan of a demo.
+    """Plan of a demo."""
 
-    Attributes:
-        out: output folder.
-        robot, world: names or YAML files.
-        recording: of a drive; None makes one with the robot's textbook kinematics.
-        episodes: number of episodes, in process and again over DDS.
-        policy: a policy file or a name, to drive with instead of training one.
-        train_steps: environment steps of the training; None uses those of `demo.yaml`.
-    """
-
-    out: Path
-    robot: str = "differential"
+    out: Path  # output folder
+    robot: str = "differential"  # name or YAML file, as the world
     world: str = "arena"
-    recording: Path | None = None
-    episodes: int = 5
-    policy: str | None = None
-    train_steps: int | None = None
+    recording: Path | None = None  # of a drive; None makes one with the robot's textbook kinematics
+    episodes: int = 5  # number of episodes, in process and again over DDS
+    policy: str | None = None  # a policy file or a name, to drive with instead of training one
+    train_steps: int | None = None  # environment steps of the training; None: as in `demo.yaml`
 
     @property
     def model(self) -> Path:
@@ -71,22 +62,16 @@ class Live:
 
 @dataclass(frozen=True)
 class DemoResults:
-    """All results of the demo.
-
-    Attributes:
-        summary: of the policy's many episodes in the fast simulator.
-        here, there: the same episodes in process and over DDS.
-        took: part of the demo -> wall time [s].
-    """
+    """All results of the demo; `here` and `there` are the same episodes in process and over DDS."""
 
     model: SimulatorModel
     identified: Identified
     learned: Learned
-    summary: Summary
+    summary: Summary  # of the policy's many episodes in the fast simulator
     here: Sequence[Episode]
     there: Sequence[Episode]
     live: Live
-    took: dict[str, float]
+    took: dict[str, float]  # part of the demo -> wall time [s]
 
 
 def report(plan: DemoPlan, results: DemoResults) -> str:

@@ -50,21 +50,13 @@ Tell = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Trial:
-    """Episodes to drive.
+    """Episodes to drive."""
 
-    Attributes:
-        policy: a policy file, or the name of a shipped policy or of a baseline.
-        model: folder of a model, or a shipped robot.
-        world: YAML file or name of the world.
-        seeds: of the episodes; each fixes obstacles, start, goal and noise.
-        logs: folder for the logs of the nodes.
-    """
-
-    policy: str
-    model: str
-    world: str
-    seeds: Sequence[int]
-    logs: Path
+    policy: str  # a policy file, or the name of a shipped policy or of a baseline
+    model: str  # folder of a model, or a shipped robot
+    world: str  # YAML file or name of the world
+    seeds: Sequence[int]  # of the episodes; each fixes obstacles, start, goal and noise
+    logs: Path  # folder for the logs of the nodes
 
 
 def drive_in(
@@ -146,24 +138,15 @@ def robot_of(policy: str) -> str:
 
 @dataclass(frozen=True)
 class EvaluationOrder:
-    """An order to evaluate policies.
+    """An order to evaluate policies; the seed is that of the first episode."""
 
-    Attributes:
-        policies: files, or names of shipped policies or of baselines.
-        out: output folder.
-        model: folder of a model or a shipped robot; None uses the policies' own robot.
-        world: YAML file or name of the world.
-        episodes, seed: number of episodes, and seed of the first.
-        places: some of `PLACES`; the others are compared with the first.
-    """
-
-    policies: Sequence[str]
-    out: Path
-    model: str | None = None
-    world: str = "circles"
+    policies: Sequence[str]  # files, or names of shipped policies or of baselines
+    out: Path  # output folder
+    model: str | None = None  # folder of a model or a shipped robot; None: the policies' own robot
+    world: str = "circles"  # YAML file or name of the world
     episodes: int = 20
     seed: int = FIRST_SEED
-    places: Sequence[str] = PLACES
+    places: Sequence[str] = PLACES  # some of `PLACES`; the others are compared with the first
 
     @property
     def seeds(self) -> range:

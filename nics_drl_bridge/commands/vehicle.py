@@ -34,21 +34,7 @@ LISTEN_S, ARM_S = 5.0, 60.0
 
 @dataclass(frozen=True)
 class VehicleOrder:
-    """An order to drive episodes on the vehicle.
-
-    Attributes:
-        policy: a file, or the name of a shipped policy or of a baseline.
-        out: output folder.
-        model: folder of the vehicle's model, or a shipped robot; None uses the policy's own.
-        world: the world around the vehicle.
-        episodes, seed: number of episodes, and seed of the first.
-        start: `wait` until the vehicle stands at the start, or begin at the `present` pose.
-        goal: in `map` [m] instead of the world's.
-        namespace: of its topics.
-        pose_type: type of `pose`, a pose sensor in `map`, or `none`.
-        arm: True arms the gate before each episode; otherwise the user does.
-        stale_after_s: an episode ends with an error if data are older [s].
-    """
+    """An order to drive episodes on the vehicle; see `EvaluationOrder` for the first ones."""
 
     policy: str
     out: Path
@@ -56,12 +42,12 @@ class VehicleOrder:
     world: str = "circles"
     episodes: int = 1
     seed: int = 0
-    start: str = "wait"
-    goal: tuple[float, float] | None = None
-    namespace: str = ""
-    pose_type: str = "none"
-    arm: bool = False
-    stale_after_s: float = 0.5
+    start: str = "wait"  # until the vehicle stands at the start; or `present`: from where it stands
+    goal: tuple[float, float] | None = None  # in `map` [m] instead of the world's
+    namespace: str = ""  # of its topics
+    pose_type: str = "none"  # type of `pose`, a pose sensor in `map`, or `none`
+    arm: bool = False  # True arms the gate before each episode; otherwise the user does
+    stale_after_s: float = 0.5  # an episode ends with an error if data are older [s]
 
 
 def drive_vehicle(order: VehicleOrder, say: Say, ask: Say) -> Evaluated:

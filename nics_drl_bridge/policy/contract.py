@@ -38,17 +38,11 @@ def shipped() -> Path:
 
 
 class TaskEntry(Schema):
-    """The task of a policy.
+    """The task of a policy."""
 
-    Attributes:
-        name: as in `env.registry.TASKS`, or the name of a user's class.
-        options: all of its options except `scan`.
-        sha256: over name, options and observation.
-    """
-
-    name: str = Field(min_length=1)
-    options: dict[str, Any]
-    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    name: str = Field(min_length=1)  # as in `env.registry.TASKS`, or the name of a user's class
+    options: dict[str, Any]  # all of its options except `scan`
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")  # over name, options and observation
 
 
 class ObservationEntry(Schema):
@@ -77,31 +71,21 @@ class GoldenEntry(Schema):
 
 
 class Contract(Schema):
-    """All that a policy file states about itself.
-
-    Attributes:
-        scan: sectors of its observations; None: the beams of exactly this lidar.
-        control_period: time between commands [s].
-        model_fingerprint: of the SimulatorModel that it was trained in.
-        provenance: command, seed and versions of its making.
-        graph_sha256: of the graph, including the weights.
-        golden: pairs that must be reproduced.
-        checksums: of each entry above, by its path.
-    """
+    """All that a policy file states about itself and the model that it was trained in."""
 
     format: Literal["nics_drl_bridge/policy/1"]
     robot: RobotSpec
     lidar: LidarSpec
-    scan: ScanLayout | None
+    scan: ScanLayout | None  # sectors of its observations; None: the beams of exactly this lidar
     task: TaskEntry
     observation: ObservationEntry
     actions: Literal["continuous", "discrete"]
-    control_period: float = Field(gt=0.0, le=10.0)
+    control_period: float = Field(gt=0.0, le=10.0)  # time between commands [s]
     model_fingerprint: str = Field(pattern="^[0-9a-f]{16}$")
-    provenance: dict[str, Any]
-    graph_sha256: str = Field(pattern="^[0-9a-f]{64}$")
-    golden: GoldenEntry
-    checksums: dict[str, str]
+    provenance: dict[str, Any]  # command, seed and versions of its making
+    graph_sha256: str = Field(pattern="^[0-9a-f]{64}$")  # of the graph, including the weights
+    golden: GoldenEntry  # pairs that must be reproduced
+    checksums: dict[str, str]  # of each entry above, by its path
 
     @field_validator("provenance")
     @classmethod

@@ -35,25 +35,18 @@ CONFIDENCE = 0.95
 class Episode:
     """Record of one episode.
 
-    Attributes:
-        result: `success`, `collision`, `time-out`, or `elsewhere` if the robot wrongly believed to
-            be at its goal. Judged by the truth if the backend knows it.
-        path: (T, 3) poses at the start and after each step: true ones if the backend knows them,
-            else estimates.
-        estimate: (T, 3) estimated poses.
-        goal: (2,) [m].
-        bodies: (K, 7) obstacles at the start, see `sim.scenes.Scene`.
-        reward: sum over the episode.
-        believed: the result by the robot's own knowledge; None if nothing else is known.
+    The result is `success`, `collision`, `time-out`, or `elsewhere` where the robot wrongly believed
+    to be at its goal. Result and path are true ones if the backend knows them, else estimates.
+    `believed` is the result by the robot's own knowledge; None if nothing else is known.
     """
 
     seed: int
     result: str
-    path: Array
-    estimate: Array
-    goal: Array
-    bodies: Array
-    reward: float
+    path: Array  # (T, 3) poses at the start and after each step
+    estimate: Array  # (T, 3) estimated poses
+    goal: Array  # (2,) [m]
+    bodies: Array  # (K, 7) obstacles at the start, see `sim.scenes.Scene`
+    reward: float  # sum over the episode
     believed: str | None = None
 
     @property
@@ -176,22 +169,14 @@ def deviation(one: Episode, other: Episode) -> float:
 
 @dataclass(frozen=True)
 class Outcomes:
-    """Outcomes of E episodes; all arrays are (E,).
-
-    Attributes:
-        success: the goal was truly reached, and nothing touched.
-        collision: the task reports one, or the robot truly touched something.
-        steps: control periods.
-        length: of the true path [m]; for a team, the mean over its robots.
-        reward: sum over the episode.
-    """
+    """Outcomes of E episodes; all arrays are (E,)."""
 
     seeds: NDArray[np.int64]
-    success: Flags
-    collision: Flags
-    steps: NDArray[np.int64]
-    length: Array
-    reward: Array
+    success: Flags  # the goal was truly reached, and nothing touched
+    collision: Flags  # the task reports one, or the robot truly touched something
+    steps: NDArray[np.int64]  # control periods
+    length: Array  # of the true path [m]; for a team, the mean over its robots
+    reward: Array  # sum over the episode
 
     @property
     def time_out(self) -> Flags:
@@ -313,18 +298,14 @@ def summarise(outcomes: Outcomes, control_period: float) -> Summary:
 class Tally(Summary):
     """Figures of the episodes of one world, by the truth if it is known.
 
-    Attributes:
-        same: share of the episodes that ended as in the first world.
-        deviation: mean over the episodes of the maximum distance between the true path and that
-            in the first world at the same step [m].
-        greatest_deviation: maximum over all episodes [m].
-        believed: share of episodes that the robot itself believed successful.
+    `deviation` is the mean of the maximum distance [m] between the true path and that in the first
+    world at the same step.
     """
 
-    same: float
+    same: float  # share of the episodes that ended as in the first world
     deviation: ConfidenceInterval
-    greatest_deviation: float
-    believed: ConfidenceInterval
+    greatest_deviation: float  # maximum over all episodes [m]
+    believed: ConfidenceInterval  # share of episodes that the robot itself believed successful
 
     def figures(self) -> dict[str, Any]:
         """The tally as plain data, an interval as a list; non-finite values become null."""

@@ -84,21 +84,15 @@ class DynamicWindow:
     It plans no path: behind a long wall it stays. Which twist a command leads to follows from the
     robot's kind and parameters.
 
-    Attributes:
-        margin: clearance to keep around the footprint [m].
-        period: between commands [s].
-        steps: of the look-ahead, each a period and a half long.
-        weights: of gap to the goal [1/m], aim, clearance, and time until a contact.
-
     Raises:
         ConfigError: it is not known where the robot's commands lead, see `steady_twist`.
     """
 
     task: Navigation
-    margin: float = 0.05
-    period: float = 0.1
-    steps: int = 10
-    weights: tuple[float, float, float, float] = (1.0, 0.6, 0.3, 1.5)
+    margin: float = 0.05  # clearance to keep around the footprint [m]
+    period: float = 0.1  # between commands [s]
+    steps: int = 10  # of the look-ahead, each a period and a half long
+    weights: tuple[float, float, float, float] = (1.0, 0.6, 0.3, 1.5)  # see `TwistWeights`
 
     def __post_init__(self) -> None:
         _ = self._twists

@@ -47,19 +47,12 @@ Tell = Callable[[Progress], None]
 
 @dataclass(frozen=True)
 class Trained:
-    """A finished training.
+    """A finished training."""
 
-    Attributes:
-        algorithm: with its policy; on Ray only the acting part.
-        steps: environment steps of all worlds together.
-        wall_s: time that this process spent on it [s].
-        stepping_s: part of it in the simulator [s].
-    """
-
-    algorithm: BaseAlgorithm | Actor
-    steps: int
-    wall_s: float
-    stepping_s: float
+    algorithm: BaseAlgorithm | Actor  # with its policy; on Ray only the acting part
+    steps: int  # environment steps of all worlds together
+    wall_s: float  # time that this process spent on it [s]
+    stepping_s: float  # part of it in the simulator [s]
 
 
 def train(
@@ -190,22 +183,14 @@ class SeedResult:
 
 @dataclass(frozen=True)
 class TrainOrder:
-    """An order for a training run.
+    """An order for a training run."""
 
-    Attributes:
-        settings: what to learn; for a resumed run its own, see `settings_of`.
-        out: folder of the run; each seed gets one below it.
-        episodes: number of episodes of the evaluation in each world.
-        resumed: True continues from the existing checkpoints.
-        command: the user's command line, for the policy files.
-    """
-
-    settings: TrainingSettings
+    settings: TrainingSettings  # what to learn; for a resumed run its own, see `settings_of`
     seeds: Sequence[int]
-    out: Path
-    episodes: int
-    resumed: bool = False
-    command: str = ""
+    out: Path  # folder of the run; each seed gets one below it
+    episodes: int  # number of episodes of the evaluation in each world
+    resumed: bool = False  # True continues from the existing checkpoints
+    command: str = ""  # the user's command line, for the policy files
 
 
 def run(

@@ -172,22 +172,15 @@ TOLD_S = 0.2  # minimum time between two reports of the progress [s]
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a training.
-
-    Attributes:
-        steps, total: environment steps done, and of the whole training.
-        success, collision: shares of the last 1000 episodes; NaN before the first has ended.
-        steps_per_s: since this process began or resumed it.
-        env_share: share of the wall time that went to the simulator.
-    """
+    """Progress of a training."""
 
     seed: int
-    steps: int
+    steps: int  # environment steps done
     total: int
-    success: float
+    success: float  # shares of the last 1000 episodes; NaN before the first has ended
     collision: float
-    steps_per_s: float
-    env_share: float
+    steps_per_s: float  # since this process began or resumed it
+    env_share: float  # share of the wall time that went to the simulator
 
 
 class Companion(BaseCallback):

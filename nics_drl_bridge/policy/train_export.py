@@ -63,30 +63,6 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
         return action, torch.minimum(torch.maximum(command, self.low), self.high)
 
 
-class _Gaussian(torch.nn.Module):  # type: ignore[misc]
-    """The mean of an actor-critic policy such as PPO's, or its logits."""
-
-    def __init__(self, policy: Any) -> None:
-        super().__init__()
-        self.features, self.action_net = policy.pi_features_extractor, policy.action_net
-        self.latent = policy.mlp_extractor.policy_net
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        raw: torch.Tensor = self.action_net(self.latent(self.features(observation)))
-        return raw
-
-
-class _Squashed(torch.nn.Module):  # type: ignore[misc]
-    """The mode of SAC's actor."""
-
-    def __init__(self, actor: Any) -> None:
-        super().__init__()
-        self.features, self.latent, self.mu = actor.features_extractor, actor.latent_pi, actor.mu
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        return torch.tanh(self.mu(self.latent(self.features(observation))))
-
-
 def actor_of(model: Any) -> torch.nn.Module:
     """Returns the acting part of a trained model, without exploration.
 
@@ -95,9 +71,12 @@ def actor_of(model: Any) -> torch.nn.Module:
     """
     policy = getattr(model, "policy", model)
     if hasattr(policy, "action_net") and hasattr(policy, "mlp_extractor"):
-        return _Gaussian(policy)
+        latent = policy.mlp_extractor.policy_net
+        return torch.nn.Sequential(policy.pi_features_extractor, latent, policy.action_net)
     if hasattr(policy, "actor") and hasattr(policy.actor, "latent_pi"):
-        return _Squashed(policy.actor)
+        actor = policy.actor  # its mode is the tanh of the mean
+        parts = actor.features_extractor, actor.latent_pi, actor.mu, torch.nn.Tanh()
+        return torch.nn.Sequential(*parts)
     if isinstance(policy, torch.nn.Module):
         return policy
     raise ConfigError(

@@ -57,30 +57,22 @@ class SacSettings(Schema):
 class TrainingSettings(Schema):
     """A training, as in `config/training/*.yaml`.
 
-    Attributes:
-        task: a name, or `path/to/file.py:ClassName`.
-        task_options: further arguments of the task's class.
-        robot: name of a shipped robot, or the folder of a model.
-        worlds: world -> number of copies; names of shipped ones or YAML files.
-        randomisation: quantities drawn in each episode: a shipped one or a YAML file.
-        steps: environment steps of all worlds together.
-        max_episode_steps: an episode ends as a time-out after this many steps.
-        hidden: widths of the hidden layers of actor and critic, which share none.
-        threads: of PyTorch; sums over several round differently from those of one.
-        checkpoint_every: environment steps between two checkpoints.
+    `worlds` maps names of shipped ones or YAML files to numbers of copies. Actor and critic have
+    hidden layers of the same widths, but share none. Sums over several threads of PyTorch round
+    differently from those of one.
     """
 
-    task: str = "navigation"
-    task_options: dict[str, Any] = Field(default_factory=dict)
-    robot: str = "differential"
+    task: str = "navigation"  # a name, or `path/to/file.py:ClassName`
+    task_options: dict[str, Any] = Field(default_factory=dict)  # of the task's class
+    robot: str = "differential"  # name of a shipped robot, or the folder of a model
     worlds: dict[str, Count] = Field(default_factory=lambda: {"circles": 256}, min_length=1)
-    randomisation: str | None = None
-    steps: Count = 1_000_000
-    max_episode_steps: Count = 300
+    randomisation: str | None = None  # quantities drawn in each episode: a shipped one or a file
+    steps: Count = 1_000_000  # environment steps of all worlds together
+    max_episode_steps: Count = 300  # an episode ends as a time-out after this many steps
     algorithm: Literal["ppo", "sac"] = "ppo"
     hidden: tuple[Width, ...] = Field(default=(64, 64), min_length=1, max_length=MOST_LAYERS)
     threads: Annotated[int, Field(ge=1, le=1024)] = 1
-    checkpoint_every: Count = 200_000
+    checkpoint_every: Count = 200_000  # environment steps between two checkpoints
     ppo: PpoSettings = PpoSettings()
     sac: SacSettings = SacSettings()
 

@@ -21,8 +21,7 @@ from nics_drl_bridge.recording.bag_file import opened
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
-Nanoseconds = NDArray[np.int64]
+Row = tuple[float, float, float]
 
 SCAN, ODOM, CMD_VEL, CLOCK = "scan", "odom", "cmd_vel", "/clock"
 SCAN_TYPE, ODOM_TYPE = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
@@ -85,38 +84,22 @@ class Layout:
 
 @dataclass
 class Facts:
-    """All facts that were collected.
-
-    Attributes:
-        live: True over DDS, False from a bag.
-        topics: topic -> its publishers and subscribers.
-        heard: role (`scan`, `odom`, `cmd_vel`, `/clock`) -> messages.
-        names: role -> topic.
-        end_ns: end of listening, on the clock of arrivals [ns].
-        layouts: distinct layouts of the scans.
-        ranges: of up to 200 scans [m].
-        poses: of odometry, rows x, y [m], heading [rad].
-        twists: of odometry, rows vx, vy [m/s], wz [rad/s].
-        lengths: of odometry's quaternions.
-        uncovered: number of odometry messages whose covariance of pose or twist is all zeros.
-        commands: rows vx, vy [m/s], wz [rad/s].
-        clock_ns: content of `/clock` [ns].
-    """
+    """All facts that were collected; a role is `scan`, `odom`, `cmd_vel` or `/clock`."""
 
     source: str
-    live: bool
-    names: dict[str, str]
-    topics: dict[str, Endpoints] = field(default_factory=dict)
-    heard: dict[str, TopicFacts] = field(default_factory=dict)
-    end_ns: int = 0
-    layouts: list[Layout] = field(default_factory=list)
-    ranges: list[NDArray[np.float32]] = field(default_factory=list)
-    poses: list[tuple[float, float, float]] = field(default_factory=list)
-    twists: list[tuple[float, float, float]] = field(default_factory=list)
-    lengths: list[float] = field(default_factory=list)
-    uncovered: int = 0
-    commands: list[tuple[float, float, float]] = field(default_factory=list)
-    clock_ns: list[int] = field(default_factory=list)
+    live: bool  # True over DDS, False from a bag
+    names: dict[str, str]  # role -> topic
+    topics: dict[str, Endpoints] = field(default_factory=dict)  # by topic
+    heard: dict[str, TopicFacts] = field(default_factory=dict)  # by role
+    end_ns: int = 0  # end of listening, on the clock of arrivals [ns]
+    layouts: list[Layout] = field(default_factory=list)  # distinct layouts of the scans
+    ranges: list[NDArray[np.float32]] = field(default_factory=list)  # of up to 200 scans [m]
+    poses: list[Row] = field(default_factory=list)  # of odometry: x, y [m], heading [rad]
+    twists: list[Row] = field(default_factory=list)  # of odometry: vx, vy [m/s], wz [rad/s]
+    lengths: list[float] = field(default_factory=list)  # of odometry's quaternions
+    uncovered: int = 0  # number of odometry messages whose covariance of pose or twist is all zeros
+    commands: list[Row] = field(default_factory=list)  # vx, vy [m/s], wz [rad/s]
+    clock_ns: list[int] = field(default_factory=list)  # content of `/clock` [ns]
 
     def take(self, role: str, arrival_ns: int, message: Any) -> None:
         """Records a message from ROS or from a bag, which have the same fields."""
@@ -154,7 +137,7 @@ class Facts:
         self.uncovered += any(not one.any() for one in covariances)
 
 
-def _twist(twist: Any) -> tuple[float, float, float]:
+def _twist(twist: Any) -> Row:
     return float(twist.linear.x), float(twist.linear.y), float(twist.angular.z)
 
 

@@ -49,19 +49,12 @@ class Physics:
 
 @dataclass(frozen=True)
 class Machine:
-    """A robot in MuJoCo's form.
+    """A robot in MuJoCo's form."""
 
-    Attributes:
-        xml: the MJCF model; its body `base_link` has the only free joint.
-        joints: J names of the joints with encoders.
-        controls: maps a wanted state (S,) to the actuators' inputs (U,).
-        state: maps positions (J,) [rad] and speeds (J,) [rad/s] of the joints to the state (S,).
-    """
-
-    xml: str
-    joints: tuple[str, ...]
-    controls: Callable[[Array], Array]
-    state: Callable[[Array, Array], Array]
+    xml: str  # the MJCF model; its body `base_link` has the only free joint
+    joints: tuple[str, ...]  # J names of the joints with encoders
+    controls: Callable[[Array], Array]  # maps a wanted state (S,) to the actuators' inputs (U,)
+    state: Callable[[Array, Array], Array]  # positions [rad] and speeds [rad/s] (J,) to state (S,)
 
 
 @dataclass(frozen=True)
