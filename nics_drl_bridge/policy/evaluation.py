@@ -35,7 +35,7 @@ CONFIDENCE = 0.95
 class Episode:
     """Record of one episode.
 
-    The result is `success`, `collision`, `time-out`, or `elsewhere` where the robot wrongly believed
+    The result is `success`, `collision`, `time-out`, or `elsewhere` if the robot wrongly believed
     to be at its goal. Result and path are true ones if the backend knows them, else estimates.
     `believed` is the result by the robot's own knowledge; None if nothing else is known.
     """
