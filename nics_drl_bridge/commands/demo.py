@@ -35,8 +35,7 @@ def demo(
 ) -> None:
     """Goes the whole road once: generate, train, evaluate, drive over DDS, deploy, report."""
     with one_sentence():
-        from nics_drl_bridge.commands.demo_report import DemoPlan
-        from nics_drl_bridge.commands.demo_run import run
+        from nics_drl_bridge.commands.demo_run import DemoPlan, run
 
         robot = robot or ("ackermann" if recording else "differential")
         plan = DemoPlan(out, robot, world, recording, episodes, policy, train_steps)

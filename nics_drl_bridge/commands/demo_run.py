@@ -1,18 +1,18 @@
-"""The parts of the demo in sequence: each uses the results of those before it."""
+"""The parts of the demo in sequence, and its report: one page with all results."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import astuple, dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nics_drl_bridge.commands.demo_report import DemoPlan, DemoResults, Learned, Live, report
-from nics_drl_bridge.commands.episodes import DDS, FAST, Say, Trial, drive_in
+from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, Say, Trial, drive_in
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -25,6 +25,7 @@ from nics_drl_bridge.policy.evaluation import (
     FIRST_SEED,
     Episode,
     Summary,
+    deviation,
     drive_worlds,
     successes,
     summarise,
@@ -34,7 +35,10 @@ from nics_drl_bridge.policy.training_settings import TrainingSettings, load_trai
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import save_recording
-from nics_drl_bridge.report.pictures import Point
+from nics_drl_bridge.report.calibration_pictures import CAPTIONS, calibration_pictures
+from nics_drl_bridge.report.fit_pictures import accuracy
+from nics_drl_bridge.report.page import Block, Code, Picture, Table, page
+from nics_drl_bridge.report.pictures import Point, training_curve, trajectories
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import load_world
@@ -47,6 +51,62 @@ LINES = 10  # number of progress reports of a training
 START_S, ARRIVE_S = 60.0, 40.0  # time that a node may take to start, and the robot to arrive
 FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05
 """Limits of the demo's gate: time from zero to the maximum command, and to its maximum rate."""
+IN_PROCESS, OVER_DDS = LABELS[FAST], LABELS[DDS]
+PANELS = 9  # maximum number of episodes that are drawn
+
+
+@dataclass(frozen=True)
+class DemoPlan:
+    """Plan of a demo."""
+
+    out: Path  # output folder
+    robot: str = "differential"  # name or YAML file, as the world
+    world: str = "arena"
+    recording: Path | None = None  # of a drive; None makes one with the robot's textbook kinematics
+    episodes: int = 5  # number of episodes, in process and again over DDS
+    policy: str | None = None  # a policy file or a name, to drive with instead of training one
+    train_steps: int | None = None  # environment steps of the training; None: as in `demo.yaml`
+
+    @property
+    def model(self) -> Path:
+        """Folder of the generated simulator."""
+        return self.out / "model"
+
+    @property
+    def policy_file(self) -> Path:
+        """Path of the trained policy."""
+        return self.out / "policy.onnx"
+
+
+@dataclass(frozen=True)
+class Learned:
+    """The policy of the demo by file or name, its origin in a sentence, and its training curve."""
+
+    policy: str
+    how: str
+    curve: Sequence[Point] = ()
+
+
+@dataclass(frozen=True)
+class Live:
+    """A drive of the deployed nodes, with its path; `arrived` is True if it reached the goal."""
+
+    arrived: bool
+    path: Episode
+
+
+@dataclass(frozen=True)
+class DemoResults:
+    """All results of the demo; `here` and `there` are the same episodes in process and over DDS."""
+
+    model: SimulatorModel
+    identified: Identified
+    learned: Learned
+    summary: Summary  # of the policy's many episodes in the fast simulator
+    here: Sequence[Episode]
+    there: Sequence[Episode]
+    live: Live
+    took: dict[str, float]  # part of the demo -> wall time [s]
 
 
 def run(plan: DemoPlan, say: Say) -> str:
@@ -85,11 +145,11 @@ def run(plan: DemoPlan, say: Say) -> str:
         arrived = (episode.seed for episode in there if episode.result == "success")
         live = _deploy(plan, model, learned.policy, next(arrived, 0), say)
     results = DemoResults(model, identified, learned, summary, here, there, live, took)
-    page = plan.out / "report.html"
-    write_text(page, report(plan, results))
+    file = plan.out / "report.html"
+    write_text(file, report(plan, results))
     return (
         f"demo: in process {successes(here)}/{plan.episodes}, "
-        f"over DDS {successes(there)}/{plan.episodes}, report {page}"
+        f"over DDS {successes(there)}/{plan.episodes}, report {file}"
     )
 
 
@@ -269,3 +329,86 @@ def _write_limits(robot: RobotSpec, path: Path) -> Path:
         commands[variable.name] = {"min": low, "max": high, "rate": rate, "jerk": jerk}
     write_text(path, dump_yaml({"robot": robot.name, "commands": commands}))
     return path
+
+
+def report(plan: DemoPlan, results: DemoResults) -> str:
+    """Builds the page, as HTML."""
+    took = {**results.took, "all": sum(results.took.values())}
+    times = [(part, f"{seconds:.0f}") for part, seconds in took.items()]
+    sections: list[tuple[str, Sequence[Block]]] = [
+        ("The model", _model(plan, results)),
+        ("The policy", _policy(plan, results)),
+        ("The same episodes, in process and over DDS", _episodes(plan, results)),
+        ("Deployed", _deployed(plan, results)),
+        ("Time", [Table(("part", "wall time [s]"), times)]),
+    ]
+    policy = results.learned.policy
+    lead = f"Robot {results.model.robot.name!r} in the world {plan.world!r}, policy {policy!r}."
+    return page("nics_drl_bridge: demo", lead, sections)
+
+
+def _model(plan: DemoPlan, results: DemoResults) -> list[Block]:
+    calibrated = calibration_pictures(results.model.robot, results.identified)
+    return [
+        f"Generated from {plan.recording or 'a textbook drive'}.",
+        Code(results.model.report),
+        Picture(
+            accuracy(results.identified),
+            "What each further term is worth; circles mark how many are kept.",
+        ),
+        *(Picture(picture, CAPTIONS[name]) for name, picture in calibrated.items()),
+    ]
+
+
+def _policy(plan: DemoPlan, results: DemoResults) -> list[Block]:
+    blocks: list[Block] = [results.learned.how]
+    if results.learned.curve:
+        caption = "Success and collisions while it explores; all episodes are new ones."
+        blocks.append(Picture(training_curve(results.learned.curve), caption))
+    summary = results.summary
+    shares = (summary.success, summary.collision, summary.time_out)
+    rows = [
+        (name, *(f"{100 * value:.1f} %" for value in astuple(share)))
+        for name, share in zip(("success", "collision", "time-out"), shares, strict=True)
+    ]
+    for name, amount in (("path [m]", summary.length), ("time [s]", summary.time)):
+        rows.append((name, *(f"{value:.2f}" for value in astuple(amount))))
+    text = (
+        f"{summary.episodes} unseen episodes in the world {plan.world!r}, side by side in the fast "
+        "simulator, the policy at its best; path and time are means of the successful ones."
+    )
+    return [*blocks, text, Table(("", "value", "95 % from", "to"), rows)]
+
+
+def _episodes(plan: DemoPlan, results: DemoResults) -> list[Block]:
+    here, there = results.here, results.there
+    rows = [
+        (
+            str(a.seed), a.result, f"{a.steps}", f"{a.length:.2f}", b.result, f"{b.steps}",
+            f"{b.length:.2f}", f"{deviation(a, b):.1g}",
+        )
+        for a, b in zip(here, there, strict=True)
+    ]  # fmt: skip
+    head = ("seed", IN_PROCESS, "steps", "path [m]", OVER_DDS, "steps", "path [m]", "deviation [m]")
+    runs = {IN_PROCESS: here[:PANELS], OVER_DDS: there[:PANELS]}
+    both = trajectories(runs, load_world(plan.world), results.model.robot.footprint_radius)
+    return [
+        f"{successes(here)} of {len(here)} episodes reached the goal in process, "
+        f"{successes(there)} of {len(there)} over DDS in lock-step. Deviation is the "
+        "greatest distance between the two true paths at the same step.",
+        Table(head, rows),
+        Picture(both, "Blue: in process. Red, dashed: over DDS."),
+    ]
+
+
+def _deployed(plan: DemoPlan, results: DemoResults) -> list[Block]:
+    live = results.live
+    beside = [episode for episode in results.here if episode.seed == live.path.seed]
+    runs = {IN_PROCESS: beside, "deployed": [live.path]}
+    drawn = trajectories(runs, load_world(plan.world), results.model.robot.footprint_radius)
+    return [
+        "simulator_node in real time, middleware_node, policy_node and command_gate ran as "
+        "processes of their own; nobody stepped them. The robot "
+        f"{'reached' if live.arrived else 'did not reach'} its goal.",
+        Picture(drawn, "The true path of the deployed robot beside the lock-step one."),
+    ]

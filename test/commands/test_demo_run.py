@@ -6,8 +6,7 @@ import pytest
 from robots import direct_model
 
 from nics_drl_bridge.commands import demo_run as learning
-from nics_drl_bridge.commands.demo_report import DemoPlan
-from nics_drl_bridge.commands.demo_run import learn, settings_of
+from nics_drl_bridge.commands.demo_run import DemoPlan, learn, settings_of
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model

@@ -8,7 +8,7 @@ import pytest
 
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.extras.mujoco.machines import Physics, build_machine, load_mujoco, roller_size
-from nics_drl_bridge.extras.mujoco.rig import MujocoRobot, Reading, record
+from nics_drl_bridge.extras.mujoco.simulator import MujocoRobot, Reading, record
 from nics_drl_bridge.recording.recording import check
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
