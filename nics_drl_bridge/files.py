@@ -60,8 +60,7 @@ def write_text(path: str | Path, text: str) -> None:
 def check_folder(path: str | Path, marker: str) -> Path:
     """Checks that `whole_folder` can create a folder, without creating anything; resolves it.
 
-    Raises:
-        ConfigError: `path` is a file, a folder of another kind, or not in a writable place.
+    Raises ConfigError if `path` is a file, a folder of another kind, or not in a writable place.
     """
     path = Path(path).resolve()
     if path.exists() and not path.is_dir():
@@ -89,10 +88,7 @@ def whole_folder(path: str | Path, marker: str) -> Iterator[Path]:
 
     An existing folder is replaced only if it is empty or contains `marker`, a file of every folder
     of this kind, so that a wrong `--out` never deletes a user's work. A symbolic link stays; the
-    folder that it points to is replaced.
-
-    Raises:
-        ConfigError: see `check_folder`.
+    folder that it points to is replaced. Raises ConfigError: see `check_folder`.
     """
     path = check_folder(path, marker)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -203,11 +199,9 @@ def check_sums(folder: Path, names: Sequence[str], editable: str = "") -> None:
     """Checks files of a model or a lidar table against the `SHA256SUMS` of their folder.
 
     The names are all that the manifest lists; other files in the folder are ignored. `editable` is
-    the one that needs no line, since a user may have removed it to edit the file.
-
-    Raises:
-        ModelError: a file is missing, too large or different from its line, or the manifest does
-            not list exactly these files.
+    the one that needs no line, since a user may have removed it to edit the file. Raises ModelError
+    if a file is missing, too large or different from its line, or the manifest does not list
+    exactly these files.
     """
     with _opened(folder / SUMS) as file:
         listed = file.readlines(_PART)

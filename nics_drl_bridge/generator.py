@@ -211,8 +211,7 @@ def save_model(model: SimulatorModel, folder: str | Path) -> None:
 def load_model(folder: str | Path) -> SimulatorModel:
     """Reads a model that `save_model` wrote.
 
-    Raises:
-        ConfigError, ModelError: a file is missing, damaged or of another format.
+    Raises ConfigError, ModelError if a file is missing, damaged or of another format.
     """
     folder = Path(folder)
     path = folder / MODEL_FILE

@@ -171,8 +171,7 @@ def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
 def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     """Trains a policy, unless the plan names one or a module for training is not installed.
 
-    Raises:
-        BridgeError: the named policy can't be used, or the settings do not fit.
+    Raises BridgeError if the named policy can't be used, or the settings do not fit.
     """
     if plan.policy is not None:
         open_policy(plan.policy, model)
@@ -261,8 +260,7 @@ def _drive(place: str, what: str, plan: DemoPlan, policy: str, say: Say) -> list
 def _deploy(plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: Say) -> Live:
     """Runs the nodes of a robot in real time, each in its own process, in the scene of a seed.
 
-    Raises:
-        BackendError: a node does not start, or ends.
+    Raises BackendError if a node does not start, or ends.
     """
     scene = sample_scene(load_world(plan.world), model.robot.footprint_radius, seed)
     goal = [float(value) for value in scene.goals[0]]

@@ -65,10 +65,7 @@ def drive_in(
     """Drives the episodes of a trial in one of `PLACES`; calls `on_episode` as each ends.
 
     The node that a place needs runs in its own process, in lock-step, and has ended when this
-    returns or raises.
-
-    Raises:
-        BridgeError: a bad name or file, or a node that does not start.
+    returns or raises. Raises BridgeError for a bad name or file, or a node that does not start.
     """
     check_place(place)
     model = open_model(trial.model)

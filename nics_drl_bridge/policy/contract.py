@@ -104,8 +104,7 @@ def contract_of(
 ) -> str:
     """Writes the contract of a policy as JSON; the golden arrays are named as in `GoldenEntry`.
 
-    Raises:
-        ConfigError: an entry has a wrong type.
+    Raises ConfigError if an entry has a wrong type.
     """
     entry, observation = task_entry(task), observation_entry(task)
     data = {
@@ -178,9 +177,8 @@ def checksums(data: Mapping[str, Any]) -> dict[str, str]:
 def read_contract(text: str, source: str) -> Contract:
     """Reads and checks the contract of a policy file.
 
-    Raises:
-        PolicyError: an entry is missing, unknown, of a wrong type, changed after the export, or
-            contradicts another; names the field.
+    Raises PolicyError if an entry is missing, unknown, of a wrong type, changed after the export,
+    or contradicts another; names the field.
     """
     entries = sum(map(text.count, ",[{"))
     if entries > MOST_ENTRIES:

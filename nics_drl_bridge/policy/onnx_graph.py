@@ -73,8 +73,7 @@ Fault = tuple[str, str]
 def parse(data: bytes, source: str) -> Any:
     """Parses and checks the ModelProto of a policy file's content.
 
-    Raises:
-        PolicyError: it is not an ONNX model, or one that this package does not run.
+    Raises PolicyError if it is not an ONNX model, or one that this package does not run.
     """
     for start, kind in OTHER_FORMATS:
         if data.startswith(start):
@@ -293,8 +292,7 @@ def check_ends(model: Any, widths: dict[str, int | None], source: str) -> None:
 def rows_at_once(model: Any, source: str) -> int:
     """Number of observations that a graph of known operators may be given in one run.
 
-    Raises:
-        PolicyError: a size is unknown, or is more than any policy needs.
+    Raises PolicyError if a size is unknown, or is more than any policy needs.
     """
     _refuse(_setting_faults(model.graph), source)
     _refuse(_integer_faults(model, source), source)

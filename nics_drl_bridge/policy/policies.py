@@ -82,10 +82,8 @@ class DynamicWindow:
     period; each is held for the look-ahead. A twist with a contact before the robot could stop is
     inadmissible; the best of the others in distance, aim, clearance and time to contact is chosen.
     It plans no path: behind a long wall it stays. Which twist a command leads to follows from the
-    robot's kind and parameters.
-
-    Raises:
-        ConfigError: it is not known where the robot's commands lead, see `steady_twist`.
+    robot's kind and parameters. Raises ConfigError if it is not known where the robot's commands
+    lead, see `steady_twist`.
     """
 
     task: Navigation
@@ -191,8 +189,7 @@ def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None
 def open_policy(name: str, model: SimulatorModel) -> tuple[Policy, Navigation]:
     """Opens a policy by name, with the navigation task that it is for.
 
-    Raises:
-        ConfigError, PolicyError: see `make_policy`; or the policy was trained for another task.
+    Raises ConfigError, PolicyError: see `make_policy`; or the policy was trained for another task.
     """
     if not is_policy_file(name):
         task = Navigation(model.robot, model.lidar)

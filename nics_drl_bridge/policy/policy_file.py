@@ -89,10 +89,8 @@ class PolicyFile:
     def make_task(self, model: SimulatorModel, kind: str | type[Task] | None = None) -> Task:
         """Makes the policy's task for a robot that it fits.
 
-        For a task that is not shipped, `kind` is its class or `path/to/file.py:ClassName`.
-
-        Raises:
-            PolicyError: the policy does not fit; names the field.
+        For a task that is not shipped, `kind` is its class or `path/to/file.py:ClassName`. Raises
+        PolicyError if the policy does not fit; names the field.
         """
         name = self.contract.task.name
         if kind is None and name not in TASKS:
@@ -163,8 +161,7 @@ def find_policy(name: str) -> Path:
 def load_policy(path: str | Path) -> PolicyFile:
     """Loads a policy file, by its path or the name of a shipped one, and runs every check.
 
-    Raises:
-        PolicyError: a check fails; names the field.
+    Raises PolicyError if a check fails; names the field.
     """
     file = find_policy(str(path))
     source = str(file)

@@ -66,10 +66,8 @@ def train(
 
     An interrupted and resumed training gives bit-identical weights to an uninterrupted one: a
     checkpoint contains the network, the optimiser, all random generators and all worlds. `tell` is
-    called with the progress, a few times per second.
-
-    Raises:
-        ConfigError: the settings are inconsistent, or no checkpoint fits them.
+    called with the progress, a few times per second. Raises ConfigError if the settings are
+    inconsistent, or no checkpoint fits them.
     """
     begin, path = time.perf_counter(), folder / CHECKPOINT
     content = read_checkpoint(path) if resumed else None
@@ -201,10 +199,8 @@ def run(
 ) -> list[SeedResult]:
     """Trains seed after seed and evaluates each in its training worlds.
 
-    `tell` is called with the progress, `done` with the result of each seed.
-
-    Raises:
-        ConfigError: the folder already contains a run, or none to resume.
+    `tell` is called with the progress, `done` with the result of each seed. Raises ConfigError if
+    the folder already contains a run, or none to resume.
     """
     _check(order.seeds, order.out, order.resumed)
     settings, model = order.settings, open_model(order.settings.robot)

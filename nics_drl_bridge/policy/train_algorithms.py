@@ -34,8 +34,7 @@ def make_algorithm(
 ) -> BaseAlgorithm:
     """Makes an untrained algorithm; `normaliser` is mean and deviation (O,) of observations.
 
-    Raises:
-        ConfigError: the algorithm does not suit the task.
+    Raises ConfigError if the algorithm does not suit the task.
     """
     check_serves(settings, env)
     torch.set_num_threads(settings.threads)

@@ -70,8 +70,7 @@ def write_content(path: Path, content: dict[str, Any]) -> None:
 def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
     """Reads the content of a checkpoint of a format; `about` is that of `save_checkpoint`.
 
-    Raises:
-        ConfigError: there is none, or it is damaged or of another format.
+    Raises ConfigError if there is none, or it is damaged or of another format.
     """
     if not path.is_file():
         raise ConfigError(f"{path}: no such checkpoint; leave out --resume to begin anew.")
@@ -262,8 +261,7 @@ def snapshot(env: BridgeVectorEnv) -> Arrays:
 def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
     """Puts a snapshot into a vector env with the same arguments.
 
-    Raises:
-        ConfigError: the snapshot is of an env with other worlds, robots, lidar or task.
+    Raises ConfigError if the snapshot is of an env with other worlds, robots, lidar or task.
     """
     targets = env.changing
     known = {name for name in state if not name.startswith((MEMORY, DRAWN))}

@@ -23,12 +23,10 @@ class TrainVecEnv(VecEnv):
     """Feeds Stable-Baselines3 from a `BridgeVectorEnv`, or from several with equal spaces.
 
     The observations are the vector env's own array of the step; only worlds that ended are handled
-    one by one: their `terminal_observation`, `TimeLimit.truncated`, `is_success` and `collision`
-    in `infos`. The envs have the `autoreset_mode` `SameStep`, and `copy`, as the algorithms keep
-    the last observation over a step. `stepping_s` is the wall time spent in them [s].
-
-    Raises:
-        ConfigError: an env with other arguments, or envs that do not fit together.
+    one by one: their `terminal_observation`, `TimeLimit.truncated`, `is_success` and `collision` in
+    `infos`. The envs have the `autoreset_mode` `SameStep`, and `copy`, as the algorithms keep the
+    last observation over a step. `stepping_s` is the wall time spent in them [s]. Raises
+    ConfigError for an env with other arguments, or envs that do not fit together.
     """
 
     def __init__(self, *envs: BridgeVectorEnv) -> None:

@@ -110,8 +110,7 @@ class TrainingSettings(Schema):
 def load_training(name: str | Path) -> TrainingSettings:
     """Loads settings by the name of a shipped file (`navigation_differential`), or by path.
 
-    Raises:
-        ConfigError: no such file, or something in it is wrong.
+    Raises ConfigError if there is no such file, or something in it is wrong.
     """
     return load_yaml(find_config(name, "training"), TrainingSettings)
 
@@ -121,10 +120,7 @@ def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> Tra
 
     `name` is that of shipped settings, or a YAML file; by default those of task and robot if they
     are shipped, else the defaults. `changes` are further keys of `TrainingSettings`; and `world`,
-    names that share the number of worlds.
-
-    Raises:
-        ConfigError: an unknown name or a wrong value.
+    names that share the number of worlds. Raises ConfigError for an unknown name or a wrong value.
     """
     robot = str(changes.get("robot", "differential"))
     shipped = {path.stem for path in (share_folder() / "config" / "training").glob("*.yaml")}

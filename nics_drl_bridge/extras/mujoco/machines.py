@@ -146,11 +146,8 @@ def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
     """Builds the machine of a robot.
 
     In addition to those of the textbook kinematics, the parameters `wheel_radius` and `track` of an
-    Ackermann robot are used if the spec has them.
-
-    Raises:
-        ConfigError: the spec names no textbook kinematics or a kind without a machine, or lacks a
-            parameter.
+    Ackermann robot are used if the spec has them. Raises ConfigError if the spec names no textbook
+    kinematics or a kind without a machine, or lacks a parameter.
     """
     kind = require_textbook(spec)
     if kind not in _BUILDERS:

@@ -140,8 +140,7 @@ class MujocoRobot:
     def step(self, command: ArrayLike, duration: float) -> Reading:
         """Drives with a command (C,), clipped to its limits, for a whole number of time steps [s].
 
-        Raises:
-            BackendError: the robot has fallen over, or the command contains NaN.
+        Raises BackendError if the robot has fallen over, or the command contains NaN.
         """
         self._rig.command(self._data, command)
         self._advance(duration)
@@ -167,11 +166,9 @@ class MujocoSimulator:
 
     The textbook kinematics of the model's robot select the machine; the fitted ones are not used.
     The M robots see and touch each other. The time step of `physics` is shortened so that a control
-    period is a whole number of steps.
-
-    Raises:
-        ConfigError: MuJoCo is not installed, the robot names no textbook kinematics or lacks a
-            parameter of its machine, or the world has no free space left.
+    period is a whole number of steps. Raises ConfigError if MuJoCo is not installed, the robot
+    names no textbook kinematics or lacks a parameter of its machine, or the world has no free space
+    left.
     """
 
     def __init__(
@@ -215,10 +212,8 @@ class MujocoSimulator:
     def reset(self, seeds: ArrayLike, starts: ArrayLike | None = None) -> Scenes:
         """Begins an episode, the same one as in a FastSimulator of this model and world.
 
-        Takes one seed (1,), and start poses (1, M, 3) instead of the scene's.
-
-        Raises:
-            ConfigError: see `FastSimulator.reset`.
+        Takes one seed (1,), and start poses (1, M, 3) instead of the scene's. Raises ConfigError:
+        see `FastSimulator.reset`.
         """
         scenes = self._driven.reset(seeds, starts)
         sampler = self._driven.fast.sampler
@@ -329,9 +324,7 @@ def record(
 
     The robot is reset to the origin first. New commands are drawn, uniform within their limits,
     every `hold` seconds; the sample period `dt` [s] is a whole number of the robot's time steps.
-
-    Raises:
-        BackendError: the robot fell over.
+    Raises BackendError if the robot fell over.
     """
     spec = robot.spec
     per_hold, holds = round(hold / dt), int(np.ceil(duration / hold))

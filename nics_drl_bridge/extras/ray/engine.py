@@ -77,10 +77,8 @@ def connected(address: str | None, runners: int | None, worlds: int) -> Iterator
 
     The address is `auto` (the cluster that this machine is part of) or `HOST:PORT`; None starts one
     on this machine, which ends with the training. By default there is an env runner, a process that
-    shares the worlds, for each CPU of the cluster.
-
-    Raises:
-        ConfigError: no cluster answers there, or it is too small.
+    shares the worlds, for each CPU of the cluster. Raises ConfigError if no cluster answers there,
+    or it is too small.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     # A lost worker is no error here, and Ray's messages about it would disturb the progress bar.
@@ -133,11 +131,8 @@ def train_on_ray(
     An env runner whose process or machine is lost is restarted, if necessary on another machine;
     the others continue meanwhile. The steps that are learned from then depend on the time of the
     loss: two runs with one seed agree only as long as no runner is lost. The arguments are those of
-    `policy.train.train`; `tell` is called after each roll-out.
-
-    Raises:
-        ConfigError: the settings are inconsistent, no checkpoint fits them, or no env runner
-            answers.
+    `policy.train.train`; `tell` is called after each roll-out. Raises ConfigError if the settings
+    are inconsistent, no checkpoint fits them, or no env runner answers.
     """
     if settings.algorithm != "ppo":
         given = settings.algorithm
