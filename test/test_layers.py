@@ -210,7 +210,10 @@ def modules_after(code: str) -> set[str]:
     return set(done.stdout.split())
 
 
-LIGHT = {"errors.py", "geometry.py", "interface.py", "robot/taylor.py", "sim/state.py"}
+LIGHT = {
+    "config.py", "errors.py", "geometry.py", "interface.py", "robot/taylor.py", "sim/state.py",
+    "strict_yaml.py",
+}  # fmt: skip
 
 
 def test_kernels_import_kernels_only_so_that_no_other_edit_compiles_them_anew():
@@ -230,6 +233,7 @@ def test_kernels_import_kernels_only_so_that_no_other_edit_compiles_them_anew():
     assert {name: found for name, found in heavy.items() if found} == {}
 
 
+@pytest.mark.process
 def test_importing_the_package_imports_nothing_heavy():
     loaded = modules_after(f"import {PACKAGE}")
     assert PACKAGE in loaded
@@ -237,6 +241,8 @@ def test_importing_the_package_imports_nothing_heavy():
     assert not loaded & (heavy | {"rclpy"})
 
 
+@pytest.mark.process
+@pytest.mark.slow
 @pytest.mark.timeout(300)  # without numba's caches, all kernels are compiled here
 def test_an_env_in_process_imports_neither_ros_nor_pictures():
     loaded = modules_after(

@@ -146,8 +146,8 @@ class Actor(torch.nn.Module):
         normaliser: tuple[Array, Array],
     ) -> None:
         super().__init__()
-        self.discrete = isinstance(actions, gymnasium.spaces.Discrete)
-        count = int(getattr(actions, "n", np.prod(actions.shape)))
+        self.discrete, size = isinstance(actions, gymnasium.spaces.Discrete), actions.shape or ()
+        count = int(actions.n if isinstance(actions, gymnasium.spaces.Discrete) else np.prod(size))
         self.normaliser = Normaliser(observations, *normaliser)
         self.layers = layers_of([self.normaliser.features_dim, *hidden, count], ACTION_GAIN)
 
