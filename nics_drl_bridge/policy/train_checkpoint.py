@@ -265,7 +265,7 @@ def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
     """
     targets = env.changing
     known = {name for name in state if not name.startswith((MEMORY, DRAWN))}
-    for name in sorted(known | set(targets)):
+    for name in (*sorted(known ^ set(targets)), *targets):
         one, other = state.get(name), targets.get(name)
         if one is None or other is None:
             fault = "is in one of both only"
