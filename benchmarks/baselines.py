@@ -14,7 +14,7 @@ from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.policy.evaluation_batch import FIRST_SEED, Summary, drive_worlds, summarise
+from nics_drl_bridge.policy.evaluation import FIRST_SEED, Summary, drive_worlds, summarise
 from nics_drl_bridge.policy.policies import POLICIES, open_policy, shipped_policies
 from nics_drl_bridge.policy.train import line_of
 

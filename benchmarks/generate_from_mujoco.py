@@ -20,7 +20,7 @@ import numpy as np
 from measuring.verdict import answer, parser_of
 
 from nics_drl_bridge.errors import BridgeError
-from nics_drl_bridge.extras.mujoco.rig import MujocoRobot, record
+from nics_drl_bridge.extras.mujoco.simulator import MujocoRobot, record
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.open_loop import open_loop_error

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.policy.evaluation_batch import FIRST_SEED, Summary, drive_worlds, summarise
+from nics_drl_bridge.policy.evaluation import FIRST_SEED, Summary, drive_worlds, summarise
 from nics_drl_bridge.policy.train import line_of, train
 from nics_drl_bridge.policy.train_algorithms import act_of
 from nics_drl_bridge.policy.training_settings import TrainingSettings, load_training

@@ -1,6 +1,9 @@
 """Strict configuration: YAML files checked against a schema.
 
-Every error names file, key and the nearest valid name.
+Every error names file, key and the nearest valid name. PyYAML alone reads `1e-3` as a string, keeps
+the last of two equal keys, lets a few lines of aliases and merge keys grow to gigabytes, and builds
+objects from tags. Here the first is a number, the second an error, the third is counted while
+reading, and tags are refused.
 """
 
 from __future__ import annotations
@@ -12,17 +15,20 @@ from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
+import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
+from yaml.composer import Composer
+from yaml.constructor import SafeConstructor
+from yaml.resolver import Resolver
 
-from nics_drl_bridge.errors import ConfigError, nearest
-from nics_drl_bridge.strict_yaml import MAX_BYTES, dump_yaml, parse_yaml
-
-__all__ = [
-    "MAX_BYTES", "PACKAGE", "Schema", "dump_yaml", "find_config", "load_yaml", "no_device",
-    "parse_yaml", "read_text", "share_folder", "validate",
-]  # fmt: skip
+from nics_drl_bridge.errors import ConfigError, nearest, shortened
 
 PACKAGE = "nics_drl_bridge"
+MAX_DEPTH = 32
+MAX_BYTES = 2**20  # maximum size of a YAML file
+MAX_VALUES = 50_000
+"""Maximum number of keys, values and lists; an alias counts as everything it stands for."""
+_LONGEST_PROBLEM = 200
 
 
 class Schema(BaseModel):
@@ -35,15 +41,7 @@ SchemaT = TypeVar("SchemaT", bound=BaseModel)
 
 
 def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> SchemaT:
-    """Checks a mapping against a schema.
-
-    Args:
-        data: content of the file.
-        schema: a pydantic model.
-        source: the file's name, for errors.
-
-    Returns:
-        The checked configuration.
+    """Checks the content of a file against a schema.
 
     Raises:
         ConfigError: the first error, with file, key, value and fix.
@@ -52,12 +50,12 @@ def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> Schema
         found = schema.model_validate(data)
     except ValidationError as error:
         raise ConfigError(f"{source}: {_sentence(error, schema)}") from None
-    for place, given in _taken_for_numbers(data, found):
+    for place, given in _coerced_to_numbers(data, found):
         raise ConfigError(f"{source}: key {place!r}: should be a number, not {given!r}.")
     return found
 
 
-def _taken_for_numbers(given: Any, found: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+def _coerced_to_numbers(given: Any, found: Any, place: str = "") -> Iterator[tuple[str, Any]]:
     """Yields strings and booleans that pydantic coerced to numbers: `true` is no length."""
     pairs: list[tuple[Any, Any, Any]] = []
     if isinstance(given, dict):
@@ -68,7 +66,7 @@ def _taken_for_numbers(given: Any, found: Any, place: str = "") -> Iterator[tupl
     elif isinstance(given, (str, bool)) and type(found) in (int, float):
         yield place.removeprefix("."), given
     for key, value, made in pairs:
-        yield from _taken_for_numbers(value, made, f"{place}.{key}")
+        yield from _coerced_to_numbers(value, made, f"{place}.{key}")
 
 
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
@@ -101,10 +99,7 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
 
 
 def _fields_at(schema: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """Field names of the model at `location` inside `schema`.
-
-    In a union of models, the location names the `kind` of the one that is present.
-    """
+    """Field names at a location, which in a union of models names the `kind` that is present."""
     current: Any = schema
     candidates: list[type] = []
     for part in location:
@@ -113,8 +108,9 @@ def _fields_at(schema: type[BaseModel], location: tuple[int | str, ...]) -> list
             candidates = _inner_models(fields[part])
             current = candidates[0] if candidates else None
         else:
-            kinds = [c for c in candidates if _kind_of(c) == part]
-            current = kinds[0] if kinds else current
+            kinds = (getattr(one, "model_fields", {}).get("kind") for one in candidates)
+            named = zip(candidates, kinds, strict=True)
+            current = next((one for one, kind in named if kind and kind.default == part), current)
     return list(_annotations_of(current))
 
 
@@ -124,11 +120,6 @@ def _annotations_of(model: Any) -> dict[Any, Any]:
         return dict(get_type_hints(model))
     fields: dict[str, Any] = getattr(model, "model_fields", {})
     return {name: field.annotation for name, field in fields.items()}
-
-
-def _kind_of(model: type) -> Any:
-    kind = getattr(model, "model_fields", {}).get("kind")
-    return None if kind is None else kind.default
 
 
 def _inner_models(annotation: Any) -> list[type]:
@@ -142,11 +133,7 @@ def _inner_models(annotation: Any) -> list[type]:
 
 
 def no_device(path: Path) -> Path:
-    """Returns the path unless it is a device or a pipe, which may never end.
-
-    Raises:
-        ConfigError: the path is a device or a pipe.
-    """
+    """Returns the path. Raises ConfigError for a device or a pipe, which may never end."""
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise ConfigError(f"{path}: is a device or a pipe, not a file; copy it to one.")
     return path
@@ -158,9 +145,8 @@ def read_text(path: str | Path, most: int = MAX_BYTES) -> str:
     try:
         size = no_device(path).stat().st_size
         if size > most and path.is_file():
-            raise ConfigError(
-                f"{path}: is larger than {most // 2**20} MB, which no such file is; give another."
-            )
+            reason = f"is larger than {most // 2**20} MB, which no such file is"
+            raise ConfigError(f"{path}: {reason}; give another.")
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; check the path.") from None
@@ -193,14 +179,7 @@ def share_folder() -> Path:
 
 
 def find_config(name: str | Path, kind: str) -> Path:
-    """Finds a configuration by the name of a shipped one, or by path.
-
-    Args:
-        name: `arena` for `config/KIND/arena.yaml`, or the path of a YAML file.
-        kind: the folder below `config`: `robots`, `worlds` or `nodes`.
-
-    Returns:
-        The file's path.
+    """Finds a configuration: `arena` for `config/KIND/arena.yaml`, or the path of a YAML file.
 
     Raises:
         ConfigError: no such configuration; names the nearest valid one.
@@ -217,3 +196,136 @@ def find_config(name: str | Path, kind: str) -> Path:
             "(or give the path of a YAML file)."
         )
     return path
+
+
+class _PythonEvents(yaml.reader.Reader, yaml.scanner.Scanner, yaml.parser.Parser):
+    """Python substitute for libyaml's parser, four times slower."""
+
+    def __init__(self, text: str) -> None:
+        yaml.reader.Reader.__init__(self, text)
+        yaml.scanner.Scanner.__init__(self)
+        yaml.parser.Parser.__init__(self)
+
+
+_Events: Any = vars(yaml)["cyaml"].CParser if yaml.__with_libyaml__ else _PythonEvents
+
+
+class _Loader(Composer, _Events, SafeConstructor, Resolver):  # type: ignore[misc]
+    """Loader with YAML 1.2 numbers, no duplicate keys, no tags, and limits on depth and size."""
+
+    def __init__(self, text: str) -> None:
+        _Events.__init__(self, text)
+        Composer.__init__(self)
+        SafeConstructor.__init__(self)
+        Resolver.__init__(self)
+        self._depth = self._values = 0
+        self._sizes: dict[str, int] = {}
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Composes a node as PyYAML does, and counts depth and values."""
+        event: Any = self.peek_event()
+        is_alias = isinstance(event, yaml.AliasEvent)
+        before, self._depth = self._values, self._depth + 1
+        self._values += self._sizes.get(event.anchor, 1) if is_alias else 1
+        if self._depth > MAX_DEPTH:
+            self._refuse(event, f"it is nested more than {MAX_DEPTH} levels deep; flatten it")
+        if self._values > MAX_VALUES:
+            self._refuse(event, f"it holds more than {MAX_VALUES} values, with all its aliases")
+        if getattr(event, "tag", None) is not None:
+            tag = reprlib.repr(event.tag.replace("tag:yaml.org,2002:", "!!"))
+            self._refuse(event, f"the tag {tag} is not read here; write the value alone")
+        if is_alias and event.anchor in self.anchors and event.anchor not in self._sizes:
+            self._refuse(event, f"the alias {reprlib.repr(event.anchor)} stands within itself")
+        node = super().compose_node(parent, index)
+        if event.anchor is not None:
+            self._sizes[event.anchor] = self._values - before
+        self._depth -= 1
+        return node
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """Constructs a mapping as PyYAML does, but refuses duplicate keys."""
+        if not isinstance(node, yaml.MappingNode):
+            self._refuse(node, "`<<` must be followed by the alias of a mapping")
+        seen: set[Any] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                self._refuse(key, "a key must be one word or number")
+            if key.value in seen:
+                self._refuse(key, f"the key {reprlib.repr(key.value)} stands twice; keep one")
+            seen.add(key.value)
+        return dict(super().construct_mapping(node, deep=deep))
+
+    @staticmethod
+    def _refuse(place: Any, problem: str) -> None:
+        raise yaml.constructor.ConstructorError(None, None, problem, place.start_mark)
+
+
+def _whole(loader: _Loader, node: Any) -> int:
+    try:
+        return int(loader.construct_scalar(node))
+    except ValueError:
+        loader._refuse(node, f"a number of {len(node.value)} digits is too long")
+        raise
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _whole)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Dumper that quotes text that either `_Loader` or YAML 1.1 would take for a number."""
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [
+        (tag, pattern) for tag, pattern in resolvers if tag.rsplit(":", 1)[-1] in ("null", "merge")
+    ]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")
+)
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:int", re.compile(r"^[-+]?(?:0|[1-9][0-9]*)$"), list("-+0123456789")
+)
+for _kind in (_Loader, _Dumper):
+    _kind.add_implicit_resolver(
+        "tag:yaml.org,2002:float",
+        re.compile(
+            r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+            r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+        ),
+        list("-+0123456789."),
+    )
+
+
+def parse_yaml(text: str, source: str) -> dict[str, Any]:
+    """Reads a YAML mapping; the source is the file's name.
+
+    Raises:
+        ConfigError: not YAML, a duplicate key, an empty file, no mapping at the top level, or more
+            than `MAX_BYTES`, `MAX_DEPTH` and `MAX_VALUES` allow.
+    """
+    if len(text) > MAX_BYTES:
+        reason = f"is larger than {MAX_BYTES // 2**20} MB; give a configuration instead."
+        raise ConfigError(f"{source}: {reason}")
+    try:
+        data = _Loader(text).get_single_data()
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        last = text.rstrip().count("\n")  # a mark may lie beyond the end
+        line = f", line {min(mark.line, last) + 1}" if mark else ""
+        problem = shortened(error.problem or "not YAML", _LONGEST_PROBLEM)
+        raise ConfigError(f"{source}{line}: {problem}.") from None
+    except (yaml.YAMLError, ValueError) as error:
+        problem = shortened(" ".join(str(error).split()), _LONGEST_PROBLEM)
+        raise ConfigError(f"{source}: {problem}.") from None
+    if data is None:
+        raise ConfigError(f"{source}: the file is empty; it must hold `key: value` lines.")
+    if not isinstance(data, dict):
+        raise ConfigError(f"{source}: the top level must be `key: value` lines.")
+    return data
+
+
+def dump_yaml(data: Any) -> str:
+    """Writes plain data as YAML that `parse_yaml` reads back to the same numbers."""
+    return str(yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100))

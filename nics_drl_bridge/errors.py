@@ -13,12 +13,8 @@ MISSING_ROS = (
     "needs the module {module!r}; source your ROS 2 installation, or "
     "pip install 'nics_drl_bridge[ros]'."
 )
-
-
-LONGEST = 800
-"""Maximum length of a sentence [characters]; a longer one loses its middle."""
-LONGEST_NAME = 100
-"""Characters of a name that are compared with the known names."""
+LONGEST = 800  # maximum length of a sentence [characters]; a longer one loses its middle
+LONGEST_NAME = 100  # characters of a name that are compared with the known names
 
 
 def shortened(text: str, most: int) -> str:
@@ -61,11 +57,7 @@ class BackendError(BridgeError):
 
 
 class PolicyError(BridgeError):
-    """A policy file can't be used, or does not fit the robot.
-
-    Attributes:
-        field: the faulty field, such as `lidar.beams`.
-    """
+    """A policy file can't be used, or does not fit the robot in a field such as `lidar.beams`."""
 
     def __init__(self, source: str, field: str, reason: str) -> None:
         self.source, self.field = source, shortened(field, LONGEST_NAME)
@@ -77,21 +69,12 @@ class PolicyError(BridgeError):
 
 
 class StaleDataError(BackendError):
-    """No fresh data arrived in time.
-
-    Attributes:
-        topic: the topic that is late.
-        age_s: age of its last message [s], `inf` if there never was one.
-        limit_s: maximum age [s].
-    """
+    """No fresh data arrived on a topic in time; the age is `inf` if there never was a message."""
 
     def __init__(self, topic: str, age_s: float, limit_s: float) -> None:
         self.topic, self.age_s, self.limit_s = topic, age_s, limit_s
-        last = (
-            "nothing has ever arrived"
-            if age_s == float("inf")
-            else f"the last is {age_s:.3f} s old"
-        )
+        never = age_s == float("inf")
+        last = "nothing has ever arrived" if never else f"the last is {age_s:.3f} s old"
         super().__init__(
             f"topic {topic!r}: no fresh data within {limit_s:.3f} s, {last}; check that its "
             "publisher runs in this ROS domain and namespace."
@@ -102,17 +85,8 @@ class StaleDataError(BackendError):
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Returns a clause that suggests the closest known name, or lists them all.
-
-    Args:
-        name: the name as given.
-        known: the valid names.
-
-    Returns:
-        `did you mean 'x'?` or `valid are: 'x', 'y'`.
-    """
-    names, name = sorted(known), shortened(name, LONGEST_NAME)
-    close = difflib.get_close_matches(name, names, n=1)
-    if close:
-        return f"did you mean {close[0]!r}?"
+    """Returns a clause: `did you mean 'x'?`, or `valid are: 'x', 'y'` if none is close."""
+    names = sorted(known)
+    for close in difflib.get_close_matches(shortened(name, LONGEST_NAME), names, n=1):
+        return f"did you mean {close!r}?"
     return "valid are: " + ", ".join(repr(n) for n in names)

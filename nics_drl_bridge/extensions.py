@@ -32,14 +32,9 @@ def known(group: str) -> dict[str, EntryPoint]:
 
 
 def load(group: str, name: str) -> Any:
-    """An extension by its name.
+    """An extension by its group and its name.
 
-    Args:
-        group: `backends`, `commands`, `engines`, `kinds`, `nodes` or `salvage`.
-        name: as it is registered.
-
-    Raises:
-        ConfigError: there is none of that name, or a library that it needs is missing.
+    Raises ConfigError if there is none of that name, or a library that it needs is missing.
     """
     extensions = known(group)
     if name not in extensions:

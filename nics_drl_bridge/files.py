@@ -30,12 +30,7 @@ def _fsync(path: Path) -> None:
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Writes a file via a temporary one, fsynced and renamed.
-
-    Args:
-        path: the file; its folder is created if missing.
-        data: the whole content.
-    """
+    """Writes a file via a temporary one, fsynced and renamed; creates its folder if missing."""
     write_parts(path, [data])
 
 
@@ -63,13 +58,9 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def check_folder(path: str | Path, marker: str) -> Path:
-    """Checks that `whole_folder` can create a folder, without creating anything.
+    """Checks that `whole_folder` can create a folder, without creating anything; resolves it.
 
-    Returns:
-        The resolved path: a symbolic link stays, the folder it points to is replaced.
-
-    Raises:
-        ConfigError: `path` is a file, a folder of another kind, or not in a writable place.
+    Raises ConfigError if `path` is a file, a folder of another kind, or not in a writable place.
     """
     path = Path(path).resolve()
     if path.exists() and not path.is_dir():
@@ -83,11 +74,7 @@ def check_folder(path: str | Path, marker: str) -> Path:
 
 
 def check_above(path: Path) -> None:
-    """Checks that a path can be created, without creating anything.
-
-    Raises:
-        ConfigError: it is not in a writable place.
-    """
+    """Raises ConfigError if a path can't be created, without creating anything."""
     above = next(parent for parent in path.resolve().parents if parent.exists())
     if not above.is_dir():
         raise ConfigError(f"{path}: {above} is a file, not a folder; choose another place.")
@@ -97,18 +84,11 @@ def check_above(path: Path) -> None:
 
 @contextmanager
 def whole_folder(path: str | Path, marker: str) -> Iterator[Path]:
-    """Yields a temporary folder that replaces `path` if the block succeeds.
+    """Yields a temporary folder that replaces `path` if the block succeeds, else is removed.
 
-    Args:
-        path: the folder to create. An existing one is replaced only if it is empty or contains
-            `marker`, so that a wrong `--out` never deletes a user's work.
-        marker: a file name that a folder of this kind always contains.
-
-    Yields:
-        The temporary folder, next to `path`. It is removed after an error.
-
-    Raises:
-        ConfigError: see `check_folder`.
+    An existing folder is replaced only if it is empty or contains `marker`, a file of every folder
+    of this kind, so that a wrong `--out` never deletes a user's work. A symbolic link stays; the
+    folder that it points to is replaced. Raises ConfigError: see `check_folder`.
     """
     path = check_folder(path, marker)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -143,16 +123,11 @@ def _swap(new: Path, path: Path) -> None:
 
 
 def _exchange(one: Path, other: Path) -> bool:
-    """Exchanges two paths atomically, so that neither is ever missing.
-
-    Returns:
-        False if the system or the file system can't (renameat2 is specific to Linux).
-    """
+    """Exchanges two paths atomically; False if the system can't (renameat2 is Linux's alone)."""
     rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if rename is None:
         return False
-    ends = os.fsencode(one), os.fsencode(other)
-    if rename(_AT_FDCWD, ends[0], _AT_FDCWD, ends[1], _RENAME_EXCHANGE) == 0:
+    if rename(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0:
         return True
     code = ctypes.get_errno()
     if code in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOENT):
@@ -166,8 +141,7 @@ def sync_folder(folder: Path) -> None:
         _fsync(file)
 
 
-SUMS = "SHA256SUMS"
-"""Manifest of a folder, which `sha256sum -c SHA256SUMS` checks as well."""
+SUMS = "SHA256SUMS"  # manifest of a folder, which `sha256sum -c SHA256SUMS` checks as well
 MOST_BYTES = 256 * 2**20
 """Greatest size of a file of arrays: a day of driving, or the table of a thousand shapes."""
 _SEAL = b"sha256 "
@@ -196,11 +170,7 @@ def sealed(data: bytes) -> bytes:
 def check_sealed(file: BinaryIO) -> None:
     """Verifies the checksum that `sealed` appended, without reading the whole file at once.
 
-    Args:
-        file: open for reading; it is left at its beginning.
-
-    Raises:
-        ValueError: the data have changed, or there is no checksum.
+    The file is left at its beginning. Raises ValueError if the data have changed.
     """
     size = file.seek(0, os.SEEK_END) - len(_SEAL) - 64
     file.seek(0)
@@ -226,16 +196,12 @@ def write_sums(folder: Path) -> None:
 
 
 def check_sums(folder: Path, names: Sequence[str], editable: str = "") -> None:
-    """Checks files against the `SHA256SUMS` of their folder.
+    """Checks files of a model or a lidar table against the `SHA256SUMS` of their folder.
 
-    Args:
-        folder: of a model or a lidar table.
-        names: every file that the manifest lists; other files in the folder are ignored.
-        editable: the name that needs no line, since a user may have removed it to edit the file.
-
-    Raises:
-        ModelError: a file is missing, too large or different from its line, or the manifest does
-            not list exactly these files.
+    The names are all that the manifest lists; other files in the folder are ignored. `editable` is
+    the one that needs no line, since a user may have removed it to edit the file. Raises ModelError
+    if a file is missing, too large or different from its line, or the manifest does not list
+    exactly these files.
     """
     with _opened(folder / SUMS) as file:
         listed = file.readlines(_PART)

@@ -36,17 +36,6 @@ from nics_drl_bridge.robot.noise import Latency, Noise
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
 
-__all__ = [
-    "Noise",
-    "SimulatorModel",
-    "builtin_model",
-    "check_place",
-    "generate",
-    "load_model",
-    "open_model",
-    "save_model",
-]
-
 FORMAT = "nics_drl_bridge/simulator_model/4"
 MODEL_FILE, TABLE_FOLDER, REPORT_FILE = "model.yaml", "lidar_table", "report.txt"
 MODEL_FILES = (
@@ -62,41 +51,29 @@ BUILTIN_SEED = 0
 
 @dataclass(frozen=True)
 class SimulatorModel:
-    """All that a fast simulator needs to know about a robot.
-
-    Attributes:
-        robot: names, units, order and limits of state and command.
-        kinematics: the fitted, pruned Taylor model.
-        calibration: clock offset, latency, sensor frames, noise of the recording.
-        lidar: the sensor.
-        table: baked ranges of the obstacles' shapes and of the robot itself.
-        noise: of sensors and motion, see `Noise`.
-        control_period: time between commands [s]; a whole number of `kinematics.dt`.
-        report: how the model was made, as readable text.
-        latency: of scan and odometry, where the recording showed it.
-    """
+    """All that a fast simulator needs to know about a robot."""
 
     robot: RobotSpec
-    kinematics: TaylorModel
-    calibration: Calibration
+    kinematics: TaylorModel  # the fitted, pruned Taylor model
+    calibration: Calibration  # clock offset, latency, sensor frames, noise of the recording
     lidar: LidarSpec
-    table: LidarTable
-    noise: Noise = field(default_factory=Noise)
-    control_period: float = CONTROL_PERIOD_S
-    report: str = ""
-    latency: Latency = field(default_factory=Latency)
+    table: LidarTable  # baked ranges of the obstacles' shapes and of the robot itself
+    noise: Noise = field(default_factory=Noise)  # of sensors and motion
+    control_period: float = CONTROL_PERIOD_S  # between commands; a whole number of `kinematics.dt`
+    report: str = ""  # how the model was made, as readable text
+    latency: Latency = field(default_factory=Latency)  # of scan and odometry, where it was shown
 
     def __post_init__(self) -> None:
-        if self.kinematics.variables != self.robot.variable_names:
-            raise ModelError(
-                f"the kinematics are of {self.kinematics.variables}, the robot "
-                f"{self.robot.name!r} has {self.robot.variable_names}; generate the model anew."
-            )
-        if self.kinematics.dofs != self.robot.dof_names:
-            raise ModelError(
-                f"the kinematics give the rates {self.kinematics.dofs}, the robot "
-                f"{self.robot.name!r} needs {self.robot.dof_names}; generate the model anew."
-            )
+        robot, kinematics = self.robot, self.kinematics
+        for known, given, needed in (
+            ("are of", kinematics.variables, robot.variable_names),
+            ("give the rates", kinematics.dofs, robot.dof_names),
+        ):
+            if given != needed:
+                raise ModelError(
+                    f"the kinematics {known} {given}, the robot {robot.name!r} needs {needed}; "
+                    "generate the model anew."
+                )
         substeps = self.control_period / self.kinematics.dt
         if not 0.5 < substeps < np.inf or abs(substeps - round(substeps)) > 1e-6:
             raise ModelError(
@@ -114,21 +91,18 @@ class SimulatorModel:
     @cached_property
     def text(self) -> str:
         """The content of `model.yaml`."""
-        measured = (
-            {"latency": self.latency.model_dump(mode="json")} if self.latency.measured else {}
-        )
-        return dump_yaml(
-            {
-                "format": FORMAT,
-                "control_period": self.control_period,
-                "robot": self.robot.model_dump(mode="json"),
-                "kinematics": self.kinematics.named.model_dump(exclude_none=True),
-                "calibration": asdict(self.calibration),
-                "lidar": self.lidar.model_dump(mode="json"),
-                "noise": self.noise.model_dump(mode="json"),
-                **measured,
-            }
-        )
+        data = {
+            "format": FORMAT,
+            "control_period": self.control_period,
+            "robot": self.robot.model_dump(mode="json"),
+            "kinematics": self.kinematics.named.model_dump(exclude_none=True),
+            "calibration": asdict(self.calibration),
+            "lidar": self.lidar.model_dump(mode="json"),
+            "noise": self.noise.model_dump(mode="json"),
+        }
+        if self.latency.measured:
+            data["latency"] = self.latency.model_dump(mode="json")
+        return dump_yaml(data)
 
     @property
     def fingerprint(self) -> str:
@@ -171,11 +145,7 @@ def generate(
         alpha: pruning threshold of Eq. 2, or `auto`.
         assume: fill in from the textbook what the drive did not show, marked as assumed.
         strict: refuse a drive that did not excite every input on its own.
-        anyway: return a model even if it predicts unseen data hardly better than a standing
-            robot would.
-
-    Returns:
-        The model, and everything that was identified on the way.
+        anyway: accept predictions of unseen data hardly better than those of a standing robot.
 
     Raises:
         RecordingError: the recording can't be used for this robot.
@@ -225,20 +195,12 @@ def open_model(name: str | Path) -> SimulatorModel:
 
 
 def check_place(folder: str | Path) -> None:
-    """Checks, before the work of a fit, that `save_model` can write to a folder.
-
-    Raises:
-        ConfigError: the folder contains something else, or is not writable.
-    """
+    """Raises ConfigError, before the work of a fit, if `save_model` can't write to a folder."""
     check_folder(folder, MODEL_FILE)
 
 
 def save_model(model: SimulatorModel, folder: str | Path) -> None:
-    """Writes a model as a folder, completely or not at all.
-
-    Raises:
-        ConfigError: the folder contains something else.
-    """
+    """Writes a model as a folder, completely or not at all; see `check_place`."""
     with whole_folder(folder, MODEL_FILE) as temporary:
         write_text(temporary / MODEL_FILE, model.text)
         write_text(temporary / REPORT_FILE, model.report)
@@ -249,8 +211,7 @@ def save_model(model: SimulatorModel, folder: str | Path) -> None:
 def load_model(folder: str | Path) -> SimulatorModel:
     """Reads a model that `save_model` wrote.
 
-    Raises:
-        ConfigError, ModelError: a file is missing, damaged or of another format.
+    Raises ConfigError, ModelError if a file is missing, damaged or of another format.
     """
     folder = Path(folder)
     path = folder / MODEL_FILE
@@ -259,10 +220,8 @@ def load_model(folder: str | Path) -> SimulatorModel:
     inode = folder.stat().st_ino
     data = parse_yaml(read_text(path), str(path))
     if data.get("format") != FORMAT:
-        raise ModelError(
-            f"{path}: key 'format' is {data.get('format')!r}, not {FORMAT!r}; generate the model "
-            "anew."
-        )
+        reason = f"key 'format' is {data.get('format')!r}, not {FORMAT!r}"
+        raise ModelError(f"{path}: {reason}; generate the model anew.")
     check_sums(folder, MODEL_FILES, editable=MODEL_FILE)
     file = validate(data, _File, str(path))
     for key in fields(Calibration):  # its defaults are those of a robot that needs none

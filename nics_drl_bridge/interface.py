@@ -9,6 +9,7 @@ from typing import Any, Protocol, TypedDict, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+Array = NDArray[np.float64]
 NS_PER_S, S_PER_NS = 1_000_000_000, 1e-9
 
 
@@ -16,21 +17,14 @@ NS_PER_S, S_PER_NS = 1_000_000_000, 1e-9
 class RobotView:
     """All that a task or a policy may know about a robot, or about a batch of robots.
 
-    The leading dimensions `...` are empty for one robot and (N, M) in a vector simulator.
-
-    Attributes:
-        pose: (..., 3) estimate of x [m], y [m], heading [rad] of `base_link` in `map`.
-        twist: (..., 3) estimate of vx [m/s], vy [m/s], wz [rad/s] in `base_link`.
-        ranges: (..., B) scan [m], float32, REP-117: `inf` no return, `-inf` too close,
-            NaN unknown.
-        stamp_s: time stamp of the newest data [s].
-        scan_age_s: age of the scan at the time of the view [s].
-        odom_age_s: age of the newest odometry at the time of the view [s].
+    The leading dimensions `...` are empty for one robot and (N, M) in a vector simulator. The time
+    stamp is that of the newest data, the ages are those at the time of the view. A range of NaN is
+    unknown.
     """
 
-    pose: NDArray[np.float64]
-    twist: NDArray[np.float64]
-    ranges: NDArray[np.float32]
+    pose: Array  # (..., 3) estimate of x [m], y [m], heading [rad] of `base_link` in `map`
+    twist: Array  # (..., 3) estimate of vx [m/s], vy [m/s], wz [rad/s] in `base_link`
+    ranges: NDArray[np.float32]  # (..., B) [m], REP-117: `inf` no return, `-inf` too close
     stamp_s: float
     scan_age_s: float
     odom_age_s: float
@@ -50,34 +44,21 @@ def stacked(views: Sequence[RobotView]) -> RobotView:
 
 @dataclass(frozen=True)
 class Start:
-    """Start of an episode.
-
-    Attributes:
-        seed: identifies the episode; a simulator draws scene and noise from it.
-        pose: (3,) of the robot: x [m], y [m], heading [rad] in `map`; (M, 3) for a team.
-    """
+    """Start of an episode, whose scene and noise a simulator draws from its seed."""
 
     seed: int
-    pose: NDArray[np.float64]
+    pose: Array  # (3,) x [m], y [m], heading [rad] in `map`; (M, 3) for a team
 
 
 class BackendFacts(TypedDict, total=False):
-    """Facts that a backend alone knows; those that it does not know are left out.
+    """Facts that a backend alone knows; those that it does not know are left out."""
 
-    Attributes:
-        true_pose: (3,) x [m], y [m], heading [rad] in `map` now; (M, 3) of a team.
-        true_collision: True once the robot has touched something; (M,) of a team.
-        bodies: (K, 7) the obstacles where they are now, see `sim.scenes.Scene`.
-        randomisation: name -> value that was drawn for the episode, where any was.
-        scenes: gives the scenes of episodes for their seeds (n,), where these are not those of the
-            world alone.
-    """
-
-    true_pose: NDArray[np.float64]
-    true_collision: bool | NDArray[np.bool_]
-    bodies: NDArray[np.float64]
-    randomisation: dict[str, Any]
+    true_pose: Array  # (3,) x [m], y [m], heading [rad] in `map` now; (M, 3) of a team
+    true_collision: bool | NDArray[np.bool_]  # True after a contact; (M,) of a team
+    bodies: Array  # (K, 7) obstacles where they are now, see `sim.scenes.Scene`
+    randomisation: dict[str, Any]  # name -> value that was drawn for the episode, where any was
     scenes: Callable[[ArrayLike], Any]
+    """Gives the scenes of episodes for their seeds (n,), where the world alone does not."""
 
 
 @runtime_checkable
@@ -86,73 +67,57 @@ class Backend(Protocol):
 
     def reset(self, start: Start) -> RobotView:
         """Begins an episode and returns its first view."""
-        ...
 
-    def step(self, command: NDArray[np.float64]) -> tuple[RobotView, dict[str, Any]]:
-        """Applies a command for one control period.
+    def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
+        """Applies a command (C,), in the units and the order of the RobotSpec, for one period.
 
-        Args:
-            command: (C,) in the units and the order of the RobotSpec.
-
-        Returns:
-            The view at the end of the period, and facts for `info` (stamps, sequence
-            numbers, and the true pose where a simulator knows it).
+        Returns the view at the end of the period, and facts for `info` (stamps, sequence numbers,
+        and the true pose where a simulator knows it).
         """
-        ...
 
     def facts(self) -> BackendFacts:
         """Returns what this backend alone knows at present; it may be called at any time."""
-        ...
 
     def halt(self) -> None:
         """Stops the robot with a zero command and ends the episode.
 
         It may be called at any time: after an error of the backend, twice, and after `close`.
         """
-        ...
 
     def close(self) -> None:
         """Stops the robot with a zero command and frees all resources."""
-        ...
 
 
 class RobotStates(Protocol):
     """State of a simulator's M robots after a step; the leading 1 is its one world."""
 
     @property
-    def pose(self) -> NDArray[np.float64]:
+    def pose(self) -> Array:
         """(1, M, 3) true pose of `base_link` in `map`."""
-        ...
 
     @property
-    def twist(self) -> NDArray[np.float64]:
+    def twist(self) -> Array:
         """(1, M, 3) measured body twist."""
-        ...
 
     @property
-    def state(self) -> NDArray[np.float64]:
+    def state(self) -> Array:
         """(1, M, S) true state, in the order of the RobotSpec."""
-        ...
 
     @property
-    def odom(self) -> NDArray[np.float64]:
+    def odom(self) -> Array:
         """(1, M, 3) pose by odometry, which starts at the start pose and drifts."""
-        ...
 
     @property
     def ranges(self) -> NDArray[np.float32]:
         """(1, M, B) scan, REP-117."""
-        ...
 
     @property
     def collided(self) -> NDArray[np.uint8]:
         """(1, M) 1 once a robot has touched something."""
-        ...
 
     @property
     def steps(self) -> NDArray[np.int64]:
         """(1,) control periods since the reset."""
-        ...
 
 
 class Simulator(Protocol):
@@ -161,12 +126,9 @@ class Simulator(Protocol):
     @property
     def data(self) -> RobotStates:
         """The current states; a step may overwrite the same arrays."""
-        ...
 
     def reset(self, seeds: ArrayLike, *, starts: ArrayLike | None = None) -> Any:
         """Begins the episode of a seed (1,), at poses (1, M, 3) if they are given."""
-        ...
 
     def step(self, commands: ArrayLike) -> None:
         """Moves the robots by one control period; commands (1, M, C) as in the RobotSpec."""
-        ...

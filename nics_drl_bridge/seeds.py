@@ -16,14 +16,9 @@ _SHORT.maxlong = _SHORT.maxstring = _SHORT.maxother = 40
 
 
 def checked_seeds(seeds: ArrayLike | Any, greatest: int = GREATEST_SEED) -> NDArray[np.int64]:
-    """Returns seeds (n,) as the kernels take them.
+    """Returns one or several seeds as (n,), as the kernels take them.
 
-    Args:
-        seeds: one or several.
-        greatest: largest allowed seed.
-
-    Raises:
-        ConfigError: a seed is negative, too large, or not an integer.
+    Raises ConfigError if a seed is negative, too large, or not an integer.
     """
     if isinstance(seeds, np.ndarray) and seeds.dtype == np.int64 and greatest == GREATEST_SEED:
         numbers = np.atleast_1d(seeds)
@@ -33,11 +28,7 @@ def checked_seeds(seeds: ArrayLike | Any, greatest: int = GREATEST_SEED) -> NDAr
     for seed in given:
         whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
         if not (whole and 0 <= seed <= greatest):
-            told = _SHORT.repr(seed) if _is_told(seed) else "of very many digits"
-            raise ConfigError(f"seed {told}: must be a whole number from 0 to {greatest}.")
+            written = not isinstance(seed, int) or seed.bit_length() < 1000
+            shown = _SHORT.repr(seed) if written else "of very many digits"
+            raise ConfigError(f"seed {shown}: must be a whole number from 0 to {greatest}.")
     return np.asarray([int(seed) for seed in given], dtype=np.int64)
-
-
-def _is_told(seed: object) -> bool:
-    """True unless the seed is an integer too long to be written in decimal."""
-    return not isinstance(seed, int) or seed.bit_length() < 1000

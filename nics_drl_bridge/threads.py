@@ -17,11 +17,7 @@ T = TypeVar("T")
 class Crew:
     """A pool of threads that wait for work; the calling thread is one of them.
 
-    Python runs in one thread at a time, so it helps only if the work is in compiled functions
-    that release the interpreter lock (`nogil`).
-
-    Args:
-        threads: number of threads, including the caller's.
+    It helps only if the work is in compiled functions that release the interpreter lock (`nogil`).
     """
 
     def __init__(self, threads: int) -> None:

@@ -14,9 +14,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from command_line import nics
 from domains import claimed_domain
 
 DEADLINE_S = 300.0
+campaign = pytest.mark.campaign
 LAST_LINE = r"demo: in process ([0-2])/2, over DDS ([0-2])/2, report (.+/report\.html)"
 READY_MADE = ("--policy", "dynamic_window")
 DEVIATION = r"<td>([0-9.e+-]+)</td></tr>"
@@ -113,6 +115,8 @@ def whole_road(*words: object, cwd: Path) -> tuple[Running, tuple[str, str], str
 
 
 @needs_ros
+@pytest.mark.process
+@pytest.mark.slow
 def test_it_goes_the_whole_road_and_leaves_a_report(tmp_path):
     running, successes, text = whole_road(*READY_MADE, cwd=tmp_path)
     assert successes == ("2", "2")
@@ -134,6 +138,8 @@ def test_it_goes_the_whole_road_and_leaves_a_report(tmp_path):
 
 
 @needs_ros
+@pytest.mark.process
+@pytest.mark.campaign
 @pytest.mark.skipif(find_spec("stable_baselines3") is None, reason="needs the extra train")
 @pytest.mark.timeout(400)
 def test_it_deploys_the_policy_file_that_it_trained(tmp_path):
@@ -154,12 +160,14 @@ def test_it_deploys_the_policy_file_that_it_trained(tmp_path):
 @pytest.mark.parametrize(
     ("phase", "pattern", "episodes", "policy"),
     [
-        ("training", "^  .* steps: success", 1, ()),
-        ("in process", "^  seed 0: ", 1000, READY_MADE),
-        ("over DDS", "^driving the same .* over DDS", 50, READY_MADE),
+        pytest.param("training", "^  .* steps: success", 1, (), marks=campaign),
+        pytest.param("in process", "^  seed 0: ", 1000, READY_MADE, marks=campaign),
+        pytest.param("over DDS", "^driving the same .* over DDS", 50, READY_MADE, marks=campaign),
         ("in real time", "^deploying ", 1, READY_MADE),
     ],
 )
+@pytest.mark.process
+@pytest.mark.slow
 def test_ctrl_c_ends_it_and_all_that_it_started(tmp_path, phase, pattern, episodes, policy):
     if phase == "training":
         pytest.importorskip("stable_baselines3")
@@ -183,17 +191,23 @@ def wait_for(condition, what):
         once.wait(0.01)
 
 
-@pytest.mark.parametrize("words", [("--recording", "drive"), ("--robot", "ackerman"),
-                                   ("--world", "areena"), ("--out", "file"),
-                                   ("--policy", "dynamic_widow")])  # fmt: skip
+@pytest.mark.skipif(find_spec("rclpy") is None, reason="needs ROS 2")
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--recording", "drive"), ("--robot", "ackerman"), ("--world", "areena"),
+        pytest.param(("--out", "file"), marks=pytest.mark.slow),
+        pytest.param(("--policy", "dynamic_widow"), marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
 def test_bad_input_ends_it_with_code_2_and_one_sentence(tmp_path, words):
     (tmp_path / "drive").mkdir()
     (tmp_path / "drive" / "cmd.csv").write_text("0.5,nan,0.0\n", encoding="utf-8")
     (tmp_path / "drive" / "vrpn.csv").write_text("", encoding="utf-8")
     (tmp_path / "file").write_text("mine", encoding="utf-8")
-    with demo(*words, cwd=tmp_path) as running:
-        assert running.process.wait(DEADLINE_S) == 2
-        (sentence,) = running.process.stderr.read().splitlines()
+    done = nics("demo", *words, cwd=tmp_path)
+    assert done.returncode == 2
+    (sentence,) = done.stderr.splitlines()
     assert sentence.startswith("nics: ")
     assert words[1].removesuffix("drive") in sentence
     assert not list(tmp_path.rglob(".*"))

@@ -7,6 +7,7 @@ import sys
 from importlib.util import find_spec
 
 import pytest
+from command_line import nics
 from domains import claimed_domain
 
 from nics_drl_bridge.config import dump_yaml
@@ -19,7 +20,7 @@ missing = [name for name in ("rclpy", "mujoco") if find_spec(name) is None]
 needs_nodes = pytest.mark.skipif(bool(missing), reason=f"needs {' and '.join(missing)}")
 
 
-def nics(*words, cwd, domain_id=0):
+def started(*words, cwd, domain_id):
     return subprocess.run(
         [sys.executable, "-m", "nics_drl_bridge.commands.cli", *map(str, words)],
         cwd=cwd,
@@ -31,11 +32,13 @@ def nics(*words, cwd, domain_id=0):
 
 
 @pytest.mark.ros
+@pytest.mark.process
+@pytest.mark.slow
 @needs_nodes
 def test_the_same_episodes_are_driven_in_three_worlds(tmp_path):
     with claimed_domain() as domain_id:
         words = ("evaluate", "dynamic_window", "--model", "differential", "--episodes", 2)
-        done = nics(*words, "--out", "out", cwd=tmp_path, domain_id=domain_id)
+        done = started(*words, "--out", "out", cwd=tmp_path, domain_id=domain_id)
     assert done.returncode == 0, done.stderr
     told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
     places = told["policies"]["dynamic_window"]
@@ -53,6 +56,7 @@ def test_the_same_episodes_are_driven_in_three_worlds(tmp_path):
     assert "dynamic_window: success in process " in done.stdout.splitlines()[-2]
 
 
+@pytest.mark.slow
 def test_several_policies_drive_the_same_episodes_in_one_table(tmp_path):
     words = ("evaluate", "dynamic_window", "random", "--in", "fast", "--episodes", 3, "--seed", 7)
     done = nics(*words, "--model", "ackermann", "--out", "out", cwd=tmp_path)
@@ -66,6 +70,7 @@ def test_several_policies_drive_the_same_episodes_in_one_table(tmp_path):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("differential" not in shipped_policies(), reason="no policy is shipped")
 def test_a_shipped_policy_brings_its_own_robot(tmp_path):
     words = ("evaluate", "differential", "--in", "fast", "--episodes", 2, "--out", "out")
@@ -99,6 +104,8 @@ def test_bad_input_ends_it_with_one_sentence(tmp_path, words, said):
 
 
 @pytest.mark.ros
+@pytest.mark.process
+@pytest.mark.slow
 @needs_nodes
 def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monkeypatch):
     from nics_drl_bridge.commands import vehicle
@@ -142,11 +149,13 @@ def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monke
 
 
 @pytest.mark.ros
+@pytest.mark.process
+@pytest.mark.campaign
 @needs_nodes
 def test_a_vehicle_that_does_not_fit_its_model_is_not_driven(tmp_path):
     with claimed_domain() as domain_id:  # nobody is there
         words = ("evaluate", "dynamic_window", "--backend", "dds", "--hardware", "--yes")
-        done = nics(*words, "--out", "out", cwd=tmp_path, domain_id=domain_id)
+        done = started(*words, "--out", "out", cwd=tmp_path, domain_id=domain_id)
     assert done.returncode == 2
     assert "the vehicle is not driven: " in done.stderr.splitlines()[-1]
     assert not (tmp_path / "out").exists()

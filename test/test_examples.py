@@ -11,6 +11,8 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+@pytest.mark.process
+@pytest.mark.slow
 @pytest.mark.timeout(300)  # a cold start compiles
 def test_every_example_runs_in_a_process_of_its_own(example, tmp_path):
     done = subprocess.run(
@@ -24,10 +26,17 @@ def test_every_example_runs_in_a_process_of_its_own(example, tmp_path):
     "imports",
     [
         "import gymnasium, nics_drl_bridge",
-        "import gymnasium; gymnasium.make('nics_drl_bridge:NicsBridge/Navigation-v0').close()",
-        "from nics_drl_bridge import make; import gymnasium; make().close()",
+        pytest.param(
+            "import gymnasium; gymnasium.make('nics_drl_bridge:NicsBridge/Navigation-v0').close()",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "from nics_drl_bridge import make; import gymnasium; make().close()",
+            marks=pytest.mark.campaign,
+        ),
     ],
 )
+@pytest.mark.process
 def test_gymnasium_knows_the_environments(imports):
     code = f"{imports}\nprint('NicsBridge/Navigation-v0' in gymnasium.registry)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

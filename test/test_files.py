@@ -83,6 +83,7 @@ def test_a_crash_while_writing_leaves_the_old_file_and_no_other(tmp_path, monkey
     assert tree(tmp_path) == {"file": b"old"}
 
 
+@pytest.mark.process
 def test_a_killed_writer_leaves_one_whole_version(tmp_path):
     path = tmp_path / "file"
     code = (
@@ -171,6 +172,7 @@ while True:
 """
 
 
+@pytest.mark.process
 def test_a_folder_is_whole_at_every_moment_while_two_write_it_and_are_killed(old):
     writers = [subprocess.Popen([sys.executable, "-c", WRITER, str(old)]) for _ in range(2)]
     try:
@@ -260,6 +262,7 @@ except OSError as error:
 """
 
 
+@pytest.mark.process
 def test_a_disk_that_takes_no_more_leaves_the_old_file_and_no_other(tmp_path):
     path = tmp_path / "file"
     write_bytes(path, b"old")

@@ -18,7 +18,7 @@ PACKAGE = "nics_drl_bridge"
 # From the bottom up. What stands on one line does not import each other.
 LAYERS = (
     ("errors", "geometry", "interface", "kernels"),
-    ("extensions", "random_kernels", "seeds", "strict_yaml"),
+    ("extensions", "random_kernels", "seeds"),
     ("config", "files", "threads"),
     ("robot",),
     ("recording",),
@@ -49,7 +49,7 @@ HOMES = {
     "ament_index_python": ("nodes/*", "extras/*"),
     "filterpy": ("middleware/ekf.py",),
     "matplotlib": ("report/*", "env/rendering.py"),
-    "yaml": ("strict_yaml.py",),
+    "yaml": ("config.py",),
     "typer": ("commands/*", "extras/*"),
     "gymnasium": ("env/*", "policy/*", "commands/*", "extras/*"),
     "numba": ("*kernels.py",),
@@ -141,8 +141,7 @@ def package(tmp_path):
     for name, text in {
         "__init__.py": "",
         "errors.py": "import numpy",
-        "strict_yaml.py": "import yaml\nfrom nics_drl_bridge.errors import E",
-        "config.py": "from nics_drl_bridge.strict_yaml import parse_yaml",
+        "config.py": "import yaml\nfrom nics_drl_bridge.errors import E",
         "robot/spec.py": "from nics_drl_bridge import config\nfrom . import model",
         "robot/taylor.py": "",
         "robot/kernels.py": "from numba import njit",
@@ -234,6 +233,7 @@ def test_kernels_import_kernels_only_so_that_no_other_edit_compiles_them_anew():
     assert {name: found for name, found in heavy.items() if found} == {}
 
 
+@pytest.mark.process
 def test_importing_the_package_imports_nothing_heavy():
     loaded = modules_after(f"import {PACKAGE}")
     assert PACKAGE in loaded
@@ -241,6 +241,8 @@ def test_importing_the_package_imports_nothing_heavy():
     assert not loaded & (heavy | {"rclpy"})
 
 
+@pytest.mark.process
+@pytest.mark.slow
 @pytest.mark.timeout(300)  # without numba's caches, all kernels are compiled here
 def test_an_env_in_process_imports_neither_ros_nor_pictures():
     loaded = modules_after(

@@ -23,7 +23,8 @@ from nics_drl_bridge.lidar.shapes import load_shapes
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
 from nics_drl_bridge.middleware.playback import EstimatedDrive, write_estimate
-from nics_drl_bridge.policy.policy_file import load_policy, shipped
+from nics_drl_bridge.policy.contract import shipped
+from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.recording.readers import load_csv_folder, read_recording
 from nics_drl_bridge.recording.recording import load_recording, save_recording

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from robots import direct_model
 
-from nics_drl_bridge.commands.episodes import EvaluationOrder, seeds_of
+from nics_drl_bridge.commands.episodes import EvaluationOrder
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.recording.drive_plan import DrivePlan
 from nics_drl_bridge.robot.spec import load_robot
@@ -45,7 +45,7 @@ def test_every_seed_of_63_bits_is_taken(simulator, seed):
 
 def test_the_last_seed_of_an_evaluation_counts_too():
     with pytest.raises(ConfigError, match="seed 9223372036854775808"):
-        seeds_of(EvaluationOrder(["straight"], None, None, "arena", 2, GREATEST_SEED))
+        _ = EvaluationOrder(["straight"], None, None, "arena", 2, GREATEST_SEED).seeds
 
 
 def test_a_seed_is_told_shortly():

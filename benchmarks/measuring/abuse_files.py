@@ -79,14 +79,14 @@ def _take_checks_out() -> None:
     """Policies and YAML are believed, in this process and those that it forks."""
     import yaml
 
-    from nics_drl_bridge import strict_yaml
-    from nics_drl_bridge.policy import onnx_graph, onnx_sizes
+    from nics_drl_bridge import config
+    from nics_drl_bridge.policy import onnx_graph
 
-    vars(strict_yaml).update(_Loader=yaml.SafeLoader, MAX_BYTES=10**9)
+    vars(config).update(_Loader=yaml.SafeLoader, MAX_BYTES=10**9)
     vars(onnx_graph).update(
-        check_wire=_believe, check_graph=_believe, check_seal=_believe, CONTRACT_LIMIT=10**9
-    )
-    vars(onnx_sizes).update(rows_at_once=lambda *_: 10**9)
+        check_wire=_believe, check_graph=_believe, check_seal=_believe,
+        rows_at_once=lambda *_: 10**9, CONTRACT_LIMIT=10**9,
+    )  # fmt: skip
 
 
 def _believe(*_: object) -> None:

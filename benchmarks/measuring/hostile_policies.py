@@ -13,7 +13,8 @@ import onnx
 
 from measuring.attempt import Attempt, nics
 from nics_drl_bridge.policy import contract, onnx_graph
-from nics_drl_bridge.policy.policy_file import load_policy, shipped
+from nics_drl_bridge.policy.contract import shipped
+from nics_drl_bridge.policy.policy_file import load_policy
 
 Rng = np.random.Generator
 node, from_array = onnx.helper.make_node, onnx.numpy_helper.from_array

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.extras.mujoco.machine import load_mujoco
+from nics_drl_bridge.extras.mujoco.machines import load_mujoco
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Rectangle, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec
 

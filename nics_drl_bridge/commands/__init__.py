@@ -1,1 +1,1 @@
-"""Commands of `nics`, one module each."""
+"""Commands of `nics`; each imports what it needs when it runs, so that the others start fast."""

@@ -7,17 +7,15 @@ import sys
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from nics_drl_bridge import __version__, extensions
 from nics_drl_bridge.commands.console import EXIT_BAD_INPUT
 from nics_drl_bridge.commands.demo import demo
-from nics_drl_bridge.commands.doctor import doctor
+from nics_drl_bridge.commands.doctor import doctor, replay
 from nics_drl_bridge.commands.evaluate import evaluate
-from nics_drl_bridge.commands.model import generate, urdf
-from nics_drl_bridge.commands.policy import policy
-from nics_drl_bridge.commands.record import record
-from nics_drl_bridge.commands.replay import replay
-from nics_drl_bridge.commands.train import train
+from nics_drl_bridge.commands.model import generate, record, urdf
+from nics_drl_bridge.commands.train import policy, train
 from nics_drl_bridge.commands.warmup import warmup
 from nics_drl_bridge.errors import LONGEST, shortened
 
@@ -38,10 +36,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _options(
     version: Annotated[
-        bool,
-        typer.Option(
-            "--version", callback=_print_version, is_eager=True, help="Print the version."
-        ),
+        bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Options of every command."""
@@ -67,9 +62,9 @@ def main() -> None:
     except Exception as error:
         if not hasattr(error, "format_message"):  # no option error of click or typer
             raise
-        if told := error.format_message().strip():  # otherwise its help has been shown
-            told = shortened(told.rstrip(".?"), LONGEST)
-            typer.echo(f"nics: {told}; see `nics --help`.", err=True)
+        if message := error.format_message().strip():  # otherwise its help has been shown
+            message = shortened(message.rstrip(".?"), LONGEST)
+            typer.echo(f"nics: {message}; see `nics --help`.", err=True)
         raise SystemExit(EXIT_BAD_INPUT) from None
     raise SystemExit(code if isinstance(code, int) else 0)
 

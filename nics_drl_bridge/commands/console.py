@@ -8,24 +8,25 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError
+from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError, nearest
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 WIDEST = 10_000
 
-RobotOption = Annotated[str, typer.Option(help="A shipped robot (ackermann) or a YAML file.")]
+RobotOption = Annotated[str, Option(help="A shipped robot (ackermann) or a YAML file.")]
 WorldOption = Annotated[
-    str, typer.Option("--world", "--scene", help="A shipped world (arena) or a YAML file.")
+    str, Option("--world", "--scene", help="A shipped world (arena) or a YAML file.")
 ]
 TopicsOption = Annotated[
-    Path | None, typer.Option(help="YAML file that says which topic of a bag plays which role.")
+    Path | None, Option(help="YAML file that says which topic of a bag plays which role.")
 ]
 TopicOption = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         metavar="ROLE=TOPIC",
         help="The same for one role, as cmd_vel=/car/drive; may be given several times. Roles: "
         "cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.",
@@ -35,7 +36,6 @@ TopicOption = Annotated[
 
 def roles_of(options: Sequence[str]) -> dict[str, str]:
     """Parses options ROLE=TOPIC for playing a bag into role -> topic. Raises ConfigError."""
-    from nics_drl_bridge.errors import nearest
     from nics_drl_bridge.middleware.playback import TYPES
 
     roles = {}

@@ -1,4 +1,4 @@
-"""`nics doctor`."""
+"""`nics doctor` and `nics replay`: what is wrong with a robot, and why its gate stopped it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 from nics_drl_bridge.commands.console import needs_ros, one_sentence, table
 
@@ -20,23 +21,21 @@ DEFAULT = "ackermann"
 
 def doctor(
     bag: Annotated[
-        Path | None, typer.Argument(help="A bag to look at; the live robot when left out.")
+        Path | None, Argument(help="A bag to look at; the live robot when left out.")
     ] = None,
     model: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="What the robot must fit: folder of a model, or a shipped robot; ackermann if "
             "neither it nor a policy is given."
         ),
     ] = None,
-    policy: Annotated[
-        str | None, typer.Option(help="What it must fit instead: a policy file.")
-    ] = None,
-    namespace: Annotated[str, typer.Option(help="Namespace of the robot's topics.")] = "",
+    policy: Annotated[str | None, Option(help="What it must fit instead: a policy file.")] = None,
+    namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
     duration: Annotated[
-        float, typer.Option(min=1.0, help="How long to listen to a live robot [s].")
+        float, Option(min=1.0, help="How long to listen to a live robot [s].")
     ] = 5.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Tells what of a robot or a bag does not fit a model or a policy; it sends nothing."""
     with one_sentence():
@@ -52,8 +51,8 @@ def doctor(
             facts = listen(duration, namespace)
         findings = examine(facts, expected)
         if as_json:
-            told = {"source": facts.source, "findings": [asdict(each) for each in findings]}
-            typer.echo(json.dumps(told))
+            plain = {"source": facts.source, "findings": [asdict(each) for each in findings]}
+            typer.echo(json.dumps(plain))
         elif findings:
             heads = ("", "check", "where", "what does not fit", "what to do")
             rows = [(f.severity, f.check, f.where, f.what, f.fix) for f in findings]
@@ -68,10 +67,25 @@ def _expected(model: str | None, policy: str | None) -> Expected:
     from nics_drl_bridge.errors import ConfigError
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.policy.policy_file import load_policy
-    from nics_drl_bridge.report.doctor_facts import expected_of_model, expected_of_policy
+    from nics_drl_bridge.report.doctor_facts import expected_of
 
     if policy is None:
-        return expected_of_model(open_model(model or DEFAULT))
+        return expected_of(open_model(model or DEFAULT))
     if model is not None:
         raise ConfigError("--model and --policy: give one of them, what the robot must fit.")
-    return expected_of_policy(load_policy(policy).contract)
+    contract = load_policy(policy).contract
+    return expected_of(contract, contract.scan)
+
+
+def replay(
+    file: Annotated[Path, Argument(help="What command_gate wrote at a stop, *.jsonl.")],
+) -> None:
+    """Decides anew on what led to a stop of the gate, and tells the stops in it."""
+    with one_sentence():
+        from nics_drl_bridge.gate import black_box
+
+        again = black_box.replay(file)
+        for line in again.story:
+            typer.echo(line)
+        if again.differing:
+            raise typer.Exit(EXIT_FINDINGS)

@@ -1,13 +1,13 @@
-"""A trial: the same episodes in process, over DDS, and in MuJoCo over DDS.
+"""Drives policies through the same episodes in process, over DDS, and in MuJoCo over DDS.
 
-Evaluates policies in several worlds: Fig. 7 of the paper, with a table.
+Compares the worlds as Fig. 7 of the paper does, with a table.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,9 +20,15 @@ from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, nearest
 from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.policy.evaluation import Episode, drive_all
-from nics_drl_bridge.policy.policies import SUFFIX, check_name, open_policy, shipped_policies
-from nics_drl_bridge.policy.statistics import ConfidenceInterval, Tally, record_of, tallies
+from nics_drl_bridge.policy.evaluation import (
+    FIRST_SEED,
+    ConfidenceInterval,
+    Episode,
+    Tally,
+    drive_all,
+    tallies,
+)
+from nics_drl_bridge.policy.policies import Policy, is_policy_file, open_policy
 from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.world import load_world
@@ -30,84 +36,64 @@ from nics_drl_bridge.sim.world import load_world
 FAST, DDS, MUJOCO, VEHICLE = "fast", "dds", "mujoco_dds", "vehicle"
 NODES = {DDS: "simulator_node", MUJOCO: "mujoco_node"}
 PLACES = (FAST, *NODES)
-LABELS = {
-    FAST: "in process",
-    DDS: "over DDS",
-    MUJOCO: "MuJoCo over DDS",
-    VEHICLE: "on the vehicle",
-}
+LABELS = {FAST: "in process", DDS: "over DDS", MUJOCO: "MuJoCo over DDS", VEHICLE: "on the vehicle"}
 DEFAULT_ROBOT = "ackermann"
-START_S = 180.0
-"""Time that a node may take to start [s]; its kernels may have to be compiled."""
-Told = Callable[[Episode], None]
+START_S = 180.0  # time that a node may take to start [s]; its kernels may have to be compiled
+PANELS = 6
+HEADS = (
+    "policy", "world", "success", "95 %", "believed", "collision", "time-out", "path [m]",
+    "time [s]", "as in the first", "deviation [m]", "greatest [m]",
+)  # fmt: skip
 Say = Callable[[str], None]
+Tell = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Episodes to drive.
+    """Episodes to drive."""
 
-    Attributes:
-        policy: a policy file, or the name of a shipped policy or of a baseline.
-        model: folder of a model, or a shipped robot.
-        world: YAML file or name of the world.
-        seeds: of the episodes; each fixes obstacles, start, goal and noise.
-        logs: folder for the logs of the nodes.
-    """
-
-    policy: str
-    model: str
-    world: str
-    seeds: Sequence[int]
-    logs: Path
+    policy: str  # a policy file, or the name of a shipped policy or of a baseline
+    model: str  # folder of a model, or a shipped robot
+    world: str  # YAML file or name of the world
+    seeds: Sequence[int]  # of the episodes; each fixes obstacles, start, goal and noise
+    logs: Path  # folder for the logs of the nodes
 
 
-def drive_in(place: str, trial: Trial, told: Told, say: Say = lambda _: None) -> list[Episode]:
-    """Drives the episodes of a trial in one of `PLACES`.
+def drive_in(
+    place: str, trial: Trial, on_episode: Callable[[Episode], None], say: Say = lambda _: None
+) -> list[Episode]:
+    """Drives the episodes of a trial in one of `PLACES`; calls `on_episode` as each ends.
 
     The node that a place needs runs in its own process, in lock-step, and has ended when this
-    returns or raises.
-
-    Args:
-        place: one of `PLACES`.
-        trial: the episodes.
-        told: called with each episode as it ends.
-        say: called with each line of progress.
-
-    Raises:
-        BridgeError: a bad name or file, or a node that does not start.
+    returns or raises. Raises BridgeError for a bad name or file, or a node that does not start.
     """
     check_place(place)
+    model = open_model(trial.model)
     if place == FAST:
-        return drive(trial, "sim", {"estimator": True}, told)
+        env, policy = env_of(trial.policy, model, trial.world, "sim", estimator=True)
+        with closing(env):
+            return drive_all(env, policy, trial.seeds, on_episode)
     from nics_drl_bridge.nodes.processes import Witness
 
     with _node(NODES[place], trial, say) as options, Witness(options["domain_id"]) as witness:
+        env, policy = env_of(trial.policy, model, trial.world, "dds", backend_options=options)
+        with closing(env):
+            return drive_all(
+                env, policy, trial.seeds, on_episode,
+                lambda: witness.touched(NODES[place], START_S),
+            )  # fmt: skip
 
-        def touched() -> bool:
-            return witness.touched(NODES[place], START_S)
 
-        return drive(trial, "dds", {"backend_options": options}, told, touched)
-
-
-def drive(
-    trial: Trial,
-    backend: str,
-    arguments: dict[str, Any],
-    told: Told,
-    touched: Callable[[], bool] | None = None,
-) -> list[Episode]:
-    """Drives the episodes of a trial in an env with this backend and further arguments."""
+def env_of(
+    policy: str, model: SimulatorModel, world: str, backend: str, **arguments: Any
+) -> tuple[gymnasium.Env[Any, Any], Policy]:
+    """Makes the env of a policy's task with a backend, and opens the policy."""
     register_envs()
-    model = open_model(trial.model)
-    policy, task = open_policy(trial.policy, model)
+    opened, task = open_policy(policy, model)
     env = gymnasium.make(
-        NAVIGATION, backend=backend, model=model, world=trial.world, task=task, **arguments
+        NAVIGATION, backend=backend, model=model, world=world, task=task, **arguments
     )
-    try:
-        return drive_all(env, policy, trial.seeds, told, touched)
-    finally:
-        env.close()
+    return env, opened
 
 
 @contextmanager
@@ -140,44 +126,31 @@ def check_place(place: str) -> None:
 
 def robot_of(policy: str) -> str:
     """The robot that a policy file was trained for; for a baseline the default robot."""
-    if not policy.endswith(SUFFIX) and policy not in shipped_policies():
+    if not is_policy_file(policy):
         return DEFAULT_ROBOT
     from nics_drl_bridge.policy.policy_file import load_policy  # needs onnx, baselines do not
 
     return str(load_policy(policy).contract.robot.name)
 
 
-FIRST_SEED = 1_000_000
-"""Far from the seeds of any training."""
-PANELS = 6
-HEADS = (
-    "policy", "world", "success", "95 %", "believed", "collision", "time-out", "path [m]",
-    "time [s]", "as in the first", "deviation [m]", "greatest [m]",
-)  # fmt: skip
-Tell = Callable[[str, int, int], None]
-
-
 @dataclass(frozen=True)
 class EvaluationOrder:
-    """An order to evaluate policies.
+    """An order to evaluate policies; the seed is that of the first episode."""
 
-    Attributes:
-        policies: files, or names of shipped policies or of baselines.
-        out: output folder.
-        model: folder of a model or a shipped robot; None uses the policies' own robot.
-        world: YAML file or name of the world.
-        episodes: number of episodes.
-        seed: of the first episode.
-        places: some of `trial.PLACES`; the others are compared with the first.
-    """
-
-    policies: Sequence[str]
-    out: Path
-    model: str | None = None
-    world: str = "circles"
+    policies: Sequence[str]  # files, or names of shipped policies or of baselines
+    out: Path  # output folder
+    model: str | None = None  # folder of a model or a shipped robot; None: the policies' own robot
+    world: str = "circles"  # YAML file or name of the world
     episodes: int = 20
     seed: int = FIRST_SEED
-    places: Sequence[str] = PLACES
+    places: Sequence[str] = PLACES  # some of `PLACES`; the others are compared with the first
+
+    @property
+    def seeds(self) -> range:
+        """Seeds of the episodes. Raises ConfigError if one is not a valid seed."""
+        seeds = range(self.seed, self.seed + self.episodes)
+        checked_seeds([seeds.start, seeds.stop - 1])
+        return seeds
 
 
 @dataclass(frozen=True)
@@ -192,10 +165,7 @@ class Evaluated:
 def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
     """Drives every policy through the same episodes in every place, and writes the results.
 
-    Args:
-        order: what to evaluate.
-        say: called with each line of progress.
-        tell: called with what is being driven, the number of episodes done, and the total.
+    `tell` is called with what is being driven, the number of episodes done, and the total.
 
     Returns:
         The results of each policy; `evaluation.json` and a picture per policy are in `order.out`.
@@ -203,31 +173,36 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
     Raises:
         BridgeError: a bad name or file, or a node that does not start.
     """
-    name = model_name(order)
-    seeds_of(order)  # before anything is driven
-    for policy in order.policies:
-        check_name(policy)
+    name, seeds = _model_name(order), order.seeds
     model, world = open_model(name), load_world(order.world)
     for place in order.places:
         check_place(place)
     evaluated = []
     for policy in order.policies:
-        runs = {place: _drive(order, policy, name, place, say, tell) for place in order.places}
+        runs = {}
+        for place in order.places:
+            what = f"{Path(policy).stem} {LABELS[place]}"
+            say(f"driving {order.episodes} episodes of {policy} {LABELS[place]}")
+
+            def on_episode(episode: Episode, what: str = what) -> None:
+                tell(what, episode.seed - order.seed + 1, order.episodes)
+
+            trial = Trial(policy, name, order.world, seeds, order.out / "logs")
+            runs[place] = drive_in(place, trial, on_episode, say)
         made = Evaluated(policy, runs, tallies(runs, model.control_period))
         evaluated.append(made)
-        picture = trajectories(
-            {LABELS[place]: some[:PANELS] for place, some in runs.items()},
-            world, model.robot.footprint_radius,
-        )  # fmt: skip
+        shown = {LABELS[place]: some[:PANELS] for place, some in runs.items()}
+        picture = trajectories(shown, world, model.robot.footprint_radius)
         write_bytes(picture_of(order.out, policy), picture)
-    told = json.dumps(told_of(order, name, model, evaluated))
-    write_text(order.out / "evaluation.json", told + "\n")
+    write_evaluation(order.out, name, model, order.world, order.seed, evaluated)
     return evaluated
 
 
-def model_name(order: EvaluationOrder) -> str:
-    """The model that the episodes are driven with."""
+def _model_name(order: EvaluationOrder) -> str:
+    """The model that the episodes are driven with. Raises ConfigError for unknown policies."""
     if order.model is not None:
+        for policy in order.policies:
+            is_policy_file(policy)
         return order.model
     robots = {policy: robot_of(policy) for policy in order.policies}
     if len(set(robots.values())) > 1:
@@ -236,54 +211,38 @@ def model_name(order: EvaluationOrder) -> str:
     return next(iter(robots.values()))
 
 
-def _drive(
-    order: EvaluationOrder, policy: str, model: str, place: str, say: Say, tell: Tell
-) -> list[Episode]:
-    seeds = seeds_of(order)
-    trial = Trial(policy, model, order.world, seeds, order.out / "logs")
-    done = []
-
-    def told(episode: Episode) -> None:
-        done.append(episode)
-        tell(f"{Path(policy).stem} {LABELS[place]}", len(done), order.episodes)
-
-    say(f"driving {order.episodes} episodes of {policy} {LABELS[place]}")
-    return drive_in(place, trial, told, say)
-
-
-def seeds_of(order: EvaluationOrder) -> range:
-    """Seeds of the episodes. Raises ConfigError if one is not a valid seed."""
-    seeds = range(order.seed, order.seed + order.episodes)
-    checked_seeds([seeds.start, seeds.stop - 1])
-    return seeds
-
-
 def picture_of(out: Path, policy: str) -> Path:
     """Path of the picture of a policy."""
     return out / f"trajectories_{Path(policy).stem}.png"
 
 
-def told_of(
-    order: EvaluationOrder, name: str, model: SimulatorModel, evaluated: Sequence[Evaluated]
-) -> dict[str, Any]:
-    """The evaluation as plain data, for JSON."""
-    return {
+def write_evaluation(
+    out: Path,
+    name: str,
+    model: SimulatorModel,
+    world: str,
+    seed: int,
+    evaluated: Sequence[Evaluated],
+) -> None:
+    """Writes `evaluation.json`; the name is that of the model, the seed of the first episode."""
+    data = {
         "model": name,
         "model_fingerprint": model.fingerprint,
         "robot": model.robot.name,
-        "world": order.world,
-        "seed": order.seed,
+        "world": world,
+        "seed": seed,
         "policies": {
             one.policy: {
                 place: {
                     **one.tallies[place].figures(),
-                    "each": [record_of(episode) for episode in one.runs[place]],
+                    "each": [episode.plain() for episode in one.runs[place]],
                 }
                 for place in one.runs
             }
             for one in evaluated
         },
     }
+    write_text(out / "evaluation.json", json.dumps(data) + "\n")
 
 
 def rows_of(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
@@ -296,23 +255,19 @@ def rows_of(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
 
 
 def _cells(tally: Tally) -> tuple[str, ...]:
-    success = tally.success
     return (
-        percent(success.value),
-        f"{100 * success.low:.0f} to {100 * success.high:.0f} %",
-        percent(tally.believed.value),
-        percent(tally.collision.value),
-        percent(tally.time_out.value),
+        _percent(tally.success.value),
+        f"{100 * tally.success.low:.0f} to {100 * tally.success.high:.0f} %",
+        *(_percent(one.value) for one in (tally.believed, tally.collision, tally.time_out)),
         _figure(tally.length),
         _figure(tally.time),
-        percent(tally.same),
+        _percent(tally.same),
         f"{tally.deviation.value:.2g}",
         f"{tally.greatest_deviation:.2g}",
     )
 
 
-def percent(share: float) -> str:
-    """Formats a share as a percentage."""
+def _percent(share: float) -> str:
     return f"{100 * share:.4g} %"
 
 
@@ -322,5 +277,5 @@ def _figure(estimate: ConfidenceInterval) -> str:
 
 def line_of(one: Evaluated) -> str:
     """Summarises a policy in one line."""
-    each = ", ".join(f"{LABELS[p]} {percent(t.success.value)}" for p, t in one.tallies.items())
+    each = ", ".join(f"{LABELS[p]} {_percent(t.success.value)}" for p, t in one.tallies.items())
     return f"{one.policy}: success {each}"

@@ -1,7 +1,4 @@
-"""`nics generate`.
-
-`nics urdf`.
-"""
+"""`nics record`, `nics generate` and `nics urdf`: from a robot to its model."""
 
 from __future__ import annotations
 
@@ -10,8 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from nics_drl_bridge.commands.console import (
+    EXIT_INTERRUPTED,
     RobotOption,
     TopicOption,
     TopicsOption,
@@ -21,38 +20,86 @@ from nics_drl_bridge.commands.console import (
 )
 
 
+def record(
+    out: Annotated[Path, Option(help="An .npz file, or the folder of a rosbag2, to write.")],
+    robot: RobotOption = "ackermann",
+    bound: Annotated[
+        float, Option(help="Radius of the circle around the start to keep within [m].")
+    ] = 2.0,
+    duration: Annotated[float, Option(help="Of the drive [s].")] = 60.0,
+    speed: Annotated[float, Option(help="Share of the greatest speeds to use.")] = 1.0,
+    seed: Annotated[int, Option(help="Of the pattern.")] = 0,
+    namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
+    remap: Annotated[
+        list[str] | None, Option(help="A topic's other name, as in odom:=/wheel_odometry.")
+    ] = None,
+    topics: Annotated[
+        Path | None, Option(help="YAML file that names the joints of state and wheels.")
+    ] = None,
+    stamped: Annotated[bool, Option(help="Send cmd_vel as TwistStamped.")] = False,
+    use_sim_time: Annotated[
+        bool, Option("--use-sim-time", help="Take the time from /clock.")
+    ] = False,
+    preview: Annotated[
+        bool, Option("--preview", help="Show what the drive will be, and stop.")
+    ] = False,
+    yes: Annotated[bool, Option("--yes", help="Do not ask before the robot moves.")] = False,
+) -> None:
+    """Drives a robot over ROS 2 so that it shows its whole motion, and records it."""
+    with one_sentence():
+        from nics_drl_bridge.nodes import recorder
+
+        order = recorder.RecordOrder(
+            robot, out, bound, duration, speed, seed, namespace, tuple(remap or ()), topics,
+            stamped, use_sim_time,
+        )  # fmt: skip
+        if not preview:
+            recorder.require_ros()  # first: with ROS 2 from wheels it restarts Python
+        for line in recorder.preview(order):
+            typer.echo(line)
+        if preview:
+            return
+        if not yes and not typer.confirm("Drive the robot now?"):
+            typer.echo("nothing was driven or recorded.")
+            return
+        lines, whole = recorder.drive(order)
+        for line in lines:
+            typer.echo(line)
+        if not whole:
+            raise typer.Exit(EXIT_INTERRUPTED)
+
+
 def generate(
     recording: Annotated[
-        Path, typer.Argument(help="A rosbag2, an .npz recording, or a folder of CSV files.")
+        Path, Argument(help="A rosbag2, an .npz recording, or a folder of CSV files.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder of the model to write.")],
+    out: Annotated[Path, Option(help="Folder of the model to write.")],
     robot: RobotOption = "ackermann",
     topics: TopicsOption = None,
     topic: TopicOption = None,
     world: WorldOption = "arena",
-    lidar: Annotated[str, typer.Option(help="A shipped lidar (paper) or a YAML file.")] = "paper",
-    order: Annotated[int, typer.Option(min=1, max=4, help="Order of the Taylor model.")] = 2,
+    lidar: Annotated[str, Option(help="A shipped lidar (paper) or a YAML file.")] = "paper",
+    order: Annotated[int, Option(min=1, max=4, help="Order of the Taylor model.")] = 2,
     alpha: Annotated[
-        str, typer.Option(help="Pruning threshold of Eq. 2, 0 to 1, or auto for the knee.")
+        str, Option(help="Pruning threshold of Eq. 2, 0 to 1, or auto for the knee.")
     ] = "auto",
     assume_textbook: Annotated[
-        bool, typer.Option(help="Fill in from the textbook what the drive did not show.")
+        bool, Option(help="Fill in from the textbook what the drive did not show.")
     ] = False,
     strict: Annotated[
-        bool, typer.Option(help="Refuse a drive that did not move every input on its own.")
+        bool, Option(help="Refuse a drive that did not move every input on its own.")
     ] = False,
     salvage: Annotated[
-        bool,
-        typer.Option("--salvage", help="Take what is intact of a damaged bag; tell the rest."),
+        bool, Option("--salvage", help="Take what is intact of a damaged bag; tell the rest.")
     ] = False,
     anyway: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--anyway", help="Write the model even if its predictions of unseen data are of no use."
         ),
     ] = False,
     pictures: Annotated[
-        bool, typer.Option(help="Draw the fit into the folder pictures of the model.")
+        bool, Option(help="Draw the fit into the folder pictures of the model.")
     ] = False,
 ) -> None:
     """Generates a simulator from a recording and writes it as a folder."""
@@ -73,9 +120,8 @@ def generate(
             drive = read_recording(whole, spec, topic_roles(topics, topic or ()))
         drive = replace(drive, source=str(recording))
         model, identified = generate_model(
-            drive, spec, sensor, shapes, order, threshold,
-            assume=assume_textbook, strict=strict, anyway=anyway,
-        )  # fmt: skip
+            drive, spec, sensor, shapes, order, threshold, assume_textbook, strict, anyway
+        )
         save_model(model, out)
         if pictures:
             from nics_drl_bridge.report.fit_pictures import write_pictures
@@ -86,8 +132,8 @@ def generate(
 
 
 def urdf(
-    model: Annotated[str, typer.Argument(help="A shipped robot, or the folder of a model.")],
-    out: Annotated[Path | None, typer.Option(help="The file to write; <robot>.urdf.")] = None,
+    model: Annotated[str, Argument(help="A shipped robot, or the folder of a model.")],
+    out: Annotated[Path | None, Option(help="The file to write; <robot>.urdf.")] = None,
 ) -> None:
     """Writes a robot's URDF, for RViz and robot_state_publisher."""
     with one_sentence():

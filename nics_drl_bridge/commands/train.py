@@ -1,7 +1,9 @@
-"""`nics train`."""
+"""`nics train` and `nics policy`."""
 
 from __future__ import annotations
 
+import json
+import math
 import shlex
 import sys
 from collections.abc import Iterator
@@ -10,73 +12,68 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.console import one_sentence, progress_bar
+from nics_drl_bridge.errors import ConfigError, nearest
 
 SB3 = "sb3"
+policy = typer.Typer(help="Policy files.", no_args_is_help=True)
 
 
 def train(
-    more_seeds: Annotated[list[int] | None, typer.Argument(hidden=True)] = None,
-    task: Annotated[str, typer.Option(help="A task, or path/to/file.py:ClassName.")] = "navigation",
+    more_seeds: Annotated[list[int] | None, Argument(hidden=True)] = None,
+    task: Annotated[str, Option(help="A task, or path/to/file.py:ClassName.")] = "navigation",
     robot: Annotated[
-        str | None,
-        typer.Option(help="A shipped robot (differential), or the folder of a model."),
+        str | None, Option(help="A shipped robot (differential), or the folder of a model.")
     ] = None,
     settings: Annotated[
-        str | None,
-        typer.Option(help="Shipped settings (navigation_differential), or a YAML file."),
+        str | None, Option(help="Shipped settings (navigation_differential), or a YAML file.")
     ] = None,
     world: Annotated[
         list[str] | None,
-        typer.Option(help="Train in this world only; given several times, in all of them."),
+        Option(help="Train in this world only; given several times, in all of them."),
     ] = None,
-    algorithm: Annotated[str | None, typer.Option(help="ppo or sac.")] = None,
-    seeds: Annotated[list[int] | None, typer.Option(help="One or more, as --seeds 0 1 2.")] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Environment steps.")] = None,
-    episodes: Annotated[int, typer.Option(min=1, help="Of the evaluation, in each world.")] = 500,
-    out: Annotated[Path | None, typer.Option(help="Folder of the run.")] = None,
-    resume: Annotated[bool, typer.Option(help="Go on where --out was interrupted.")] = False,
+    algorithm: Annotated[str | None, Option(help="ppo or sac.")] = None,
+    seeds: Annotated[list[int] | None, Option(help="One or more, as --seeds 0 1 2.")] = None,
+    steps: Annotated[int | None, Option(min=1, help="Environment steps.")] = None,
+    episodes: Annotated[int, Option(min=1, help="Of the evaluation, in each world.")] = 500,
+    out: Annotated[Path | None, Option(help="Folder of the run.")] = None,
+    resume: Annotated[bool, Option(help="Go on where --out was interrupted.")] = False,
     engine: Annotated[
-        str, typer.Option(help="sb3 (Stable-Baselines3, this process) or ray (RLlib, a cluster).")
+        str, Option(help="sb3 (Stable-Baselines3, this process) or ray (RLlib, a cluster).")
     ] = "sb3",
     address: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Of the Ray cluster: auto (the one this machine is part of) or HOST:PORT; by "
             "default one is started here."
         ),
     ] = None,
     env_runners: Annotated[
         int | None,
-        typer.Option(min=1, help="Processes on Ray that share the worlds; by default one per CPU."),
+        Option(min=1, help="Processes on Ray that share the worlds; by default one per CPU."),
     ] = None,
 ) -> None:
     """Trains policies in the fast simulator, and evaluates them."""
     with one_sentence():
-        from nics_drl_bridge.errors import ConfigError
         from nics_drl_bridge.policy.training_settings import chosen_settings
 
         given = {"robot": robot, "algorithm": algorithm, "steps": steps, "world": world}
         named = {name: value for name, value in given.items() if value}
         if resume and (settings or named):
-            raise ConfigError(
-                f"--{next(iter(named), 'settings')}: a resumed run has its own settings; leave it "
-                "out."
-            )
+            option = next(iter(named), "settings")
+            raise ConfigError(f"--{option}: a resumed run has its own settings; leave it out.")
         if resume and out is None:
             raise ConfigError("--resume needs --out, the folder of the run to go on with.")
         try:
             from nics_drl_bridge.policy import train as train_run
         except ModuleNotFoundError as error:
-            raise ConfigError(
-                f"training needs the module {error.name!r}; pip install 'nics_drl_bridge[train]'."
-            ) from None
-        if resume and out is not None:
-            chosen = train_run.settings_of(out)
-        else:
-            chosen = chosen_settings(task, settings, named)
+            fix = "pip install 'nics_drl_bridge[train]'."
+            raise ConfigError(f"training needs the module {error.name!r}; {fix}") from None
+        resumed = train_run.settings_of(out) if resume and out is not None else None
+        chosen = resumed or chosen_settings(task, settings, named)
         folder = out or Path("runs") / chosen.title
         command = shlex.join(["nics", *sys.argv[1:]])
         every = [*(seeds or [0]), *(more_seeds or [])]
@@ -90,8 +87,6 @@ def _learner(
     engine: str, address: str | None, env_runners: int | None, worlds: int
 ) -> Iterator[Any]:
     """Yields the function that trains one policy; on Ray while connected to its cluster."""
-    from nics_drl_bridge.errors import ConfigError, nearest
-
     engines = (SB3, *extensions.known("engines"))
     if engine not in engines:
         raise ConfigError(f"unknown engine {engine!r}; {nearest(engine, engines)}")
@@ -102,9 +97,9 @@ def _learner(
             if value is not None:
                 raise ConfigError(f"--{name}: belongs to --engine ray; add that, or leave it out.")
         yield learn
-        return
-    with extensions.load("engines", engine)(address, env_runners, worlds) as learn:
-        yield learn
+    else:
+        with extensions.load("engines", engine)(address, env_runners, worlds) as learn:
+            yield learn
 
 
 def _run(train_run: Any, order: Any, learn: Any) -> None:
@@ -126,3 +121,50 @@ def _run(train_run: Any, order: Any, learn: Any) -> None:
         train_run.run(order, told, done, learn)
     folder = order.out
     typer.echo(f"policy files, checkpoints and logs: {folder}; tensorboard --logdir {folder}")
+
+
+@policy.callback()
+def _group() -> None:
+    """Policy files."""
+
+
+@policy.command()
+def info(
+    file: Annotated[str, Argument(help="A policy file, or the name of a shipped one.")],
+    as_json: Annotated[bool, Option("--json", help="One JSON object instead.")] = False,
+) -> None:
+    """Checks a policy file and tells what it was trained on and needs."""
+    with one_sentence():
+        from nics_drl_bridge.policy.policy_file import load_policy, summary
+
+        facts = summary(load_policy(file))
+        lines = (f"{name:<18} {value}" for name, value in _lines(facts))
+        typer.echo(json.dumps(facts) if as_json else "\n".join(lines))
+
+
+def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
+    """Name and text of each printed line."""
+    lidar, scan, seen = facts["lidar"], facts["scan"], facts["observation"]
+    commands = [
+        f"{c['name']} {c['min']:g} to {c['max']:g} {c['unit']}" for c in facts["robot"]["command"]
+    ]
+    observed = "the beams of this lidar"
+    if scan is not None:
+        observed = (
+            f"{scan['sectors']} sectors from {math.degrees(scan['angle_min']):.4g} to "
+            f"{math.degrees(scan['angle_max']):.4g} deg, {scan['range_max']:g} m"
+        )
+    lines = {
+        "file": f"{facts['file']}, {facts['bytes'] / 1024:.0f} kB, all checks passed",
+        "robot": f"{facts['robot']['name']}: {', '.join(commands)}",
+        "task": facts["task"]["name"],
+        "actions": facts["actions"],
+        "scan": observed,
+        "lidar": f"{lidar['name']}: {lidar['beams']} beams, {lidar['range_max']:g} m",
+        "observation": f"{seen['size']} parts, {seen['scan_parts']} of them the scan",
+        "control period": f"{facts['control_period']:g} s",
+        "model": facts["model_fingerprint"],
+        "graph": facts["graph_sha256"][:16],
+    }
+    provenance = {name: str(value) for name, value in facts["provenance"].items()}
+    return [*lines.items(), *provenance.items()]

@@ -2,59 +2,39 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import gymnasium
 
 from nics_drl_bridge.commands.episodes import (
     FAST,
     LABELS,
     VEHICLE,
     Evaluated,
-    EvaluationOrder,
+    Say,
+    env_of,
     picture_of,
     robot_of,
-    told_of,
+    write_evaluation,
 )
-from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.files import write_bytes, write_text
+from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.policy.evaluation import Episode, drive
+from nics_drl_bridge.policy.evaluation import Episode, drive, tallies
 from nics_drl_bridge.policy.policies import open_policy
-from nics_drl_bridge.policy.statistics import tallies
 from nics_drl_bridge.report.doctor import examine
-from nics_drl_bridge.report.doctor_facts import Mismatch, expected_of_model
+from nics_drl_bridge.report.doctor_facts import expected_of
 from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world import load_world
 
 GATE, RAW = "command_gate", "cmd_vel_raw"
 LISTEN_S, ARM_S = 5.0, 60.0
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class VehicleOrder:
-    """An order to drive episodes on the vehicle.
-
-    Attributes:
-        policy: a file, or the name of a shipped policy or of a baseline.
-        out: output folder.
-        model: folder of the vehicle's model, or a shipped robot; None uses the policy's own.
-        world: the world around the vehicle.
-        episodes, seed: number of episodes, and seed of the first.
-        start: `wait` until the vehicle stands at the start, or begin at the `present` pose.
-        goal: in `map` [m] instead of the world's.
-        namespace: of its topics.
-        pose_type: type of `pose`, a pose sensor in `map`, or `none`.
-        arm: True arms the gate before each episode; otherwise the user does.
-        stale_after_s: an episode ends with an error if data are older [s].
-    """
+    """An order to drive episodes on the vehicle; see `EvaluationOrder` for the first ones."""
 
     policy: str
     out: Path
@@ -62,24 +42,20 @@ class VehicleOrder:
     world: str = "circles"
     episodes: int = 1
     seed: int = 0
-    start: str = "wait"
-    goal: tuple[float, float] | None = None
-    namespace: str = ""
-    pose_type: str = "none"
-    arm: bool = False
-    stale_after_s: float = 0.5
+    start: str = "wait"  # until the vehicle stands at the start; or `present`: from where it stands
+    goal: tuple[float, float] | None = None  # in `map` [m] instead of the world's
+    namespace: str = ""  # of its topics
+    pose_type: str = "none"  # type of `pose`, a pose sensor in `map`, or `none`
+    arm: bool = False  # True arms the gate before each episode; otherwise the user does
+    stale_after_s: float = 0.5  # an episode ends with an error if data are older [s]
 
 
 def drive_vehicle(order: VehicleOrder, say: Say, ask: Say) -> Evaluated:
     """Checks that the vehicle fits its model, drives the episodes, and compares them.
 
     Commands go to `cmd_vel_raw`, so that only an armed `command_gate` lets them pass. Afterwards
-    the fast simulator drives the same episodes from the vehicle's actual starting poses.
-
-    Args:
-        order: what to drive.
-        say: called with each line of progress.
-        ask: called before each episode with where to place the vehicle; returns when it may begin.
+    the fast simulator drives the same episodes from the vehicle's actual starting poses. `ask` is
+    called before each episode with where to place the vehicle, and returns when it may begin.
 
     Returns:
         The episodes of both; `evaluation.json` and a picture are in `order.out`.
@@ -93,16 +69,18 @@ def drive_vehicle(order: VehicleOrder, say: Say, ask: Say) -> Evaluated:
     open_policy(order.policy, model)  # a misfit is an error before anything moves
     _examine(order, model, say)
     episodes = _drive(order, model, say, ask)
-    runs = {VEHICLE: episodes, FAST: _drive_again(order, model, episodes)}
+    env, policy = env_of(order.policy, model, order.world, "sim", estimator=True)
+    with closing(env):
+        again = [
+            drive(env, policy, one.seed, {"start": one.path[0], "goal": one.goal})
+            for one in episodes
+        ]
+    runs = {VEHICLE: episodes, FAST: again}
     made = Evaluated(order.policy, runs, tallies(runs, model.control_period))
     shown = {LABELS[place]: some for place, some in runs.items()}
     picture = trajectories(shown, world, model.robot.footprint_radius)
     write_bytes(picture_of(order.out, order.policy), picture)
-    general = EvaluationOrder(
-        (order.policy,), order.out, name, order.world, order.episodes, order.seed, tuple(runs)
-    )
-    told = json.dumps(told_of(general, name, model, [made]))
-    write_text(order.out / "evaluation.json", told + "\n")
+    write_evaluation(order.out, name, model, order.world, order.seed, [made])
     return made
 
 
@@ -111,24 +89,13 @@ def _examine(order: VehicleOrder, model: SimulatorModel, say: Say) -> None:
     from nics_drl_bridge.nodes.listen import listen
 
     say(f"listening to the vehicle for {LISTEN_S:g} s, as nics doctor does")
-    findings = examine(listen(LISTEN_S, order.namespace), expected_of_model(model))
-    for finding in findings:
-        say(f"  {finding.severity}: {_sentence(finding)}")
-    errors = [_sentence(finding) for finding in findings if finding.severity == "error"]
+    errors = []
+    for finding in examine(listen(LISTEN_S, order.namespace), expected_of(model)):
+        sentence = f"{finding.where}: {finding.what} ({finding.fix})"
+        say(f"  {finding.severity}: {sentence}")
+        errors += [sentence] if finding.severity == "error" else []
     if errors:
         raise BackendError(f"the vehicle is not driven: {errors[0]}; see nics doctor for the rest.")
-
-
-def _sentence(finding: Mismatch) -> str:
-    return f"{finding.where}: {finding.what} ({finding.fix})"
-
-
-def _env(order: VehicleOrder, model: SimulatorModel, backend: str, **arguments: Any) -> Any:
-    register_envs()
-    _, task = open_policy(order.policy, model)
-    return gymnasium.make(
-        NAVIGATION, backend=backend, model=model, world=order.world, task=task, **arguments
-    )
 
 
 def _drive(order: VehicleOrder, model: SimulatorModel, say: Say, ask: Say) -> list[Episode]:
@@ -137,21 +104,18 @@ def _drive(order: VehicleOrder, model: SimulatorModel, say: Say, ask: Say) -> li
         "namespace": order.namespace, "pose_type": order.pose_type, "say": say,
         "stale_after_s": order.stale_after_s,
     }  # fmt: skip
-    env = _env(order, model, "dds", backend_options=options)
-    policy, _ = open_policy(order.policy, model)
+    env, policy = env_of(order.policy, model, order.world, "dds", backend_options=options)
     world, episodes = load_world(order.world), list[Episode]()
-    asked = {} if order.goal is None else {"goal": order.goal}
-    try:
+    goal = {} if order.goal is None else {"goal": order.goal}
+    with closing(env):
         for count in range(order.episodes):
             seed = order.seed + count
             scene = sample_scene(world, model.robot.footprint_radius, seed)
             ask(f"episode {count + 1} of {order.episodes}: {_placed(order, scene)}")
-            driven = drive(env, policy, seed, asked, lambda: _arm(order, say))
+            driven = drive(env, policy, seed, goal, lambda: _arm(order, say))
             # The vehicle's own estimate is all that is known of its path.
             episodes.append(replace(driven, path=driven.estimate))
             say(f"  {driven.result}, {driven.steps} steps, {episodes[-1].length:.2f} m")
-    finally:
-        env.close()
     return episodes
 
 
@@ -177,18 +141,3 @@ def _arm(order: VehicleOrder, say: Say) -> None:
     if refused:
         raise BackendError(f"{gate} can't be armed: {refused}")
     say(f"  {gate} is armed")
-
-
-def _drive_again(
-    order: VehicleOrder, model: SimulatorModel, episodes: Sequence[Episode]
-) -> list[Episode]:
-    """Drives the same episodes in the fast simulator."""
-    env = _env(order, model, "sim", estimator=True)
-    policy, _ = open_policy(order.policy, model)
-    try:
-        return [
-            drive(env, policy, one.seed, {"start": one.path[0], "goal": one.goal})
-            for one in episodes
-        ]
-    finally:
-        env.close()

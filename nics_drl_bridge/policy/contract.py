@@ -7,13 +7,14 @@ import dataclasses
 import json
 import reprlib
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from nics_drl_bridge.config import Schema, validate
+from nics_drl_bridge.config import Schema, share_folder, validate
 from nics_drl_bridge.env.registry import TASKS
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, PolicyError
@@ -24,35 +25,28 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot.spec import RobotSpec
 
 FORMAT = "nics_drl_bridge/policy/1"
+SUFFIX = ".onnx"
 GOLDEN = 16
 MOST_ENTRIES = 20_000
-CHECKSUM = 8
-"""Hexadecimal digits of a field's checksum, which detects mistakes but is no signature."""
+CHECKSUM = 8  # hexadecimal digits of a field's checksum, which detects mistakes but is no signature
 Rows = NDArray[np.float32]
 
 
+def shipped() -> Path:
+    """The folder of the policy files that come with the package."""
+    return share_folder() / "config" / "policies"
+
+
 class TaskEntry(Schema):
-    """The task of a policy.
+    """The task of a policy."""
 
-    Attributes:
-        name: as in `env.registry.TASKS`, or the name of a user's class.
-        options: all of its options except `scan`.
-        sha256: over name, options and observation.
-    """
-
-    name: str = Field(min_length=1)
-    options: dict[str, Any]
-    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    name: str = Field(min_length=1)  # as in `env.registry.TASKS`, or the name of a user's class
+    options: dict[str, Any]  # all of its options except `scan`
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")  # over name, options and observation
 
 
 class ObservationEntry(Schema):
-    """Input of the network.
-
-    Attributes:
-        size: O, number of parts.
-        scan_parts: P, number of leading parts that are a scan.
-        rest_low, rest_high: (O - P) limits of the other parts.
-    """
+    """Input of the network: `scan_parts` that are a scan, then others with their limits."""
 
     size: int = Field(ge=1, le=200_000)
     scan_parts: int = Field(ge=0)
@@ -63,10 +57,7 @@ class ObservationEntry(Schema):
 class GoldenEntry(Schema):
     """Sixteen pairs that must be reproduced; float32, little endian, in base 64.
 
-    Attributes:
-        observations: (16, O).
-        actions: (16, C) continuous, or (16, 1) discrete.
-        commands: (16, C), SI.
+    Observations are (16, O); actions (16, C), or (16, 1) discrete; commands (16, C), SI.
     """
 
     observations: str
@@ -80,37 +71,21 @@ class GoldenEntry(Schema):
 
 
 class Contract(Schema):
-    """All that a policy file states about itself.
-
-    Attributes:
-        format: of the file.
-        robot: the robot that it commands.
-        lidar: the lidar that it was trained with.
-        scan: sectors of its observations; None: the beams of exactly this lidar.
-        task: the task that it was trained for.
-        observation: input of the network.
-        actions: `continuous` or `discrete`.
-        control_period: time between commands [s].
-        model_fingerprint: of the SimulatorModel that it was trained in.
-        provenance: command, seed and versions of its making.
-        graph_sha256: of the graph, including the weights.
-        golden: pairs that must be reproduced.
-        checksums: of each entry above, by its path.
-    """
+    """All that a policy file states about itself and the model that it was trained in."""
 
     format: Literal["nics_drl_bridge/policy/1"]
     robot: RobotSpec
     lidar: LidarSpec
-    scan: ScanLayout | None
+    scan: ScanLayout | None  # sectors of its observations; None: the beams of exactly this lidar
     task: TaskEntry
     observation: ObservationEntry
     actions: Literal["continuous", "discrete"]
-    control_period: float = Field(gt=0.0, le=10.0)
+    control_period: float = Field(gt=0.0, le=10.0)  # time between commands [s]
     model_fingerprint: str = Field(pattern="^[0-9a-f]{16}$")
-    provenance: dict[str, Any]
-    graph_sha256: str = Field(pattern="^[0-9a-f]{64}$")
-    golden: GoldenEntry
-    checksums: dict[str, str]
+    provenance: dict[str, Any]  # command, seed and versions of its making
+    graph_sha256: str = Field(pattern="^[0-9a-f]{64}$")  # of the graph, including the weights
+    golden: GoldenEntry  # pairs that must be reproduced
+    checksums: dict[str, str]  # of each entry above, by its path
 
     @field_validator("provenance")
     @classmethod
@@ -127,25 +102,18 @@ def contract_of(
     graph_sha256: str,
     provenance: Mapping[str, Any],
 ) -> str:
-    """Writes the contract of a policy for a task of a robot, as JSON.
+    """Writes the contract of a policy as JSON; the golden arrays are named as in `GoldenEntry`.
 
-    Args:
-        task: gives observation, action, scan and options.
-        model: the model that it was trained in.
-        golden: the arrays of `GoldenEntry` by name.
-        graph_sha256: see `Contract`.
-        provenance: strings and numbers.
-
-    Raises:
-        ConfigError: an entry has a wrong type.
+    Raises ConfigError if an entry has a wrong type.
     """
+    entry, observation = task_entry(task), observation_entry(task)
     data = {
         "format": FORMAT,
         "robot": task.robot.model_dump(mode="json"),
         "lidar": task.lidar.model_dump(mode="json"),
         "scan": None if task.scan is None else task.scan.model_dump(mode="json"),
-        "task": {**task_entry(task), "sha256": task_hash(task)},
-        "observation": observation_entry(task),
+        "task": {**entry, "sha256": _task_hash(entry, observation)},
+        "observation": observation,
         "actions": task.actions,
         "control_period": model.control_period,
         "model_fingerprint": model.fingerprint,
@@ -175,7 +143,7 @@ def task_entry(task: Task) -> dict[str, Any]:
 
 
 def observation_entry(task: Task) -> dict[str, Any]:
-    """Observation of a task, as an entry."""
+    """Observation of a task, as the entries of `ObservationEntry`."""
     space, parts = task.observation_space, task.scan_parts
     return {
         "size": int(space.shape[0]),
@@ -185,14 +153,8 @@ def observation_entry(task: Task) -> dict[str, Any]:
     }
 
 
-def task_hash(task: Task) -> str:
-    """Identifies a task: SHA-256 over name, options and observation."""
-    return hash_of(task_entry(task), observation_entry(task))
-
-
-def hash_of(entry: Mapping[str, Any], observation: Mapping[str, Any]) -> str:
-    """`task_hash` from the entries of a contract."""
-    known = {"name": entry["name"], "options": entry["options"], "observation": dict(observation)}
+def _task_hash(entry: Mapping[str, Any], observation: Mapping[str, Any]) -> str:
+    known = {"name": entry["name"], "options": entry["options"], "observation": observation}
     return sha256(json.dumps(known, sort_keys=True).encode())
 
 
@@ -215,9 +177,8 @@ def checksums(data: Mapping[str, Any]) -> dict[str, str]:
 def read_contract(text: str, source: str) -> Contract:
     """Reads and checks the contract of a policy file.
 
-    Raises:
-        PolicyError: an entry is missing, unknown, of a wrong type, changed after the export, or
-            contradicts another; names the field.
+    Raises PolicyError if an entry is missing, unknown, of a wrong type, changed after the export,
+    or contradicts another; names the field.
     """
     entries = sum(map(text.count, ",[{"))
     if entries > MOST_ENTRIES:
@@ -228,18 +189,17 @@ def read_contract(text: str, source: str) -> Contract:
     except (ValueError, RecursionError) as error:
         reason = f"is not JSON as `export_policy` writes it ({str(error)[:80]})"
         raise PolicyError(source, "metadata", f"{reason}; export the policy anew.") from None
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
-        given = data.get("format") if isinstance(data, dict) else None
-        raise PolicyError(
-            source,
-            "format",
-            f"is {reprlib.repr(given)}, not {FORMAT!r}; export the policy with this version.",
-        )
+    given = data.get("format") if isinstance(data, dict) else None
+    if given != FORMAT:
+        reason = f"is {reprlib.repr(given)}, not {FORMAT!r}; export the policy with this version."
+        raise PolicyError(source, "format", reason)
     try:
         contract = validate(data, Contract, source)
     except ConfigError as error:
         reason = str(error).removeprefix(f"{source}: ")
-        raise PolicyError(source, _key_in(reason), reason) from None
+        quoted = reason.split("'")
+        key = quoted[1] if len(quoted) > 2 and "key" in quoted[0] else "metadata"
+        raise PolicyError(source, key, reason) from None
     _check_unchanged(data, source)
     _check_agreement(contract, source)
     return contract
@@ -255,18 +215,12 @@ def _no_constant(word: str) -> Any:
     raise ValueError(f"{word} is no number")
 
 
-def _key_in(sentence: str) -> str:
-    quoted = sentence.split("'")
-    return quoted[1] if len(quoted) > 2 and "key" in quoted[0] else "metadata"
-
-
 def _check_unchanged(data: dict[str, Any], source: str) -> None:
     now, then = checksums(data), data["checksums"]
     for path in (*now, *then):
         if now.get(path) != then.get(path):
-            raise PolicyError(
-                source, path, "was changed after the export; take the file as it was exported."
-            )
+            reason = "was changed after the export; take the file as it was exported."
+            raise PolicyError(source, path, reason)
 
 
 def _check_agreement(contract: Contract, source: str) -> None:
@@ -280,14 +234,15 @@ def _check_agreement(contract: Contract, source: str) -> None:
     if observation.size != parts + rest or len(observation.rest_high) != rest:
         reason = f"is {observation.size}, not the {parts} of the scan and {rest} others."
         raise PolicyError(source, "observation.size", reason)
-    entry, seen = contract.task, observation.model_dump(mode="json")
-    if entry.sha256 != hash_of({"name": entry.name, "options": entry.options}, seen):
+    seen = observation.model_dump(mode="json")
+    if contract.task.sha256 != _task_hash(contract.task.model_dump(), seen):
         raise PolicyError(source, "task.sha256", "does not belong to the task and observation.")
-    width = {"actions": 1 if contract.actions == "discrete" else None}
+    commands = len(contract.robot.command)
     sizes = {
-        "observations": observation.size, "commands": len(contract.robot.command),
-        "actions": width["actions"] or len(contract.robot.command),
-    }  # fmt: skip
+        "observations": observation.size,
+        "commands": commands,
+        "actions": 1 if contract.actions == "discrete" else commands,
+    }
     for name, size in sizes.items():
         try:
             rows = contract.golden.rows(name)

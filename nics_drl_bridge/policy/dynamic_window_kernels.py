@@ -14,51 +14,30 @@ Array = NDArray[np.float64]
 
 
 class ScanRays(NamedTuple):
-    """Rays of a scan.
+    """Rays of a scan in `base_link`; a share of 1 stands for `range_max`."""
 
-    Attributes:
-        directions: (P, 2) unit vectors in `base_link`.
-        origin: (2,) in `base_link` [m].
-        range_max: range that a share of 1 stands for [m].
-    """
-
-    directions: Array
-    origin: Array
-    range_max: float
+    directions: Array  # (P, 2) unit vectors
+    origin: Array  # (2,) [m]
+    range_max: float  # [m]
 
 
 class LookAhead(NamedTuple):
-    """Parameters of the roll-outs of a robot.
+    """Parameters of the roll-outs of a robot."""
 
-    Attributes:
-        reach: (3,) greatest change of a twist in one period.
-        radius: of the footprint with its margin [m].
-        period: time step [s].
-        steps: number of time steps.
-        rest: time to come to rest [s].
-    """
-
-    reach: Array
-    radius: float
-    period: float
+    reach: Array  # (3,) greatest change of a twist in one period
+    radius: float  # of the footprint with its margin [m]
+    period: float  # time step [s]
     steps: int
-    rest: float
+    rest: float  # time to come to rest [s]
 
 
 class TwistWeights(NamedTuple):
-    """Weights of the cost of a twist.
+    """Weights of the cost of a twist."""
 
-    Attributes:
-        gap: to the goal [1/m].
-        aim: of the heading at the goal.
-        clearance: of the nearest thing on the way.
-        time: until a contact.
-    """
-
-    gap: float
-    aim: float
-    clearance: float
-    time: float
+    gap: float  # to the goal [1/m]
+    aim: float  # of the heading at the goal
+    clearance: float  # of the nearest obstacle on the way
+    time: float  # until a contact
 
 
 @kernel(allocates=True)
@@ -74,10 +53,7 @@ def choose_all(out, scans, goals, twists, candidates, rays, ahead, weights):  # 
 def hits_of(hits, shares, rays):  # type: ignore[no-untyped-def]
     """Writes the end points of a scan into hits (P, 2) [m] in `base_link`; returns their number.
 
-    Args:
-        hits: result.
-        shares: (P,) of the maximum range; 1 is free.
-        rays: `ScanRays`.
+    `shares` (P,) are of the maximum range; 1 is free.
     """
     count = 0
     for p in range(shares.shape[0]):
@@ -91,15 +67,9 @@ def hits_of(hits, shares, rays):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def choose(hits, goal, twist, candidates, ahead, weights):  # type: ignore[no-untyped-def]
-    """Returns the index of the cheapest candidate, preferring those within the window.
+    """Returns the index of the cheapest candidate (K, 3), preferring those within the window.
 
-    Args:
-        hits: (H, 2) end points of the scan [m].
-        goal: (2,) in `base_link` [m].
-        twist: (3,) present twist of the robot.
-        candidates: (K, 3) twists to choose from.
-        ahead: `LookAhead`.
-        weights: `TwistWeights`.
+    Hits (H, 2) [m] and goal (2,) [m] are in `base_link`; `twist` (3,) is the present one.
     """
     best, least = 0, math.inf
     for k in range(candidates.shape[0]):

@@ -1,51 +1,52 @@
-"""Drives episodes with a policy, records them, and judges them by the truth."""
+"""Evaluation: drives episodes, judges them by the truth, and tallies the results."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.policy.policies import Policy
+from nics_drl_bridge.seeds import checked_seeds
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Act = Callable[[NDArray[np.float32]], NDArray[Any]]
+"""Actions (N, C) for observations (N, O)."""
 
-DRIFT_M = 0.1
-"""A robot stops where it believes its goal is; odometry may have drifted by this much."""
+FIRST_SEED = 1_000_000  # first seed of an evaluation, far from the seeds of any training
+DRIFT_M = 0.1  # a robot stops where it believes its goal is; odometry may have drifted by this much
 ELSEWHERE = "elsewhere"
+CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
 class Episode:
     """Record of one episode.
 
-    Attributes:
-        seed: of the episode.
-        result: `success`, `collision`, `time-out`, or `elsewhere` if the robot wrongly believed to
-            be at its goal. Judged by the truth if the backend knows it.
-        path: (T, 3) poses at the start and after each step: true ones if the backend knows them,
-            else estimates.
-        estimate: (T, 3) estimated poses.
-        goal: (2,) [m].
-        bodies: (K, 7) obstacles at the start, see `sim.scenes.Scene`.
-        reward: sum over the episode.
-        believed: the result by the robot's own knowledge; None if nothing else is known.
+    The result is `success`, `collision`, `time-out`, or `elsewhere` if the robot wrongly believed
+    to be at its goal. Result and path are true ones if the backend knows them, else estimates.
+    `believed` is the result by the robot's own knowledge; None if nothing else is known.
     """
 
     seed: int
     result: str
-    path: Array
-    estimate: Array
-    goal: Array
-    bodies: Array
-    reward: float
+    path: Array  # (T, 3) poses at the start and after each step
+    estimate: Array  # (T, 3) estimated poses
+    goal: Array  # (2,) [m]
+    bodies: Array  # (K, 7) obstacles at the start, see `sim.scenes.Scene`
+    reward: float  # sum over the episode
     believed: str | None = None
 
     @property
@@ -68,6 +69,30 @@ class Episode:
         """Length of the path [m]."""
         return float(np.linalg.norm(np.diff(self.path[:, :2], axis=0), axis=1).sum())
 
+    def plain(self) -> dict[str, Any]:
+        """The episode as plain data."""
+        return {
+            "seed": self.seed,
+            "result": self.result,
+            "believed": self.believed,
+            "goal_distance_m": round(self.miss, 4),
+            "steps": self.steps,
+            "length_m": round(self.length, 4),
+            "goal": self.goal.tolist(),
+            "path": np.round(self.path, 4).tolist(),
+        }
+
+
+@contextmanager
+def _halted_on_error(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
+    try:
+        yield
+    except BaseException:
+        if isinstance(env.unwrapped, BridgeEnv):  # it does not see errors of a policy
+            with uninterrupted():
+                env.unwrapped.halt()
+        raise
+
 
 def drive(
     env: gymnasium.Env[Any, Any],
@@ -79,65 +104,33 @@ def drive(
 ) -> Episode:
     """Drives one episode to its end; halts the robot if the policy or a callback raises.
 
-    Args:
-        env: to drive in.
-        policy: chooses the actions.
-        seed: of the episode.
-        options: of `env.reset`.
-        on_start: called when the robot stands at its start.
-        touched: returns at the end whether the robot truly touched something, if `info` does not.
+    `on_start` is called when the robot stands at its start. `touched` returns at the end whether
+    the robot truly touched something, if `info` does not.
     """
-    try:
-        return _drive(env, policy, seed, options, on_start, touched)
-    except BaseException:
-        if isinstance(env.unwrapped, BridgeEnv):  # it does not see errors of a policy
-            with uninterrupted():
-                env.unwrapped.halt()
-        raise
+    with _halted_on_error(env):
+        observation, info = env.reset(seed=seed, options=options)
+        on_start()
+        goal, bodies = info["goal"], info["bodies"]
+        paths, estimates, total, ended = [info["start"]], [info["pose"]], 0.0, False
+        while not ended:
+            observation, reward, terminated, truncated, info = env.step(policy.act(observation))
+            paths.append(info.get("true_pose", info["pose"]))
+            estimates.append(info["pose"])
+            total += float(reward)
+            ended = bool(terminated or truncated)
+        collided = "collision" if np.any(info["collision"]) else "time-out"
+        believed = "success" if np.all(info["is_success"]) else collided
+        driven = np.array(paths), np.array(estimates), goal, bodies, total
+        if "true_pose" not in info:
+            return Episode(seed, believed, *driven)
+        known = info.get("true_collision")
+        hit = bool(np.any(known)) if known is not None else touched is not None and touched()
+        there = truly_near(getattr(env.unwrapped, "task", None), info["true_pose"], goal).all()
+        true = ELSEWHERE if believed == "success" and not there else believed
+        return Episode(seed, "collision" if hit else true, *driven, believed)
 
 
-def _drive(
-    env: gymnasium.Env[Any, Any],
-    policy: Policy,
-    seed: int,
-    options: dict[str, Any] | None,
-    on_start: Callable[[], None],
-    touched: Callable[[], bool] | None,
-) -> Episode:
-    observation, info = env.reset(seed=seed, options=options)
-    on_start()
-    goal, bodies = info["goal"], info["bodies"]
-    paths, estimates, total = [info["start"]], [info["pose"]], 0.0
-    while True:
-        observation, reward, terminated, truncated, info = env.step(policy.act(observation))
-        paths.append(info.get("true_pose", info["pose"]))
-        estimates.append(info["pose"])
-        total += float(reward)
-        if terminated or truncated:
-            break
-    believed = _believed(info)
-    driven = np.array(paths), np.array(estimates), goal, bodies, total
-    if "true_pose" not in info:
-        return Episode(seed, believed, *driven)
-    known = info.get("true_collision")
-    hit = bool(np.any(known)) if known is not None else touched is not None and touched()
-    there = bool(truly_near(getattr(env.unwrapped, "task", None), info["true_pose"], goal).all())
-    return Episode(seed, _true(believed, there, hit), *driven, believed)
-
-
-def _believed(info: dict[str, Any]) -> str:
-    if np.all(info["is_success"]):
-        return "success"
-    return "collision" if np.any(info["collision"]) else "time-out"
-
-
-def _true(believed: str, there: bool, hit: bool) -> str:
-    if hit:
-        return "collision"
-    return ELSEWHERE if believed == "success" and not there else believed
-
-
-def truly_near(task: Any, poses: Array, goals: Array) -> NDArray[np.bool_]:
+def truly_near(task: Any, poses: Array, goals: Array) -> Flags:
     """True where robots at true poses (..., 3) are at their goals (..., 2), up to `DRIFT_M`.
 
     Always True for tasks other than `Navigation`, whose robots have no individual goals.
@@ -172,3 +165,186 @@ def deviation(one: Episode, other: Episode) -> float:
     """Maximum distance between two paths at the same step, over their common length [m]."""
     steps = min(len(one.path), len(other.path))
     return float(np.linalg.norm(one.path[:steps, :2] - other.path[:steps, :2], axis=1).max())
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """Outcomes of E episodes; all arrays are (E,)."""
+
+    seeds: NDArray[np.int64]
+    success: Flags  # the goal was truly reached, and nothing touched
+    collision: Flags  # the task reports one, or the robot truly touched something
+    steps: NDArray[np.int64]  # control periods
+    length: Array  # of the true path [m]; for a team, the mean over its robots
+    reward: Array  # sum over the episode
+
+    @property
+    def time_out(self) -> Flags:
+        """Neither success nor collision."""
+        return ~(self.success | self.collision)
+
+
+def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcomes:
+    """Drives one episode per seed, as many at once as the env has worlds.
+
+    The episodes are bit-identical to those of `BridgeEnv.reset(seed=...)` without estimator. The
+    env's `autoreset_mode` is `NextStep`, the default.
+    """
+    width, given = env.num_envs, checked_seeds(seeds)
+    done = []
+    for first in range(0, len(given), width):
+        # The last batch is padded with seeds that are driven but not counted.
+        chunk = np.resize(given[first : first + width], width)
+        rows = _drive_once(env, act, chunk)
+        done.append(tuple(row[: len(given) - first] for row in rows))
+    return Outcomes(given, *(np.concatenate(each) for each in zip(*done, strict=True)))
+
+
+def _drive_once(env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]) -> tuple[Any, ...]:
+    """Drives one episode in each world: success, collision, steps, length, reward, each (N,)."""
+    count = env.num_envs
+    observation, info = env.reset(seed=list(seeds))
+    where = np.reshape(info["start"], (count, -1, 3))[..., :2]
+    success, collision = np.zeros((2, count), np.bool_)
+    steps, reward = np.zeros(count, np.int64), np.zeros(count)
+    length, running = np.zeros(count), np.ones(count, np.bool_)
+    while running.any():
+        observation, gain, terminated, truncated, info = env.step(act(observation))
+        there = np.reshape(info["true_pose"], (count, -1, 3))[..., :2]
+        moved = np.hypot(*np.moveaxis(there - where, -1, 0)).mean(axis=-1)
+        where = there
+        length += np.where(running, moved, 0.0)
+        reward += np.where(running, gain, 0.0)
+        steps += running
+        ended = running & (terminated | truncated)
+        touched = _robots(info, "collision").any(axis=1)
+        touched = touched | _robots(info, "true_collision").any(axis=1)
+        collision |= ended & touched
+        arrived = _robots(info, "is_success").all(axis=1)
+        if arrived.any() and "goal" in info:
+            near = truly_near(env.task, info["true_pose"], info["goal"])
+            arrived = arrived & near.reshape(count, -1).all(axis=1)
+        success |= ended & ~touched & arrived
+        running &= ~ended
+    return success, collision, steps, length, reward
+
+
+def _robots(info: dict[str, Any], name: str) -> Flags:
+    """Flags (N, M) of an info; (1, 1) False if it has none."""
+    values = np.asarray(info.get(name, [False]), np.bool_)
+    return values.reshape(len(values), -1)
+
+
+@dataclass(frozen=True)
+class ConfidenceInterval:
+    """A figure with its 95 % confidence interval.
+
+    `value` is NaN if nothing was observed; the ends are infinite for the mean of one observation.
+    """
+
+    value: float
+    low: float
+    high: float
+
+
+def rate(hits: int, trials: int) -> ConfidenceInterval:
+    """A share of trials with Wilson's score interval (1927), valid for few trials too."""
+    if trials < 1:
+        return ConfidenceInterval(math.nan, 0.0, 1.0)
+    share, z = hits / trials, float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
+    scale = 1.0 + z * z / trials
+    middle = (share + z * z / (2.0 * trials)) / scale
+    half = z / scale * math.sqrt(share * (1.0 - share) / trials + (z / (2.0 * trials)) ** 2)
+    # With no hits, or hits only, rounding must not move the end away from 0 or 1.
+    low = 0.0 if hits == 0 else middle - half
+    return ConfidenceInterval(share, low, 1.0 if hits == trials else middle + half)
+
+
+def mean(values: ArrayLike) -> ConfidenceInterval:
+    """The mean of observations (n,) with the interval of Student's t."""
+    seen = np.asarray(values, np.float64)
+    middle = float(seen.mean()) if len(seen) else math.nan
+    if len(seen) < 2:
+        return ConfidenceInterval(middle, -math.inf, math.inf)
+    quantile = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, len(seen) - 1))
+    half = quantile * float(seen.std(ddof=1)) / math.sqrt(len(seen))
+    return ConfidenceInterval(middle, middle - half, middle + half)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Shares of the episodes; mean path [m] and duration [s] of the successful ones."""
+
+    episodes: int
+    success: ConfidenceInterval
+    collision: ConfidenceInterval
+    time_out: ConfidenceInterval
+    length: ConfidenceInterval
+    time: ConfidenceInterval
+
+
+def summarise(outcomes: Outcomes, control_period: float) -> Summary:
+    """Summarises episodes; `control_period` [s]."""
+    count, arrived = len(outcomes.seeds), outcomes.success
+    success, collision, time_out = (
+        rate(int(flags.sum()), count)
+        for flags in (outcomes.success, outcomes.collision, outcomes.time_out)
+    )
+    length, time = outcomes.length[arrived], outcomes.steps[arrived] * control_period
+    return Summary(count, success, collision, time_out, mean(length), mean(time))
+
+
+@dataclass(frozen=True)
+class Tally(Summary):
+    """Figures of the episodes of one world, by the truth if it is known.
+
+    `deviation` is the mean of the maximum distance [m] between the true path and that in the first
+    world at the same step.
+    """
+
+    same: float  # share of the episodes that ended as in the first world
+    deviation: ConfidenceInterval
+    greatest_deviation: float  # maximum over all episodes [m]
+    believed: ConfidenceInterval  # share of episodes that the robot itself believed successful
+
+    def figures(self) -> dict[str, Any]:
+        """The tally as plain data, an interval as a list; non-finite values become null."""
+        return {
+            name: [_finite(each) for each in vars(value).values()]
+            if isinstance(value, ConfidenceInterval)
+            else _finite(value)
+            for name, value in vars(self).items()
+        }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def tally(episodes: Sequence[Episode], first: Sequence[Episode], control_period: float) -> Tally:
+    """Computes the figures of episodes, compared with the same seeds in the first world."""
+    results = np.array([episode.result for episode in episodes])
+    outcomes = Outcomes(
+        np.array([episode.seed for episode in episodes]),
+        results == "success",
+        results == "collision",
+        np.array([episode.steps for episode in episodes]),
+        np.array([episode.length for episode in episodes]),
+        np.array([episode.reward for episode in episodes]),
+    )
+    gaps = [deviation(one, other) for one, other in zip(episodes, first, strict=True)]
+    same = sum(one.result == other.result for one, other in zip(episodes, first, strict=True))
+    believed = sum(episode.believed_success for episode in episodes)
+    return Tally(
+        **vars(summarise(outcomes, control_period)),
+        same=same / len(episodes),
+        deviation=mean(gaps),
+        greatest_deviation=max(gaps),
+        believed=rate(believed, len(episodes)),
+    )
+
+
+def tallies(runs: Mapping[str, Sequence[Episode]], control_period: float) -> dict[str, Tally]:
+    """Computes the figures of each world, compared with the first."""
+    first = next(iter(runs.values()))
+    return {place: tally(episodes, first, control_period) for place, episodes in runs.items()}

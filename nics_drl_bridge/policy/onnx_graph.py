@@ -1,16 +1,15 @@
-"""Checks of the graph of a policy file, before anything of it runs.
-
-Size checks of a policy file's bytes before they are parsed.
+"""Checks of the graph of a policy file, before anything of it runs: form, operators, size.
 
 Two bytes of a file can become a message of some hundred bytes in memory, and one byte a number of
-eight. So the parts are counted in the raw bytes, and only a file with few of them is parsed.
+eight. So the parts are counted in the raw bytes, and only a file with few of them is parsed. Memory
+and work of a graph come from onnx's strict shape inference on a copy without weights.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,22 +19,26 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from nics_drl_bridge.errors import PolicyError
 from nics_drl_bridge.files import sha256
 
-KEY = "nics_drl_bridge"
-"""Key of the metadata entry with the contract."""
-SEAL = "sha256"
-"""Key of the metadata entry at the file's end: the checksum of everything before it."""
+KEY = "nics_drl_bridge"  # key of the metadata entry with the contract
+SEAL = "sha256"  # key of the metadata entry at the file's end: the checksum of everything before it
 SIZE_LIMIT = 32 * 2**20
-MOST_NODES = 1000
-"""Maximum number of nodes; an exported network has some dozens."""
-MOST_DIMENSIONS = 8
-"""Maximum number of dimensions of an array of weights."""
-NUMBERS = frozenset(
-    getattr(onnx.TensorProto, kind)
-    for kind in ("FLOAT", "DOUBLE", "FLOAT16", "INT64", "INT32", "BOOL")
-)
-"""Types of arrays that are as large in memory as in the file."""
+MOST_PARTS = 50_000  # maximum number of fields of all messages; each array of weights is one part
+MOST_NESTED = 16  # maximum nesting of messages; an exported graph needs six levels
+MOST_PACKED = 2**20
+"""Maximum size of packed integers in one part, such as an array's shape [bytes]; not weights."""
+MOST_NODES = 1000  # maximum number of nodes; an exported network has some dozens
+MOST_DIMENSIONS = 8  # maximum number of dimensions of an array of weights
 CONTRACT_LIMIT = 4 * 2**20
 """Maximum size of the contract [bytes], most of which are golden observations."""
+MOST_NUMBERS = 1_000_000  # maximum output of all nodes together for one observation
+MOST_WORK = 20_000_000
+"""Maximum number of multiplications, or of numbers read and written, for one observation."""
+MOST_AT_ONCE = 64 * MOST_NUMBERS
+"""Maximum output of all nodes together in one run, so at most 256 MB of float32."""
+ROWS = 16  # observations for which the sizes are computed, as many as there are golden ones
+SMALL = 1024  # maximum length of an integer array that may be a shape, an axis or an index
+GREATEST_SETTING = 65_536  # maximum size, stride, padding or dilation of a kernel
+MOST_AXES = 256  # axes that all nodes together may add to their arrays; each makes inference longer
 INPUT, ACTION, COMMAND = "observation", "action", "command"
 OPERATORS = frozenset({
     "Abs", "Add", "ArgMax", "AveragePool", "Cast", "Clip", "Concat", "Constant", "Conv", "Div",
@@ -46,6 +49,12 @@ OPERATORS = frozenset({
     "Split", "Sqrt", "Squeeze", "Sub", "Tanh", "Transpose", "Unsqueeze",
 })  # fmt: skip
 """Operators of feed-forward networks: no loops, branches, random draws or data-dependent sizes."""
+FLOATS = frozenset({onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE, onnx.TensorProto.FLOAT16})
+INTEGERS = frozenset({onnx.TensorProto.INT64, onnx.TensorProto.INT32})
+NUMBERS = FLOATS | INTEGERS | {onnx.TensorProto.BOOL}
+"""Types of arrays that are as large in memory as in the file."""
+DIVIDING = frozenset({"Div", "ReduceMean"})
+"""On integers, division by zero, or of the minimum by -1, ends the process."""
 OTHER_FORMATS = (
     (b"PK", "a zip archive, as Stable-Baselines3 and torch write them"),
     (b"\x80", "a pickle"),
@@ -54,13 +63,17 @@ OTHER_FORMATS = (
     (b"\x1f\x8b", "a gzip file"),
 )
 """First bytes of files that trainers write and that are never opened here."""
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
+_LONGEST_VARINT = 10
+Shape = tuple[int, ...]
+Fault = tuple[str, str]
+"""Faulty field, and the reason."""
 
 
 def parse(data: bytes, source: str) -> Any:
     """Parses and checks the ModelProto of a policy file's content.
 
-    Raises:
-        PolicyError: it is not an ONNX model, or one that this package does not run.
+    Raises PolicyError if it is not an ONNX model, or one that this package does not run.
     """
     for start, kind in OTHER_FORMATS:
         if data.startswith(start):
@@ -69,126 +82,22 @@ def parse(data: bytes, source: str) -> Any:
     try:
         check_wire(data)
         model = onnx.load_model_from_string(data)
+        if not model.HasField("graph"):
+            raise ValueError
     except WireError as error:
         reason = f"{error}, which no policy is; export or copy it again."
         raise PolicyError(source, "file", reason) from None
     except (DecodeError, ValueError, TypeError):
         reason = "is no ONNX model, or is cut off; copy it again."
         raise PolicyError(source, "file", reason) from None
-    if not model.HasField("graph"):
-        raise PolicyError(source, "file", "is no ONNX model, or is cut off; copy it again.")
     metadata(model, source)
     check_graph(model, source)
     return model
 
 
-def sealed(data: bytes) -> bytes:
-    """Appends to a model's bytes their checksum, as another metadata entry.
-
-    Parts of a protobuf message may be concatenated, so other programs read the file as usual.
-    """
-    end = onnx.ModelProto()
-    entry = end.metadata_props.add()
-    entry.key, entry.value = SEAL, sha256(data)
-    return data + bytes(end.SerializeToString(deterministic=True))
-
-
-def check_seal(data: bytes, source: str) -> None:
-    """Raises PolicyError unless a file is bit-identical to what was written."""
-    size = len(sealed(b""))
-    if data != sealed(data[:-size]):
-        reason = "does not fit the file, which was changed or damaged; copy or export it again."
-        raise PolicyError(source, SEAL, reason)
-
-
-def check_graph(model: Any, source: str) -> None:
-    """Raises PolicyError for a graph that is not self-contained, or has other operators."""
-    graph = model.graph
-    if len(graph.node) > MOST_NODES:
-        reason = f"has {len(graph.node)} operators, a policy at most {MOST_NODES}; not run."
-        raise PolicyError(source, "graph.node", reason)
-    for tensor in tensors(graph):
-        if tensor.data_type not in NUMBERS or len(tensor.dims) > MOST_DIMENSIONS:
-            reason = f"is no array of numbers with at most {MOST_DIMENSIONS} dimensions; not run."
-            raise PolicyError(source, f"weights.{tensor.name}", reason)
-        location = next((entry.value for entry in tensor.external_data if entry.key), "")
-        if tensor.data_location == onnx.TensorProto.EXTERNAL or tensor.external_data:
-            reason = f"refers to another file ({location!r}); a policy holds its own weights."
-            raise PolicyError(source, f"weights.{tensor.name}", reason)
-    if len(model.functions) or len(model.training_info) or len(graph.sparse_initializer):
-        raise PolicyError(source, "graph", "holds functions, training or sparse weights; remove.")
-    for opset in model.opset_import:
-        if opset.domain not in ("", "ai.onnx"):
-            reason = f"holds the domain {opset.domain!r}; only standard operators are run."
-            raise PolicyError(source, "opset_import", reason)
-    for node in graph.node:
-        if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
-            name = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
-            reason = f"the operator {name} is not one of a feed-forward network; not run."
-            raise PolicyError(source, "graph.node", reason)
-        if any(a.HasField("g") or len(a.graphs) for a in node.attribute):
-            raise PolicyError(source, "graph.node", f"{node.op_type} holds a graph of its own.")
-        if any(a.HasField("sparse_tensor") or len(a.sparse_tensors) for a in node.attribute):
-            raise PolicyError(source, "graph.node", f"{node.op_type} holds sparse weights.")
-    _check_weights(graph, source)
-    try:
-        onnx.checker.check_model(model)
-    except (onnx.checker.ValidationError, ValueError) as error:
-        words = " ".join(str(error).split())[:120]
-        raise PolicyError(source, "graph", f"is no valid ONNX graph ({words}).") from None
-
-
-def tensors(graph: Any) -> Iterator[Any]:
-    """Yields every tensor of a graph: its weights, and constants in its nodes."""
-    yield from graph.initializer
-    for attribute in itertools.chain.from_iterable(node.attribute for node in graph.node):
-        if attribute.HasField("t"):
-            yield attribute.t
-        yield from attribute.tensors
-
-
-def _check_weights(graph: Any, source: str) -> None:
-    for tensor in tensors(graph):
-        try:
-            values = onnx.numpy_helper.to_array(tensor)
-        except (ValueError, TypeError, KeyError, RuntimeError):
-            name = f"weights.{tensor.name}"
-            raise PolicyError(source, name, "is damaged; export the policy anew.") from None
-        if values.dtype.kind == "f" and not np.isfinite(values).all():
-            raise PolicyError(source, f"weights.{tensor.name}", "holds NaN or inf; train anew.")
-    for node in graph.node:
-        for attribute in node.attribute:
-            numbers = [attribute.f, *attribute.floats]
-            if not all(math.isfinite(number) for number in numbers):
-                raise PolicyError(source, f"graph.node.{attribute.name}", "is NaN or inf.")
-
-
-def check_ends(model: Any, widths: dict[str, int | None], source: str) -> None:
-    """Raises PolicyError unless inputs and outputs are those of a policy.
-
-    Args:
-        model: the ModelProto.
-        widths: of `observation`, `action` and `command`; None: integers (n,).
-        source: the file's name.
-    """
-    weights = {tensor.name for tensor in model.graph.initializer}
-    inputs = [one for one in model.graph.input if one.name not in weights]
-    for kind, ends, names in (
-        ("inputs", inputs, [INPUT]),
-        ("outputs", model.graph.output, [ACTION, COMMAND]),
-    ):
-        if [end.name for end in ends] != names:
-            reason = f"are {[end.name for end in ends]}, not {names}; export the policy anew."
-            raise PolicyError(source, f"graph.{kind}", reason)
-    for end in (*inputs, *model.graph.output):
-        tensor, width = end.type.tensor_type, widths[end.name]
-        kind = onnx.TensorProto.INT64 if width is None else onnx.TensorProto.FLOAT
-        sizes = [d.dim_value if d.HasField("dim_value") else None for d in tensor.shape.dim]
-        wanted = [None] if width is None else [None, width]
-        if tensor.elem_type != kind or sizes != wanted:
-            name = onnx.TensorProto.DataType.Name(tensor.elem_type)
-            reason = f"is {name} of shape {sizes}, where {wanted} is needed; export anew."
-            raise PolicyError(source, f"graph.{end.name}", reason)
+def _refuse(faults: Iterator[Fault], source: str) -> None:
+    for field, reason in faults:
+        raise PolicyError(source, field, reason)
 
 
 def metadata(model: Any, source: str) -> str:
@@ -211,14 +120,23 @@ def graph_hash(model: Any) -> str:
     return sha256(bare.SerializeToString(deterministic=True))
 
 
-MOST_PARTS = 50_000
-"""Maximum number of fields of all messages; each array of weights is one part."""
-MOST_NESTED = 16
-"""Maximum nesting of messages; an exported graph needs six levels."""
-MOST_PACKED = 2**20
-"""Maximum size of packed integers in one part, such as an array's shape [bytes]; not weights."""
-_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
-_LONGEST_VARINT = 10
+def sealed(data: bytes) -> bytes:
+    """Appends to a model's bytes their checksum, as another metadata entry.
+
+    Parts of a protobuf message may be concatenated, so other programs read the file as usual.
+    """
+    end = onnx.ModelProto()
+    entry = end.metadata_props.add()
+    entry.key, entry.value = SEAL, sha256(data)
+    return data + bytes(end.SerializeToString(deterministic=True))
+
+
+def check_seal(data: bytes, source: str) -> None:
+    """Raises PolicyError unless a file is bit-identical to what was written."""
+    size = len(sealed(b""))
+    if data != sealed(data[:-size]):
+        reason = "does not fit the file, which was changed or damaged; copy or export it again."
+        raise PolicyError(source, SEAL, reason)
 
 
 class WireError(ValueError):
@@ -226,11 +144,7 @@ class WireError(ValueError):
 
 
 def check_wire(data: bytes) -> None:
-    """Checks that the bytes of a ModelProto have few parts.
-
-    Raises:
-        WireError: they are no message, or have more parts or deeper nesting than allowed.
-    """
+    """Raises WireError unless the bytes are of a ModelProto with few parts and little nesting."""
     view, parts = memoryview(data), 0
     ahead: list[tuple[int, int, Any, int]] = [(0, len(data), onnx.ModelProto.DESCRIPTOR, 1)]
     while ahead:
@@ -246,18 +160,15 @@ def check_wire(data: bytes) -> None:
             field = kind.fields_by_number.get(key >> 3)
             if field is None or key & 7 != _BYTES:
                 continue
+            # Numbers of variable length grow when they are parsed.
+            grows = field.type in (
+                field.TYPE_INT64, field.TYPE_UINT64, field.TYPE_INT32, field.TYPE_UINT32,
+                field.TYPE_ENUM,
+            )  # fmt: skip
             if field.message_type is not None:
                 ahead.append((begin, start, field.message_type, depth + 1))
-            elif _is_packed_number(field) and start - begin > MOST_PACKED:
+            elif grows and start - begin > MOST_PACKED:
                 raise WireError(f"has {start - begin} bytes of {field.name!r}, not weights")
-
-
-def _is_packed_number(field: Any) -> bool:
-    """True for a field of variable-length numbers, which grow when they are parsed."""
-    growing = (
-        field.TYPE_INT64, field.TYPE_UINT64, field.TYPE_INT32, field.TYPE_UINT32, field.TYPE_ENUM,
-    )  # fmt: skip
-    return field.type in growing
 
 
 def _extent(view: memoryview, start: int, end: int, wire: int) -> tuple[int, int]:
@@ -277,10 +188,258 @@ def _extent(view: memoryview, start: int, end: int, wire: int) -> tuple[int, int
 
 def _varint(view: memoryview, start: int, end: int) -> tuple[int, int]:
     value = 0
-    for k in range(_LONGEST_VARINT):
-        if start + k >= end:
-            break
+    for k in range(min(_LONGEST_VARINT, end - start)):
         value |= (view[start + k] & 0x7F) << (7 * k)
         if view[start + k] < 0x80:
             return value, start + k + 1
     raise WireError("is no ONNX model, or is cut off")
+
+
+def check_graph(model: Any, source: str) -> None:
+    """Raises PolicyError for a graph that is not self-contained, or has other operators."""
+    _refuse(itertools.chain(_graph_faults(model), _weight_faults(model.graph)), source)
+    try:
+        onnx.checker.check_model(model)
+    except (onnx.checker.ValidationError, ValueError) as error:
+        words = " ".join(str(error).split())[:120]
+        raise PolicyError(source, "graph", f"is no valid ONNX graph ({words}).") from None
+
+
+def _graph_faults(model: Any) -> Iterator[Fault]:
+    graph = model.graph
+    if len(graph.node) > MOST_NODES:
+        yield (
+            "graph.node",
+            f"has {len(graph.node)} operators, a policy at most {MOST_NODES}; not run.",
+        )
+    for tensor in _tensors(graph):
+        name = f"weights.{tensor.name}"
+        if tensor.data_type not in NUMBERS or len(tensor.dims) > MOST_DIMENSIONS:
+            yield (
+                name,
+                f"is no array of numbers with at most {MOST_DIMENSIONS} dimensions; not run.",
+            )
+        location = next((entry.value for entry in tensor.external_data if entry.key), "")
+        if tensor.data_location == onnx.TensorProto.EXTERNAL or tensor.external_data:
+            yield name, f"refers to another file ({location!r}); a policy holds its own weights."
+    if len(model.functions) or len(model.training_info) or len(graph.sparse_initializer):
+        yield "graph", "holds functions, training or sparse weights; remove."
+    standard = ("", "ai.onnx")
+    for domain in (opset.domain for opset in model.opset_import if opset.domain not in standard):
+        yield "opset_import", f"holds the domain {domain!r}; only standard operators are run."
+    for node in graph.node:
+        if node.domain not in standard or node.op_type not in OPERATORS:
+            name = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
+            reason = f"the operator {name} is not one of a feed-forward network; not run."
+            yield "graph.node", reason
+        if any(a.HasField("g") or len(a.graphs) for a in node.attribute):
+            yield "graph.node", f"{node.op_type} holds a graph of its own."
+        if any(a.HasField("sparse_tensor") or len(a.sparse_tensors) for a in node.attribute):
+            yield "graph.node", f"{node.op_type} holds sparse weights."
+
+
+def _weight_faults(graph: Any) -> Iterator[Fault]:
+    for tensor in _tensors(graph):
+        try:
+            values = onnx.numpy_helper.to_array(tensor)
+        except (ValueError, TypeError, KeyError, RuntimeError):
+            yield f"weights.{tensor.name}", "is damaged; export the policy anew."
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            yield f"weights.{tensor.name}", "holds NaN or inf; train anew."
+    for attribute in _attributes(graph):
+        if not all(map(math.isfinite, [attribute.f, *attribute.floats])):
+            yield f"graph.node.{attribute.name}", "is NaN or inf."
+
+
+def _attributes(graph: Any) -> Iterator[Any]:
+    return itertools.chain.from_iterable(node.attribute for node in graph.node)
+
+
+def _tensors(graph: Any) -> Iterator[Any]:
+    """Yields every tensor of a graph: its weights, and constants in its nodes."""
+    yield from graph.initializer
+    for attribute in _attributes(graph):
+        if attribute.HasField("t"):
+            yield attribute.t
+        yield from attribute.tensors
+
+
+def check_ends(model: Any, widths: dict[str, int | None], source: str) -> None:
+    """Raises PolicyError unless inputs and outputs are those of a policy.
+
+    `widths` are those of `observation`, `action` and `command`; None: integers (n,).
+    """
+    weights = {tensor.name for tensor in model.graph.initializer}
+    inputs = [one for one in model.graph.input if one.name not in weights]
+    for kind, ends, names in (
+        ("inputs", inputs, [INPUT]),
+        ("outputs", model.graph.output, [ACTION, COMMAND]),
+    ):
+        if [end.name for end in ends] != names:
+            reason = f"are {[end.name for end in ends]}, not {names}; export the policy anew."
+            raise PolicyError(source, f"graph.{kind}", reason)
+    for end in (*inputs, *model.graph.output):
+        tensor, width = end.type.tensor_type, widths[end.name]
+        kind = onnx.TensorProto.INT64 if width is None else onnx.TensorProto.FLOAT
+        sizes = [d.dim_value if d.HasField("dim_value") else None for d in tensor.shape.dim]
+        wanted = [None] if width is None else [None, width]
+        if tensor.elem_type != kind or sizes != wanted:
+            name = onnx.TensorProto.DataType.Name(tensor.elem_type)
+            reason = f"is {name} of shape {sizes}, where {wanted} is needed; export anew."
+            raise PolicyError(source, f"graph.{end.name}", reason)
+
+
+def rows_at_once(model: Any, source: str) -> int:
+    """Number of observations that a graph of known operators may be given in one run.
+
+    Raises PolicyError if a size is unknown, or is more than any policy needs.
+    """
+    _refuse(_setting_faults(model.graph), source)
+    _refuse(_integer_faults(model, source), source)
+    numbers, work = _costs(model, ROWS, source)
+    if max(numbers / MOST_NUMBERS, work / MOST_WORK) > ROWS:
+        reason = (
+            f"needs {numbers / ROWS:.3g} numbers and {work / ROWS:.3g} multiplications for an "
+            f"observation, where a policy has {MOST_NUMBERS:.0e} and {MOST_WORK:.0e}; not run."
+        )
+        raise PolicyError(source, "graph", reason)
+    more_numbers, more_work = _costs(model, 2 * ROWS, source)
+    if more_numbers > 2 * numbers or more_work > 2 * work:
+        reason = "grows faster than the number of its observations; not run."
+        raise PolicyError(source, "graph", reason)
+    return max(1, ROWS * MOST_AT_ONCE // max(numbers, 1))
+
+
+def _setting_faults(graph: Any) -> Iterator[Fault]:
+    """Huge kernels, and arrays of thousands of dimensions, which take inference too long."""
+    lengths = {tensor.name: math.prod(tensor.dims) for tensor in graph.initializer}
+    for node in graph.node:
+        for attribute in node.attribute:
+            if node.op_type != "Slice" and any(abs(n) > GREATEST_SETTING for n in attribute.ints):
+                reason = f"of {node.op_type} is beyond {GREATEST_SETTING}; not run."
+                yield f"graph.node.{attribute.name}", reason
+        if node.op_type == "Constant":
+            given = (max(len(a.ints), math.prod(a.t.dims)) for a in node.attribute)
+            lengths.update(dict.fromkeys(node.output, max(given, default=0)))
+    added = 0
+    for node in graph.node:
+        if node.op_type in ("Reshape", "Unsqueeze"):
+            named = [lengths.get(name, 1) for name in node.input[1:2]]
+            added += max(named + [len(a.ints) for a in node.attribute], default=0)
+    if added > MOST_AXES:
+        yield (
+            "graph.node",
+            f"reshapes to {added} dimensions in all, a policy to {MOST_AXES}; not run.",
+        )
+
+
+def _integer_faults(model: Any, source: str) -> Iterator[Fault]:
+    """Integers that are divided, or that grow while shapes are inferred."""
+    inferred = _inferred(model, ROWS, source, values=False)
+    kinds = {tensor.name: tensor.data_type for tensor in inferred.initializer}
+    sizes = {}
+    for value in (*inferred.input, *inferred.value_info, *inferred.output):
+        tensor = value.type.tensor_type
+        kinds[value.name] = tensor.elem_type
+        sizes[value.name] = math.prod(d.dim_value for d in tensor.shape.dim)
+    for node in model.graph.node:
+        if node.op_type in DIVIDING and kinds.get(node.input[0]) not in FLOATS:
+            reason = f"{node.op_type} of whole numbers may end the process; use float32."
+            yield "graph.node", reason
+        if node.op_type in ("Concat", "Gather") and kinds.get(node.output[0]) not in FLOATS:
+            size = sizes.get(node.output[0], 0)
+            if size > SMALL * ROWS:
+                reason = (
+                    f"{node.op_type} of {size} whole numbers is no shape and no index; not run."
+                )
+                yield "graph.node", reason
+
+
+def _costs(model: Any, rows: int, source: str) -> tuple[int, int]:
+    """Output and work of all nodes for `rows` observations."""
+    shapes = _shapes(model, rows, source)
+    numbers = work = 0
+    for node in model.graph.node:
+        given, made = _known(node.input, shapes), _known(node.output, shapes)
+        if given is None or made is None:
+            reason = f"the size of what {node.op_type} gives can't be known before it runs."
+            raise PolicyError(source, "graph.node", reason)
+        buffer, multiplied = _work(node, given, made)
+        numbers += sum(map(math.prod, made)) + buffer
+        work += sum(map(math.prod, (*given, *made))) + multiplied + buffer
+    return numbers, work
+
+
+def _known(names: Any, shapes: Mapping[str, Shape]) -> list[Shape] | None:
+    """Shapes of a node's tensors, except omitted ones; None if one is unknown."""
+    found = [shapes.get(name) for name in names if name]
+    return None if None in found else [shape for shape in found if shape is not None]
+
+
+def _work(node: Any, given: list[Shape], made: list[Shape]) -> tuple[int, int]:
+    """Numbers that the runtime allocates in addition to the output, and multiplications."""
+    settings = {attribute.name: attribute for attribute in node.attribute}
+    if node.op_type in ("MatMul", "Gemm"):
+        turned = node.op_type == "Gemm" and "transA" in settings and settings["transA"].i
+        return 0, math.prod(made[0]) * (given[0][0] if turned else given[0][-1])
+    if node.op_type == "Conv":
+        groups = int(settings["group"].i) if "group" in settings else 1
+        kernel = math.prod(given[1][1:])
+        return math.prod(made[0][2:]) * kernel * max(groups, 1), math.prod(made[0]) * kernel
+    if "kernel_shape" in settings:  # of a pool
+        return 0, math.prod(made[0]) * int(math.prod(settings["kernel_shape"].ints))
+    return 0, 0
+
+
+def _shapes(model: Any, rows: int, source: str) -> dict[str, Shape]:
+    """Shape of every tensor for `rows` observations; unknown ones are missing."""
+    inferred = _inferred(model, rows, source, values=True)
+    shapes = {tensor.name: tuple(tensor.dims) for tensor in inferred.initializer}
+    for value in (*inferred.input, *inferred.value_info, *inferred.output):
+        dims = value.type.tensor_type.shape.dim
+        if value.type.tensor_type.HasField("shape") and all(d.HasField("dim_value") for d in dims):
+            shapes[value.name] = tuple(d.dim_value for d in dims)
+    return {name: shape for name, shape in shapes.items() if all(size >= 0 for size in shape)}
+
+
+def _inferred(model: Any, rows: int, source: str, values: bool) -> Any:
+    """A graph without weights, with types and shapes; `values`: infers from integers too."""
+    bare = _without_weights(model, rows)
+    try:
+        return onnx.shape_inference.infer_shapes(bare, strict_mode=True, data_prop=values).graph
+    except Exception as error:  # noqa: BLE001 - a damaged graph raises anything
+        words = " ".join(str(error).split())[:120]
+        raise PolicyError(source, "graph", f"its shapes do not fit ({words}).") from None
+
+
+def _without_weights(model: Any, rows: int) -> Any:
+    """The graph for `rows` observations, with weights and constants as inputs of their shape."""
+    bare = onnx.ModelProto(ir_version=model.ir_version, opset_import=model.opset_import)
+    graph = bare.graph
+    graph.name = "sizes"
+    for tensor in model.graph.initializer:
+        _add_tensor(graph, tensor, tensor.name)
+    for node in model.graph.node:
+        tensor = next((a.t for a in node.attribute if a.name == "value"), None)
+        if node.op_type == "Constant" and tensor is not None and len(node.output) == 1:
+            _add_tensor(graph, tensor, node.output[0])
+        else:
+            graph.node.append(node)
+    held = {tensor.name for tensor in model.graph.initializer}
+    for value in (one for one in model.graph.input if one.name not in held):
+        graph.input.append(value)
+        graph.input[-1].type.tensor_type.shape.dim[0].dim_value = rows
+    for value in model.graph.output:  # their shapes are to be inferred, not trusted
+        kind = value.type.tensor_type.elem_type
+        graph.output.append(onnx.helper.make_tensor_value_info(value.name, kind, None))
+    return bare
+
+
+def _add_tensor(graph: Any, tensor: Any, name: str) -> None:
+    """Adds a small integer array, which may be a shape, as it is; of others only the shape."""
+    if math.prod(tensor.dims) <= SMALL and tensor.data_type in INTEGERS:
+        graph.initializer.append(tensor)
+        graph.initializer[-1].name = name
+        return
+    info = onnx.helper.make_tensor_value_info(name, tensor.data_type, list(tensor.dims))
+    graph.input.append(info)

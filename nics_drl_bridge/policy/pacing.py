@@ -1,7 +1,4 @@
-"""Pacing of a policy's actions, and handling of inferences that take too long.
-
-Times are in seconds on a steady clock, given by the caller.
-"""
+"""Pacing of a policy's actions, and inferences that take too long; times on a steady clock [s]."""
 
 from __future__ import annotations
 
@@ -9,13 +6,10 @@ from enum import Enum
 
 
 class ActionPace:
-    """Allows at most one action per period, as soon as there are data to act on.
+    """Allows at most one action per period, as soon as there are data to act on; 0 acts on all.
 
     Due times are a period apart, so that jitter of the data makes it neither faster nor slower;
     if data come late, the next due time is a period after them.
-
-    Args:
-        period_s: between actions; 0 acts on everything.
     """
 
     def __init__(self, period_s: float) -> None:
@@ -40,18 +34,10 @@ class Answer(Enum):
 
 
 class Deadline:
-    """Judges the duration of each inference.
+    """Judges the duration of each inference, and counts those in time and the late ones.
 
-    A late command is dropped, because the world has moved on. After several in a row the robot is
-    stopped until one is in time again.
-
-    Args:
-        limit_s: maximum duration of an inference.
-        patience: number of late ones in a row from which zero is sent.
-
-    Attributes:
-        answered, late: number of inferences in time, and of late ones.
-        longest_s: maximum duration so far.
+    A late command is dropped, because the world has moved on. After `patience` in a row the robot
+    is stopped until one is in time again. `longest_s` is the maximum duration so far.
     """
 
     def __init__(self, limit_s: float, patience: int) -> None:

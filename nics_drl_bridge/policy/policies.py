@@ -1,71 +1,30 @@
-"""Baselines that any policy must beat: straight to the goal, and random actions.
-
-Policies by name.
-"""
+"""Policies by name: baselines that any trained policy must beat, a planner, and policy files."""
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from importlib import import_module
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.policy.planners import DynamicWindow
+from nics_drl_bridge.policy import dynamic_window_kernels as kernels
+from nics_drl_bridge.policy.contract import SUFFIX, shipped
+from nics_drl_bridge.robot.kinds import steady_twist
+from nics_drl_bridge.robot.spec import RobotSpec
 
-FULL_TURN_RAD = 0.8
-"""Bearing of the goal from which a robot turns as fast as it can."""
+Array = NDArray[np.float64]
+
+FULL_TURN_RAD = 0.8  # bearing of the goal from which a robot turns as fast as it can
 CREEP = 0.3
 """Share of the maximum speed for a robot that can't turn on the spot and has its goal behind."""
-
-
-@dataclass(frozen=True)
-class StraightToGoal:
-    """Turns to the goal and drives there, ignoring obstacles.
-
-    Attributes:
-        task: defines observations and actions.
-    """
-
-    task: Navigation
-
-    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Returns the action (C,) for an observation (O,); or (N, C) for (N, O)."""
-        robot, first = self.task.robot, self.task.scan_parts + 1
-        cosine, sine = np.moveaxis(observation[..., first : first + 2].astype(float), -1, 0)
-        turn = np.clip(np.arctan2(sine, cosine) / FULL_TURN_RAD, -1.0, 1.0)
-        ahead = np.maximum(cosine, CREEP if robot.steers else 0.0)
-        shares = np.stack([ahead, np.zeros_like(ahead), turn], axis=-1)
-        wanted = robot.from_cmd_vel(shares) * robot.command_high
-        low, high = robot.command_low, robot.command_high
-        return np.clip(2.0 * (wanted - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class RandomActions:
-    """Draws each action at random, ignoring the observation.
-
-    Attributes:
-        task: defines the actions.
-        seed: of the draws.
-    """
-
-    task: Navigation
-    seed: int = 0
-    _rng: list[np.random.Generator] = field(default_factory=list, repr=False)
-
-    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Returns an action (C,); or (N, C) for (N, O)."""
-        if not self._rng:
-            self._rng.append(np.random.default_rng(self.seed))
-        shape = (*observation.shape[:-1], len(self.task.robot.command))
-        return self._rng[0].uniform(-1.0, 1.0, shape).astype(np.float32)
 
 
 class Policy(Protocol):
@@ -73,7 +32,119 @@ class Policy(Protocol):
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Returns the action (C,) in [-1, 1] for an observation (O,); or (N, C) for (N, O)."""
-        ...
+
+
+def _actions(robot: RobotSpec, commands: Array) -> Array:
+    """Commands (..., C), scaled to [-1, 1]."""
+    low, high = robot.command_low, robot.command_high
+    return np.asarray(2.0 * (commands - low) / (high - low) - 1.0)
+
+
+@dataclass(frozen=True)
+class StraightToGoal:
+    """Turns to the goal and drives there, ignoring obstacles."""
+
+    task: Navigation
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """See `Policy`."""
+        robot, first = self.task.robot, self.task.scan_parts + 1
+        cosine, sine = np.moveaxis(observation[..., first : first + 2].astype(float), -1, 0)
+        turn = np.clip(np.arctan2(sine, cosine) / FULL_TURN_RAD, -1.0, 1.0)
+        ahead = np.maximum(cosine, CREEP if robot.steers else 0.0)
+        shares = np.stack([ahead, np.zeros_like(ahead), turn], axis=-1)
+        wanted = robot.from_cmd_vel(shares) * robot.command_high
+        return np.clip(_actions(robot, wanted), -1.0, 1.0).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class RandomActions:
+    """Draws each action at random, ignoring the observation."""
+
+    task: Navigation
+    seed: int = 0
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """See `Policy`."""
+        shape = (*observation.shape[:-1], len(self.task.robot.command))
+        return self._rng.uniform(-1.0, 1.0, shape).astype(np.float32)
+
+    @cached_property
+    def _rng(self) -> np.random.Generator:
+        return np.random.default_rng(self.seed)
+
+
+@dataclass(frozen=True)
+class DynamicWindow:
+    """The dynamic-window approach (Fox, Burgard, Thrun 1997) on scan, goal and twist.
+
+    Tries the twists that the commands allow and that the robot can reach from its present one in a
+    period; each is held for the look-ahead. A twist with a contact before the robot could stop is
+    inadmissible; the best of the others in distance, aim, clearance and time to contact is chosen.
+    It plans no path: behind a long wall it stays. Which twist a command leads to follows from the
+    robot's kind and parameters. Raises ConfigError if it is not known where the robot's commands
+    lead, see `steady_twist`.
+    """
+
+    task: Navigation
+    margin: float = 0.05  # clearance to keep around the footprint [m]
+    period: float = 0.1  # between commands [s]
+    steps: int = 10  # of the look-ahead, each a period and a half long
+    weights: tuple[float, float, float, float] = (1.0, 0.6, 0.3, 1.5)  # see `TwistWeights`
+
+    def __post_init__(self) -> None:
+        _ = self._twists
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """See `Policy`."""
+        parts = self.task.scan_parts
+        seen = np.atleast_2d(observation).astype(np.float64)
+        goals = seen[:, parts : parts + 1] * seen[:, parts + 1 : parts + 3]
+        chosen = np.empty(len(seen), np.int64)
+        kernels.choose_all(
+            chosen, np.ascontiguousarray(seen[:, :parts]), goals,
+            np.ascontiguousarray(seen[:, parts + 3 : parts + 6]),
+            self._twists, self._rays, self._ahead, kernels.TwistWeights(*self.weights),
+        )  # fmt: skip
+        return self._scaled[chosen[0] if observation.ndim == 1 else chosen]
+
+    @cached_property
+    def _rays(self) -> kernels.ScanRays:
+        sight = self.task.sight
+        directions = np.stack([np.cos(sight.angles), np.sin(sight.angles)], axis=-1)
+        return kernels.ScanRays(directions, sight.origin, float(sight.range_max))
+
+    @cached_property
+    def _ahead(self) -> kernels.LookAhead:
+        robot = self.task.robot
+        lags = [value for name, value in robot.parameters.items() if name.endswith("_lag")]
+        lag = max(lags, default=0.0)
+        share = 1.0 - math.exp(-self.period / lag) if lag > 0.0 else 1.0
+        reach = share * (self._twists.max(axis=0) - self._twists.min(axis=0)) + 1e-6
+        radius = robot.footprint_radius + self.margin
+        rest = 2.0 * self.period + lag
+        return kernels.LookAhead(reach, radius, 1.5 * self.period, self.steps, rest)
+
+    @cached_property
+    def _commands(self) -> Array:
+        """(K, C) grid of commands between their limits, including zero."""
+        robot = self.task.robot
+        counts = {1: (15,), 2: (7, 15), 3: (7, 7, 5)}.get(len(robot.command))
+        axes = [
+            np.unique(np.append(np.linspace(one.min, one.max, count), np.clip(0, one.min, one.max)))
+            for one, count in zip(robot.command, counts or [3] * len(robot.command), strict=True)
+        ]
+        return np.array(list(itertools.product(*axes)))
+
+    @cached_property
+    def _scaled(self) -> NDArray[np.float32]:
+        """(K, C) action of each command."""
+        return _actions(self.task.robot, self._commands).astype(np.float32)
+
+    @cached_property
+    def _twists(self) -> Array:
+        """(K, 3) body twist of each command."""
+        return steady_twist(self.task.robot, self._commands)
 
 
 POLICIES: dict[str, Callable[[Navigation], Policy]] = {
@@ -83,56 +154,49 @@ POLICIES: dict[str, Callable[[Navigation], Policy]] = {
 }
 
 
-SUFFIX = ".onnx"
-
-
 def shipped_policies() -> list[str]:
     """Names of the policy files that come with the package."""
-    return sorted(file.stem for file in (share_folder() / "config" / "policies").glob(f"*{SUFFIX}"))
+    return sorted(file.stem for file in shipped().glob(f"*{SUFFIX}"))
 
 
-def check_name(name: str) -> None:
-    """Raises ConfigError for a name that is neither a policy's nor a policy file's."""
+def is_policy_file(name: str) -> bool:
+    """True for a policy file or the name of a shipped one. Raises ConfigError if unknown."""
     files = shipped_policies()
     if name not in POLICIES and not name.endswith(SUFFIX) and name not in files:
         raise ConfigError(f"unknown policy {name!r}; {nearest(name, (*POLICIES, *files))}")
+    return name not in POLICIES
 
 
 def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None) -> Policy:
     """Makes a policy by name.
 
-    Args:
-        name: a key of `POLICIES`, a shipped policy file, or the path of a policy file.
-        task: defines observations and actions.
-        model: of the robot; a policy file is checked against it and the task.
+    The name is a key of `POLICIES`, a shipped policy file, or the path of a policy file, which is
+    checked against the task and the model of the robot.
 
     Raises:
         ConfigError: an unknown name; suggests the nearest.
         PolicyError: the file can't be used, or does not fit; names the field.
     """
-    check_name(name)
-    if name in POLICIES:
+    if not is_policy_file(name):
         return POLICIES[name](task)
-    # Imported here: the others need neither onnx nor onnxruntime.
-    policy: Policy = import_module("nics_drl_bridge.policy.policy_file").load_policy(name)
-    policy.check_fits(model, task)  # type: ignore[attr-defined]
+    from nics_drl_bridge.policy.policy_file import load_policy  # the others need no onnxruntime
+
+    policy = load_policy(name)
+    policy.check_fits(model, task)
     return policy
 
 
 def open_policy(name: str, model: SimulatorModel) -> tuple[Policy, Navigation]:
     """Opens a policy by name, with the navigation task that it is for.
 
-    Args:
-        name: see `make_policy`.
-        model: of the robot.
-
-    Raises:
-        ConfigError, PolicyError: see `make_policy`; or the policy was trained for another task.
+    Raises ConfigError, PolicyError: see `make_policy`; or the policy was trained for another task.
     """
-    if name in POLICIES or not (name.endswith(SUFFIX) or name in shipped_policies()):
+    if not is_policy_file(name):
         task = Navigation(model.robot, model.lidar)
-        return make_policy(name, task, model), task
-    policy = import_module("nics_drl_bridge.policy.policy_file").load_policy(name)
+        return POLICIES[name](task), task
+    from nics_drl_bridge.policy.policy_file import load_policy
+
+    policy = load_policy(name)
     found = policy.make_task(model)
     if not isinstance(found, Navigation):
         reason = f"is {policy.contract.task.name!r}; this drives policies of 'navigation'."

@@ -14,36 +14,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.env.registry import TASKS, make_task
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.policy import onnx_graph, onnx_sizes
+from nics_drl_bridge.policy import onnx_graph
 from nics_drl_bridge.policy.contract import (
+    SUFFIX,
     Contract,
     leaves,
     observation_entry,
     read_contract,
+    shipped,
     task_entry,
 )
 from nics_drl_bridge.robot.spec import RobotSpec
 
-SUFFIX = ".onnx"
 GOLDEN_TOLERANCE = 1e-5
 PERIOD_TOLERANCE = 1e-9
+ROBOT = {"command", "footprint", "footprint_radius"}
+LIDAR = {"beams", "angle_min", "angle_max", "range_max", "mount"}
 Rows = NDArray[np.float32]
 
 
 class PolicyFile:
-    """A loaded and checked policy.
-
-    Attributes:
-        path: of the file.
-        contract: its contract.
-    """
+    """A loaded and checked policy, with the path of its file and its contract."""
 
     def __init__(self, path: Path, contract: Contract, session: Any, rows_at_once: int) -> None:
         self.path, self.contract, self._session = path, contract, session
@@ -51,13 +48,14 @@ class PolicyFile:
 
     def act(self, observation: Rows) -> NDArray[Any]:
         """Returns the action (C,) in [-1, 1], or () discrete, for (O,); or n of them for (n, O)."""
-        return self._run(observation)[0]
+        return self.run(observation)[0]
 
     def command(self, observation: Rows) -> Rows:
         """Returns the command (C,) in SI, in the robot's order, for (O,); or (n, C) for (n, O)."""
-        return self._run(observation)[1]
+        return self.run(observation)[1]
 
-    def _run(self, observation: Rows) -> list[NDArray[Any]]:
+    def run(self, observation: Rows) -> list[NDArray[Any]]:
+        """Returns action and command for (O,) or (n, O)."""
         given = np.asarray(observation, np.float32)
         size = self.contract.observation.size
         if given.ndim not in (1, 2) or given.shape[-1] != size:
@@ -91,12 +89,8 @@ class PolicyFile:
     def make_task(self, model: SimulatorModel, kind: str | type[Task] | None = None) -> Task:
         """Makes the policy's task for a robot that it fits.
 
-        Args:
-            model: the robot.
-            kind: for a task that is not shipped, its class or `path/to/file.py:ClassName`.
-
-        Raises:
-            PolicyError: the policy does not fit; names the field.
+        For a task that is not shipped, `kind` is its class or `path/to/file.py:ClassName`. Raises
+        PolicyError if the policy does not fit; names the field.
         """
         name = self.contract.task.name
         if kind is None and name not in TASKS:
@@ -137,23 +131,15 @@ class PolicyFile:
         self._compare(ours, theirs)
 
     def _check_task(self, task: Task) -> None:
-        contract, scan = self.contract, task.scan
-        sees = None if scan is None else scan.model_dump(mode="json")
-        wants = None if contract.scan is None else contract.scan.model_dump(mode="json")
-        self._compare(
-            {
-                "task": {"name": contract.task.name},
-                "actions": contract.actions,
-                "scan": wants,
-                "observation": contract.observation.model_dump(mode="json"),
-            },
-            {
-                "task": {"name": task_entry(task)["name"]},
-                "actions": task.actions,
-                "scan": sees,
-                "observation": observation_entry(task),
-            },
-        )
+        theirs = {
+            "task": {"name": task_entry(task)["name"]},
+            "actions": task.actions,
+            "scan": None if task.scan is None else task.scan.model_dump(mode="json"),
+            "observation": observation_entry(task),
+        }
+        ours = self.contract.model_dump(mode="json", include=set(theirs))
+        ours["task"] = {"name": ours["task"]["name"]}
+        self._compare({name: ours[name] for name in theirs}, theirs)
 
     def _compare(self, ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> None:
         mine, other = dict(leaves(dict(ours))), dict(leaves(dict(theirs)))
@@ -166,47 +152,31 @@ class PolicyFile:
         raise PolicyError(str(self.path), field, reason)
 
 
-ROBOT = {"command", "footprint", "footprint_radius"}
-LIDAR = {"beams", "angle_min", "angle_max", "range_max", "mount"}
-
-
 def find_policy(name: str) -> Path:
     """Path of a policy file, by its path or by the name of a shipped one."""
     path = Path(name)
     return path if name.endswith(SUFFIX) or path.is_file() else shipped() / f"{name}{SUFFIX}"
 
 
-def shipped() -> Path:
-    """The folder of the policies that come with the package."""
-    return share_folder() / "config" / "policies"
-
-
 def load_policy(path: str | Path) -> PolicyFile:
-    """Loads a policy file and runs every check.
+    """Loads a policy file, by its path or the name of a shipped one, and runs every check.
 
-    Args:
-        path: path of the file, or the name of a shipped one.
-
-    Raises:
-        PolicyError: a check fails; names the field.
+    Raises PolicyError if a check fails; names the field.
     """
     file = find_policy(str(path))
-    return policy_of(_read(file), file)
-
-
-def _read(path: Path) -> bytes:
-    source = str(path)
+    source = str(file)
     try:
-        size = path.stat().st_size
-        if not path.is_file():
+        size = file.stat().st_size
+        if not file.is_file():
             raise PolicyError(source, "file", "is no file; give the path of an .onnx file.")
         if size > onnx_graph.SIZE_LIMIT:
             limit = onnx_graph.SIZE_LIMIT // 2**20
             reason = f"is {size / 2**20:.0f} MB, a policy is at most {limit} MB; not opened."
             raise PolicyError(source, "file", reason)
-        return path.read_bytes()
+        data = file.read_bytes()
     except OSError as error:
         raise PolicyError(source, "file", f"can't be read ({error.strerror}).") from None
+    return policy_of(data, file)
 
 
 def policy_of(data: bytes, path: Path) -> PolicyFile:
@@ -221,7 +191,7 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
     if onnx_graph.graph_hash(model) != contract.graph_sha256:
         reason = "does not belong to the graph, which was changed after the export."
         raise PolicyError(source, "graph_sha256", reason)
-    rows = onnx_sizes.rows_at_once(model, source)
+    rows = onnx_graph.rows_at_once(model, source)
     del model  # the runtime parses the bytes itself
     policy = PolicyFile(path, contract, open_session(data, source), rows)
     _check_golden(policy, source)
@@ -259,9 +229,8 @@ def _cannot_run(source: str, error: Exception) -> PolicyError:
 
 def _check_golden(policy: PolicyFile, source: str) -> None:
     golden = policy.contract.golden
-    observations = golden.rows("observations")
-    action, command = policy._run(observations)
-    found = {"actions": action.reshape(len(observations), -1), "commands": command}
+    action, command = policy.run(golden.rows("observations"))
+    found = {"actions": action.reshape(len(command), -1), "commands": command}
     for name, rows in found.items():
         gap = np.abs(rows - golden.rows(name)).max()
         if not gap <= GOLDEN_TOLERANCE:
@@ -275,6 +244,5 @@ def _check_golden(policy: PolicyFile, source: str) -> None:
 
 def summary(policy: PolicyFile) -> dict[str, Any]:
     """The contract as plain data, without arrays and checksums."""
-    data = policy.contract.model_dump(mode="json")
-    del data["golden"], data["checksums"]
+    data = policy.contract.model_dump(mode="json", exclude={"golden", "checksums"})
     return {"file": str(policy.path), "bytes": policy.path.stat().st_size, **data}

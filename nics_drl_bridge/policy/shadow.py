@@ -21,39 +21,25 @@ from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.messages import command_row
 
 Array = NDArray[np.float64]
-JITTER = 0.25
-"""Permitted earliness of a scan, in control periods."""
-HELD_S = 1.0
-"""Age from which a command no longer applies to the robot."""
-DEAD_BAND = 0.05
-"""Commands below this share of their maximum have no sign."""
+JITTER = 0.25  # permitted earliness of a scan, in control periods
+HELD_S = 1.0  # age from which a command no longer applies to the robot
+DEAD_BAND = 0.05  # commands below this share of their maximum have no sign
 PERCENTILES = (50, 90, 99)
 
 
 @dataclass(frozen=True)
 class Shadow:
-    """A policy compared with a drive, at the T times at which it would have acted.
+    """A policy compared with a drive, at the T times at which it would have acted."""
 
-    Attributes:
-        names, units: (C) of the commands.
-        time: (T,) since the first [s].
-        pose: (T, 3) estimated, in `map`.
-        goal: (T, 2) goal given to the policy [m].
-        policy: (T, C) commands of the policy.
-        driven: (T, C) recorded commands.
-        scale: (C,) maximum magnitude of each command.
-        skipped: reason -> number of times that were not compared.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # (C) of the commands
     units: tuple[str, ...]
-    time: Array
-    pose: Array
-    goal: Array
-    policy: Array
-    driven: Array
-    scale: Array
-    skipped: Mapping[str, int]
+    time: Array  # (T,) since the first [s]
+    pose: Array  # (T, 3) estimated, in `map`
+    goal: Array  # (T, 2) given to the policy [m]
+    policy: Array  # (T, C) commands of the policy
+    driven: Array  # (T, C) recorded commands
+    scale: Array  # (C,) maximum magnitude of each command
+    skipped: Mapping[str, int]  # reason -> number of times that were not compared
 
     def differences(self) -> dict[str, dict[str, float]]:
         """Differences between policy and drive, for each command.
@@ -61,29 +47,27 @@ class Shadow:
         Mean of policy minus drive; mean, percentiles and maximum of its magnitude, in the command's
         unit; and the share of opposite signs among the times at which both have a sign.
         """
-        told = {}
-        for c, name in enumerate(self.names):
-            gap = self.policy[:, c] - self.driven[:, c]
-            size, band = np.abs(gap), DEAD_BAND * self.scale[c]
-            told[name] = {
+        found = {}
+        for name, one, other, scale in zip(
+            self.names, self.policy.T, self.driven.T, self.scale, strict=True
+        ):
+            gap, band = one - other, DEAD_BAND * scale
+            size = np.abs(gap)
+            signed = (np.abs(one) > band) & (np.abs(other) > band)
+            opposite = (one[signed] * other[signed] < 0.0).mean() if signed.any() else 0.0
+            found[name] = {
                 "mean": float(gap.mean()),
                 "mean_size": float(size.mean()),
                 **{f"p{q}": float(np.percentile(size, q)) for q in PERCENTILES},
                 "greatest": float(size.max()),
-                "opposite": _opposite(self.policy[:, c], self.driven[:, c], band),
+                "opposite": float(opposite),
             }
-        return told
-
-
-def _opposite(one: Array, other: Array, band: float) -> float:
-    """Share of opposite signs among the times at which both are outside a band."""
-    told = (np.abs(one) > band) & (np.abs(other) > band)
-    return float((one[told] * other[told] < 0.0).mean()) if told.any() else 0.0
+        return found
 
 
 @dataclass
 class _Moment:
-    """A time at which the policy would act, with its view and the driven command."""
+    """A time at which the policy would act."""
 
     receive_ns: int
     stamp_ns: int
@@ -105,14 +89,9 @@ def shadow(
     once per control period of the stamps. Its command is compared with the first one recorded after
     that, or else with the one that still applied.
 
-    Args:
-        path: of the bag.
-        model: of the robot.
-        policy: a file, or the name of a shipped policy or of a baseline.
-        topics: role -> topic, see `playback.chosen`.
-        goal: (2,) in `map` [m], in which the first odometry is taken at face value. None uses the
-            robot's position `ahead_s` later instead: the driver's intention, in hindsight.
-        ahead_s: see `goal` [s].
+    The goal (2,) [m] is in `map`, in which the first odometry is taken at face value. None uses the
+    robot's position `ahead_s` later instead: the driver's intention, in hindsight. `topics` are by
+    role, see `playback.chosen`.
 
     Raises:
         RecordingError: the bag can't be used, or lacks scans or commands.
@@ -123,10 +102,8 @@ def shadow(
     messages = played(path, topics)
     for role in (SCAN, CMD_VEL):
         if role not in messages:
-            raise RecordingError(
-                f"{path}: has no {role}, which a policy is compared by; say which topic it is, as "
-                f"in --topic {role}=/car/{role}."
-            )
+            reason = f"has no {role}, which a policy is compared by; say which topic it is"
+            raise RecordingError(f"{path}: {reason}, as in --topic {role}=/car/{role}.")
     playback = Playback(model, POSE in messages, any_lidar=True)
     moments = _moments(playback, messages, model)
     if not moments:

@@ -1,7 +1,4 @@
-"""Trains a policy with Stable-Baselines3 on the vector env, with checkpoints and resumption.
-
-A training run: several seeds, each trained, evaluated, and saved in its own folder.
-"""
+"""Trains policies with Stable-Baselines3 on the vector env, seed after seed, and evaluates them."""
 
 from __future__ import annotations
 
@@ -23,14 +20,7 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, shortened
 from nics_drl_bridge.files import write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.policy.evaluation_batch import (
-    FIRST_SEED,
-    Outcomes,
-    Summary,
-    drive_worlds,
-    summarise,
-)
-from nics_drl_bridge.policy.statistics import ConfidenceInterval
+from nics_drl_bridge.policy.evaluation import FIRST_SEED, Outcomes, Summary, drive_worlds, summarise
 from nics_drl_bridge.policy.train_algorithms import Actor, act_of, make_algorithm, observed
 from nics_drl_bridge.policy.train_checkpoint import (
     Companion,
@@ -45,28 +35,24 @@ from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.world import World
 
-CHECKPOINT = "checkpoint.pt"
+CHECKPOINT, SETTINGS = "checkpoint.pt", "settings.yaml"
+EVALUATION, POLICY = "evaluation.json", "policy.onnx"
 SEEDS = 2**40
-Tell = Callable[[Progress], None]
+GREATEST_SEED = 2**32 - 1
+"""Largest seed of numpy's global generator, from which Stable-Baselines3 draws."""
 LOG_EVERY = {"ppo": 1, "sac": 1000}
 """Roll-outs (PPO) or episodes (SAC) between two entries of TensorBoard."""
+Tell = Callable[[Progress], None]
 
 
 @dataclass(frozen=True)
 class Trained:
-    """A finished training.
+    """A finished training."""
 
-    Attributes:
-        algorithm: with its policy; on Ray only the acting part.
-        steps: environment steps of all worlds together.
-        wall_s: time that this process spent on it [s].
-        stepping_s: part of it in the simulator [s].
-    """
-
-    algorithm: BaseAlgorithm | Actor
-    steps: int
-    wall_s: float
-    stepping_s: float
+    algorithm: BaseAlgorithm | Actor  # with its policy; on Ray only the acting part
+    steps: int  # environment steps of all worlds together
+    wall_s: float  # time that this process spent on it [s]
+    stepping_s: float  # part of it in the simulator [s]
 
 
 def train(
@@ -76,28 +62,24 @@ def train(
     tell: Tell = lambda _: None,
     resumed: bool = False,
 ) -> Trained:
-    """Trains one policy.
+    """Trains one policy; checkpoint and TensorBoard logs are in `folder`.
 
     An interrupted and resumed training gives bit-identical weights to an uninterrupted one: a
-    checkpoint contains the network, the optimiser, all random generators and all worlds.
-
-    Args:
-        settings: what to learn.
-        seed: of all random numbers.
-        folder: for checkpoint and TensorBoard logs; created if missing.
-        tell: called with the progress, a few times per second.
-        resumed: True continues from the checkpoint in `folder`.
-
-    Raises:
-        ConfigError: the settings are inconsistent, or no checkpoint fits them.
+    checkpoint contains the network, the optimiser, all random generators and all worlds. `tell` is
+    called with the progress, a few times per second. Raises ConfigError if the settings are
+    inconsistent, or no checkpoint fits them.
     """
     begin, path = time.perf_counter(), folder / CHECKPOINT
     content = read_checkpoint(path) if resumed else None
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
     env = make_train_env(settings)
-    algorithm = _begin(settings, env, seed) if content is None else _again(
-        content, about, settings, env, path
-    )  # fmt: skip
+    if content is None:
+        rng = np.random.default_rng(seed)
+        env.seed(int(rng.integers(SEEDS)))
+        algorithm = make_algorithm(settings, env, seed, observed(env, rng))
+        env.seed(int(rng.integers(SEEDS)))  # replaces the algorithm's, near those of other runs
+    else:
+        algorithm = _again(content, about, settings, env, path)
     algorithm.set_logger(configure(str(folder), ["tensorboard"]))
     busy = env.stepping_s
 
@@ -120,13 +102,7 @@ def make_train_env(
     model: SimulatorModel | None = None,
     scenes: Mapping[str, World] | None = None,
 ) -> TrainVecEnv:
-    """Makes the worlds of the settings in one env.
-
-    Args:
-        settings: of the training.
-        model: of the robot, if it is already open.
-        scenes: name -> world, if they are already loaded.
-    """
+    """Makes the worlds of the settings in one env; model and worlds may already be open."""
     model = model or open_model(settings.robot)
     return TrainVecEnv(
         *(
@@ -138,14 +114,6 @@ def make_train_env(
             for world, count in settings.worlds.items()
         )
     )  # fmt: skip
-
-
-def _begin(settings: TrainingSettings, env: TrainVecEnv, seed: int) -> BaseAlgorithm:
-    rng = np.random.default_rng(seed)
-    env.seed(int(rng.integers(SEEDS)))
-    algorithm = make_algorithm(settings, env, seed, observed(env, rng))
-    env.seed(int(rng.integers(SEEDS)))  # replaces the algorithm's seed, near those of other runs
-    return algorithm
 
 
 def _again(
@@ -170,13 +138,7 @@ def _again(
 
 
 def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
-    """Raises ConfigError unless a checkpoint has the settings and seed of a training.
-
-    Args:
-        old: seed and settings of the checkpoint.
-        new: those of the training.
-        path: of the checkpoint.
-    """
+    """Raises ConfigError unless a checkpoint has the settings and seed of a training."""
     if not isinstance(old, dict) or not isinstance(old.get("settings"), dict) or "seed" not in old:
         raise ConfigError(f"{path}: does not say of which training it is; train anew.")
     for key, value in new["settings"].items():
@@ -204,22 +166,13 @@ def evaluate(
     return drive_worlds(env, act_of(algorithm), range(FIRST_SEED, FIRST_SEED + episodes))
 
 
-SETTINGS, EVALUATION, POLICY = "settings.yaml", "evaluation.json", "policy.onnx"
-GREATEST_SEED = 2**32 - 1
-"""Largest seed of numpy's global generator, from which Stable-Baselines3 draws."""
 Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]
 """A function like `train`: of settings, seed, folder, progress callback and `resumed`."""
 
 
 @dataclass(frozen=True)
 class SeedResult:
-    """Result of one seed.
-
-    Attributes:
-        seed: of the training.
-        trained: the training that ended, with its policy.
-        summaries: world -> evaluation of the policy there.
-    """
+    """A finished training with its seed, and its policy's evaluation by world."""
 
     seed: int
     trained: Trained
@@ -228,23 +181,14 @@ class SeedResult:
 
 @dataclass(frozen=True)
 class TrainOrder:
-    """An order for a training run.
+    """An order for a training run."""
 
-    Attributes:
-        settings: what to learn; for a resumed run its own, see `settings_of`.
-        seeds: of the trainings.
-        out: folder of the run; each seed gets one below it.
-        episodes: number of episodes of the evaluation in each world.
-        resumed: True continues from the existing checkpoints.
-        command: the user's command line, for the policy files.
-    """
-
-    settings: TrainingSettings
+    settings: TrainingSettings  # what to learn; for a resumed run its own, see `settings_of`
     seeds: Sequence[int]
-    out: Path
-    episodes: int
-    resumed: bool = False
-    command: str = ""
+    out: Path  # folder of the run; each seed gets one below it
+    episodes: int  # number of episodes of the evaluation in each world
+    resumed: bool = False  # True continues from the existing checkpoints
+    command: str = ""  # the user's command line, for the policy files
 
 
 def run(
@@ -255,25 +199,23 @@ def run(
 ) -> list[SeedResult]:
     """Trains seed after seed and evaluates each in its training worlds.
 
-    Args:
-        order: the order.
-        tell: called with the progress.
-        done: called with the result of each seed.
-        learn: trains one policy.
-
-    Raises:
-        ConfigError: the folder already contains a run, or none to resume.
+    `tell` is called with the progress, `done` with the result of each seed. Raises ConfigError if
+    the folder already contains a run, or none to resume.
     """
     _check(order.seeds, order.out, order.resumed)
-    settings = order.settings
+    settings, model = order.settings, open_model(order.settings.robot)
     write_text(order.out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
     results = []
     for seed in order.seeds:
         folder = order.out / f"seed_{seed}"
         begun = (folder / CHECKPOINT).is_file()
         trained = learn(settings, seed, folder, tell, order.resumed and begun)
-        result = SeedResult(seed, trained, _evaluated(settings, trained, order.episodes))
-        plain = {world: dataclasses.asdict(one) for world, one in result.summaries.items()}
+        summaries = {}
+        for world in settings.worlds:
+            outcomes = evaluate(trained.algorithm, settings, world, order.episodes, model)
+            summaries[world] = summarise(outcomes, model.control_period)
+        result = SeedResult(seed, trained, summaries)
+        plain = {world: dataclasses.asdict(one) for world, one in summaries.items()}
         write_text(folder / EVALUATION, json.dumps(plain, indent=2) + "\n")
         export(settings, result, order.command, folder / POLICY)
         done(result)
@@ -282,14 +224,7 @@ def run(
 
 
 def export(settings: TrainingSettings, result: SeedResult, command: str, path: Path) -> None:
-    """Writes the policy file, which records the policy's origin and its success rates.
-
-    Args:
-        settings: of the training.
-        result: of one seed.
-        command: the user's command line.
-        path: of the file, `*.onnx`.
-    """
+    """Writes the policy file `*.onnx`, with the user's command line and the success rates."""
     model = open_model(settings.robot)
     task = make_task(settings.task, model, settings.task_options)
     rates = {f"success in {world}": one.success.value for world, one in result.summaries.items()}
@@ -317,28 +252,18 @@ def settings_of(out: Path) -> TrainingSettings:
     return load_yaml(out / SETTINGS, TrainingSettings)
 
 
-def _evaluated(settings: TrainingSettings, trained: Trained, episodes: int) -> dict[str, Summary]:
-    model = open_model(settings.robot)
-    return {
-        world: summarise(
-            evaluate(trained.algorithm, settings, world, episodes, model), model.control_period
-        )
-        for world in settings.worlds
-    }
-
-
 def line_of(summary: Summary) -> str:
     """Formats a summary as text, every figure with its 95 % interval."""
-    shares = (summary.success, summary.collision, summary.time_out)
-    named = zip(("success", "collision", "time-out"), shares, strict=True)
-    rates = ", ".join(f"{name} {_percent(share)}" for name, share in named)
-    length, time = _amount(summary.length, "m"), _amount(summary.time, "s")
+    rates = ", ".join(
+        f"{name} {100 * share.value:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})"
+        for name, share in (
+            ("success", summary.success),
+            ("collision", summary.collision),
+            ("time-out", summary.time_out),
+        )
+    )
+    length, time = (
+        f"{one.value:.2f} {unit} ({one.low:.2f} to {one.high:.2f})"
+        for one, unit in ((summary.length, "m"), (summary.time, "s"))
+    )
     return f"{rates}, path {length}, time {time} of {summary.episodes} episodes"
-
-
-def _percent(share: ConfidenceInterval) -> str:
-    return f"{100 * share.value:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})"
-
-
-def _amount(value: ConfidenceInterval, unit: str) -> str:
-    return f"{value.value:.2f} {unit} ({value.low:.2f} to {value.high:.2f})"

@@ -1,9 +1,4 @@
-"""PPO and SAC of Stable-Baselines3, built from settings.
-
-Normaliser of observations, a part of the network so that it can't get lost.
-
-The acting part of a network as a separate module: normaliser and layers.
-"""
+"""PPO and SAC of Stable-Baselines3, built from settings, and the networks that they train."""
 
 from __future__ import annotations
 
@@ -21,42 +16,50 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.policy.evaluation_batch import Act
+from nics_drl_bridge.policy.evaluation import Act
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
-from nics_drl_bridge.policy.training_settings import PpoSettings, SacSettings, TrainingSettings
+from nics_drl_bridge.policy.training_settings import TrainingSettings
 
 Array = NDArray[np.float64]
-RECENT = 1000
-"""Number of episodes over which the progress reports its rates."""
-LEAST_RATE = 0.02
-"""Share of PPO's learning rate that is left at the end."""
+RECENT = 1000  # number of episodes over which the progress reports its rates
+LEAST_RATE = 0.02  # share of PPO's learning rate that is left at the end
+LEAST_STD, LIMIT = 0.05, 5.0
+OBSERVED_STEPS = 64
+GAIN = 2.0**0.5
+ACTION_GAIN = 0.01  # initial gain of an actor's last layer: all its actions are near zero
 
 
 def make_algorithm(
     settings: TrainingSettings, env: TrainVecEnv, seed: int, normaliser: tuple[Array, Array]
 ) -> BaseAlgorithm:
-    """Makes an untrained algorithm.
+    """Makes an untrained algorithm; `normaliser` is mean and deviation (O,) of observations.
 
-    Args:
-        settings: of the training.
-        env: the training env.
-        seed: of the network's weights and all random numbers of the algorithm.
-        normaliser: mean and standard deviation (O,) of the observations.
-
-    Raises:
-        ConfigError: the algorithm does not suit the task.
+    Raises ConfigError if the algorithm does not suit the task.
     """
     check_serves(settings, env)
     torch.set_num_threads(settings.threads)
     shared: dict[str, Any] = {"seed": seed, "device": "cpu", "stats_window_size": RECENT}
-    network = {
+    network: dict[str, Any] = {
         "net_arch": list(settings.hidden),
         "features_extractor_class": Normaliser,
         "features_extractor_kwargs": {"mean": normaliser[0], "std": normaliser[1]},
     }
-    if settings.algorithm == "ppo":
-        return _ppo(settings.ppo, env, network, shared)
-    return _sac(settings.sac, env, network, shared)
+    if settings.algorithm == "sac":
+        sac = settings.sac
+        return SAC(
+            "MlpPolicy", env, sac.learning_rate, buffer_size=sac.buffer,
+            learning_starts=sac.begin_after, batch_size=sac.batch, tau=sac.soft_update,
+            gamma=sac.discount, train_freq=1, gradient_steps=sac.updates,
+            policy_kwargs=network, **shared,
+        )  # fmt: skip
+    ppo = settings.ppo
+    network |= {"log_std_init": ppo.log_std, "activation_fn": torch.nn.Tanh}
+    return PPO(
+        "MlpPolicy", env, lambda remaining: ppo.learning_rate * max(remaining, LEAST_RATE),
+        n_steps=ppo.rollout, batch_size=ppo.batch, n_epochs=ppo.epochs, gamma=ppo.discount,
+        gae_lambda=ppo.gae_lambda, clip_range=ppo.clip, ent_coef=ppo.entropy,
+        policy_kwargs=network, **shared,
+    )  # fmt: skip
 
 
 def check_serves(settings: TrainingSettings, env: TrainVecEnv) -> None:
@@ -76,48 +79,6 @@ def check_serves(settings: TrainingSettings, env: TrainVecEnv) -> None:
         )
 
 
-def _ppo(
-    chosen: PpoSettings, env: TrainVecEnv, network: dict[str, Any], shared: dict[str, Any]
-) -> PPO:
-    return PPO(
-        "MlpPolicy",
-        env,
-        lambda remaining: chosen.learning_rate * max(remaining, LEAST_RATE),
-        n_steps=chosen.rollout,
-        batch_size=chosen.batch,
-        n_epochs=chosen.epochs,
-        gamma=chosen.discount,
-        gae_lambda=chosen.gae_lambda,
-        clip_range=chosen.clip,
-        ent_coef=chosen.entropy,
-        policy_kwargs={
-            **network,
-            "log_std_init": chosen.log_std,
-            "activation_fn": torch.nn.Tanh,
-        },
-        **shared,
-    )
-
-
-def _sac(
-    chosen: SacSettings, env: TrainVecEnv, network: dict[str, Any], shared: dict[str, Any]
-) -> SAC:
-    return SAC(
-        "MlpPolicy",
-        env,
-        chosen.learning_rate,
-        buffer_size=chosen.buffer,
-        learning_starts=chosen.begin_after,
-        batch_size=chosen.batch,
-        tau=chosen.soft_update,
-        gamma=chosen.discount,
-        train_freq=1,
-        gradient_steps=chosen.updates,
-        policy_kwargs=network,
-        **shared,
-    )
-
-
 def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
     """Returns the deterministic policy of an algorithm, without exploration noise."""
 
@@ -132,17 +93,10 @@ def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
     return act
 
 
-LEAST_STD = 0.05
-LIMIT = 5.0
-LOOKS = 64
-
-
 class Normaliser(BaseFeaturesExtractor):
     """First layer of actor and critic: (observation - mean) / std, cut at +-5; not trained.
 
-    Args:
-        space: observation space, Box (O,).
-        mean, std: (O,), see `observed`.
+    Mean and std (O,) are those of `observed`; a part of the network, they can't get lost.
     """
 
     mean: torch.Tensor
@@ -166,34 +120,22 @@ def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
     afterwards.
     """
     seen = [np.array(env.reset())]
-    for k in range(LOOKS):
+    for k in range(OBSERVED_STEPS):
         if k % 8 == 0:
-            actions = _random_actions(env, rng)
+            space: Any = env.action_space
+            if isinstance(space, gymnasium.spaces.Discrete):
+                actions: NDArray[Any] = rng.integers(space.n, size=env.num_envs)
+            else:
+                actions = rng.uniform(-1.0, 1.0, (env.num_envs, *space.shape)).astype(np.float32)
         seen.append(np.array(env.step(actions)[0]))
     rows = np.concatenate(seen).reshape(-1, seen[0].shape[-1]).astype(np.float64)
     return rows.mean(axis=0), np.maximum(rows.std(axis=0), LEAST_STD)
 
 
-def _random_actions(env: VecEnv, rng: np.random.Generator) -> NDArray[Any]:
-    space = env.action_space
-    if isinstance(space, gymnasium.spaces.Discrete):
-        return np.asarray(rng.integers(space.n, size=env.num_envs))
-    return rng.uniform(-1.0, 1.0, (env.num_envs, *space.shape)).astype(np.float32)
-
-
-GAIN = 2.0**0.5
-ACTION_GAIN = 0.01
-"""Initial gain of an actor's last layer: all its actions are near zero."""
-
-
 class Actor(torch.nn.Module):
     """Maps observations (n, O) to raw actions (n, C), or to logits (n, A) of discrete ones.
 
-    Args:
-        observations: space of one observation, Box (O,).
-        actions: space of one action.
-        hidden: widths of the hidden layers.
-        normaliser: mean and standard deviation (O,) of the observations.
+    `hidden` are the widths of the hidden layers, `normaliser` is as in `make_algorithm`.
     """
 
     def __init__(
@@ -204,10 +146,8 @@ class Actor(torch.nn.Module):
         normaliser: tuple[Array, Array],
     ) -> None:
         super().__init__()
-        if isinstance(actions, gymnasium.spaces.Discrete):
-            self.discrete, count = True, int(actions.n)
-        else:
-            self.discrete, count = False, int(np.prod(actions.shape))
+        self.discrete, size = isinstance(actions, gymnasium.spaces.Discrete), actions.shape or ()
+        count = int(actions.n if isinstance(actions, gymnasium.spaces.Discrete) else np.prod(size))
         self.normaliser = Normaliser(observations, *normaliser)
         self.layers = layers_of([self.normaliser.features_dim, *hidden, count], ACTION_GAIN)
 
@@ -225,9 +165,7 @@ class Actor(torch.nn.Module):
 def layers_of(widths: Sequence[int], gain: float) -> torch.nn.Sequential:
     """Linear layers with tanh in between, initialised orthogonally as in Stable-Baselines3.
 
-    Args:
-        widths: of input, hidden layers and output.
-        gain: of the last layer.
+    The gain is that of the last layer.
     """
     layers: list[torch.nn.Module] = []
     for ins, outs in itertools.pairwise(widths):

@@ -2,10 +2,6 @@
 
 A checkpoint is for training only and is never deployed. It contains only tensors, numbers and text
 and is read by PyTorch's `weights_only` reader, which builds no other objects: it can't run code.
-
-Progress of a training: reported to the user and to TensorBoard; checkpoints.
-
-Snapshots of a vector env: saves and restores all that changes while it runs.
 """
 
 from __future__ import annotations
@@ -36,39 +32,32 @@ from nics_drl_bridge.policy.train_algorithms import RECENT
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 
 FORMAT = "nics_drl_bridge/checkpoint/2"
-MOST_BYTES = 4 * 2**30
-"""Maximum size of a file, which contains all of SAC's buffer."""
+MOST_BYTES = 4 * 2**30  # maximum size of a file, which contains all of SAC's buffer
 COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
+LAST = ("_last_obs", "_last_episode_starts")
 REPLAYED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
 def save_checkpoint(
     path: Path, algorithm: BaseAlgorithm, env: TrainVecEnv, about: dict[str, Any]
 ) -> None:
-    """Writes a checkpoint, completely or not at all, between two roll-outs.
-
-    Args:
-        path: the file.
-        algorithm: the algorithm that learns on `env`.
-        env: the training env.
-        about: plain data that identify the training.
-    """
+    """Writes a checkpoint between two roll-outs; `about` identifies the training."""
     content = {
         "format": FORMAT,
         "about": json.dumps(about),
         "parameters": algorithm.get_parameters(),
-        "variables": _variables(algorithm),
+        "variables": {  # other than the networks: the temperature of SAC
+            name: getattr(algorithm, name).detach().clone()
+            for name in algorithm._get_torch_save_params()[1]
+        },
         "counters": {name: getattr(algorithm, name) for name in COUNTERS},
         "recent": list(algorithm.ep_success_buffer or ()),
-        "last": _tensors({name: getattr(algorithm, name) for name in _LAST}),
+        "last": _tensors({name: getattr(algorithm, name) for name in LAST}),
         "replay": _replay(algorithm),
         "random": _random_state(algorithm),
         "envs": [_tensors(snapshot(one)) for one in env.envs],
     }
     write_content(path, content)
-
-
-_LAST = ("_last_obs", "_last_episode_starts")
 
 
 def write_content(path: Path, content: dict[str, Any]) -> None:
@@ -79,14 +68,9 @@ def write_content(path: Path, content: dict[str, Any]) -> None:
 
 
 def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
-    """Reads the content of a checkpoint; `about` is that of `save_checkpoint`.
+    """Reads the content of a checkpoint of a format; `about` is that of `save_checkpoint`.
 
-    Args:
-        path: the file.
-        kind: the expected format.
-
-    Raises:
-        ConfigError: there is none, or it is damaged or of another format.
+    Raises ConfigError if there is none, or it is damaged or of another format.
     """
     if not path.is_file():
         raise ConfigError(f"{path}: no such checkpoint; leave out --resume to begin anew.")
@@ -142,18 +126,16 @@ def resume(content: dict[str, Any], algorithm: BaseAlgorithm, env: TrainVecEnv) 
     for one, state in zip(env.envs, content["envs"], strict=True):
         restore(one, {name: value.numpy() for name, value in state.items()})
     if isinstance(algorithm, OffPolicyAlgorithm):
-        _fill_replay(algorithm, content["replay"])
+        buffer: Any = algorithm.replay_buffer
+        replay = content["replay"]
+        buffer.pos, buffer.full = replay["pos"], replay["full"]
+        for name in REPLAYED:
+            getattr(buffer, name)[: buffer.size()] = replay[name].numpy()
     _set_random_state(algorithm, content["random"])
 
 
 def _tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
     return {name: torch.from_numpy(np.ascontiguousarray(rows)) for name, rows in arrays.items()}
-
-
-def _variables(algorithm: BaseAlgorithm) -> dict[str, torch.Tensor]:
-    """Learned variables other than the networks: the temperature of SAC."""
-    names = algorithm._get_torch_save_params()[1]
-    return {name: getattr(algorithm, name).detach().clone() for name in names}
 
 
 def _replay(algorithm: BaseAlgorithm) -> dict[str, Any]:
@@ -162,13 +144,6 @@ def _replay(algorithm: BaseAlgorithm) -> dict[str, Any]:
     buffer: Any = algorithm.replay_buffer
     rows = {name: getattr(buffer, name)[: buffer.size()] for name in REPLAYED}
     return {"pos": buffer.pos, "full": buffer.full, **_tensors(rows)}
-
-
-def _fill_replay(algorithm: OffPolicyAlgorithm, content: dict[str, Any]) -> None:
-    buffer: Any = algorithm.replay_buffer
-    buffer.pos, buffer.full = content["pos"], content["full"]
-    for name in REPLAYED:
-        getattr(buffer, name)[: buffer.size()] = content[name].numpy()
 
 
 def _random_state(algorithm: BaseAlgorithm) -> dict[str, Any]:
@@ -191,42 +166,27 @@ def _set_random_state(algorithm: BaseAlgorithm, content: dict[str, Any]) -> None
     algorithm.action_space.np_random.bit_generator.state = json.loads(content["actions"])
 
 
-TOLD_S = 0.2
-"""Minimum time between two reports of the progress [s]."""
+TOLD_S = 0.2  # minimum time between two reports of the progress [s]
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a training.
-
-    Attributes:
-        seed: of the training.
-        steps: environment steps done.
-        total: environment steps of the whole training.
-        success, collision: shares of the last 1000 episodes; NaN before the first has ended.
-        steps_per_s: since this process began or resumed it.
-        env_share: share of the wall time that went to the simulator.
-    """
+    """Progress of a training."""
 
     seed: int
-    steps: int
+    steps: int  # environment steps done
     total: int
-    success: float
+    success: float  # shares of the last 1000 episodes; NaN before the first has ended
     collision: float
-    steps_per_s: float
-    env_share: float
+    steps_per_s: float  # since this process began or resumed it
+    env_share: float  # share of the wall time that went to the simulator
 
 
 class Companion(BaseCallback):
-    """Callback that monitors each step and roll-out of a training.
+    """Callback that monitors each step and roll-out of a training of `total` environment steps.
 
-    Args:
-        env: the training env.
-        seed: of the training.
-        total: environment steps of the whole training.
-        checkpoint_every: environment steps between two calls of `save`.
-        save: saves everything; called between two roll-outs only.
-        tell: called with the progress.
+    It calls `tell` with the progress, and `save` about every `checkpoint_every` environment steps,
+    between two roll-outs only.
     """
 
     def __init__(
@@ -266,16 +226,9 @@ class Companion(BaseCallback):
         if now - self._told < TOLD_S and self.num_timesteps < self._total:
             return
         self._told = now
-        progress = self.progress()
-        self.logger.record("rollout/collision_rate", progress.collision)
-        self.logger.record("time/env_share", progress.env_share)
-        self._tell(progress)
-
-    def progress(self) -> Progress:
-        """The current progress."""
-        taken = max(time.perf_counter() - self._begin, 1e-9)
+        taken = max(now - self._begin, 1e-9)
         successes = self.model.ep_success_buffer
-        return Progress(
+        progress = Progress(
             self._seed,
             self.num_timesteps,
             self._total,
@@ -284,6 +237,9 @@ class Companion(BaseCallback):
             (self.num_timesteps - self._first) / taken,
             (self._env.stepping_s - self._busy) / taken,
         )
+        self.logger.record("rollout/collision_rate", progress.collision)
+        self.logger.record("time/env_share", progress.env_share)
+        self._tell(progress)
 
 
 Arrays = dict[str, NDArray[Any]]
@@ -305,32 +261,28 @@ def snapshot(env: BridgeVectorEnv) -> Arrays:
 def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
     """Puts a snapshot into a vector env with the same arguments.
 
-    Raises:
-        ConfigError: the snapshot is of an env with other worlds, robots, lidar or task.
+    Raises ConfigError if the snapshot is of an env with other worlds, robots, lidar or task.
     """
     targets = env.changing
     known = {name for name in state if not name.startswith((MEMORY, DRAWN))}
-    for name in sorted(known ^ set(targets)):
-        raise ConfigError(f"state of a vector env: {name!r} is in one of both only; {_SAME}")
-    for name, target in targets.items():
-        if state[name].shape != target.shape or state[name].dtype != target.dtype:
-            raise ConfigError(
-                f"state of a vector env: {name!r} is of shape {state[name].shape}, this env's of "
-                f"{target.shape}; {_SAME}"
-            )
+    for name in (*sorted(known ^ set(targets)), *targets):
+        one, other = state.get(name), targets.get(name)
+        if one is None or other is None:
+            fault = "is in one of both only"
+        elif one.shape != other.shape or one.dtype != other.dtype:
+            fault = f"is of shape {one.shape}, this env's of {other.shape}"
+        else:
+            continue
+        advice = "make the env with the arguments that it had"
+        raise ConfigError(f"state of a vector env: {name!r} {fault}; {advice}.")
     for name, target in targets.items():
         target[...] = state[name]  # in place: the compiled steps refer to these arrays
-    env.memory = _below(MEMORY, state)
-    env.simulator.drawn = _below(DRAWN, state)
+    env.memory, env.simulator.drawn = (
+        {
+            name.removeprefix(prefix): np.array(rows)
+            for name, rows in state.items()
+            if name.startswith(prefix)
+        }
+        for prefix in (MEMORY, DRAWN)
+    )
     env.ready = bool((targets["episode"] >= 0).all())
-
-
-_SAME = "make the env with the arguments that it had."
-
-
-def _below(prefix: str, state: Mapping[str, NDArray[Any]]) -> Arrays:
-    return {
-        name.removeprefix(prefix): np.array(rows)
-        for name, rows in state.items()
-        if name.startswith(prefix)
-    }

@@ -1,7 +1,4 @@
-"""From a trained network to a policy file: normaliser, network and commands in one graph.
-
-Stable-Baselines3's own recipe for ONNX omits clipping, unscaling and the normaliser.
-"""
+"""From a trained network to a policy file: normaliser, network and commands in one graph."""
 
 from __future__ import annotations
 
@@ -22,14 +19,8 @@ from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import onnx_graph
-from nics_drl_bridge.policy.contract import GOLDEN, contract_of
-from nics_drl_bridge.policy.policy_file import (
-    GOLDEN_TOLERANCE,
-    SUFFIX,
-    PolicyFile,
-    open_session,
-    policy_of,
-)
+from nics_drl_bridge.policy.contract import GOLDEN, SUFFIX, contract_of
+from nics_drl_bridge.policy.policy_file import GOLDEN_TOLERANCE, PolicyFile, open_session, policy_of
 
 Rows = NDArray[np.float32]
 Normaliser = tuple[ArrayLike, ArrayLike, float]
@@ -40,12 +31,9 @@ GOLDEN_SPREAD = 3.0
 
 
 class Deployed(torch.nn.Module):  # type: ignore[misc]
-    """Computation of the graph of a policy file.
+    """Computation of the graph of a policy file, for an actor as `actor_of` returns it.
 
-    Args:
-        actor: maps observations (n, O) to raw actions (n, C), or logits (n, A) of discrete ones.
-        task: gives the commands and their limits.
-        normaliser: mean (O,), standard deviation (O,), limit; None if the actor has its own.
+    Stable-Baselines3's own recipe for ONNX omits clipping, unscaling and the normaliser.
     """
 
     def __init__(self, actor: torch.nn.Module, task: Task, normaliser: Normaliser | None) -> None:
@@ -75,45 +63,20 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
         return action, torch.minimum(torch.maximum(command, self.low), self.high)
 
 
-class _Gaussian(torch.nn.Module):  # type: ignore[misc]
-    """The mean of an actor-critic policy such as PPO's, or its logits."""
-
-    def __init__(self, policy: Any) -> None:
-        super().__init__()
-        self.features, self.action_net = policy.pi_features_extractor, policy.action_net
-        self.latent = policy.mlp_extractor.policy_net
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        raw: torch.Tensor = self.action_net(self.latent(self.features(observation)))
-        return raw
-
-
-class _Squashed(torch.nn.Module):  # type: ignore[misc]
-    """The mode of SAC's actor."""
-
-    def __init__(self, actor: Any) -> None:
-        super().__init__()
-        self.features, self.latent, self.mu = actor.features_extractor, actor.latent_pi, actor.mu
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        return torch.tanh(self.mu(self.latent(self.features(observation))))
-
-
 def actor_of(model: Any) -> torch.nn.Module:
     """Returns the acting part of a trained model, without exploration.
 
-    Args:
-        model: an algorithm or policy of Stable-Baselines3 (PPO, A2C, SAC), or any module that maps
-            observations (n, O) to raw actions (n, C) or logits (n, A).
-
-    Raises:
-        ConfigError: it is none of these.
+    The model is an algorithm or policy of Stable-Baselines3 (PPO, A2C, SAC), or any module that
+    maps observations (n, O) to raw actions (n, C) or logits (n, A); else ConfigError is raised.
     """
     policy = getattr(model, "policy", model)
     if hasattr(policy, "action_net") and hasattr(policy, "mlp_extractor"):
-        return _Gaussian(policy)
+        latent = policy.mlp_extractor.policy_net
+        return torch.nn.Sequential(policy.pi_features_extractor, latent, policy.action_net)
     if hasattr(policy, "actor") and hasattr(policy.actor, "latent_pi"):
-        return _Squashed(policy.actor)
+        actor = policy.actor  # its mode is the tanh of the mean
+        parts = actor.features_extractor, actor.latent_pi, actor.mu, torch.nn.Tanh()
+        return torch.nn.Sequential(*parts)
     if isinstance(policy, torch.nn.Module):
         return policy
     raise ConfigError(
@@ -136,7 +99,8 @@ def export_policy(
         task: the task that it was trained on.
         simulator_model: the model that it was trained in.
         path: of the file, `*.onnx`.
-        normaliser: mean (O,), standard deviation (O,) and limit of the normalised observations.
+        normaliser: mean (O,), standard deviation (O,) and limit of the normalised observations;
+            None if the model has its own.
         provenance: command, seed and so on, as strings and numbers.
 
     Raises:
@@ -148,16 +112,7 @@ def export_policy(
         raise ConfigError(f"{file}: a policy file ends with {SUFFIX!r}; change the name.")
     deployed = Deployed(actor_of(model), task, normaliser).eval().cpu()
     graph = _graph(deployed, task)
-    observations = golden_observations(task)
-    session = open_session(graph.SerializeToString(), str(file))
-    names = [onnx_graph.ACTION, onnx_graph.COMMAND]
-    action, command = session.run(names, {onnx_graph.INPUT: observations})
-    _compare(deployed, observations, action, command, str(file))
-    golden = {
-        "observations": observations,
-        "actions": np.asarray(action, np.float32).reshape(GOLDEN, -1),
-        "commands": command,
-    }
+    golden = _golden(deployed, graph, task, str(file))
     text = contract_of(
         task, simulator_model, golden, onnx_graph.graph_hash(graph), provenance or {}
     )
@@ -168,13 +123,24 @@ def export_policy(
     return policy
 
 
-def golden_observations(task: Task) -> Rows:
-    """(16, O) fixed observations within their limits."""
+def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str, Rows]:
+    """The golden pairs. Raises PolicyError unless the graph reproduces the module's outputs."""
     space = task.observation_space
     low = np.maximum(space.low, -GOLDEN_SPREAD)
     high = np.minimum(space.high, GOLDEN_SPREAD)
     rng = np.random.default_rng(GOLDEN_SEED)
-    return rng.uniform(low, high, (GOLDEN, len(low))).astype(np.float32)
+    seen = rng.uniform(low, high, (GOLDEN, len(low))).astype(np.float32)
+    session = open_session(graph.SerializeToString(), source)
+    out = session.run([onnx_graph.ACTION, onnx_graph.COMMAND], {onnx_graph.INPUT: seen})
+    with torch.no_grad():
+        wanted = [part.numpy() for part in deployed(torch.as_tensor(seen))]
+    for name, ours, theirs in zip(("actions", "commands"), out, wanted, strict=True):
+        error = float(np.abs(ours - theirs).max())
+        if not error <= GOLDEN_TOLERANCE:
+            reason = f"onnxruntime and torch differ by {error:.3g}; the model can't be exported."
+            raise PolicyError(source, f"golden.{name}", reason)
+    action = np.asarray(out[0], np.float32).reshape(GOLDEN, -1)
+    return {"observations": seen, "actions": action, "commands": out[1]}
 
 
 def _graph(deployed: Deployed, task: Task) -> Any:
@@ -191,17 +157,6 @@ def _graph(deployed: Deployed, task: Task) -> Any:
             dynamo=False,
         )  # fmt: skip
     return onnx.load_model_from_string(buffer.getvalue())
-
-
-def _compare(deployed: Deployed, seen: Rows, action: Rows, command: Rows, source: str) -> None:
-    """Raises PolicyError unless the graph reproduces the module's outputs."""
-    with torch.no_grad():
-        wanted = [part.numpy() for part in deployed(torch.as_tensor(seen))]
-    for name, ours, theirs in zip(("actions", "commands"), (action, command), wanted, strict=True):
-        error = float(np.abs(ours - theirs).max())
-        if not error <= GOLDEN_TOLERANCE:
-            reason = f"onnxruntime and torch differ by {error:.3g}; the model can't be exported."
-            raise PolicyError(source, f"golden.{name}", reason)
 
 
 def _vector(values: ArrayLike) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""TrainVecEnv: the vector env as Stable-Baselines3's VecEnv, without a copy for each world."""
+"""The vector env as Stable-Baselines3's VecEnv, without a copy for each world."""
 
 from __future__ import annotations
 
@@ -20,22 +20,13 @@ Observation = NDArray[np.float32]
 
 
 class TrainVecEnv(VecEnv):
-    """Feeds Stable-Baselines3 from a `BridgeVectorEnv`, or from several side by side.
+    """Feeds Stable-Baselines3 from a `BridgeVectorEnv`, or from several with equal spaces.
 
     The observations are the vector env's own array of the step; only worlds that ended are handled
-    one by one: their `terminal_observation`, `TimeLimit.truncated`, `is_success` and `collision`
-    in `infos`.
-
-    Args:
-        envs: with equal spaces, for instance of several worlds; their `autoreset_mode` is
-            `SameStep` and their `copy` is True, as the algorithms keep the last observation over a
-            step.
-
-    Attributes:
-        stepping_s: wall time spent in the vector envs [s].
-
-    Raises:
-        ConfigError: an env with other arguments, or envs that do not fit together.
+    one by one: their `terminal_observation`, `TimeLimit.truncated`, `is_success` and `collision` in
+    `infos`. The envs have the `autoreset_mode` `SameStep`, and `copy`, as the algorithms keep the
+    last observation over a step. `stepping_s` is the wall time spent in them [s]. Raises
+    ConfigError for an env with other arguments, or envs that do not fit together.
     """
 
     def __init__(self, *envs: BridgeVectorEnv) -> None:
@@ -57,7 +48,7 @@ class TrainVecEnv(VecEnv):
         count = int(edges[-1])
         super().__init__(count, first.single_observation_space, first.single_action_space)
         self._infos: list[dict[str, Any]] = [{} for _ in range(count)]
-        self._told: list[int] = []
+        self._ended: list[int] = []
         self._actions: NDArray[Any] = np.zeros(0)
         self.stepping_s = 0.0
 
@@ -79,9 +70,9 @@ class TrainVecEnv(VecEnv):
     def step_wait(self) -> tuple[Observation, NDArray[np.float32], NDArray[np.bool_], list[Any]]:
         """Advances every world by one control period; see Stable-Baselines3."""
         begin = time.perf_counter()
-        for n in self._told:  # new dicts: an algorithm may still refer to the old ones
+        for n in self._ended:  # new dicts: an algorithm may still refer to the old ones
             self._infos[n] = {}
-        self._told = []
+        self._ended = []
         parts = [self._step_env(env, rows) for env, rows in zip(self.envs, self._rows, strict=True)]
         observation, reward, done = (_together(list(each)) for each in zip(*parts, strict=True))
         self.stepping_s += time.perf_counter() - begin
@@ -94,11 +85,16 @@ class TrainVecEnv(VecEnv):
         observation, reward, terminated, truncated, info = env.step(self._actions[rows])
         done = terminated | truncated
         for n in np.flatnonzero(done):
-            self._told.append(rows.start + int(n))
+            final = info["final_info"]
+            self._ended.append(rows.start + int(n))
             self._infos[rows.start + n] = {
                 "terminal_observation": info["final_obs"][n],
                 "TimeLimit.truncated": bool(truncated[n] and not terminated[n]),
-                **_results(info["final_info"], n),
+                **{
+                    name: bool(np.all(final[name][n]))
+                    for name in ("is_success", "collision")
+                    if name in final
+                },
             }
         return observation, reward, done
 
@@ -122,8 +118,7 @@ class TrainVecEnv(VecEnv):
 
     def _env_of(self, n: int) -> BridgeVectorEnv:
         """The vector env that contains world n."""
-        which = next(k for k, rows in enumerate(self._rows) if n < rows.stop)
-        return self.envs[which]
+        return next(env for env, rows in zip(self.envs, self._rows, strict=True) if n < rows.stop)
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None
@@ -144,9 +139,3 @@ class TrainVecEnv(VecEnv):
 def _together(parts: list[NDArray[Any]]) -> NDArray[Any]:
     """Concatenates the rows of several envs; those of one are returned unchanged."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-
-def _results(final: dict[str, Any], n: np.intp) -> dict[str, Any]:
-    """Result of the episode of world n, as far as its task reports it."""
-    known = {name: final[name][n] for name in ("is_success", "collision") if name in final}
-    return {name: bool(np.all(value)) for name, value in known.items()}

@@ -11,29 +11,19 @@ from nics_drl_bridge.config import Schema, find_config, load_yaml, share_folder,
 
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1, le=10**12)]
-MOST_WORLDS = 65_536
-"""Maximum number of copies of all worlds together."""
+MOST_WORLDS = 65_536  # maximum number of copies of all worlds together
 MOST_LAYERS, MOST_WIDE = 16, 8_192
 MOST_KEPT = 2**26
 """Maximum number of stored transitions: of a roll-out in all worlds, or of SAC's buffer."""
-Algorithm = Literal["ppo", "sac"]
-
-
 Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
 
 
 class PpoSettings(Schema):
     """Proximal policy optimisation (Schulman and others 2017), as in Stable-Baselines3.
 
-    Attributes:
-        learning_rate: at the start; it falls linearly to a fiftieth at the end.
-        rollout: steps in each world between two updates.
-        batch: transitions of one gradient step.
-        epochs: passes of an update through the roll-outs.
-        discount, gae_lambda: of the advantages.
-        clip: of the ratio of the new policy to the old one.
-        entropy: weight of the entropy of the policy.
-        log_std: logarithm of the standard deviation of actions at the start.
+    The learning rate is that at the start and falls linearly to a fiftieth. `rollout` is the steps
+    in each world between two updates, `batch` the transitions of one gradient step, `epochs` the
+    passes of an update through the roll-outs, `log_std` that of the actions at the start.
     """
 
     learning_rate: float = Field(default=1e-3, gt=0.0)
@@ -50,14 +40,9 @@ class PpoSettings(Schema):
 class SacSettings(Schema):
     """Soft actor-critic (Haarnoja and others 2018), as in Stable-Baselines3.
 
-    Attributes:
-        learning_rate: of actor, critics and entropy; constant.
-        buffer: transitions that are stored, of all worlds together.
-        batch: transitions of one gradient step.
-        updates: gradient steps after each step of the worlds.
-        begin_after: transitions of random actions before the first update.
-        discount: of later rewards.
-        soft_update: share by which the target critics move to the critics in each gradient step.
+    `buffer` is the transitions that are stored of all worlds together, `batch` those of one
+    gradient step, `begin_after` those of random actions before the first update. `updates` gradient
+    steps follow each step of the worlds; each moves the target critics by the share `soft_update`.
     """
 
     learning_rate: float = Field(default=1e-3, gt=0.0)
@@ -72,32 +57,22 @@ class SacSettings(Schema):
 class TrainingSettings(Schema):
     """A training, as in `config/training/*.yaml`.
 
-    Attributes:
-        task: a name, or `path/to/file.py:ClassName`.
-        task_options: further arguments of the task's class.
-        robot: name of a shipped robot, or the folder of a model.
-        worlds: world -> number of copies; names of shipped ones or YAML files.
-        randomisation: quantities drawn in each episode: a shipped one or a YAML file.
-        steps: environment steps of all worlds together.
-        max_episode_steps: an episode ends as a time-out after this many steps.
-        algorithm: one of the two sections below.
-        hidden: widths of the hidden layers of actor and critic, which share none.
-        threads: of PyTorch; sums over several round differently from those of one.
-        checkpoint_every: environment steps between two checkpoints.
-        ppo, sac: settings of the algorithms.
+    `worlds` maps names of shipped ones or YAML files to numbers of copies. Actor and critic have
+    hidden layers of the same widths, but share none. Sums over several threads of PyTorch round
+    differently from those of one.
     """
 
-    task: str = "navigation"
-    task_options: dict[str, Any] = Field(default_factory=dict)
-    robot: str = "differential"
+    task: str = "navigation"  # a name, or `path/to/file.py:ClassName`
+    task_options: dict[str, Any] = Field(default_factory=dict)  # of the task's class
+    robot: str = "differential"  # name of a shipped robot, or the folder of a model
     worlds: dict[str, Count] = Field(default_factory=lambda: {"circles": 256}, min_length=1)
-    randomisation: str | None = None
-    steps: Count = 1_000_000
-    max_episode_steps: Count = 300
-    algorithm: Algorithm = "ppo"
+    randomisation: str | None = None  # quantities drawn in each episode: a shipped one or a file
+    steps: Count = 1_000_000  # environment steps of all worlds together
+    max_episode_steps: Count = 300  # an episode ends as a time-out after this many steps
+    algorithm: Literal["ppo", "sac"] = "ppo"
     hidden: tuple[Width, ...] = Field(default=(64, 64), min_length=1, max_length=MOST_LAYERS)
     threads: Annotated[int, Field(ge=1, le=1024)] = 1
-    checkpoint_every: Count = 200_000
+    checkpoint_every: Count = 200_000  # environment steps between two checkpoints
     ppo: PpoSettings = PpoSettings()
     sac: SacSettings = SacSettings()
 
@@ -135,8 +110,7 @@ class TrainingSettings(Schema):
 def load_training(name: str | Path) -> TrainingSettings:
     """Loads settings by the name of a shipped file (`navigation_differential`), or by path.
 
-    Raises:
-        ConfigError: no such file, or something in it is wrong.
+    Raises ConfigError if there is no such file, or something in it is wrong.
     """
     return load_yaml(find_config(name, "training"), TrainingSettings)
 
@@ -144,29 +118,18 @@ def load_training(name: str | Path) -> TrainingSettings:
 def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> TrainingSettings:
     """Settings chosen by the user.
 
-    Args:
-        task: to learn.
-        name: of shipped settings, or a YAML file; by default those of task and robot if they are
-            shipped, else the defaults.
-        changes: further keys of `TrainingSettings`; and `world`, names that share the number of
-            worlds.
-
-    Raises:
-        ConfigError: an unknown name or a wrong value.
+    `name` is that of shipped settings, or a YAML file; by default those of task and robot if they
+    are shipped, else the defaults. `changes` are further keys of `TrainingSettings`; and `world`,
+    names that share the number of worlds. Raises ConfigError for an unknown name or a wrong value.
     """
     robot = str(changes.get("robot", "differential"))
-    if name is not None:
-        base = load_training(name)
-    elif f"{task}_{robot}" in _shipped():
-        base = load_training(f"{task}_{robot}")
-    else:
+    shipped = {path.stem for path in (share_folder() / "config" / "training").glob("*.yaml")}
+    if name is None and f"{task}_{robot}" not in shipped:
         base = TrainingSettings(task=task, robot=robot)
+    else:
+        base = load_training(name or f"{task}_{robot}")
     changed = base.model_dump(mode="json") | changes
     if worlds := changed.pop("world", None):
         each = max(1, base.num_envs // len(worlds))
         changed["worlds"] = dict.fromkeys(worlds, each)
     return validate(changed, TrainingSettings, "training settings")
-
-
-def _shipped() -> list[str]:
-    return [path.stem for path in (share_folder() / "config" / "training").glob("*.yaml")]

@@ -138,7 +138,7 @@ def _place(path: Path) -> Path:
 
 
 def metadata_of(folder: Path) -> dict[str, Any]:
-    """Returns a bag's metadata, read within the limits of `strict_yaml`, which rosbags lacks.
+    """Returns a bag's metadata, read within the limits of `parse_yaml`, which rosbags lacks.
 
     Raises:
         ValueError: they are not YAML, exceed the limits, or lack the part that rosbag2 writes.

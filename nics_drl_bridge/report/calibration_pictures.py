@@ -1,14 +1,9 @@
-"""Pictures of a calibration: one per estimate that the recording allowed, which is its title.
-
-Picture of the noise of each sensor, and of the robot's drift from its model.
-
-Curves behind the timing estimates: the residual against a shift in time.
-"""
+"""Pictures of a calibration: one per estimate that the recording allowed, which is its title."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -34,6 +29,9 @@ Array = NDArray[np.float64]
 
 BURSTS_SHOWN = 12
 MOST_POINTS = 3000
+BINS = 60
+REACH = 5.0  # histograms end at this many standard deviations
+REACH_S, POINTS = 0.5, 81  # largest shift in time of a curve, and number of its points
 CAPTIONS = {
     "timing": "What each shift in time leaves unexplained; the estimate lies at the least.",
     "bursts": "Poses that arrive in bursts, and the times that they were taken to be of.",
@@ -52,13 +50,8 @@ def calibration_pictures(spec: RobotSpec, identified: Identified) -> dict[str, b
     report in text says why the others are missing.
     """
     found = estimates(identified)
-    drawn = {
-        "timing": timing(identified, found),
-        "bursts": bursts(identified, found),
-        "mounting": mounting(identified, found),
-        "wheels": wheels(identified, found),
-        "noise": noise(identified),
-    }
+    drawn = {each.__name__: each(identified, found) for each in (timing, bursts, mounting, wheels)}
+    drawn["noise"] = noise(identified)
     return {name: picture for name, picture in drawn.items() if picture is not None}
 
 
@@ -72,17 +65,11 @@ def timing(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
         estimate = found[curve.name]
         value, sigma = estimate.value or 0.0, estimate.sigma or 0.0
         axes.plot(curve.value, curve.unexplained, color=MEASURED)
-        axes.axvspan(
-            value - 2.0 * sigma,
-            value + 2.0 * sigma,
-            color=MODEL,
-            alpha=0.25,
-            label="two standard uncertainties",
-        )
+        span, label = 2.0 * sigma, "two standard uncertainties"
+        axes.axvspan(value - span, value + span, color=MODEL, alpha=0.25, label=label)
         axes.axvline(value, color=MODEL, linestyle="--", label="estimate")
-        axes.set_xlabel(f"{estimate.name} [s]")
-        axes.set_ylabel("unexplained / spread of the signal")
-        _finish(axes, _plus_minus(estimate))
+        axes.set(xlabel=f"{estimate.name} [s]", ylabel="unexplained / spread of the signal")
+        _finish(axes, estimate.text)
     return png(figure)
 
 
@@ -98,14 +85,12 @@ def bursts(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
     number = np.arange(len(t))[shown]
     axes.plot(t[shown] - t[0], number, ".", color=OTHER, label="as they arrived")
     axes.plot(spread[shown] - t[0], number, "-", color=MODEL, label="spread over the period")
-    axes.set_xlabel("stamp [s]")
-    axes.set_ylabel("pose number")
-    _finish(axes, f"{_plus_minus(found['burst_period_s'])}, {groups.size:.0f} poses in each")
+    axes.set(xlabel="stamp [s]", ylabel="pose number")
+    _finish(axes, f"{found['burst_period_s'].text}, {groups.size:.0f} poses in each")
     edges = np.linspace(0.0, 1.5 * groups.period_s, 60)
     intervals.hist(np.diff(t), edges, color=OTHER, label="as they arrived")
     intervals.hist(np.diff(spread), edges, color=MODEL, alpha=0.7, label="spread over the period")
-    intervals.set_xlabel("time between two poses [s]")
-    intervals.set_ylabel("number")
+    intervals.set(xlabel="time between two poses [s]", ylabel="number")
     _finish(intervals, "intervals")
     return png(figure)
 
@@ -128,14 +113,12 @@ def mounting(identified: Identified, found: dict[str, CalibratedValue]) -> bytes
     grid = figure.subplots(1, count, squeeze=False)[0]
     _points(grid[0], (tracked[:, 0], tracked[:, 1]), (base[:, 0], base[:, 1]))
     grid[0].set_aspect("equal", adjustable="datalim")
-    grid[0].set_xlabel("velocity along x of its own frame [m/s]")
-    grid[0].set_ylabel("velocity along y [m/s]")
-    _finish(grid[0], _plus_minus(rotation))
+    grid[0].set(xlabel="velocity along x of its own frame [m/s]", ylabel="velocity along y [m/s]")
+    _finish(grid[0], rotation.text)
     for axes in grid[1:]:
         _points(axes, (tracked[:, 2], turned[:, 1]), (tracked[:, 2], base[:, 1]))
-        axes.set_xlabel("yaw rate [rad/s]")
-        axes.set_ylabel("lateral velocity [m/s]")
-        _finish(axes, f"{_plus_minus(lever_x)}\n{_plus_minus(lever_y)}")
+        axes.set(xlabel="yaw rate [rad/s]", ylabel="lateral velocity [m/s]")
+        _finish(axes, f"{lever_x.text}\n{lever_y.text}")
     return png(figure)
 
 
@@ -163,33 +146,20 @@ def wheels(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
         if estimate.value is not None:
             ends = np.array([x.min(), x.max()])
             axes.plot(ends, estimate.value * ends, "--", color=MODEL, label="scale")
-        axes.set_xlabel(x_label)
-        axes.set_ylabel(y_label)
+        axes.set(xlabel=x_label, ylabel=y_label)
         swapped = "" if name == "wheel_scale" else f"\n{found['wheels_swapped'].text}"
-        _finish(axes, _plus_minus(estimate) + swapped)
+        _finish(axes, estimate.text + swapped)
     return png(figure)
 
 
-def _plus_minus(estimate: CalibratedValue) -> str:
-    return estimate.text.replace("+-", "±")
-
-
 def _finish(axes: Axes, title: str) -> None:
-    axes.set_title(title, fontsize=10, color=DARK)
+    axes.set_title(title.replace("+-", "±"), fontsize=10, color=DARK)
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, fontsize=9)
 
 
-BINS = 60
-REACH = 5.0
-"""Histograms end at this many standard deviations."""
-
-
 def noise(identified: Identified) -> bytes | None:
-    """Draws histograms of the residuals with the normal curve, and the growth of the drift.
-
-    Returns None if the recording is free of noise.
-    """
+    """Draws histograms of the residuals, and the growth of the drift; None if free of noise."""
     levels, panels = identified.noise, []
     drive, calibration, model = identified.drive, identified.calibration, identified.model
     pose = pose_residual(drive)
@@ -231,19 +201,15 @@ def _histogram(axes: Axes, name: str, level: Level, rest: Array) -> None:
     normal = np.exp(-0.5 * (edges / level.std) ** 2) / (level.std * np.sqrt(2.0 * np.pi))
     axes.plot(edges, normal, "--", color=MODEL)
     axes.xaxis.set_major_locator(MaxNLocator(5))
-    axes.set_xlabel(f"residual [{level.unit}]")
-    axes.set_ylabel("density")
+    axes.set(xlabel=f"residual [{level.unit}]", ylabel="density")
     axes.set_title(f"noise of the {name}\n{_value(level)}", fontsize=10, color=DARK)
 
 
 def _growth(axes: Axes, horizon: Array, name: str, level: Level, error: Array, unit: str) -> None:
     axes.plot(horizon, error, "o-", color=MEASURED, markersize=4, label="error of the prediction")
     axes.plot(horizon, level.std * np.sqrt(horizon), "--", color=MODEL, label="the drift alone")
-    axes.set_xlabel("horizon [s]")
-    axes.set_ylabel(f"root mean square [{unit}]")
-    axes.set_title(f"drift of the {name}\n{_value(level)}", fontsize=10, color=DARK)
-    axes.grid(alpha=0.3)
-    axes.legend(frameon=False, fontsize=9)
+    axes.set(xlabel="horizon [s]", ylabel=f"root mean square [{unit}]")
+    _finish(axes, f"drift of the {name}\n{_value(level)}")
 
 
 def _value(level: Level) -> str:
@@ -251,23 +217,12 @@ def _value(level: Level) -> str:
     return f"{level.std:.3g}{spread} {level.unit}"
 
 
-REACH_S = 0.5
-POINTS = 81
-
-
-@dataclass(frozen=True)
-class ShiftCurve:
-    """Residual against an estimated time.
-
-    Attributes:
-        name: of the estimate, as in `Calibration`.
-        value: (n,) trial values of the time [s].
-        unexplained: (n,) root mean square residual, as a share of the signal's spread.
-    """
+class ShiftCurve(NamedTuple):
+    """Residual against an estimated time, which is named as in `Calibration`."""
 
     name: str
-    value: Array
-    unexplained: Array
+    value: Array  # (n,) trial values of the time [s]
+    unexplained: Array  # (n,) root mean square, as a share of the signal's spread
 
 
 @one_blas_thread
@@ -275,12 +230,9 @@ def timing_curves(drive: Drive, calibration: Calibration) -> tuple[ShiftCurve, .
     """Returns a curve for the clock offset and one for the latency, if they were estimated."""
     if not moved_commands(drive.recording.command).any():
         return ()
-    curves = []
-    for name in ("clock_offset_s", "command_latency_s"):
-        if name in calibration.uncertainty:
-            found = _curve(drive, calibration, name)
-            curves += [found] if found is not None else []
-    return tuple(curves)
+    names = ("clock_offset_s", "command_latency_s")
+    found = (_curve(drive, calibration, name) for name in names if name in calibration.uncertainty)
+    return tuple(curve for curve in found if curve is not None)
 
 
 def _curve(drive: Drive, calibration: Calibration, name: str) -> ShiftCurve | None:

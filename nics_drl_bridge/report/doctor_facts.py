@@ -1,7 +1,4 @@
-"""Facts about a robot, live or from a bag, for the doctor to judge.
-
-Expectations of the doctor, and its findings.
-"""
+"""Facts about a robot, live or from a bag; expectations of the doctor, and its findings."""
 
 from __future__ import annotations
 
@@ -24,26 +21,22 @@ from nics_drl_bridge.recording.bag_file import opened
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
-Nanoseconds = NDArray[np.int64]
+Row = tuple[float, float, float]
 
 SCAN, ODOM, CMD_VEL, CLOCK = "scan", "odom", "cmd_vel", "/clock"
 SCAN_TYPE, ODOM_TYPE = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 TWIST_TYPE, TWIST_STAMPED_TYPE = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
-MOST_SCANS = 200
-"""Maximum number of scans whose ranges are kept; of the others only the times are."""
+MOST_SCANS = 200  # maximum number of scans whose ranges are kept; of the others only the times are
 MOST_RAD = 7.0
 
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Publishers and subscribers of a topic.
+    """Publishers and subscribers of a topic, without the doctor's own.
 
-    Attributes:
-        types: of the messages, as declared by the publishers.
-        offers: quality of service of each publisher.
-        asks: quality of service requested by each subscriber, without the doctor's own.
+    Types of the messages as the publishers declare them, and the quality of service that each
+    publisher offers and each subscriber asks for.
     """
 
     types: tuple[str, ...]
@@ -53,14 +46,7 @@ class Endpoints:
 
 @dataclass
 class TopicFacts:
-    """The messages of a topic.
-
-    Attributes:
-        arrivals_ns: times of arrival [ns].
-        stamps_ns: of the headers [ns].
-        frames: ids of the headers.
-        children: ids of the child frames.
-    """
+    """Times of arrival, stamps and frames of the messages of a topic."""
 
     arrivals_ns: list[int] = field(default_factory=list)
     stamps_ns: list[int] = field(default_factory=list)
@@ -98,39 +84,22 @@ class Layout:
 
 @dataclass
 class Facts:
-    """All facts that were collected.
-
-    Attributes:
-        source: name of the source, for messages.
-        live: True over DDS, False from a bag.
-        topics: topic -> its publishers and subscribers.
-        heard: role (`scan`, `odom`, `cmd_vel`, `/clock`) -> messages.
-        names: role -> topic.
-        end_ns: end of listening, on the clock of arrivals [ns].
-        layouts: distinct layouts of the scans.
-        ranges: of up to 200 scans [m].
-        poses: of odometry, rows x, y [m], heading [rad].
-        twists: of odometry, rows vx, vy [m/s], wz [rad/s].
-        lengths: of odometry's quaternions.
-        uncovered: number of odometry messages whose covariance of pose or twist is all zeros.
-        commands: rows vx, vy [m/s], wz [rad/s].
-        clock_ns: content of `/clock` [ns].
-    """
+    """All facts that were collected; a role is `scan`, `odom`, `cmd_vel` or `/clock`."""
 
     source: str
-    live: bool
-    names: dict[str, str]
-    topics: dict[str, Endpoints] = field(default_factory=dict)
-    heard: dict[str, TopicFacts] = field(default_factory=dict)
-    end_ns: int = 0
-    layouts: list[Layout] = field(default_factory=list)
-    ranges: list[NDArray[np.float32]] = field(default_factory=list)
-    poses: list[tuple[float, float, float]] = field(default_factory=list)
-    twists: list[tuple[float, float, float]] = field(default_factory=list)
-    lengths: list[float] = field(default_factory=list)
-    uncovered: int = 0
-    commands: list[tuple[float, float, float]] = field(default_factory=list)
-    clock_ns: list[int] = field(default_factory=list)
+    live: bool  # True over DDS, False from a bag
+    names: dict[str, str]  # role -> topic
+    topics: dict[str, Endpoints] = field(default_factory=dict)  # by topic
+    heard: dict[str, TopicFacts] = field(default_factory=dict)  # by role
+    end_ns: int = 0  # end of listening, on the clock of arrivals [ns]
+    layouts: list[Layout] = field(default_factory=list)  # distinct layouts of the scans
+    ranges: list[NDArray[np.float32]] = field(default_factory=list)  # of up to 200 scans [m]
+    poses: list[Row] = field(default_factory=list)  # of odometry: x, y [m], heading [rad]
+    twists: list[Row] = field(default_factory=list)  # of odometry: vx, vy [m/s], wz [rad/s]
+    lengths: list[float] = field(default_factory=list)  # of odometry's quaternions
+    uncovered: int = 0  # number of odometry messages whose covariance of pose or twist is all zeros
+    commands: list[Row] = field(default_factory=list)  # vx, vy [m/s], wz [rad/s]
+    clock_ns: list[int] = field(default_factory=list)  # content of `/clock` [ns]
 
     def take(self, role: str, arrival_ns: int, message: Any) -> None:
         """Records a message from ROS or from a bag, which have the same fields."""
@@ -141,7 +110,14 @@ class Facts:
             heard.stamps_ns.append(int(time.sec) * NS_PER_S + int(time.nanosec))
             heard.frames.add(str(message.header.frame_id))
         if role == SCAN:
-            self._scan(message)
+            layout = Layout(
+                len(message.ranges), float(message.angle_min), float(message.angle_max),
+                float(message.angle_increment), float(message.range_min), float(message.range_max),
+            )  # fmt: skip
+            if layout not in self.layouts:
+                self.layouts.append(layout)
+            if len(self.ranges) < MOST_SCANS:
+                self.ranges.append(np.array(message.ranges, dtype=np.float32))
         elif role == ODOM:
             heard.children.add(str(message.child_frame_id))
             self._odometry(message)
@@ -149,16 +125,6 @@ class Facts:
             self.commands.append(_twist(getattr(message, "twist", message)))
         else:
             self.clock_ns.append(int(message.clock.sec) * NS_PER_S + int(message.clock.nanosec))
-
-    def _scan(self, message: Any) -> None:
-        layout = Layout(
-            len(message.ranges), float(message.angle_min), float(message.angle_max),
-            float(message.angle_increment), float(message.range_min), float(message.range_max),
-        )  # fmt: skip
-        if layout not in self.layouts:
-            self.layouts.append(layout)
-        if len(self.ranges) < MOST_SCANS:
-            self.ranges.append(np.array(message.ranges, dtype=np.float32))
 
     def _odometry(self, message: Any) -> None:
         pose = message.pose.pose
@@ -171,7 +137,7 @@ class Facts:
         self.uncovered += any(not one.any() for one in covariances)
 
 
-def _twist(twist: Any) -> tuple[float, float, float]:
+def _twist(twist: Any) -> Row:
     return float(twist.linear.x), float(twist.linear.y), float(twist.angular.z)
 
 
@@ -191,11 +157,7 @@ KINDS: dict[str, Sequence[str]] = {
 
 
 def facts_of_bag(path: str | Path, namespace: str = "") -> Facts:
-    """Collects the facts of a robot from a bag.
-
-    Raises:
-        RecordingError: the bag is damaged.
-    """
+    """Collects the facts of a robot from a bag. Raises RecordingError if it is damaged."""
     facts = Facts(str(path), False, names_in(namespace))
     with opened(path) as bag:
         facts.end_ns = bag.span_ns[1]
@@ -210,14 +172,9 @@ def facts_of_bag(path: str | Path, namespace: str = "") -> Facts:
 
 @dataclass(frozen=True)
 class Mismatch:
-    """A mismatch between robot and expectation.
+    """A mismatch between robot and expectation on a topic, with numbers and the remedy.
 
-    Attributes:
-        severity: an `error` makes a policy misbehave; a `warning` may.
-        check: name of the check.
-        where: the topic.
-        what: the mismatch, with numbers.
-        fix: the remedy.
+    An `error` makes a policy misbehave; a `warning` may.
     """
 
     severity: Literal["error", "warning"]
@@ -229,13 +186,9 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class Expected:
-    """Expectations of a robot, by a model or a policy.
+    """Expectations of a robot: its spec, its lidar and the time between commands.
 
-    Attributes:
-        robot: units and limits of state and command.
-        lidar: beams, limits, rate, frame and range convention.
-        period_s: between commands [s].
-        scan: sectors that any lidar may fill; None: the beams of exactly this one.
+    `scan` are the sectors that any lidar may fill; None: the beams of exactly this one.
     """
 
     robot: RobotSpec
@@ -244,14 +197,9 @@ class Expected:
     scan: ScanLayout | None = None
 
 
-def expected_of_model(model: SimulatorModel) -> Expected:
-    """Expectations of a SimulatorModel."""
-    return Expected(model.robot, model.lidar, model.control_period)
-
-
-def expected_of_policy(contract: Contract) -> Expected:
-    """Expectations of a policy file: its robot, and its lidar or one that fills its sectors."""
-    return Expected(contract.robot, contract.lidar, contract.control_period, contract.scan)
+def expected_of(source: SimulatorModel | Contract, scan: ScanLayout | None = None) -> Expected:
+    """Expectations of a model, or of a policy file with the sectors of its scan."""
+    return Expected(source.robot, source.lidar, source.control_period, scan)
 
 
 def seen(facts: Facts, expected: Expected) -> Expected:
@@ -266,11 +214,7 @@ def seen(facts: Facts, expected: Expected) -> Expected:
 
 
 def filling(have: Layout, like: LidarSpec, scan: ScanLayout) -> LidarSpec:
-    """The lidar of a scan header, mounted like another one.
-
-    Raises:
-        ConfigError: it does not fill the sectors.
-    """
+    """The lidar of a scan header, mounted like another one. Raises ConfigError if it fills less."""
     header = ScanHeader(
         have.angle_min, have.angle_max, have.angle_increment, 0.0, 0.0, have.range_min,
         have.range_max,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
@@ -18,7 +18,7 @@ from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, predict, wind
 from nics_drl_bridge.identify.signals import held
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.report.calibration_pictures import calibration_pictures
-from nics_drl_bridge.report.page import MEASURED, MODEL, OTHER, png
+from nics_drl_bridge.report.page import DARK, MEASURED, MODEL, OTHER, png
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
@@ -31,23 +31,11 @@ LEAST_RATE = 1e-6
 
 
 def write_pictures(spec: RobotSpec, identified: Identified, folder: str | Path) -> tuple[Path, ...]:
-    """Writes the pictures of a fit and of its calibration as PNG files.
-
-    Args:
-        spec: the robot.
-        identified: all results of the identification.
-        folder: output folder; created if missing.
-
-    Returns:
-        The files.
-    """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    files = []
+    """Writes the pictures of a fit and of its calibration as PNG files, and returns these."""
     drawn = {**fit_pictures(spec, identified), **calibration_pictures(spec, identified)}
-    for name, picture in drawn.items():
-        write_bytes(folder / f"{name}.png", picture)
-        files.append(folder / f"{name}.png")
+    files = {Path(folder) / f"{name}.png": picture for name, picture in drawn.items()}
+    for file, picture in files.items():
+        write_bytes(file, picture)
     return tuple(files)
 
 
@@ -71,18 +59,12 @@ def accuracy(identified: Identified) -> bytes:
     """Draws the cross-validated error over the number of terms, a line per degree of freedom."""
     figure = Figure(figsize=(7.5, 4.5), layout="constrained")
     axes = figure.subplots()
+    circle: dict[str, Any] = {"markersize": 10, "fillstyle": "none"}
     for n, curve in enumerate(identified.fit.curves):
         share = np.maximum(curve.share, LEAST_SHARE)
         line = axes.plot(share, marker=".", color=f"C{n}", label=curve.dof)[0]
-        axes.plot(
-            curve.kept,
-            share[curve.kept],
-            "o",
-            markersize=10,
-            fillstyle="none",
-            color=line.get_color(),
-        )
-    axes.plot([], [], "o", markersize=10, fillstyle="none", color="#333333", label="kept")
+        axes.plot(curve.kept, share[curve.kept], "o", color=line.get_color(), **circle)
+    axes.plot([], [], "o", color=DARK, label="kept", **circle)
     axes.set_yscale("log")
     axes.set_xlabel("number of terms, largest standardised coefficient first (Eq. 2)")
     axes.set_ylabel("cross-validated error / size of the rates")
@@ -110,17 +92,14 @@ def held_out_paths(identified: Identified) -> bytes:
         truth = pose.values[during]
         axes.plot(*truth[:, :2].T, color=MEASURED, linewidth=3.5, alpha=0.55, label="measured")
         axes.plot(*path[:, :2].T, color=MODEL, linestyle="--", label="predicted")
-        axes.plot(*truth[0, :2], "o", color="#333333", markersize=5, label="start")
+        axes.plot(*truth[0, :2], "o", color=DARK, markersize=5, label="start")
         axes.set_aspect("equal", adjustable="datalim")
         apart = float(np.hypot(*(path[-1] - chosen.end[n])[:2]))
         axes.set_title(f"{apart:.3f} m apart after {HORIZON_S:g} s", fontsize=10)
-        axes.set_xlabel("x [m]")
-        axes.set_ylabel("y [m]")
+        axes.set(xlabel="x [m]", ylabel="y [m]")
     for axes in grid[count:]:
         axes.set_axis_off()
-    handles, labels = grid[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
-    return png(figure)
+    return png(figure, grid[0])
 
 
 def residuals(identified: Identified, unseen: Samples) -> bytes:
@@ -141,9 +120,7 @@ def residuals(identified: Identified, unseen: Samples) -> bytes:
     grid[-1].set_xlabel("time since the end of the training part [s]")
     for color, label in ((MEASURED, "measured"), (MODEL, "model"), (OTHER, "residual")):
         grid[0].plot([], [], color=color, label=label)
-    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper center", ncols=3,
-                  frameon=False)  # fmt: skip
-    return png(figure)
+    return png(figure, grid[0])
 
 
 def alignment(spec: RobotSpec, identified: Identified) -> bytes:
@@ -158,22 +135,17 @@ def alignment(spec: RobotSpec, identified: Identified) -> bytes:
     t = samples.t[shown]
     for axes, c in zip(grid, moved, strict=True):
         name, unit = spec.command[c].name, spec.command[c].unit
-        for delay, style, label in ((0.0, ":", "as stamped"), (None, "-", "as it takes effect")):
-            late = calibration.command_latency_s if delay is None else delay
+        latency = calibration.command_latency_s
+        for late, style, label in ((0.0, ":", "as stamped"), (latency, "-", "as it takes effect")):
             value = held(command, spec, t - late, t - late + samples.dt)[:, c]
             axes.plot(t - begin, value, style, color=MODEL, linewidth=1.4, label=label)
         axes.set_ylabel(f"{name} [{unit}]", fontsize=9, color=MODEL)
         _response(axes, samples, shown, len(spec.state) + int(c), identified)
     grid[-1].set_xlabel("time on the commands' clock [s]")
-    handles, labels = grid[0].get_legend_handles_labels()
-    handles.append(Line2D([], [], color=MEASURED, linewidth=2.5, alpha=0.55))
-    figure.legend(handles, [*labels, "response"], loc="outside upper center", ncols=3,
-                  frameon=False)  # fmt: skip
-    grid[0].set_title(
-        f"clock offset {calibration.clock_offset_s:.4g} s, command latency "
-        f"{calibration.command_latency_s:.4g} s", fontsize=10,
-    )  # fmt: skip
-    return png(figure)
+    grid[0].plot([], [], color=MEASURED, linewidth=2.5, alpha=0.55, label="response")
+    title = f"clock offset {calibration.clock_offset_s:.4g} s, command latency {latency:.4g} s"
+    grid[0].set_title(title, fontsize=10)
+    return png(figure, grid[0])
 
 
 def _response(
@@ -197,13 +169,6 @@ def _predicted(identified: Identified, chosen: Windows) -> Array:
     """Open-loop paths (W, n, 3) over windows."""
     shares = np.linspace(0.02, 1.0, POINTS)
     ends = [chosen.start_t + share * (chosen.end_t - chosen.start_t) for share in shares]
-    poses = [
-        predict(
-            identified.model,
-            identified.calibration,
-            identified.drive,
-            replace(chosen, end_t=end),
-        )
-        for end in ends
-    ]
+    model, calibration, drive = identified.model, identified.calibration, identified.drive
+    poses = [predict(model, calibration, drive, replace(chosen, end_t=end)) for end in ends]
     return np.stack([chosen.start, *poses], axis=1)

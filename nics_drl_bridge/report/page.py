@@ -1,7 +1,4 @@
-"""The report: one self-contained HTML file, including pictures.
-
-Colours and PNG export shared by the pictures of a fit.
-"""
+"""The report as one self-contained HTML file; colours and PNG export of its pictures."""
 
 from __future__ import annotations
 
@@ -11,8 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+MEASURED, MODEL, OTHER, DARK = "#1f6fb2", "#d1495b", "#8d99ae", "#333333"
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 64rem;
   padding: 0 1rem; color: #222; background: #fff }
@@ -50,16 +49,11 @@ class Code:
 
 
 Block = Table | Picture | Code | str
+"""Part of a section; plain text is a paragraph."""
 
 
 def page(title: str, lead: str, sections: Sequence[tuple[str, Sequence[Block]]]) -> str:
-    """Builds an HTML page.
-
-    Args:
-        title: of the page.
-        lead: one sentence below the title.
-        sections: heading and blocks of each section; plain text is a paragraph.
-    """
+    """Builds an HTML page of sections, each a heading and blocks, below a lead sentence."""
     body = "".join(
         f"<h2>{escape(heading)}</h2>{''.join(_block(block) for block in blocks)}"
         for heading, blocks in sections
@@ -90,11 +84,12 @@ def _block(block: Block) -> str:
     return f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
 
 
-MEASURED, MODEL, OTHER, DARK = "#1f6fb2", "#d1495b", "#8d99ae", "#333333"
-
-
-def png(figure: Figure) -> bytes:
-    """Renders a figure as a PNG."""
+def png(figure: Figure, legend: Axes | None = None) -> bytes:
+    """Renders a figure as a PNG, with the legend of one of its axes above them."""
+    if legend is not None:
+        handles, labels = legend.get_legend_handles_labels()
+        columns = max(3, len(labels))
+        figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return buffer.getvalue()

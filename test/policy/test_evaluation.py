@@ -1,21 +1,38 @@
 from __future__ import annotations
 
+import json
+import math
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.wrappers import TimeLimit
 from robots import direct_model, field
+from scipy import stats
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.env.vector_rows import VectorFacts
 from nics_drl_bridge.policy.evaluation import (
     ELSEWHERE,
     Episode,
+    Outcomes,
     deviation,
     drive,
     drive_all,
+    drive_worlds,
+    mean,
+    rate,
     successes,
+    summarise,
+    tallies,
 )
+from nics_drl_bridge.policy.policies import make_policy
+
+LIMIT = 40
+MODEL, WORLD = direct_model(odometry=(0.02, 0.02)), field(count=6)
 
 
 class Constant:
@@ -33,10 +50,10 @@ def env():
     return TimeLimit(BridgeEnv(model=direct_model(), world=field()), 12)
 
 
-def episode(points, result="success"):
+def episode(points, result="success", seed=0):
     path = np.zeros((len(points), 3))
     path[:, :2] = points
-    return Episode(0, result, path, path, np.zeros(2), np.zeros((0, 7)), 0.0)
+    return Episode(seed, result, path, path, np.zeros(2), np.zeros((0, 7)), 0.0)
 
 
 def test_an_episode_that_nobody_ends_is_a_time_out(env):
@@ -146,3 +163,127 @@ def test_deviation_is_the_greatest_distance_over_the_common_steps():
 
 def test_the_length_is_the_sum_of_the_steps():
     assert episode([[0, 0], [3, 4], [3, 5]]).length == pytest.approx(6.0)
+
+
+@pytest.mark.parametrize("worlds", [3, 8])
+def test_many_at_once_end_as_one_after_the_other(worlds):
+    env = BridgeVectorEnv(worlds, MODEL, WORLD, max_episode_steps=LIMIT)
+    policy = make_policy("straight", env.task)
+    seeds = [7, 3, 11, 5, 100, 42, 43]
+    found = drive_worlds(env, policy.act, seeds)
+    alone = TimeLimit(BridgeEnv(model=MODEL, world=WORLD), LIMIT)
+    episodes = [drive(alone, policy, seed) for seed in seeds]
+    assert found.seeds.tolist() == seeds
+    assert found.steps.tolist() == [one.steps for one in episodes]
+    assert np.allclose(found.length, [one.length for one in episodes], atol=1e-12)
+    assert np.allclose(found.reward, [one.reward for one in episodes], atol=1e-9)
+    assert found.success.tolist() == [one.result == "success" for one in episodes]
+    assert found.collision.tolist() == [one.result == "collision" for one in episodes]
+    assert len({one.result for one in episodes}) > 1
+
+
+def test_arrived_is_who_truly_is_there(monkeypatch):
+    env = BridgeVectorEnv(8, MODEL, WORLD, max_episode_steps=LIMIT)
+    policy = make_policy("straight", env.task)
+    honest = drive_worlds(env, policy.act, range(8))
+    assert honest.success.any()
+    of_step = VectorFacts.of_step
+
+    def aside(self, outcome):
+        facts = of_step(self, outcome)
+        return facts | {"true_pose": facts["true_pose"] + [0.5, 0.0, 0.0]}
+
+    monkeypatch.setattr(VectorFacts, "of_step", aside)
+    lied = drive_worlds(env, policy.act, range(8))
+    assert lied.success.sum() < honest.success.sum()
+    assert lied.collision.tolist() == honest.collision.tolist()
+
+
+def test_a_robot_that_stands_still_runs_out_of_time():
+    env = BridgeVectorEnv(4, MODEL, WORLD, max_episode_steps=5)
+    found = drive_worlds(env, lambda seen: np.zeros((len(seen), 3)), range(4))
+    assert found.time_out.all()
+    assert found.steps.tolist() == [5] * 4
+    assert found.length == pytest.approx(np.zeros(4), abs=1e-9)
+
+
+def test_time_and_length_are_those_of_the_successful():
+    flags = np.array([True, False, True, False])
+    outcomes = Outcomes(
+        np.arange(4), flags, np.array([False, True, False, False]), np.array([10, 99, 30, 300]),
+        np.array([1.0, 50.0, 2.0, 60.0]), np.zeros(4),
+    )  # fmt: skip
+    summary = summarise(outcomes, 0.1)
+    assert summary.episodes == 4
+    assert (summary.success.value, summary.collision.value, summary.time_out.value) == (
+        0.5, 0.25, 0.25,
+    )  # fmt: skip
+    assert summary.length.value == pytest.approx(1.5)
+    assert summary.time.value == pytest.approx(2.0)
+
+
+def line(length, aside=0.0):
+    return [(0.1 * k * length, aside * k / 10.0) for k in range(11)]
+
+
+RUNS = {
+    "fast": [episode(line(2.0)), episode(line(1.0), seed=1)],
+    "dds": [episode(line(2.0, 0.3)), episode(line(1.0)[:6], "collision", 1)],
+}
+
+
+def test_worlds_are_compared_with_the_first():
+    told = tallies(RUNS, 0.1)
+    assert told["fast"].success.value == 1.0
+    assert told["fast"].same == 1.0
+    assert told["fast"].greatest_deviation == 0.0
+    assert told["dds"].success.value == told["dds"].collision.value == told["dds"].same == 0.5
+    assert told["dds"].greatest_deviation == pytest.approx(0.3)
+    assert told["dds"].deviation.value == pytest.approx(0.15)
+    assert told["fast"].time.value == pytest.approx(1.0)
+    assert told["fast"].length.value == pytest.approx(1.5)
+
+
+def test_without_any_success_its_length_is_unknown_and_the_json_is_still_json():
+    told = tallies({"fast": [episode(line(0.0), "time-out")]}, 0.1)["fast"]
+    assert math.isnan(told.length.value)
+    text = json.dumps(told.figures(), allow_nan=False)
+    assert json.loads(text)["length"] == [None, None, None]
+
+
+def test_what_the_robot_took_for_a_success_is_told_beside_what_was_one():
+    lied = replace(episode(line(2.0), "elsewhere"), believed="success")
+    told = tallies({"fast": [lied, episode(line(1.0), seed=1)]}, 0.1)["fast"]
+    assert (told.success.value, told.believed.value, told.time_out.value) == (0.5, 1.0, 0.5)
+    assert lied.plain()["believed"] == "success"
+    assert lied.plain()["goal_distance_m"] == pytest.approx(2.0)
+
+
+def test_an_episode_as_plain_data_keeps_its_path():
+    told = json.loads(json.dumps(RUNS["dds"][0].plain()))
+    assert told["seed"] == 0
+    assert told["steps"] == 10
+    assert np.allclose(told["path"], RUNS["dds"][0].path)
+
+
+@pytest.mark.parametrize(("hits", "trials"), [(0, 10), (1, 3), (7, 10), (480, 500), (500, 500)])
+def test_the_interval_of_a_rate_is_wilsons(hits, trials):
+    wanted = stats.binomtest(hits, trials).proportion_ci(method="wilson")
+    found = rate(hits, trials)
+    assert found.value == hits / trials
+    assert (found.low, found.high) == pytest.approx((wanted.low, wanted.high), abs=1e-12)
+    assert found.low <= found.value <= found.high
+
+
+def test_the_interval_of_a_mean_is_students():
+    seen = np.random.default_rng(0).normal(3.0, 2.0, 17)
+    found = mean(seen)
+    low, high = stats.t.interval(0.95, 16, loc=seen.mean(), scale=stats.sem(seen))
+    assert (found.value, found.low, found.high) == pytest.approx((seen.mean(), low, high))
+
+
+def test_nothing_observed_leaves_everything_open():
+    assert (rate(0, 0).low, rate(0, 0).high) == (0.0, 1.0)
+    assert math.isnan(mean([]).value)
+    assert mean([2.0]).value == 2.0
+    assert mean([2.0]).high == math.inf

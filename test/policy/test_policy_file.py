@@ -410,6 +410,7 @@ sys.meta_path.insert(0, Block())
 """
 
 
+@pytest.mark.process
 def test_it_loads_where_nothing_of_training_is_installed(file):
     code = (
         "from nics_drl_bridge.policy.policy_file import load_policy\n"

@@ -1,22 +1,15 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
+from pathlib import Path
+
+from command_line import nics
 
 from policy.policy_rig import SECTORS, export
 
 
-def info(*words: object) -> subprocess.CompletedProcess[str]:
-    command = [
-        sys.executable,
-        "-m",
-        "nics_drl_bridge.commands.cli",
-        "policy",
-        "info",
-        *map(str, words),
-    ]
-    return subprocess.run(command, capture_output=True, text=True, timeout=100)
+def info(*words: object):
+    return nics("policy", "info", *words, cwd=Path())
 
 
 def test_nics_policy_info_tells_what_a_file_is_for_people_and_programs(tmp_path):

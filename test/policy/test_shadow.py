@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -10,19 +8,23 @@ import pytest
 pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 
 import bags
+from command_line import nics
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.policy.policies import make_policy
 from nics_drl_bridge.policy.shadow import Shadow, shadow
+from nics_drl_bridge.robot.spec import load_robot
 
-MODEL = builtin_model("ackermann")
+pytestmark = pytest.mark.slow
+LIDAR, ROBOT = load_lidar("paper"), load_robot("ackermann")
 SEED, PERIOD = 4, 0.1
 LATE = {"/odom": 0.005, "/scan": 0.01, "/cmd_vel": 0.02}
 
 
-def scan(t, ranges, lidar=MODEL.lidar):
+def scan(t, ranges, lidar=LIDAR):
     fields = [float(value) for value in lidar.header]
     ranges = np.array(ranges, np.float32)
     return bags.new(
@@ -40,14 +42,14 @@ def odometry(t, pose, twist):
 
 def driven_by(name):
     """Goal and messages of an episode that a policy drives with the estimator."""
-    env = BridgeEnv(model=MODEL, world="circles", estimator=True)
+    env = BridgeEnv(model="ackermann", world="circles", estimator=True)
     policy = make_policy(name, env.task)
     observation, info = env.reset(seed=SEED)
     topics, ended, k = {topic: [] for topic in LATE}, False, 1
     while not ended and k < 60:
         t, data = PERIOD * k, env._backend.simulator.data
         action = policy.act(observation)
-        twist = MODEL.robot.to_cmd_vel(env.task.command(action))
+        twist = ROBOT.to_cmd_vel(env.task.command(action))
         told = {
             "/scan": scan(t, data.ranges[0, 0]),
             "/odom": odometry(t, data.odom[0, 0], data.twist[0, 0]),
@@ -70,7 +72,10 @@ def recorded(tmp_path_factory):
 
 def test_a_policy_in_the_shadow_of_its_own_drive_commands_what_was_driven(recorded):
     goal, bag, count = recorded
-    made = shadow(bag, MODEL, "dynamic_window", {}, goal)
+    made, again = (
+        shadow(bag, builtin_model("ackermann"), "dynamic_window", {}, goal) for _ in range(2)
+    )
+    assert made.policy.tobytes() == again.policy.tobytes()
     assert len(made.time) == count
     assert np.abs(made.policy - made.driven).max() < 1e-4
     assert np.abs(made.driven).max() > 0.1
@@ -79,22 +84,16 @@ def test_a_policy_in_the_shadow_of_its_own_drive_commands_what_was_driven(record
 
 def test_another_policy_differs(recorded):
     goal, bag, _ = recorded
-    told = shadow(bag, MODEL, "random", {}, goal).differences()
+    told = shadow(bag, builtin_model("ackermann"), "random", {}, goal).differences()
     assert all(figures["mean_size"] > 0.1 for figures in told.values())
     assert told["steering_command"]["opposite"] > 0.2
 
 
 def test_without_a_goal_it_is_where_the_robot_was_later(recorded):
     _, bag, _ = recorded
-    made = shadow(bag, MODEL, "dynamic_window", {}, ahead_s=2.0)
+    made = shadow(bag, builtin_model("ackermann"), "dynamic_window", {}, ahead_s=2.0)
     ahead = round(2.0 / PERIOD)
     assert made.goal[0] == pytest.approx(made.pose[ahead, :2], abs=1e-6)
-
-
-def test_the_same_bag_gives_the_same_commands_to_the_bit(recorded):
-    goal, bag, _ = recorded
-    one, other = (shadow(bag, MODEL, "dynamic_window", {}, goal) for _ in range(2))
-    assert one.policy.tobytes() == other.policy.tobytes()
 
 
 def test_figures_are_those_of_the_definition():
@@ -125,11 +124,11 @@ def test_what_can_not_be_compared_is_told(recorded, topics, goal, ahead, words):
         bag = bags.write(bag.parent / "standing", driven_standing())
         goal = (0.0, 0.0)
     with pytest.raises((RecordingError, ConfigError), match=words):
-        shadow(bag, MODEL, "dynamic_window", topics, goal, ahead)
+        shadow(bag, builtin_model("ackermann"), "dynamic_window", topics, goal, ahead)
 
 
 def driven_standing():
-    free = np.full(MODEL.lidar.beams, 2.0)
+    free = np.full(LIDAR.beams, 2.0)
     moments = [PERIOD * k for k in range(1, 8)]
     return {
         "/scan": [(t + LATE["/scan"], scan(t, free)) for t in moments],
@@ -143,17 +142,14 @@ def test_a_bag_without_commands_is_refused(tmp_path):
     del topics["/cmd_vel"]
     bag = bags.write(tmp_path / "bag", topics)
     with pytest.raises(RecordingError, match="has no cmd_vel"):
-        shadow(bag, MODEL, "dynamic_window", {})
+        shadow(bag, builtin_model("ackermann"), "dynamic_window", {})
 
 
 def test_the_command_writes_a_table_a_picture_and_json(recorded, tmp_path):
     goal, bag, count = recorded
     words = ["evaluate", "dynamic_window", "--shadow", str(bag), "--model", "ackermann"]
     words += [f"--goal={goal[0]},{goal[1]}", "--out", str(tmp_path / "out")]
-    done = subprocess.run(
-        [sys.executable, "-m", "nics_drl_bridge.commands.cli", *words],
-        capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
+    done = nics(*words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert f"compared at {count} times" in done.stdout
     told = json.loads((tmp_path / "out" / "shadow_dynamic_window.json").read_text(encoding="utf-8"))

@@ -53,6 +53,7 @@ def weights(algorithm):
     return {name: value.clone() for name, value in algorithm.policy.state_dict().items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["ppo", "sac"])
 def test_an_interrupted_training_comes_to_the_same_weights(algorithm, tmp_path, monkeypatch):
     whole = train(settings(algorithm), 1, tmp_path / "whole")
@@ -75,15 +76,17 @@ def test_an_interrupted_training_comes_to_the_same_weights(algorithm, tmp_path, 
         assert torch.equal(value, weights(again.algorithm)[name]), name
 
 
+@pytest.mark.slow
 def test_training_again_with_the_same_seed_gives_the_same_weights_and_with_another_others(tmp_path):
     one, same, other = (
-        train(settings(steps=256), seed, tmp_path / str(k)) for k, seed in enumerate((0, 0, 1))
+        train(settings(steps=128), seed, tmp_path / str(k)) for k, seed in enumerate((0, 0, 1))
     )
     parameter = "action_net.weight"
     assert torch.equal(weights(one.algorithm)[parameter], weights(same.algorithm)[parameter])
     assert not torch.equal(weights(one.algorithm)[parameter], weights(other.algorithm)[parameter])
 
 
+@pytest.mark.slow
 def test_a_little_training_reaches_more_goals_than_none(tmp_path):
     def successes(steps):
         chosen = settings(

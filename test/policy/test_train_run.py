@@ -30,6 +30,7 @@ def settings(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed(
     tmp_path, settings
 ):

@@ -28,6 +28,7 @@ def vector(count=4, **arguments):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 @pytest.mark.parametrize("actions", ["continuous", "discrete"])
 def test_stable_baselines3s_checker_finds_nothing_to_warn_of(name, actions):
@@ -81,7 +82,8 @@ def test_the_observations_are_those_of_the_vector_env_without_a_copy():
     assert observation is made[0][0]
 
 
-@pytest.mark.parametrize("algorithm", [PPO, DQN])
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", [PPO, pytest.param(DQN, marks=pytest.mark.campaign)])
 def test_an_algorithm_learns_on_it_and_counts_episodes(algorithm):
     options = {"actions": "discrete"} if algorithm is DQN else None
     env = VecMonitor(TrainVecEnv(vector(task_options=options)))

@@ -18,6 +18,7 @@ from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 Found = tuple[RobotSpec, Identified]
 PNG = b"\x89PNG"
+pytestmark = pytest.mark.slow
 WHEEL_TICK_S = 0.01
 """Whether a wheel speed is of its stamp or of the tick before, a recording does not say."""
 

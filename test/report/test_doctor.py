@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -9,23 +10,23 @@ pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 
 import bags
 
-from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.lidar.sectors import ScanLayout
+from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.report.doctor import examine
 from nics_drl_bridge.report.doctor_facts import (
     Endpoints,
     Expected,
     Facts,
-    expected_of_model,
     facts_of_bag,
     names_in,
 )
+from nics_drl_bridge.robot.spec import load_robot
 
 SECONDS = 8.0
 RELIABLE, BEST_EFFORT = Offer(), Offer(reliable=False)
-EXPECTED = expected_of_model(builtin_model("ackermann"))
-LIDAR = EXPECTED.lidar
+LIDAR = load_lidar("paper")
+EXPECTED = Expected(load_robot("ackermann"), LIDAR, 0.1)
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 
 
@@ -55,12 +56,23 @@ def odometry(
     return bags.new("nav_msgs/msg/Odometry", bags.header(t, frames[0]), frames[1], inner, twist)
 
 
+def each_scan(**changed):
+    return [(t, scan(t, **changed)) for t in bags.times(1.0 / LIDAR.rate, SECONDS)]
+
+
+def each_odometry(**changed):
+    return [(t, odometry(t, **changed)) for t in bags.times(0.02, SECONDS)]
+
+
+own_odometry = cache(each_odometry)
+
+
 def heard(scans=None, odometries=None, commands=None, late=0.002, ticks=None):
     """Facts of a robot on a circle; rows (time, message) take the place of its own."""
     facts = Facts("a robot", True, names_in(""))
     every = {
-        "scan": scans or [(t, scan(t)) for t in bags.times(1.0 / LIDAR.rate, SECONDS)],
-        "odom": odometries or [(t, odometry(t)) for t in bags.times(0.02, SECONDS)],
+        "scan": scans or each_scan(),
+        "odom": odometries or own_odometry(),
         "cmd_vel": commands or [(t, bags.twist(0.5, 0.0, 0.2)) for t in bags.times(0.1, SECONDS)],
     }
     if ticks is not None:
@@ -90,14 +102,6 @@ def only(facts):
 
 def test_a_robot_that_fits_has_no_findings():
     assert examine(heard(), EXPECTED) == []
-
-
-def each_scan(**changed):
-    return [(t, scan(t, **changed)) for t in bags.times(1.0 / LIDAR.rate, SECONDS)]
-
-
-def each_odometry(**changed):
-    return [(t, odometry(t, **changed)) for t in bags.times(0.02, SECONDS)]
 
 
 FREE = np.where(np.arange(LIDAR.beams) % 3, 0.6 * LIDAR.range_max, 0.0)

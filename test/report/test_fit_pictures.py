@@ -10,6 +10,7 @@ from nics_drl_bridge.report.fit_pictures import fit_pictures, write_pictures
 from nics_drl_bridge.robot.spec import load_robot
 
 PNG = b"\x89PNG"
+slow = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -18,12 +19,14 @@ def found():
     return spec, identify(record(spec, np.random.default_rng(0), 30.0), spec, alpha="auto")
 
 
+@slow
 def test_every_picture_of_a_fit_is_drawn(found, tmp_path):
     files = write_pictures(*found, tmp_path / "pictures")
     assert {f.stem for f in files} >= {"accuracy", "alignment", "paths", "residuals", "timing"}
     assert all(f.read_bytes().startswith(PNG) for f in files)
 
 
+@slow
 def test_a_short_drive_has_fewer_pictures():
     spec = load_robot("ackermann")
     short = identify(record(spec, np.random.default_rng(0), 9.0), spec)
@@ -32,6 +35,7 @@ def test_a_short_drive_has_fewer_pictures():
     assert "accuracy" in pictures
 
 
+@slow
 def test_the_report_names_errors_pruning_and_validity(found):
     spec, identified = found
     text = fit_report("here", spec, identified)

@@ -1,18 +1,22 @@
-"""The machines of the three robots, built from the parameters of their RobotSpec.
+"""The machines of the three robots in MuJoCo: mass, friction, motors, and their MJCF.
 
-A mecanum wheel with real rollers, as MJCF.
+MuJoCo solves the contact of each wheel with the floor; nothing ties the robot to its textbook
+kinematics. Tyres are ellipsoids: a round tread touches a plane in one point, which neither jumps
+from edge to edge, as a cylinder's contact does, nor scrubs when the robot turns. Contacts have no
+torsional friction, and nothing is dragged over the floor: with MuJoCo's elliptic cones a contact
+that slides for long pushes itself off the floor and chatters.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.extras.mujoco import machine
-from nics_drl_bridge.extras.mujoco.machine import Machine, Motor, Physics
 from nics_drl_bridge.robot.ackermann import track_and_radius
 from nics_drl_bridge.robot.kinds import require_textbook
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -20,21 +24,130 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Array = NDArray[np.float64]
 Parameters = dict[str, float]
 
-STEERING_STIFFNESS = 1.0
-"""Torque of a steering servo per error [N m/rad]."""
-STEERING_TORQUE = 1.0
-"""Torque limit of a steering servo [N m], that of a small hobby servo."""
+TORQUE_RESERVE = 1.5
+"""Torque limit of a motor, as a multiple of the torque for the maximum acceleration."""
+SERVO_LAG_S = 0.005  # lag of a motor behind its set point
+STEERING_STIFFNESS = 1.0  # torque of a steering servo per error [N m/rad]
+STEERING_TORQUE = 1.0  # torque limit of a steering servo [N m], that of a small hobby servo
+THICKNESS = 0.25  # radius of a roller at its middle, relative to the radius of the wheel
+ROLLER_MASS = 0.005
+
+
+@dataclass(frozen=True)
+class Physics:
+    """Parameters of a machine that a RobotSpec does not have; the mass is that of a small robot."""
+
+    timestep: float = 0.001  # of MuJoCo [s]
+    mass: float = 4.0  # of the chassis with its load, without wheels [kg]
+    wheel_mass: float = 0.15  # of a wheel [kg]
+    friction: float = 1.0  # between tyre and floor
+    acceleration: float = 5.0  # of the robot after the maximum step of a command [m/s^2]
+    softness: float = 0.005  # time constant of a tyre that was pressed into the floor [s]
+    bearing: float = 1e-6  # viscous friction of free wheels and rollers [N m s/rad]
+    rollers: int = 12  # of a mecanum wheel
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A robot in MuJoCo's form."""
+
+    xml: str  # the MJCF model; its body `base_link` has the only free joint
+    joints: tuple[str, ...]  # J names of the joints with encoders
+    controls: Callable[[Array], Array]  # maps a wanted state (S,) to the actuators' inputs (U,)
+    state: Callable[[Array, Array], Array]  # positions [rad] and speeds [rad/s] (J,) to state (S,)
+
+
+@dataclass(frozen=True)
+class Motor:
+    """A motor under a velocity servo: torque = gain x (wanted - actual speed), up to a limit.
+
+    The wanted speed follows the command with a first-order lag, like the set point of a motor
+    controller, so that the servo is stiff and keeps its speed under load.
+    """
+
+    gain: float  # [N m s/rad]
+    torque: float  # limit [N m]
+    lag: float  # of the set point [s]
+
+    def mjcf(self, transmission: str) -> str:
+        """The MJCF of the motor at a `joint="NAME"` or a `tendon="NAME"`."""
+        return f"""
+    <general {transmission} dyntype="filterexact" dynprm="{self.lag:.8g}" gainprm="{self.gain:.8g}"
+             biastype="affine" biasprm="0 0 {-self.gain:.8g}"
+             forcerange="{-self.torque:.8g} {self.torque:.8g}"/>"""
+
+
+def _motor(inertia: float, lag: float, radius: float, step: float, physics: Physics) -> Motor:
+    """Motor that makes a wheel follow its target with a lag [s], within the limits of friction.
+
+    Spinning or locked wheels do not steer, so the lag is longer than requested if the maximum step
+    [m/s] of the command would accelerate the robot by more than `physics.acceleration`. The inertia
+    is that at the motor's shaft, including the share of the moving robot [kg m^2].
+    """
+    lag = max(lag, step / physics.acceleration)
+    limit = TORQUE_RESERVE * physics.acceleration
+    return Motor(inertia / SERVO_LAG_S, inertia * limit / radius, lag - SERVO_LAG_S)
+
+
+def _document(name: str, physics: Physics, height: float, robot: str, actuators: str) -> str:
+    """MJCF of a robot on an infinite floor: contents of its `base_link`, and its actuators."""
+    return f"""
+<mujoco model="{name}">
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="{physics.timestep}" integrator="implicitfast" cone="elliptic"
+          jacobian="sparse"/>
+  <default>
+    <geom contype="0" conaffinity="0" condim="3" friction="{physics.friction}"/>
+    <default class="tread">
+      <geom contype="1" priority="1" solref="{physics.softness} 1"/>
+    </default>
+  </default>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1" conaffinity="1"/>
+    <body name="base_link" pos="0 0 {height}">
+      <freejoint/>{robot}
+    </body>
+  </worldbody>
+{actuators}
+</mujoco>
+"""
+
+
+def _chassis(mass: float, centre: tuple[float, float, float], size: tuple[float, ...]) -> str:
+    """MJCF of a box: mass [kg], centre in `base_link` [m], full size [m]."""
+    half = " ".join(f"{0.5 * s:.6g}" for s in size)
+    x, y, z = centre
+    return f"""
+      <geom name="chassis" type="box" mass="{mass}" pos="{x:.6g} {y:.6g} {z:.6g}" size="{half}"/>"""
+
+
+def _wheel(name: str, radius: float, width: float, physics: Physics, damping: float = 0.0) -> str:
+    """MJCF inside a wheel's body: a hinge about y, a hub with the mass, a round tread."""
+    return f"""
+        <joint name="{name}" axis="0 1 0" damping="{damping}"/>
+        <geom type="cylinder" mass="{physics.wheel_mass}" size="{radius:.6g} {0.5 * width:.6g}"
+              zaxis="0 1 0"/>
+        <geom class="tread" type="ellipsoid" mass="0" zaxis="0 1 0"
+              size="{radius:.6g} {radius:.6g} {0.5 * width:.6g}"/>"""
+
+
+def load_mujoco() -> Any:
+    """Returns the module `mujoco`. Raises ConfigError if it is not installed."""
+    try:
+        import mujoco
+    except ImportError:
+        raise ConfigError(
+            "MuJoCo is not installed; run pip install 'nics_drl_bridge[mujoco]'."
+        ) from None
+    return mujoco
 
 
 def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
     """Builds the machine of a robot.
 
     In addition to those of the textbook kinematics, the parameters `wheel_radius` and `track` of an
-    Ackermann robot are used if the spec has them.
-
-    Raises:
-        ConfigError: the spec names no textbook kinematics or a kind without a machine, or lacks a
-            parameter.
+    Ackermann robot are used if the spec has them. Raises ConfigError if the spec names no textbook
+    kinematics or a kind without a machine, or lacks a parameter.
     """
     kind = require_textbook(spec)
     if kind not in _BUILDERS:
@@ -43,7 +156,8 @@ def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
             f"{', '.join(_BUILDERS)}, or the fast simulator."
         )
     try:
-        return _BUILDERS[kind](spec.parameters, greatest_step(spec), physics or Physics())
+        step = max(c.max - c.min for c in spec.command if not c.turns)
+        return _BUILDERS[kind](spec.parameters, step, physics or Physics())
     except KeyError as error:
         raise ConfigError(
             f"robot {spec.name!r}: the {kind} machine needs the parameter {error}; add it under "
@@ -51,12 +165,7 @@ def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
         ) from None
 
 
-def greatest_step(spec: RobotSpec) -> float:
-    """Maximum step of a speed that commands within their limits can request [m/s]."""
-    return max(c.max - c.min for c in spec.command if not c.turns)
-
-
-def ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
+def _ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
     """Builds a car: rear axle with an open differential, front wheels steered by two servos.
 
     `base_link` is the centre of the rear axle. One motor turns both rear wheels through a
@@ -65,20 +174,20 @@ def ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
     wheelbase = p["wheelbase"]
     track, radius = track_and_radius(p)
     total = physics.mass + 4 * physics.wheel_mass
-    engine = machine.motor(
+    engine = _motor(
         (total + 2 * physics.wheel_mass) * radius**2, p["speed_lag"], radius, step, physics
     )
-    robot = machine.chassis(
+    robot = _chassis(
         physics.mass, (0.45 * wheelbase, 0.0, 0.0), (1.3 * wheelbase, 0.7 * track, 0.04)
     ) + "".join(_car_wheels(wheelbase, track, radius, p["steering_lag"], physics))
-    height = radius
-    xml = machine.document("ackermann", physics, height, robot, _car_actuators(engine))
-
+    xml = _document("ackermann", physics, radius, robot, _car_actuators(engine))
     half_ratio = 0.5 * track / wheelbase
 
     def controls(state: Array) -> Array:
         speed, steering = state
-        return np.array([speed / radius, *ackermann_angles(steering, half_ratio)])
+        t = np.tan(steering)  # of a virtual wheel in the middle; both turn about one centre
+        left, right = t / (1.0 - half_ratio * t), t / (1.0 + half_ratio * t)
+        return np.array([speed / radius, np.arctan(left), np.arctan(right)])
 
     def measured(position: Array, speed: Array) -> Array:
         each = np.tan(position[2:])
@@ -87,20 +196,7 @@ def ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
         return np.array([0.5 * radius * (speed[0] + speed[1]), steering])
 
     joints = ("rear_left", "rear_right", "steer_left", "steer_right")
-    return Machine(xml, height, joints, controls, measured)
-
-
-def ackermann_angles(steering: float, half_ratio: float) -> tuple[float, float]:
-    """Steering angles of the left and right front wheels about a common turning centre.
-
-    Args:
-        steering: angle of a virtual wheel in the middle [rad].
-        half_ratio: half the track divided by the wheelbase.
-    """
-    t = np.tan(steering)
-    return float(np.arctan(t / (1.0 - half_ratio * t))), float(
-        np.arctan(t / (1.0 + half_ratio * t))
-    )
+    return Machine(xml, joints, controls, measured)
 
 
 def _car_wheels(
@@ -108,8 +204,8 @@ def _car_wheels(
 ) -> list[str]:
     parts = []
     for side, y in (("left", 0.5 * track), ("right", -0.5 * track)):
-        rear = machine.wheel(f"rear_{side}", radius, 0.4 * radius, physics)
-        front = machine.wheel(f"front_{side}", radius, 0.4 * radius, physics, physics.bearing)
+        rear = _wheel(f"rear_{side}", radius, 0.4 * radius, physics)
+        front = _wheel(f"front_{side}", radius, 0.4 * radius, physics, physics.bearing)
         parts.append(f"""
       <body pos="0 {y:.6g} 0">{rear}
       </body>
@@ -139,37 +235,35 @@ def _car_actuators(engine: Motor) -> str:
   </actuator>"""
 
 
-def differential(p: Parameters, step: float, physics: Physics) -> Machine:
+def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
     """Builds a robot of two driven wheels and a ball caster; `base_link` is the axle's centre."""
     radius, track = p["wheel_radius"], p["track"]
     behind, ball = -0.5 * track, 0.4 * radius
     total = physics.mass + 2 * physics.wheel_mass
-    servo = machine.motor(
+    servo = _motor(
         0.5 * (total + physics.wheel_mass) * radius**2,
         p["wheel_lag"], radius, step, physics,
     )  # fmt: skip
     sides = (("left", 0.5 * track), ("right", -0.5 * track))
     wheels = "".join(
         f"""
-      <body pos="0 {y:.6g} 0">{machine.wheel(side, radius, 0.4 * radius, physics)}
+      <body pos="0 {y:.6g} 0">{_wheel(side, radius, 0.4 * radius, physics)}
       </body>"""
         for side, y in sides
     )
     # Low and just behind the axle: braking must not tip the robot over its wheels, and a mass far
     # behind would push it further into every turn.
     centre, size = (-0.06 * track, 0.0, -0.55 * radius), (track, 0.7 * track, 0.03)
-    robot = f"""{machine.chassis(physics.mass, centre, size)}
+    robot = f"""{_chassis(physics.mass, centre, size)}
       <body pos="{behind:.6g} 0 {ball - radius:.6g}">
         <joint type="ball" damping="{physics.bearing}"/>
         <geom class="tread" type="sphere" size="{ball:.6g}" mass="0.03"/>
       </body>{wheels}"""
-    xml = machine.document(
-        "differential", physics, radius, robot, _motors(("left", "right"), servo)
-    )
-    return Machine(xml, radius, ("left", "right"), _same, lambda _, speed: speed)
+    xml = _document("differential", physics, radius, robot, _motors(("left", "right"), servo))
+    return Machine(xml, ("left", "right"), lambda state: state, lambda _, speed: speed)
 
 
-def mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
+def _mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
     """Builds a robot of four wheels with real rollers, which carry it in turn.
 
     Friction that differs by direction would be simpler, but MuJoCo aligns it with the world or
@@ -178,7 +272,7 @@ def mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
     """
     radius = p["wheel_radius"]
     total = physics.mass + 4 * physics.wheel_mass
-    servo = machine.motor(
+    servo = _motor(
         (0.25 * total + 0.5 * physics.wheel_mass) * radius**2,
         p["wheel_lag"], radius, step, physics,
     )  # fmt: skip
@@ -186,12 +280,12 @@ def mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
     names = tuple(f"{place}_{side}" for place in ("front", "rear") for side in ("left", "right"))
     places = ((x, y, -1), (x, -y, 1), (-x, y, 1), (-x, -y, -1))
     wheels = "".join(
-        roller_wheel(name, (px, py), lean, radius, physics)
+        _roller_wheel(name, (px, py), lean, radius, physics)
         for name, (px, py, lean) in zip(names, places, strict=True)
     )
-    body = machine.chassis(physics.mass, (0, 0, 0), (2.2 * x, 1.4 * y, 0.04))
-    xml = machine.document("mecanum", physics, radius, body + wheels, _motors(names, servo))
-    return Machine(xml, radius, names, _same, lambda _, speed: speed)
+    body = _chassis(physics.mass, (0, 0, 0), (2.2 * x, 1.4 * y, 0.04))
+    xml = _document("mecanum", physics, radius, body + wheels, _motors(names, servo))
+    return Machine(xml, names, lambda state: state, lambda _, speed: speed)
 
 
 def _motors(names: tuple[str, ...], servo: Motor) -> str:
@@ -201,35 +295,19 @@ def _motors(names: tuple[str, ...], servo: Motor) -> str:
   </actuator>"""
 
 
-def _same(state: Array) -> Array:
-    return state
-
-
 _BUILDERS: dict[str, Callable[[Parameters, float, Physics], Machine]] = {
-    "ackermann": ackermann,
-    "differential": differential,
-    "mecanum": mecanum,
+    "ackermann": _ackermann,
+    "differential": _differential,
+    "mecanum": _mecanum,
 }
 
 
-THICKNESS = 0.25
-"""Radius of a roller at its middle, relative to the radius of the wheel."""
-ROLLER_MASS = 0.005
-
-
 def roller_size(radius: float, rollers: int) -> tuple[float, float]:
-    """Semi-axes [m] of ellipsoidal rollers whose outline best approximates a circle.
+    """Semi-axes [m], thickness and length, of ellipsoidal rollers that best outline a circle.
 
     Seen from the side, an ellipsoid at angle q from the bottom reaches
     `(R - a) cos q + sqrt(a^2 + (b^2 - a^2) sin^2 q / 2)` below the axle. Its length b makes this R
     at q = 0 and where the next roller takes over, at half the angle between two.
-
-    Args:
-        radius: R, of the wheel [m].
-        rollers: number of rollers.
-
-    Returns:
-        Thickness a and length b, as semi-axes.
     """
     a, q = THICKNESS * radius, np.pi / rollers
     reach = radius - (radius - a) * np.cos(q)
@@ -237,18 +315,13 @@ def roller_size(radius: float, rollers: int) -> tuple[float, float]:
     return float(a), float(b)
 
 
-def roller_wheel(
+def _roller_wheel(
     name: str, place: tuple[float, float], lean: int, radius: float, physics: Physics
 ) -> str:
     """MJCF of a wheel's body: a driven hub, and free rollers at 45 degrees to its axle.
 
-    Args:
-        name: of the wheel's joint.
-        place: (x, y) of the wheel in `base_link` [m].
-        lean: +1 if the axle of the roller on the floor points forward and left, -1 if it points
-            forward and right.
-        radius: of the wheel [m].
-        physics: gives masses and bearings.
+    The wheel is at a place (x, y) in `base_link` [m]; it leans by +1 if the axle of the roller on
+    the floor points forward and left, by -1 if it points forward and right.
     """
     a, b = roller_size(radius, physics.rollers)
     hub = physics.wheel_mass - physics.rollers * ROLLER_MASS

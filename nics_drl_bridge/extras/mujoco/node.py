@@ -8,7 +8,7 @@ from typing import cast
 from rclpy.context import Context
 from rclpy.node import Node
 
-from nics_drl_bridge.extras.mujoco.machine import Physics
+from nics_drl_bridge.extras.mujoco.machines import Physics
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Simulator

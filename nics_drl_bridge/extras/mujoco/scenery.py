@@ -1,9 +1,8 @@
 """A scene in MuJoCo: robots with their bumpers, walls, map and obstacles.
 
 A bumper is the footprint of the RobotSpec, at the height of the axles; it collides with walls,
-obstacles and the bumpers of other robots. Wheels touch only the floor.
-
-Convex parts of outlines and rectangles of maps, because MuJoCo's bodies are convex.
+obstacles and the bumpers of other robots. Wheels touch only the floor. MuJoCo's bodies are convex,
+so outlines are cut into convex parts and maps into rectangles.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.extras.mujoco.machine import Machine, Physics
+from nics_drl_bridge.extras.mujoco.machines import Machine, Physics
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import (
     RADIUS,
@@ -29,32 +28,23 @@ from nics_drl_bridge.lidar.shapes import (
 
 Array = NDArray[np.float64]
 
-HEIGHT = 0.5
-"""Height of walls and obstacles [m]."""
-THICKNESS = 0.002
-"""Thickness of walls, which have none for the lidar [m]."""
-BUMPER = 4
-"""Bit of MuJoCo's `contype` and `conaffinity` for contacts of bumpers."""
+HEIGHT = 0.5  # height of walls and obstacles [m]
+THICKNESS = 0.002  # thickness of walls, which have none for the lidar [m]
+BUMPER = 4  # bit of MuJoCo's `contype` and `conaffinity` for contacts of bumpers
 BUMPER_FRICTION = 0.3
+BUMPER_NAME = "bumper_"
+SLIVER = 1e-9  # triangles of less area, relative to the square of the outline's size, are omitted
 
 
 @dataclass(frozen=True)
 class Scenery:
-    """Walls, map and obstacles of a world in one episode.
+    """Walls, map and obstacles of a world in one episode."""
 
-    Attributes:
-        walls: (W, 4) x1, y1, x2, y2 [m].
-        grid: a static map, if any.
-        shapes: of the obstacles.
-        bodies: (K, 7) obstacles as in `lidar.shapes.BODY`.
-        moving: (K,) True for moving obstacles, whose poses are prescribed (mocap).
-    """
-
-    walls: Array
+    walls: Array  # (W, 4) x1, y1, x2, y2 [m]
     grid: GridMap | None
-    shapes: tuple[Shape, ...]
-    bodies: Array
-    moving: NDArray[np.bool_]
+    shapes: tuple[Shape, ...]  # of the obstacles
+    bodies: Array  # (K, 7) as in `lidar.shapes.BODY`
+    moving: NDArray[np.bool_]  # (K,) obstacles whose poses are prescribed (mocap)
 
 
 def prefix_of(robot: int) -> str:
@@ -67,23 +57,12 @@ def obstacle_name(k: int) -> str:
     return f"obstacle_{k}"
 
 
-def bumper_name(part: int) -> str:
-    """Name of one geom of a robot's bumper."""
-    return f"bumper_{part}"
-
-
 def compile_scene(
     mujoco: Any, machine: Machine, footprint: Shape, robots: int, scenery: Scenery, physics: Physics
 ) -> Any:
-    """Compiles the MuJoCo model of robots of one kind in a scene.
+    """Compiles the MuJoCo model of robots of one kind, whose parts have names with `prefix_of`.
 
-    Args:
-        mujoco: the module.
-        machine: of each robot.
-        footprint: a circle or a polygon.
-        robots: M; the parts of robot m have names with `prefix_of(m)`.
-        scenery: walls, map and obstacles.
-        physics: of the machine.
+    `mujoco` is the module; the footprint is a circle or a polygon.
     """
     spec = mujoco.MjSpec.from_string(machine.xml)
     maker = _Maker(mujoco, spec, physics)
@@ -106,7 +85,7 @@ def compile_scene(
 def bumpers(model: Any, robots: int) -> NDArray[np.int64]:
     """(geoms,) index of the robot whose bumper each geom of a scene belongs to; -1 for none."""
     names = [model.geom(i).name for i in range(model.ngeom)]
-    own = {f"{prefix_of(m)}{bumper_name(0)}".rstrip("0"): m for m in range(robots)}
+    own = {f"{prefix_of(m)}{BUMPER_NAME}": m for m in range(robots)}
     found = [next((m for head, m in own.items() if n.startswith(head)), -1) for n in names]
     return np.array(found, dtype=np.int64)
 
@@ -126,10 +105,10 @@ class _Maker:
             # Its round edge touches a wall in one point, at the height of the axles.
             size = [footprint.radius, footprint.radius, half]
             kind = self._kinds.mjGEOM_ELLIPSOID
-            self._add(base, type=kind, size=size, name=bumper_name(0), **own)
+            self._add(base, type=kind, size=size, name=f"{BUMPER_NAME}0", **own)
             return
         for i, part in enumerate(convex_parts(footprint.outline)):
-            self._prism(base, part, (-half, half), name=bumper_name(i), **own)
+            self._prism(base, part, (-half, half), name=f"{BUMPER_NAME}{i}", **own)
 
     def wall(self, body: Any, start: Array, end: Array) -> None:
         """Adds a straight wall between two points (2,) [m]."""
@@ -164,9 +143,8 @@ class _Maker:
 
     def _box(self, body: Any, middle: Array, heading: float, size: Sequence[float]) -> None:
         pos = [middle[0], middle[1], 0.5 * HEIGHT]
-        self._add(
-            body, type=self._kinds.mjGEOM_BOX, size=size, pos=pos, quat=quaternion(heading)
-        )  # fmt: skip
+        turned = quaternion(heading)
+        self._add(body, type=self._kinds.mjGEOM_BOX, size=size, pos=pos, quat=turned)
 
     def _prism(self, body: Any, corners: Array, z: tuple[float, float], **others: Any) -> None:
         """Adds the prism over a convex outline (v, 2) between two heights [m]."""
@@ -184,10 +162,6 @@ class _Maker:
 def quaternion(heading: float) -> list[float]:
     """Quaternion w, x, y, z of a rotation about the vertical [rad]."""
     return [float(np.cos(0.5 * heading)), 0.0, 0.0, float(np.sin(0.5 * heading))]
-
-
-SLIVER = 1e-9
-"""Triangles of less area, relative to the square of the outline's size, are omitted."""
 
 
 def convex_parts(outline: Array) -> list[Array]:
@@ -226,15 +200,10 @@ def _is_ear(outline: Array, rest: list[int], i: int) -> bool:
 
 
 def rectangles(blocked: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Rectangles that together cover exactly the blocked cells of a map.
+    """Rectangles (R, 4) that together cover exactly the blocked cells (rows, columns) of a map.
 
-    They are runs along the rows; equal runs in consecutive rows are merged.
-
-    Args:
-        blocked: (rows, columns).
-
-    Returns:
-        (R, 4) first row, first column, and those after the last.
+    Each is first row, first column, and those after the last. They are runs along the rows; equal
+    runs in consecutive rows are merged.
     """
     done: list[tuple[int, int, int, int]] = []
     open_runs: dict[tuple[int, int], int] = {}

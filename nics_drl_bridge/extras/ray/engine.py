@@ -1,4 +1,4 @@
-"""Training on a Ray cluster: RLlib's PPO, with the worlds spread over its machines.
+"""Training on a Ray cluster, or on one of this machine: RLlib's PPO, with the worlds spread out.
 
 Settings, normaliser, network, evaluation and policy file are those of training on one machine.
 """
@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import functools
 import json
+import logging
+import os
+import socket
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
@@ -27,7 +30,6 @@ from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
 from stable_baselines3.common.logger import configure
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.extras.ray.cluster import connected
 from nics_drl_bridge.extras.ray.runner import (
     COLLISION,
     ENDED,
@@ -53,27 +55,67 @@ from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]
 FORMAT = "nics_drl_bridge/ray_checkpoint/1"
-VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5
-"""Parameters of the loss, as in Stable-Baselines3."""
+VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5  # parameters of the loss, as in Stable-Baselines3
 SILENCE_S = 600.0
 """A run ends after this time without a step from any env runner [s]; it can be resumed."""
-PROBE_S = 1.0
-"""Time that a roll-out waits for a lost env runner [s]; later ones try again."""
+TRIED_S = 5.0  # timeout of an attempt to connect to an address [s]
+PROBE_S = 1.0  # time that a roll-out waits for a lost env runner [s]; later ones try again
 
 
 @contextmanager
 def learner(
     address: str | None, env_runners: int | None, worlds: int
 ) -> Iterator[Callable[..., Trained]]:
-    """Connects with a cluster, and gives the function that trains one policy on it.
-
-    Args:
-        address: of the cluster, see `cluster.connected`.
-        env_runners: processes that share the worlds.
-        worlds: how many.
-    """
+    """Connects with a cluster, see `connected`; gives the function that trains one policy on it."""
     with connected(address, env_runners, worlds) as runners:
         yield functools.partial(train_on_ray, runners=runners)
+
+
+@contextmanager
+def connected(address: str | None, runners: int | None, worlds: int) -> Iterator[int]:
+    """Connects this process to a cluster, and yields the number of env runners.
+
+    The address is `auto` (the cluster that this machine is part of) or `HOST:PORT`; None starts one
+    on this machine, which ends with the training. By default there is an env runner, a process that
+    shares the worlds, for each CPU of the cluster. Raises ConfigError if no cluster answers there,
+    or it is too small.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # A lost worker is no error here, and Ray's messages about it would disturb the progress bar.
+    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")
+    logging.getLogger("ray.rllib").setLevel(logging.CRITICAL)
+    local = {"include_dashboard": False} if address is None else {}
+    try:
+        if address not in (None, "auto"):  # Ray itself would try for minutes
+            host, _, port = str(address).rpartition(":")
+            socket.create_connection((host, int(port)), TRIED_S).close()
+        ray.init(address or "local", log_to_driver=False, logging_level="ERROR", **local)
+    except (OSError, OverflowError, ValueError, RuntimeError) as error:
+        first = str(error).strip().partition("\n")[0].rstrip(".")
+        raise ConfigError(
+            f"--address {address}: no Ray cluster answers ({first}); start one on the first "
+            "machine with 'ray start --head', and name the HOST:PORT that it prints."
+        ) from None
+    try:
+        yield _runners(runners, int(ray.cluster_resources().get("CPU", 0)), worlds)
+    finally:
+        ray.shutdown()
+
+
+def _runners(runners: int | None, cpus: int, worlds: int) -> int:
+    if runners is None:
+        return max(1, min(cpus, worlds))
+    if runners > cpus:
+        raise ConfigError(
+            f"--env-runners {runners}: the cluster has {cpus} CPUs, and each env runner takes one; "
+            "add machines with 'ray start', or ask for fewer."
+        )
+    if runners > worlds:
+        raise ConfigError(
+            f"--env-runners {runners}: the settings have {worlds} worlds to share; give them more, "
+            "or ask for fewer."
+        )
+    return runners
 
 
 def train_on_ray(
@@ -88,24 +130,13 @@ def train_on_ray(
 
     An env runner whose process or machine is lost is restarted, if necessary on another machine;
     the others continue meanwhile. The steps that are learned from then depend on the time of the
-    loss: two runs with one seed agree only as long as no runner is lost.
-
-    Args:
-        settings: what to learn.
-        seed: of all random numbers.
-        folder: for checkpoint and TensorBoard logs; created if missing.
-        tell: called with the progress after each roll-out.
-        resumed: True continues from the checkpoint in `folder`.
-        runners: number of processes that share the worlds.
-
-    Raises:
-        ConfigError: the settings are inconsistent, no checkpoint fits them, or no env runner
-            answers.
+    loss: two runs with one seed agree only as long as no runner is lost. The arguments are those of
+    `policy.train.train`; `tell` is called after each roll-out. Raises ConfigError if the settings
+    are inconsistent, no checkpoint fits them, or no env runner answers.
     """
     if settings.algorithm != "ppo":
-        raise ConfigError(
-            f"--engine ray learns with ppo, not {settings.algorithm!r}; leave it out."
-        )
+        given = settings.algorithm
+        raise ConfigError(f"--engine ray learns with ppo, not {given!r}; leave it out.")
     begin, path = time.perf_counter(), folder / CHECKPOINT
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
     content = read_checkpoint(path, FORMAT) if resumed else None
@@ -125,16 +156,7 @@ def train_on_ray(
 
 @dataclass
 class Learning:
-    """A training in progress.
-
-    Attributes:
-        algorithm: RLlib's.
-        settings, seed, path, runners: settings and seed of the training, path of the checkpoint,
-            number of env runners.
-        steps: environment steps so far.
-        stepping_s: time in the simulator, averaged over the env runners [s].
-        recent: per roll-out, for the last ones: episodes ended, successes, collisions.
-    """
+    """A training in progress, with the path of its checkpoint and the number of env runners."""
 
     algorithm: PPO
     settings: TrainingSettings
@@ -142,8 +164,9 @@ class Learning:
     path: Path
     runners: int
     steps: int = 0
-    stepping_s: float = 0.0
+    stepping_s: float = 0.0  # in the simulator, averaged over the env runners
     recent: deque[tuple[int, int, int]] = field(default_factory=deque)
+    """Per roll-out, for the last ones: episodes ended, successes, collisions."""
 
     @property
     def learner(self) -> Any:
@@ -163,6 +186,7 @@ class Learning:
         logger = configure(str(self.path.parent), ["tensorboard"])
         begin = heard = time.perf_counter()
         first = saved = self.steps
+        every = self.settings.checkpoint_every
         while self.steps < self.settings.steps:
             before = self.steps
             self._take(self.algorithm.train())
@@ -176,10 +200,7 @@ class Learning:
             for name in ("success", "collision", "steps_per_s", "env_share"):
                 logger.record(f"rollout/{name}", getattr(progress, name))
             logger.dump(self.steps)
-            if (
-                self.steps // self.settings.checkpoint_every
-                > saved // self.settings.checkpoint_every
-            ):
+            if self.steps // every > saved // every:
                 self.save(about)
                 saved = self.steps
         self.save(about)
@@ -187,10 +208,10 @@ class Learning:
 
     def _take(self, result: Mapping[str, Any]) -> None:
         """Adds the results of a roll-out of all env runners."""
-        told = result.get(ENV_RUNNER_RESULTS, {})
-        self.steps += int(told.get(NUM_ENV_STEPS_SAMPLED, 0))
-        self.stepping_s += float(told.get(STEPPING, 0.0)) / self.runners
-        ended, success, collision = (int(told.get(n, 0)) for n in (ENDED, SUCCESS, COLLISION))
+        found = result.get(ENV_RUNNER_RESULTS, {})
+        self.steps += int(found.get(NUM_ENV_STEPS_SAMPLED, 0))
+        self.stepping_s += float(found.get(STEPPING, 0.0)) / self.runners
+        ended, success, collision = (int(found.get(n, 0)) for n in (ENDED, SUCCESS, COLLISION))
         self.recent.append((ended, success, collision))
         while sum(one[0] for one in self.recent) - self.recent[0][0] >= RECENT:
             self.recent.popleft()
@@ -249,21 +270,15 @@ def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -
     spaces = env.observation_space, env.action_space
     env.close()
     make = ray.put(functools.partial(share_of_worlds, settings, model, scenes))
+    env_config = {
+        "make": make, "rollout": settings.ppo.rollout, "seed": (seed, done),
+        "threads": settings.threads,
+    }  # fmt: skip
     config = _config(settings, seed, done, normaliser, spaces).env_runners(
-        env_runner_cls=WorldsRunner,
-        num_env_runners=runners,
-        rollout_fragment_length="auto",
+        env_runner_cls=WorldsRunner, num_env_runners=runners, rollout_fragment_length="auto",
         sample_timeout_s=SILENCE_S,
-    )
-    config.environment(
-        env_config={
-            "make": make,
-            "rollout": settings.ppo.rollout,
-            "seed": (seed, done),
-            "threads": settings.threads,
-        }
-    )
-    algorithm = config.build_algo()
+    )  # fmt: skip
+    algorithm = config.environment(env_config=env_config).build_algo()
     Path(algorithm.logdir).rmdir()  # RLlib creates it and leaves it empty
     return algorithm
 

@@ -1,9 +1,7 @@
-"""An env runner of RLlib that steps many worlds at once.
+"""An env runner of RLlib that steps many worlds at once, and the network that it runs.
 
 RLlib's own iterates over its worlds in Python in every step, which takes many times longer than
 the simulator. This one keeps arrays, and cuts them into episodes at the end.
-
-The network for training on Ray: an actor as in the policy file, and a critic.
 """
 
 from __future__ import annotations
@@ -36,23 +34,16 @@ ENDED, SUCCESS, COLLISION, STEPPING = "ended", "success", "collision", "stepping
 
 @dataclass(frozen=True)
 class Rollout:
-    """T steps of N worlds.
+    """T steps of N worlds."""
 
-    Attributes:
-        seen: (T + 1, N, O) observations; after the end of an episode, the first of the next one.
-        actions, logits, logp: (T, N, ...) actions, parameters of their distribution, and their log
-            probabilities.
-        rewards: (T, N).
-        final: (t, n) -> last observation (O,) of the episode that ended in step t of world n, and
-            True if it only ran out of time.
-    """
-
-    seen: NDArray[np.float32]
-    actions: NDArray[Any]
-    logits: NDArray[np.float32]
-    logp: NDArray[np.float32]
-    rewards: NDArray[np.float32]
+    seen: NDArray[np.float32]  # (T + 1, N, O); after an episode, the first of the next one
+    actions: NDArray[Any]  # (T, N, ...)
+    logits: NDArray[np.float32]  # (T, N, ...) parameters of the distribution of actions
+    logp: NDArray[np.float32]  # (T, N) log probabilities of the actions
+    rewards: NDArray[np.float32]  # (T, N)
     final: dict[tuple[int, int], tuple[NDArray[np.float32], bool]]
+    """(t, n) -> last observation (O,) of the episode that ended in step t of world n, and True if
+    it only ran out of time."""
 
     def episodes(self) -> Iterator[SingleAgentEpisode]:
         """Yields the pieces of episodes in the roll-out, each of one world."""
@@ -115,7 +106,11 @@ class WorldsRunner(SingleAgentEnvRunner):
         seen, actions, logits, logp, rewards = (np.stack(one) for one in arrays)
         final = {place: end for one in finals for place, end in one.items()}
         whole = np.concatenate([seen, self._seen[None]])
-        self._count(steps * self.num_envs, len(final), self.env.stepping_s - busy)
+        ended, count = len(final), steps * self.num_envs
+        self.metrics.log_value(ENDED, ended, reduce="sum")
+        self.metrics.log_value(STEPPING, self.env.stepping_s - busy, reduce="sum")
+        self._log_env_steps(self._metrics_num_env_steps_sampled, count)
+        self._increase_sampled_metrics(count, ended)
         return list(Rollout(whole, actions, logits, logp, rewards, final).episodes())
 
     def _step(self, t: int) -> tuple[Any, ...]:
@@ -126,26 +121,17 @@ class WorldsRunner(SingleAgentEnvRunner):
         distribution = self.module.get_exploration_action_dist_cls().from_logits(logits)
         chosen = distribution.sample()
         logp, actions = distribution.logp(chosen).numpy(), chosen.numpy()
-        space = self.env.action_space
-        bounded = (
-            np.clip(actions, space.low, space.high)
-            if isinstance(space, gymnasium.spaces.Box)
-            else actions
-        )
+        space, bounded = self.env.action_space, actions
+        if isinstance(space, gymnasium.spaces.Box):
+            bounded = np.clip(actions, space.low, space.high)
         self._seen, rewards, done, infos = self.env.step(bounded)
         final = {}
         for n in np.flatnonzero(done):
             info = infos[n]
-            for name in (("is_success", SUCCESS), ("collision", COLLISION)):
-                self.metrics.log_value(name[1], int(info.get(name[0], False)), reduce="sum")
+            for name, metric in (("is_success", SUCCESS), ("collision", COLLISION)):
+                self.metrics.log_value(metric, int(info.get(name, False)), reduce="sum")
             final[t, int(n)] = info["terminal_observation"], info["TimeLimit.truncated"]
         return seen, actions, logits.numpy(), logp, rewards, final
-
-    def _count(self, steps: int, ended: int, stepping_s: float) -> None:
-        self.metrics.log_value(ENDED, ended, reduce="sum")
-        self.metrics.log_value(STEPPING, stepping_s, reduce="sum")
-        self._log_env_steps(self._metrics_num_env_steps_sampled, steps)
-        self._increase_sampled_metrics(steps, ended)
 
 
 Batch = dict[str, Any]

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.extras.mujoco.machine import Physics, load_mujoco
-from nics_drl_bridge.extras.mujoco.machines import build_machine, roller_size
-from nics_drl_bridge.extras.mujoco.rig import MujocoRobot, Reading, record
+from nics_drl_bridge.extras.mujoco.machines import Physics, build_machine, load_mujoco, roller_size
+from nics_drl_bridge.extras.mujoco.simulator import MujocoRobot, Reading, record
 from nics_drl_bridge.recording.recording import check
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
@@ -155,6 +154,7 @@ def test_a_drive_is_a_recording_of_this_robot(robots, name):
     assert len(recording.pose.t) == len(recording.state.t) == len(recording.command.t) == 500
 
 
+@pytest.mark.slow
 @needs_mujoco
 def test_a_model_is_identified_from_a_drive(robots):
     from nics_drl_bridge.identify.identify import identify

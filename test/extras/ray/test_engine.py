@@ -20,8 +20,7 @@ pytest.importorskip("ray", reason="needs Ray, in an environment of its own; run 
 
 from ray.cluster_utils import Cluster
 
-from nics_drl_bridge.extras.ray.cluster import connected
-from nics_drl_bridge.extras.ray.engine import FORMAT, share_of_worlds, train_on_ray
+from nics_drl_bridge.extras.ray.engine import FORMAT, connected, share_of_worlds, train_on_ray
 from nics_drl_bridge.policy.train import CHECKPOINT, TrainOrder, run
 from nics_drl_bridge.policy.train_checkpoint import read_checkpoint
 

@@ -1,4 +1,4 @@
-"""Policies whose graph takes more memory or time than any policy needs: never run."""
+"""Policies that take more memory or time than any policy needs: never parsed, never run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import onnx
 import pytest
 
 from nics_drl_bridge.errors import PolicyError
-from nics_drl_bridge.policy import onnx_graph, onnx_sizes, policy_file
+from nics_drl_bridge.policy import onnx_graph, policy_file
+from nics_drl_bridge.policy.contract import shipped
+from nics_drl_bridge.policy.onnx_graph import MOST_NESTED, MOST_PACKED, MOST_PARTS, check_wire
 from nics_drl_bridge.policy.policy_file import load_policy
 from policy.policy_rig import SECTORS, bytes_of, contract_in, export, signed, with_contract
 
@@ -126,7 +128,7 @@ REFUSED = {
     "a square": (outer, "graph", "grows faster"),
     "work": (heavy, "graph", "multiplications"),
     "broadcasting": (broadcast, "graph", "numbers"),
-    "sizes by value": (by_value, "graph.node", "can't be told"),
+    "sizes by value": (by_value, "graph.node", "can't be known"),
     "a huge kernel": (padded, "graph.node.kernel_shape", "beyond"),
     "shapes that do not fit": (mismatched, "graph", "do not fit"),
     "sparse weights": (sparse, "graph.node", "sparse"),
@@ -183,7 +185,7 @@ def test_what_fails_only_when_it_runs_is_a_policy_error(file, tmp_path):
 
 def test_more_observations_than_fit_at_once_are_run_in_parts(file, monkeypatch):
     whole = load_policy(file)
-    monkeypatch.setattr(onnx_sizes, "MOST_AT_ONCE", 3 * 30)
+    monkeypatch.setattr(onnx_graph, "MOST_AT_ONCE", 3 * 30)
     policy = load_policy(file)
     rows = np.random.default_rng(0).uniform(0.0, 1.0, (10, SECTORS + 6)).astype(np.float32)
     assert policy._rows_at_once < len(rows)
@@ -222,3 +224,55 @@ def test_a_long_name_is_not_told_whole(file, tmp_path):
     with pytest.raises(PolicyError) as refused:
         load_policy(path)
     assert len(str(refused.value)) < 600 + len(str(path))
+
+
+GRAPH, NODE, ATTRIBUTE, SUBGRAPH = 7, 1, 5, 6
+"""Numbers of the fields of onnx.proto."""
+
+
+def field(number: int, content: bytes) -> bytes:
+    size, length = len(content), b""
+    while size >= 0x80:
+        length, size = length + bytes([size & 0x7F | 0x80]), size >> 7
+    return bytes([number << 3 | 2]) + length + bytes([size]) + content
+
+
+def many() -> bytes:
+    return field(GRAPH, field(NODE, b"") * 3_000_000)
+
+
+def deep() -> bytes:
+    content = b""
+    for _ in range(MOST_NESTED):
+        content = field(NODE, field(ATTRIBUTE, field(SUBGRAPH, content)))
+    return field(GRAPH, content)
+
+
+def packed() -> bytes:
+    return field(GRAPH, field(5, field(1, bytes(MOST_PACKED + 1))))
+
+
+BAD = {
+    "millions of operators": (many, f"more than {MOST_PARTS} parts"),
+    "a graph in a graph in a graph": (deep, f"more than {MOST_NESTED} levels"),
+    "a million sizes": (packed, "'dims'"),
+    "a group": (lambda: b"\x0b\x0c", "no ONNX model"),
+    "an endless number": (lambda: b"\x08" + b"\xff" * 11, "no ONNX model"),
+    "cut off": (lambda: field(GRAPH, b"abc")[:-1], "cut off"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_grows_when_it_is_parsed_is_not_parsed(tmp_path, monkeypatch, name):
+    make, words = BAD[name]
+    path = tmp_path / "bad.onnx"
+    path.write_bytes(make())
+    monkeypatch.setattr(onnx, "load_model_from_string", lambda _: pytest.fail("it was parsed"))
+    with pytest.raises(PolicyError, match=words) as refused:
+        load_policy(path)
+    assert refused.value.field == "file"
+
+
+def test_policies_as_they_are_exported_have_few_parts():
+    for path in shipped().glob("*.onnx"):
+        check_wire(path.read_bytes())

@@ -3,10 +3,10 @@ from __future__ import annotations
 from importlib.util import find_spec
 
 import pytest
+from robots import direct_model
 
-from nics_drl_bridge.commands import demo_policy as learning
-from nics_drl_bridge.commands.demo_plan import DemoPlan
-from nics_drl_bridge.commands.demo_policy import learn, settings_of
+from nics_drl_bridge.commands import demo_run as learning
+from nics_drl_bridge.commands.demo_run import DemoPlan, learn, settings_of
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
@@ -20,7 +20,11 @@ def without_torch(monkeypatch):
     )
 
 
-@pytest.mark.parametrize("robot", ["ackermann", "differential", "mecanum"])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "robot", ["differential", *(pytest.param(name, marks=pytest.mark.campaign)
+                                for name in ("ackermann", "mecanum"))],
+)  # fmt: skip
 def test_without_the_extra_the_shipped_policy_of_the_robot_drives(tmp_path, without_torch, robot):
     pytest.importorskip("onnxruntime")
     said: list[str] = []
@@ -33,6 +37,7 @@ def test_without_the_extra_the_shipped_policy_of_the_robot_drives(tmp_path, with
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_without_the_extra_a_robot_without_a_shipped_policy_gets_a_baseline(
     tmp_path, without_torch
 ):
@@ -44,7 +49,7 @@ def test_without_the_extra_a_robot_without_a_shipped_policy_gets_a_baseline(
 
 
 def test_a_named_policy_is_taken_and_a_misspelt_one_refused(tmp_path):
-    model = builtin_model("differential")
+    model = direct_model()
     learned = learn(DemoPlan(tmp_path, policy="straight"), model, pytest.fail)
     assert learned.policy == "straight"
     with pytest.raises(ConfigError, match="unknown policy 'strait'; did you mean 'straight'"):

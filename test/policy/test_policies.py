@@ -12,14 +12,13 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.policy.evaluation import drive_all, successes
-from nics_drl_bridge.policy.evaluation_batch import drive_worlds
-from nics_drl_bridge.policy.planners import DynamicWindow
-from nics_drl_bridge.policy.policies import POLICIES, make_policy
+from nics_drl_bridge.policy.evaluation import drive_all, drive_worlds, successes
+from nics_drl_bridge.policy.policies import POLICIES, DynamicWindow, make_policy
 from nics_drl_bridge.robot.kinds import steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 ROBOTS = ("ackermann", "differential", "mecanum")
+campaign = pytest.mark.campaign
 
 
 def task_of(robot, **changes):
@@ -88,7 +87,11 @@ def test_random_actions_are_those_of_the_seed():
     assert not np.array_equal(first, one.act(seen))
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "robot", [pytest.param("ackermann", marks=campaign), "differential",
+              pytest.param("mecanum", marks=campaign)],
+)  # fmt: skip
 def test_the_planner_reaches_most_goals_where_straight_ones_collide(robot):
     env = BridgeVectorEnv(30, robot, "arena", max_episode_steps=200)
     share = {
@@ -99,7 +102,10 @@ def test_the_planner_reaches_most_goals_where_straight_ones_collide(robot):
     assert share["dynamic_window"] > share["straight"] > share["random"]
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "robot", ["ackermann", *(pytest.param(name, marks=campaign) for name in ROBOTS[1:])]
+)
 def test_the_planner_reaches_every_goal_of_the_empty_world(robot):
     env = BridgeEnv(model=robot, world="empty")
     policy = make_policy("dynamic_window", env.task)

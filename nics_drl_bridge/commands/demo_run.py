@@ -1,0 +1,411 @@
+"""The parts of the demo in sequence, and its report: one page with all results."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import astuple, dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, Say, Trial, drive_in
+from nics_drl_bridge.config import dump_yaml
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, PolicyError
+from nics_drl_bridge.files import write_text
+from nics_drl_bridge.generator import SimulatorModel, generate, save_model
+from nics_drl_bridge.identify.identify import Identified
+from nics_drl_bridge.lidar.spec import load_lidar
+from nics_drl_bridge.policy.evaluation import (
+    FIRST_SEED,
+    Episode,
+    Summary,
+    deviation,
+    drive_worlds,
+    successes,
+    summarise,
+)
+from nics_drl_bridge.policy.policies import open_policy, shipped_policies
+from nics_drl_bridge.policy.training_settings import TrainingSettings, load_training
+from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.recording.recording import save_recording
+from nics_drl_bridge.report.calibration_pictures import CAPTIONS, calibration_pictures
+from nics_drl_bridge.report.fit_pictures import accuracy
+from nics_drl_bridge.report.page import Block, Code, Picture, Table, page
+from nics_drl_bridge.report.pictures import Point, training_curve, trajectories
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
+from nics_drl_bridge.sim.scenes import sample_scene
+from nics_drl_bridge.sim.world import load_world
+
+RECORDING_SEED, TRAINING_SEED = 1, 0
+MANY = 500  # episodes of the evaluation in the fast simulator
+NEEDED = ("torch", "stable_baselines3", "tensorboard", "onnx", "onnxruntime")
+BASELINE = "dynamic_window"
+LINES = 10  # number of progress reports of a training
+START_S, ARRIVE_S = 60.0, 40.0  # time that a node may take to start, and the robot to arrive
+FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05
+"""Limits of the demo's gate: time from zero to the maximum command, and to its maximum rate."""
+IN_PROCESS, OVER_DDS = LABELS[FAST], LABELS[DDS]
+PANELS = 9  # maximum number of episodes that are drawn
+
+
+@dataclass(frozen=True)
+class DemoPlan:
+    """Plan of a demo."""
+
+    out: Path  # output folder
+    robot: str = "differential"  # name or YAML file, as the world
+    world: str = "arena"
+    recording: Path | None = None  # of a drive; None makes one with the robot's textbook kinematics
+    episodes: int = 5  # number of episodes, in process and again over DDS
+    policy: str | None = None  # a policy file or a name, to drive with instead of training one
+    train_steps: int | None = None  # environment steps of the training; None: as in `demo.yaml`
+
+    @property
+    def model(self) -> Path:
+        """Folder of the generated simulator."""
+        return self.out / "model"
+
+    @property
+    def policy_file(self) -> Path:
+        """Path of the trained policy."""
+        return self.out / "policy.onnx"
+
+
+@dataclass(frozen=True)
+class Learned:
+    """The policy of the demo by file or name, its origin in a sentence, and its training curve."""
+
+    policy: str
+    how: str
+    curve: Sequence[Point] = ()
+
+
+@dataclass(frozen=True)
+class Live:
+    """A drive of the deployed nodes, with its path; `arrived` is True if it reached the goal."""
+
+    arrived: bool
+    path: Episode
+
+
+@dataclass(frozen=True)
+class DemoResults:
+    """All results of the demo; `here` and `there` are the same episodes in process and over DDS."""
+
+    model: SimulatorModel
+    identified: Identified
+    learned: Learned
+    summary: Summary  # of the policy's many episodes in the fast simulator
+    here: Sequence[Episode]
+    there: Sequence[Episode]
+    live: Live
+    took: dict[str, float]  # part of the demo -> wall time [s]
+
+
+def run(plan: DemoPlan, say: Say) -> str:
+    """Generates a simulator, trains a policy in it, drives it over DDS, and writes the report.
+
+    Every process that this starts has ended when it returns or raises.
+
+    Returns:
+        The last line of the demo: successes in process and over DDS, and the path of the report.
+
+    Raises:
+        BridgeError: a bad recording or name, or a node that does not start.
+    """
+    if find_spec("rclpy") is None:
+        raise ConfigError(f"the demo {MISSING_ROS.format(module='rclpy')}")
+    took: dict[str, float] = {}
+
+    @contextmanager
+    def part(name: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        took[name] = time.perf_counter() - begin
+        say(f"  {name} took {took[name]:.0f} s")
+
+    with part("generating"):
+        model, identified = _generate(plan, say)
+    with part("learning"):
+        learned = learn(plan, model, say)
+    with part("evaluating"):
+        summary = _evaluate(plan, model, learned.policy, say)
+    with part("driving in process"):
+        here = _drive(FAST, f"driving {plan.episodes} episodes", plan, learned.policy, say)
+    with part("driving over DDS"):
+        there = _drive(DDS, f"driving the same {plan.episodes} episodes", plan, learned.policy, say)
+    with part("deploying"):
+        arrived = (episode.seed for episode in there if episode.result == "success")
+        live = _deploy(plan, model, learned.policy, next(arrived, 0), say)
+    results = DemoResults(model, identified, learned, summary, here, there, live, took)
+    file = plan.out / "report.html"
+    write_text(file, report(plan, results))
+    return (
+        f"demo: in process {successes(here)}/{plan.episodes}, "
+        f"over DDS {successes(there)}/{plan.episodes}, report {file}"
+    )
+
+
+def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
+    robot, world = load_robot(plan.robot), load_world(plan.world)
+    source = plan.recording or plan.out / "recording.npz"
+    if plan.recording is None:
+        say(f"recording a drive of the textbook {robot.name!r} robot")
+        save_recording(textbook.record(robot, np.random.default_rng(RECORDING_SEED)), source)
+    say(f"generating a simulator of the robot {robot.name!r} from {source}")
+    recording = read_recording(source, robot)
+    # The demo has to steer even if the drive never did; the report names the assumptions.
+    model, identified = generate(recording, robot, load_lidar("paper"), world.shapes, assume=True)
+    save_model(model, plan.model)
+    say(model.report.rstrip())
+    return model, identified
+
+
+def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
+    """Trains a policy, unless the plan names one or a module for training is not installed.
+
+    Raises BridgeError if the named policy can't be used, or the settings do not fit.
+    """
+    if plan.policy is not None:
+        open_policy(plan.policy, model)
+        return Learned(plan.policy, f"The policy {plan.policy!r} was given; none was trained.")
+    missing = next((module for module in NEEDED if find_spec(module) is None), None)
+    if missing is None:
+        return _trained(plan, say)
+    policy = _ready_made(model)
+    say(
+        f"not training, which needs the module {missing!r} (pip install "
+        f"'nics_drl_bridge[train,deploy]'); driving with the policy {policy!r} instead"
+    )
+    return Learned(policy, f"None was trained, as {missing!r} is not installed: {policy!r} drives.")
+
+
+def settings_of(plan: DemoPlan) -> TrainingSettings:
+    """Settings of the demo's training, in the plan's simulator and world."""
+    chosen = load_training("demo")
+    changes = {
+        "robot": str(plan.model),
+        "worlds": {plan.world: chosen.num_envs},
+        "steps": plan.train_steps or chosen.steps,
+    }
+    return chosen.model_copy(update=changes)
+
+
+def _trained(plan: DemoPlan, say: Say) -> Learned:
+    from nics_drl_bridge.policy.train import SeedResult, export, train  # needs torch
+
+    settings, curve = settings_of(plan), list[Point]()
+    say(f"training a policy for {settings.steps:,} steps in {settings.num_envs} worlds at once")
+
+    def tell(progress: Any) -> None:
+        before = curve[-1].steps if curve else 0
+        curve.append(Point(progress.steps, progress.success, progress.collision))
+        if progress.steps * LINES // settings.steps > before * LINES // settings.steps:
+            say(
+                f"  {progress.steps:,} steps: success {100 * progress.success:.1f} %, "
+                f"{progress.steps_per_s:,.0f} steps/s"
+            )
+
+    trained = train(settings, TRAINING_SEED, plan.out / "training", tell)
+    result = SeedResult(TRAINING_SEED, trained, {})
+    export(settings, result, f"nics demo --robot {plan.robot}", plan.policy_file)
+    steps = f"{trained.steps:,} steps, {trained.stepping_s:.0f} s of {trained.wall_s:.0f} s"
+    how = f"PPO learned it from nothing in the generated simulator: {steps} in the simulator."
+    return Learned(str(plan.policy_file), how, curve)
+
+
+def _ready_made(model: SimulatorModel) -> str:
+    """The shipped policy of the robot if it fits, else a baseline."""
+    name = model.robot.name
+    if name in shipped_policies() and find_spec("onnxruntime") and find_spec("onnx"):
+        try:
+            open_policy(name, model)
+        except PolicyError:
+            return BASELINE
+        return name
+    return BASELINE
+
+
+def _evaluate(plan: DemoPlan, model: SimulatorModel, name: str, say: Say) -> Summary:
+    """Drives many unseen episodes at once, without the estimator."""
+    say(f"evaluating {name} in {MANY} unseen episodes, all at once")
+    policy, task = open_policy(name, model)
+    env = BridgeVectorEnv(MANY, model, plan.world, task)
+    outcomes = drive_worlds(env, policy.act, range(FIRST_SEED, FIRST_SEED + MANY))
+    summary = summarise(outcomes, model.control_period)
+    rates = (summary.success, summary.collision, summary.time_out)
+    named = zip(("success", "collision", "time-out"), rates, strict=True)
+    say("  " + ", ".join(f"{word} {100 * rate.value:.1f} %" for word, rate in named))
+    return summary
+
+
+def _drive(place: str, what: str, plan: DemoPlan, policy: str, say: Say) -> list[Episode]:
+    """Drives the plan's episodes in one of `episodes.PLACES` and reports each."""
+    say(f"{what} {'in process' if place == FAST else 'over DDS in lock-step'}")
+    return drive_in(
+        place,
+        Trial(policy, str(plan.model), plan.world, range(plan.episodes), plan.out / "logs" / place),
+        lambda e: say(f"  seed {e.seed}: {e.result}, {e.steps} steps, {e.length:.2f} m"),
+        say,
+    )
+
+
+def _deploy(plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: Say) -> Live:
+    """Runs the nodes of a robot in real time, each in its own process, in the scene of a seed.
+
+    Raises BackendError if a node does not start, or ends.
+    """
+    scene = sample_scene(load_world(plan.world), model.robot.footprint_radius, seed)
+    goal = [float(value) for value in scene.goals[0]]
+    folder = str(plan.model)
+    nodes: dict[str, dict[str, Any]] = {
+        "simulator_node": {"model": folder, "world": plan.world, "episode_seed": seed},
+        "middleware_node": {"model": folder},
+        "command_gate": {
+            "model": folder,
+            "use_sim_time": True,
+            "e_stop_required": False,
+            "limits": str(_write_limits(model.robot, plan.out / "limits.yaml")),
+            "black_box": str(plan.out / "black_box"),
+        },
+        "policy_node": {"model": folder, "policy": policy, "goal": goal},
+    }
+    say(f"deploying {', '.join(nodes)} in real time")
+    # The policy stops where it believes the goal is; its odometry drifts.
+    near = Navigation(model.robot, model.lidar).goal_radius + 0.1
+    arrived, path = _watched(nodes, plan.out / "logs" / "realtime", goal, near, say)
+    say(f"  the deployed nodes {'reached' if arrived else 'did not reach'} the goal of seed {seed}")
+    result = "success" if arrived else "time-out"
+    return Live(arrived, Episode(seed, result, path, path, scene.goals[0], scene.bodies, 0.0))
+
+
+def _watched(
+    nodes: dict[str, dict[str, Any]], logs: Path, goal: list[float], near: float, say: Say
+) -> tuple[bool, Any]:
+    """Starts the nodes, arms the gate, waits; returns arrival and the robot's path (T, 3)."""
+    from nics_drl_bridge.nodes.processes import NodeProcess, Witness, free_domain_id
+
+    domain_id = free_domain_id()
+    with ExitStack() as stack:
+        witness = stack.enter_context(Witness(domain_id))
+        processes = []
+        for node, parameters in nodes.items():
+            processes.append(stack.enter_context(NodeProcess(node, logs, parameters, domain_id)))
+            if node == "simulator_node" and not witness.sees(START_S):
+                processes[0].check()
+                raise BackendError(
+                    f"{node} publishes nothing after {START_S:g} s; look at its log, "
+                    f"{processes[0].log}."
+                )
+        refused = witness.arms("command_gate", START_S)
+        for process in processes:
+            process.check()
+        if refused:
+            raise BackendError(f"command_gate can't be armed: {refused}")
+        say("  command_gate is armed; no emergency stop is required of a simulation")
+        arrived = witness.arrives(goal, near, ARRIVE_S)
+        for process in processes:
+            process.check()
+        return arrived, witness.path
+
+
+def _write_limits(robot: RobotSpec, path: Path) -> Path:
+    """Writes limits that allow a simulated robot all its commands, with limited rate and jerk."""
+    commands = {}
+    for variable in robot.command:
+        low, high = min(variable.min, 0.0), max(variable.max, 0.0)
+        rate = max(-low, high) / FULL_COMMAND_S
+        jerk = rate / FULL_RATE_S
+        commands[variable.name] = {"min": low, "max": high, "rate": rate, "jerk": jerk}
+    write_text(path, dump_yaml({"robot": robot.name, "commands": commands}))
+    return path
+
+
+def report(plan: DemoPlan, results: DemoResults) -> str:
+    """Builds the page, as HTML."""
+    took = {**results.took, "all": sum(results.took.values())}
+    times = [(part, f"{seconds:.0f}") for part, seconds in took.items()]
+    sections: list[tuple[str, Sequence[Block]]] = [
+        ("The model", _model(plan, results)),
+        ("The policy", _policy(plan, results)),
+        ("The same episodes, in process and over DDS", _episodes(plan, results)),
+        ("Deployed", _deployed(plan, results)),
+        ("Time", [Table(("part", "wall time [s]"), times)]),
+    ]
+    policy = results.learned.policy
+    lead = f"Robot {results.model.robot.name!r} in the world {plan.world!r}, policy {policy!r}."
+    return page("nics_drl_bridge: demo", lead, sections)
+
+
+def _model(plan: DemoPlan, results: DemoResults) -> list[Block]:
+    calibrated = calibration_pictures(results.model.robot, results.identified)
+    return [
+        f"Generated from {plan.recording or 'a textbook drive'}.",
+        Code(results.model.report),
+        Picture(
+            accuracy(results.identified),
+            "What each further term is worth; circles mark how many are kept.",
+        ),
+        *(Picture(picture, CAPTIONS[name]) for name, picture in calibrated.items()),
+    ]
+
+
+def _policy(plan: DemoPlan, results: DemoResults) -> list[Block]:
+    blocks: list[Block] = [results.learned.how]
+    if results.learned.curve:
+        caption = "Success and collisions while it explores; all episodes are new ones."
+        blocks.append(Picture(training_curve(results.learned.curve), caption))
+    summary = results.summary
+    shares = (summary.success, summary.collision, summary.time_out)
+    rows = [
+        (name, *(f"{100 * value:.1f} %" for value in astuple(share)))
+        for name, share in zip(("success", "collision", "time-out"), shares, strict=True)
+    ]
+    for name, amount in (("path [m]", summary.length), ("time [s]", summary.time)):
+        rows.append((name, *(f"{value:.2f}" for value in astuple(amount))))
+    text = (
+        f"{summary.episodes} unseen episodes in the world {plan.world!r}, side by side in the fast "
+        "simulator, the policy at its best; path and time are means of the successful ones."
+    )
+    return [*blocks, text, Table(("", "value", "95 % from", "to"), rows)]
+
+
+def _episodes(plan: DemoPlan, results: DemoResults) -> list[Block]:
+    here, there = results.here, results.there
+    rows = [
+        (
+            str(a.seed), a.result, f"{a.steps}", f"{a.length:.2f}", b.result, f"{b.steps}",
+            f"{b.length:.2f}", f"{deviation(a, b):.1g}",
+        )
+        for a, b in zip(here, there, strict=True)
+    ]  # fmt: skip
+    head = ("seed", IN_PROCESS, "steps", "path [m]", OVER_DDS, "steps", "path [m]", "deviation [m]")
+    runs = {IN_PROCESS: here[:PANELS], OVER_DDS: there[:PANELS]}
+    both = trajectories(runs, load_world(plan.world), results.model.robot.footprint_radius)
+    return [
+        f"{successes(here)} of {len(here)} episodes reached the goal in process, "
+        f"{successes(there)} of {len(there)} over DDS in lock-step. Deviation is the "
+        "greatest distance between the two true paths at the same step.",
+        Table(head, rows),
+        Picture(both, "Blue: in process. Red, dashed: over DDS."),
+    ]
+
+
+def _deployed(plan: DemoPlan, results: DemoResults) -> list[Block]:
+    live = results.live
+    beside = [episode for episode in results.here if episode.seed == live.path.seed]
+    runs = {IN_PROCESS: beside, "deployed": [live.path]}
+    drawn = trajectories(runs, load_world(plan.world), results.model.robot.footprint_radius)
+    return [
+        "simulator_node in real time, middleware_node, policy_node and command_gate ran as "
+        "processes of their own; nobody stepped them. The robot "
+        f"{'reached' if live.arrived else 'did not reach'} its goal.",
+        Picture(drawn, "The true path of the deployed robot beside the lock-step one."),
+    ]

@@ -1,0 +1,31 @@
+"""`nics` as a user calls it, in this process: without the seconds that an interpreter takes."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+from unittest import mock
+
+from nics_drl_bridge.commands.cli import main
+
+
+def nics(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Exit code and output of a command in a folder."""
+    argv, out, err, here = ["nics", *map(str, words)], io.StringIO(), io.StringIO(), os.getcwd()
+    os.chdir(cwd)
+    try:
+        with (
+            mock.patch.object(sys, "argv", argv),
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+        ):
+            main()
+    except SystemExit as end:
+        return subprocess.CompletedProcess(argv, end.code, out.getvalue(), err.getvalue())
+    finally:
+        os.chdir(here)
+    raise AssertionError("a command ends with an exit code")
