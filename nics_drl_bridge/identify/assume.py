@@ -22,15 +22,8 @@ def assume_textbook(
 
     A fit at a constant input is a section through the whole model: `wz = c speed`, measured at
     the steering angle s0, becomes `wz = (c/s0) speed*steering`. At s0 = 0 the section shows
-    nothing of the input's effect, so the coefficient comes from the spec's parameters.
-
-    Args:
-        model: fitted to a drive.
-        spec: names the textbook kinematics and holds their parameters.
-        unmoved: variables of X that the drive never moved.
-
-    Returns:
-        The model, with the new terms listed in `assumed`, and a sentence per change.
+    nothing of the input's effect, so the coefficient comes from the spec's parameters. The model
+    lists the new terms in `assumed`; a sentence is returned per change.
 
     Raises:
         ConfigError: the spec names no textbook kinematics.

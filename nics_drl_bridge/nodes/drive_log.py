@@ -12,7 +12,7 @@ from sensor_msgs.msg import JointState
 
 from nics_drl_bridge.errors import BackendError, RecordingError
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.recording.joints import JointMessage, Joints, gather, state_of, wheels_of
+from nics_drl_bridge.recording.bag_reader import JointMessage, Joints, gather, state_of, wheels_of
 from nics_drl_bridge.recording.messages import imu_row, pose_row, stamp, twist_row
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.recording.stamping import TopicData, streams

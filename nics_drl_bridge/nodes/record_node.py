@@ -30,8 +30,7 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.drive_log import DriveLog
 from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import EXIT_BAD_INPUT, declare, last_word, run_node
-from nics_drl_bridge.recording.drive_plan import DrivePlan
-from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S
+from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.recording.topic_roles import TopicRoles, topic_roles
 from nics_drl_bridge.recording.write import check_out, write_drive

@@ -11,8 +11,7 @@ from identify.drives import drive
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify import drive as prepared
 from nics_drl_bridge.identify.drive import Drive, Settings
-from nics_drl_bridge.identify.findings import Findings
-from nics_drl_bridge.identify.identify import STAGES, begun, identify, run
+from nics_drl_bridge.identify.identify import STAGES, Findings, begun, identify, run
 from nics_drl_bridge.robot.spec import RobotSpec
 
 NAMES = tuple(stage.__name__ for stage in STAGES)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.recording.drive_plan import DrivePlan
+from nics_drl_bridge.recording.excite import DrivePlan
 from nics_drl_bridge.robot.spec import load_robot
 
 CAR = load_robot("ackermann")

@@ -6,8 +6,13 @@ from robots import DIRECT
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.excitation import commands_together, levels, unmoved_variables
-from nics_drl_bridge.recording.drive_plan import DrivePlan
-from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, Exploration, expected_motion
+from nics_drl_bridge.recording.excite import (
+    PERIOD_S,
+    STILL_S,
+    DrivePlan,
+    Exploration,
+    expected_motion,
+)
 from nics_drl_bridge.recording.recording import samples_on_one_clock
 from nics_drl_bridge.robot.spec import load_robot
 

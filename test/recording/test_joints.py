@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.recording.joints import JointMessage, gather, state_of, wheels_of
+from nics_drl_bridge.recording.bag_reader import JointMessage, gather, state_of, wheels_of
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
 

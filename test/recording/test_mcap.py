@@ -13,10 +13,9 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.extras.bags.salvage import salvage
-from nics_drl_bridge.recording import messages, packing
+from nics_drl_bridge.recording import mcap, messages
 from nics_drl_bridge.recording.bag_file import opened
-from nics_drl_bridge.recording.mcap import MAGIC, PREFIX, DamageError, records, seal
-from nics_drl_bridge.recording.mcap_check import check_mcap
+from nics_drl_bridge.recording.mcap import MAGIC, PREFIX, DamageError, check_mcap, records, seal
 
 TWIST, COUNT = "geometry_msgs/msg/Twist", 200
 DATA = b"\x00\x01\x00\x00" + struct.pack("<6d", 1.0, 0.0, 0.0, 0.0, 0.0, 0.5)
@@ -113,7 +112,7 @@ def test_a_record_that_is_shorter_than_its_fields_is_refused(record, said):
 def test_a_chunk_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
     """Also in a file without summary, whose chunks rosbags unpacks when it opens it."""
     path = written(tmp_path / "drive.mcap", size=2**22, data=DATA + bytes(2**14), **FORMS["zstd"])
-    monkeypatch.setattr(packing, "MOST_UNPACKED", 2**20)
+    monkeypatch.setattr(mcap, "MOST_UNPACKED", 2**20)
     for data in (path.read_bytes(), without_summary(path.read_bytes())):
         path.write_bytes(data)
         with pytest.raises(RecordingError, match="more than 1048576 bytes"), opened(path):
@@ -125,7 +124,7 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(tmp_p
 
 def packed_as_a_whole(folder, data):
     folder.mkdir(exist_ok=True)
-    (folder / "drive.mcap.zstd").write_bytes(packing._zstd().compress(data))
+    (folder / "drive.mcap.zstd").write_bytes(mcap._zstd().compress(data))
     about = {"compression_mode": "FILE", "relative_file_paths": ["drive.mcap.zstd"]}
     text = yaml.safe_dump({"rosbag2_bagfile_information": about})
     (folder / "metadata.yaml").write_text(text, encoding="utf-8")

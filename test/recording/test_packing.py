@@ -6,10 +6,10 @@ pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 
 import lz4.frame
 
-from nics_drl_bridge.recording import packing
-from nics_drl_bridge.recording.packing import check_message, unpack, unpack_file
+from nics_drl_bridge.recording import mcap
+from nics_drl_bridge.recording.mcap import check_message, unpack, unpack_file
 
-ZSTD = packing._zstd()
+ZSTD = mcap._zstd()
 PACK = {"zstd": ZSTD.compress, "lz4": lz4.frame.compress}
 PLAIN = bytes(range(256)) * 40
 
@@ -24,7 +24,7 @@ def test_what_was_packed_comes_out(kind):
 def test_more_than_was_said_or_is_allowed_is_refused(kind, monkeypatch):
     with pytest.raises(ValueError, match="more than 10239 bytes"):
         unpack(PACK[kind](PLAIN), kind, len(PLAIN) - 1)
-    monkeypatch.setattr(packing, "MOST_UNPACKED", 1000)
+    monkeypatch.setattr(mcap, "MOST_UNPACKED", 1000)
     with pytest.raises(ValueError, match="more than 1000 bytes"):
         unpack(PACK[kind](PLAIN), kind, 10**18)
 
@@ -38,7 +38,7 @@ def test_what_is_cut_off_is_refused(kind):
 def test_a_file_of_zeros_that_unpacks_to_thousands_of_times_its_length_is_refused(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(packing, "MOST_UNPACKED", 2**20)
+    monkeypatch.setattr(mcap, "MOST_UNPACKED", 2**20)
     path = tmp_path / "bag.db3.zst"
     path.write_bytes(ZSTD.compress(bytes(2**26)))
     with pytest.raises(ValueError, match="1000 times"):
@@ -49,6 +49,6 @@ def test_a_file_of_zeros_that_unpacks_to_thousands_of_times_its_length_is_refuse
 
 def test_a_message_has_to_say_how_long_it_is(monkeypatch):
     check_message(ZSTD.compress(PLAIN))
-    monkeypatch.setattr(packing, "MOST_UNPACKED", 1000)
+    monkeypatch.setattr(mcap, "MOST_UNPACKED", 1000)
     with pytest.raises(ValueError, match="10240 bytes"):
         check_message(ZSTD.compress(PLAIN))

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from nics_drl_bridge.recording.drive_plan import DrivePlan
+from nics_drl_bridge.recording.excite import DrivePlan
 from nics_drl_bridge.report.pictures import drive_picture
 from nics_drl_bridge.robot.spec import load_robot
 

@@ -15,65 +15,43 @@ from nics_drl_bridge.recording.stamping import MAX_WANDER_S, SAME_CLOCK_S
 
 Nanoseconds = NDArray[np.int64]
 
-GAP = 3.0
-"""A silence longer than this many usual periods is a gap."""
+GAP = 3.0  # a silence longer than this many usual periods is a gap
 NO_HEADER, UNSTAMPED, UNKNOWN = "no header", "never stamped", "unknown type"
 RECORDER, FOREIGN, SEVERAL = "recorder's", "another", "several"
 
 
 @dataclass(frozen=True)
 class BagTopic:
-    """A topic of a bag.
+    """A topic of a bag."""
 
-    Attributes:
-        topic: its name.
-        type: of its messages.
-        count: number of messages.
-        rate_hz: inverse of the median time between receipts [Hz]; None for fewer than two
-            messages.
-        first_s, last_s: receipt of the first and last message, from the start of the bag [s].
-        gaps: number of silences of more than three usual periods.
-        longest_gap_s: longest time between two messages [s].
-        clock: of the header stamps: the recorder's, another one or several; otherwise why there
-            are no stamps.
-        delay_s: median of receipt minus stamp [s]; None without stamps.
-        jitter_s: from the 5 % to the 95 % quantile of that delay [s].
-        backwards: number of stamps earlier than their predecessor.
-    """
-
-    topic: str
-    type: str
-    count: int
+    topic: str  # its name
+    type: str  # of its messages
+    count: int  # number of messages
+    # inverse of the median time between receipts [Hz]; None for fewer than two messages
     rate_hz: float | None = None
+    # first_s, last_s: receipt of the first and last message, from the start of the bag [s]
     first_s: float | None = None
     last_s: float | None = None
-    gaps: int = 0
-    longest_gap_s: float | None = None
+    gaps: int = 0  # number of silences of more than three usual periods
+    longest_gap_s: float | None = None  # longest time between two messages [s]
+    # of the header stamps: the recorder's, another one or several; otherwise why there are no
+    # stamps
     clock: str = UNKNOWN
-    delay_s: float | None = None
-    jitter_s: float | None = None
-    backwards: int = 0
+    delay_s: float | None = None  # median of receipt minus stamp [s]; None without stamps
+    jitter_s: float | None = None  # from the 5 % to the 95 % quantile of that delay [s]
+    backwards: int = 0  # number of stamps earlier than their predecessor
 
 
 @dataclass(frozen=True)
 class BagInfo:
-    """Contents of a bag.
+    """Contents of a bag."""
 
-    Attributes:
-        path: of the bag.
-        size_bytes: of all its files.
-        start_ns: receipt of the first message, on the recorder's clock [ns].
-        duration_s: from that to the receipt of the last message [s].
-        messages: number of messages.
-        topics: by name.
-    """
-
-    path: str
-    size_bytes: int
-    start_ns: int
-    duration_s: float
-    messages: int
-    topics: tuple[BagTopic, ...]
+    path: str  # of the bag
+    size_bytes: int  # of all its files
+    start_ns: int  # receipt of the first message, on the recorder's clock [ns]
+    duration_s: float  # from that to the receipt of the last message [s]
+    messages: int  # number of messages
+    topics: tuple[BagTopic, ...]  # by name
 
 
 def bag_info(path: str | Path) -> BagInfo:
