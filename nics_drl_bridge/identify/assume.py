@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.kinds import Textbook, textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
-
-Array = NDArray[np.float64]
 
 MIN_OPERATING_POINT = 1e-3
 DIFFERENCE = 1e-4

@@ -11,11 +11,10 @@ from pydantic import AllowInfNan, NonNegativeFloat
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import MAX_GAP_S, MIN_STAMPS, Drive
 from nics_drl_bridge.identify.signals import held, inferred_states, resample, unwrapped
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
-
-Array = NDArray[np.float64]
 
 STEP_S = 0.01  # step of the samples where the pose's own step is not usable
 STEP_RANGE_S = (0.002, 0.02)

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import signals
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import MIN_STAMPS, Drive, TwistIntervals
@@ -28,7 +28,6 @@ from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
 Target = tuple[Array, Array, Array]  # start (n,), end (n,) of intervals, a signal's means (n, K)
 
 STEP_S = 0.01

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.fit import ALPHA, ORDER, Alpha
 from nics_drl_bridge.identify.signals import DIFFERENCE, DIFFERENCE_GAIN, GAUSSIAN_MAD, unwrapped
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import RobotSpec
-
-Array = NDArray[np.float64]
 
 MIN_STAMPS = 20
 BURSTY = 5.0  # in bursts the mean interval is more than this many times the 30th percentile

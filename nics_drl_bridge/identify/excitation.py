@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from nics_drl_bridge.errors import FitError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.signals import GAUSSIAN_MAD, white_noise
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 from nics_drl_bridge.robot.spec import RobotSpec
-
-Array = NDArray[np.float64]
 
 STILL = 1e-3  # a variable whose spread is below this share of its range did not move
 NOISE_ONLY = 1.5  # nor did a state below this multiple of its noise whose command did not move

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.excitation import (
     Excitation,
     independent_columns,
@@ -40,7 +41,6 @@ from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.threads import one_blas_thread
 
-Array = NDArray[np.float64]
 Alpha = float | Literal["auto"]
 
 ALPHA: Alpha = 0.99

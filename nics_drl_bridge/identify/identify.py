@@ -13,9 +13,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from nics_drl_bridge.errors import FitError, RecordingError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import verdict
 from nics_drl_bridge.identify.assume import assume_textbook
-from nics_drl_bridge.identify.calibration import Array, Calibration, align
+from nics_drl_bridge.identify.calibration import Calibration, align
 from nics_drl_bridge.identify.clocks import (
     SEARCH_S,
     TimingEstimate,

@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.geometry import rotate, wrap_angle
+from nics_drl_bridge.geometry import Array, rotate, wrap_angle
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import (
     LONG_STEP,
@@ -27,8 +27,6 @@ from nics_drl_bridge.identify.drive import Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import followed, held
 from nics_drl_bridge.identify.statistics import standard_errors
 from nics_drl_bridge.recording.recording import Stream
-
-Array = NDArray[np.float64]
 
 TURN_SCALE_M = 0.2  # a yaw rate counts as the speed at this distance
 DISTINCT = 4.0  # the second direction of motion must exceed the noise by this factor

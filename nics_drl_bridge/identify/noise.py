@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, find_bursts, pose_noise
 from nics_drl_bridge.identify.open_loop import (
@@ -27,8 +27,6 @@ from nics_drl_bridge.identify.signals import white_noise
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.noise import ASSUMED_STATE_DRIFT, MEASURED, Level, Noise, assumed
 from nics_drl_bridge.robot.taylor import TaylorModel
-
-Array = NDArray[np.float64]
 
 HORIZON_S = 1.0
 SPACING_S = 0.25

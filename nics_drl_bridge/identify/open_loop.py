@@ -9,14 +9,13 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, states_at
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.kernels import follow
 from nics_drl_bridge.identify.signals import followed, held
 from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
 from nics_drl_bridge.robot.taylor import TaylorModel
-
-Array = NDArray[np.float64]
 
 HORIZON_S = 5.0
 SPACING_S = 0.1

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import (
@@ -30,7 +31,6 @@ from nics_drl_bridge.identify.statistics import clustered_errors, minimise, unce
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Errors = Mapping[str, Mapping[str, float]]
 

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.signals import interval_means
 from nics_drl_bridge.identify.statistics import unexplained
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import RobotSpec, Variable
-
-Array = NDArray[np.float64]
 
 NEIGHBOURS = 3  # a jump is measured by the median difference from this many samples on either side
 STEPS = 6.0  # it is larger than this many usual changes from sample to sample,

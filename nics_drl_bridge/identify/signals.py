@@ -7,11 +7,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.signal import lfilter
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
-
-Array = NDArray[np.float64]
 
 SMOOTHING_BATCH = 64
 DEFAULT_LAG_S = 0.1

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import least_squares
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.taylor import TaylorModel
-
-Array = NDArray[np.float64]
 
 UNLIKE = 0.05  # correlation below which residuals are assumed to be independent
 LONGEST = 0.1  # longest correlation of residuals, as a share of the rows

@@ -7,9 +7,9 @@ from dataclasses import replace
 from math import isfinite
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import FitError, RecordingError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import TimingEstimate
 from nics_drl_bridge.identify.drive import Drive
@@ -22,8 +22,6 @@ from nics_drl_bridge.identify.statistics import errors_of
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import Quality, TaylorModel
-
-Array = NDArray[np.float64]
 
 MIN_ROWS = 20
 FEW_LEVELS = 2

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import RecordingError, nearest
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.recording import topic_roles as roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
@@ -35,8 +35,6 @@ from nics_drl_bridge.recording.stamping import SAME_CLOCK_S, Nanoseconds, TopicD
 from nics_drl_bridge.recording.topic_roles import JointSource, TopicRoles
 from nics_drl_bridge.robot.noise import Delay, Latency
 from nics_drl_bridge.robot.spec import RobotSpec, StateVariable
-
-Array = NDArray[np.float64]
 
 QUATERNION_TOLERANCE = 0.05
 SCAN = "sensor_msgs/msg/LaserScan"

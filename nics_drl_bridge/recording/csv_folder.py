@@ -6,13 +6,11 @@ import csv
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import SLOWEST_SAMPLING_S, Recording, Stream
-
-Array = NDArray[np.float64]
 
 COLUMNS = {
     "cmd.csv": ("linear.x", "angular.z", "time [s]"),

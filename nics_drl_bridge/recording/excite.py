@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.messages import POSITION_UNITS
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.seeds import checked_seeds
-
-Array = NDArray[np.float64]
 
 PERIOD_S = 0.05
 STILL_S = 1.0  # standstill at both ends of a drive [s]

@@ -27,10 +27,10 @@ from nics_drl_bridge.files import (
     sha256,
     write_bytes,
 )
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.noise import Latency
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
 FORMAT = "nics_drl_bridge/recording/3"
 COMMENT_FORMAT = "nics_drl_bridge/recording/2"  # checksum in the comment of the archive
 UNSEALED_FORMAT = "nics_drl_bridge/recording/1"  # without checksum; both can still be read

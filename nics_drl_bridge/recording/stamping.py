@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.recording.topic_roles import Stamps
 
-Array = NDArray[np.float64]
 Nanoseconds = NDArray[np.int64]
 
 RECEIVE, HEADER = "receive", "header"

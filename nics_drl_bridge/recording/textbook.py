@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.kinds import Textbook, textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
 INTEGRATION_STEP_S = 1e-3
 
 

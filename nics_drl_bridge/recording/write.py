@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.files import check_above, sync_folder
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.recording.messages import (
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from rosbags.rosbag2 import Writer
     from rosbags.typesys.store import Typestore
 
-Array = NDArray[np.float64]
 Make = Callable[[Any, Array], Any]
 Storage = Literal["mcap", "sqlite3"]
 

@@ -22,7 +22,7 @@ def delays(count, seed=0):
 
 def drive(path, ahead=0.0, sweep=0.0, scans=300):
     """A drive whose scans come LEAST_S to JITTER_S more after they were measured."""
-    times = bags.times(0.1)[:scans]
+    times = bags.times(0.1, 30.0)[:scans]
     topics = bags.drive() | {
         "/odom": [(t + 0.003, bags.odometry(t, *bags.place_at(t))) for t in bags.times(0.05)],
         "/scan": [
