@@ -9,16 +9,19 @@ from __future__ import annotations
 
 import sqlite3
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from nics_drl_bridge.config import no_device, parse_yaml, read_text
 from nics_drl_bridge.errors import LONGEST_NAME, BridgeError, RecordingError, shortened
-from nics_drl_bridge.recording.messages import Offer, check_libraries, offers_of, typestore
+from nics_drl_bridge.recording.messages import Offer, check_libraries, offers_of, stamp, typestore
+from nics_drl_bridge.recording.stamping import Nanoseconds
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -219,6 +222,14 @@ def _counts(reader: Any) -> Counter[tuple[str, str]]:
     for connection in reader.connections:
         counts[connection.topic, connection.msgtype] += connection.msgcount
     return counts
+
+
+def times_of(messages: Sequence[Message]) -> tuple[Nanoseconds, Nanoseconds | None]:
+    """Returns times of receipt and header stamps (T,) [ns]; None if there are no headers."""
+    receive = np.array([m.receive_ns for m in messages], dtype=np.int64)
+    if not messages or not hasattr(messages[0].content, "header"):
+        return receive, None
+    return receive, np.array([stamp(m.content) for m in messages], dtype=np.int64)
 
 
 class BagFile:

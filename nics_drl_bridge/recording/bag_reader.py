@@ -17,7 +17,7 @@ from nics_drl_bridge.errors import RecordingError, nearest
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.recording import topic_roles as roles
-from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
+from nics_drl_bridge.recording.bag_file import BagFile, Message, opened, times_of
 from nics_drl_bridge.recording.messages import (
     POSITION_UNITS,
     WHEELS,
@@ -80,10 +80,7 @@ def _table(
     bag: BagFile, topic: str, messages: Sequence[Message], row: Callable[[Any], Row]
 ) -> TopicData:
     """Converts a topic's messages to rows."""
-    receive = np.array([m.receive_ns for m in messages], dtype=np.int64)
-    header = None
-    if hasattr(messages[0].content, "header"):
-        header = np.array([stamp(m.content) for m in messages], dtype=np.int64)
+    receive, header = times_of(messages)
     values = np.array([row(m.content) for m in messages], dtype=np.float64)
     for k in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
         raise RecordingError(
@@ -303,11 +300,12 @@ def _delay(messages: Sequence[Message]) -> Delay | None:
     """Fits a uniform distribution to the delays of stamped messages."""
     if len(messages) < LEAST_MESSAGES:
         return None
-    stamps = np.array([stamp(m.content) for m in messages], dtype=np.int64)
-    late = (np.array([m.receive_ns for m in messages], dtype=np.int64) - stamps) * S_PER_NS
-    late = late - np.array([_sweep(m.content) for m in messages])
+    receive, stamps = times_of(messages)
+    if stamps is None or not stamps.all():
+        return None
+    late = (receive - stamps) * S_PER_NS - np.array([_sweep(m.content) for m in messages])
     low, middle, high = np.percentile(late, PERCENTILES)
-    if not stamps.all() or not SAME_CLOCK_S[0] <= middle <= SAME_CLOCK_S[1]:
+    if not SAME_CLOCK_S[0] <= middle <= SAME_CLOCK_S[1]:
         return None
     jitter = float(high - low) / SPANNED
     return Delay(least=max(0.0, float(middle) - jitter / 2.0), jitter=jitter)

@@ -6,14 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.interface import S_PER_NS
-from nics_drl_bridge.recording.bag_file import BagFile, opened
-from nics_drl_bridge.recording.messages import stamp
-from nics_drl_bridge.recording.stamping import MAX_WANDER_S, SAME_CLOCK_S
-
-Nanoseconds = NDArray[np.int64]
+from nics_drl_bridge.recording.bag_file import BagFile, opened, times_of
+from nics_drl_bridge.recording.stamping import MAX_WANDER_S, SAME_CLOCK_S, Nanoseconds
 
 GAP = 3.0  # a silence longer than this many usual periods is a gap
 NO_HEADER, UNSTAMPED, UNKNOWN = "no header", "never stamped", "unknown type"
@@ -24,21 +20,17 @@ RECORDER, FOREIGN, SEVERAL = "recorder's", "another", "several"
 class BagTopic:
     """A topic of a bag."""
 
-    topic: str  # its name
-    type: str  # of its messages
+    topic: str
+    type: str
     count: int  # number of messages
-    # inverse of the median time between receipts [Hz]; None for fewer than two messages
-    rate_hz: float | None = None
-    # first_s, last_s: receipt of the first and last message, from the start of the bag [s]
-    first_s: float | None = None
+    rate_hz: float | None = None  # from the median time between receipts
+    first_s: float | None = None  # receipt of the first message, from the start of the bag
     last_s: float | None = None
     gaps: int = 0  # number of silences of more than three usual periods
-    longest_gap_s: float | None = None  # longest time between two messages [s]
-    # of the header stamps: the recorder's, another one or several; otherwise why there are no
-    # stamps
-    clock: str = UNKNOWN
-    delay_s: float | None = None  # median of receipt minus stamp [s]; None without stamps
-    jitter_s: float | None = None  # from the 5 % to the 95 % quantile of that delay [s]
+    longest_gap_s: float | None = None
+    clock: str = UNKNOWN  # of the header stamps, or why there are none
+    delay_s: float | None = None  # median of receipt minus stamp; None without stamps
+    jitter_s: float | None = None  # from the 5 % to the 95 % quantile of that delay
     backwards: int = 0  # number of stamps earlier than their predecessor
 
 
@@ -46,20 +38,16 @@ class BagTopic:
 class BagInfo:
     """Contents of a bag."""
 
-    path: str  # of the bag
+    path: str
     size_bytes: int  # of all its files
-    start_ns: int  # receipt of the first message, on the recorder's clock [ns]
-    duration_s: float  # from that to the receipt of the last message [s]
+    start_ns: int  # receipt of the first message, on the recorder's clock
+    duration_s: float  # from that to the receipt of the last message
     messages: int  # number of messages
-    topics: tuple[BagTopic, ...]  # by name
+    topics: tuple[BagTopic, ...]
 
 
 def bag_info(path: str | Path) -> BagInfo:
-    """Reads a whole bag and describes its contents.
-
-    Raises:
-        RecordingError: it is damaged.
-    """
+    """Reads a whole bag and describes its contents; a damaged one raises RecordingError."""
     path = Path(path)
     with opened(path) as bag:
         received = {topic: _received(bag, topic) for topic in sorted(bag.types)}
@@ -78,11 +66,9 @@ def _received(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]
     """Returns times of receipt [ns], and receipt minus stamp [ns] or why there are no stamps."""
     if not bag.knows(topic):
         return np.array([ns for ns, _ in bag.serialized(topic)], dtype=np.int64), UNKNOWN
-    messages = bag.messages(topic)
-    receive = np.array([m.receive_ns for m in messages], dtype=np.int64)
-    if not messages or not hasattr(messages[0].content, "header"):
+    receive, stamps = times_of(bag.messages(topic))
+    if stamps is None:
         return receive, NO_HEADER
-    stamps = np.array([stamp(m.content) for m in messages], dtype=np.int64)
     return receive, receive - stamps if stamps.any() else UNSTAMPED
 
 
