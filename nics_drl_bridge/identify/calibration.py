@@ -131,10 +131,7 @@ def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
 
 
 def _shared_stamps(recording: Recording) -> tuple[Array, Array, Array, Array] | None:
-    """Returns stamps (T,), poses, states and commands of the rows with common stamps.
-
-    None without a measured state, or if the stamps are on no uniform grid; rows may be missing.
-    """
+    """Returns stamps (T,), poses, states, commands of the rows whose stamps share one grid."""
     pose, state, command = recording.pose, recording.state, recording.command
     if state is None or not (step := np.median(np.diff(pose.t))) > 0.0:
         return None
@@ -173,10 +170,7 @@ def _grid(recording: Recording, calibration: Calibration) -> Array:
 def _outside_gaps(
     t: Array, samples: Array, step: float, usual: float = 3.0, least: float = MAX_GAP_S
 ) -> NDArray[np.bool_]:
-    """Selects the steps (T,) between samples that are close together.
-
-    Close means less than the larger of `least` [s] and `usual` times the median interval.
-    """
+    """Selects steps (T,) between samples less than `least` [s] or `usual` median steps apart."""
     after = np.clip(np.searchsorted(samples, t + step / 2.0), 1, len(samples) - 1)
     gap = samples[after] - samples[after - 1]
     return np.asarray(gap < max(least, usual * float(np.median(np.diff(samples)))))

@@ -144,10 +144,7 @@ def _search_or_zero(
 def _search(
     residual: Callable[[Array], Array], centers: tuple[float, ...], lags: Array
 ) -> DelayEstimate:
-    """Finds the delay and the logarithms of the lags, in this order, of least residual.
-
-    The delay is searched on ever finer grids, then refined together with the lags.
-    """
+    """Finds the delay on ever finer grids, then refines it together with the lags' logarithms."""
     around, log_lags = np.array(centers), np.log(lags)
     for reach, step in zip((SEARCH_S, *STEPS_S[:-1]), STEPS_S, strict=True):
         tries = np.add.outer(around, np.arange(-reach, reach + step / 2.0, step)).ravel()
@@ -179,11 +176,7 @@ class TimingEstimate:
 
 
 def timing_of(drive: Drive) -> TimingEstimate:
-    """Estimates clock offset, latency and lags as far as the recording allows.
-
-    Raises:
-        RecordingError: the state can't be known, or there are too few poses.
-    """
+    """Estimates clock offset, latency and lags as far as the recording allows (RecordingError)."""
     recording, spec, twists = drive.recording, drive.spec, drive.twists
     missing = [v.name for v in spec.state if v.follows is None]
     if recording.state is None and missing:
@@ -294,7 +287,7 @@ def expected_speed(drive: Drive, timing: TimingEstimate) -> Array | None:
 def responses_of(
     drive: Drive, calibration: Calibration, timing: TimingEstimate, expected: Array | None
 ) -> tuple[Response, ...]:
-    """Returns the inferred states; a speed is scaled to the speed along the direction of travel.
+    """Returns the inferred states; a speed is scaled to that along the direction of travel.
 
     `expected` (n,) is that speed over the intervals of the twists at gain 1; None if unknown.
     """

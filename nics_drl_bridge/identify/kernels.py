@@ -21,7 +21,6 @@ def _product(row, factors, count):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _sinc(half):  # type: ignore[no-untyped-def]
-    """Returns sin(a) / a."""
     if abs(half) > SMALL_TURN:
         return math.sin(half) / half
     square = half * half

@@ -190,10 +190,7 @@ def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
 
 
 def _fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
-    """Selects the times (n,) at which the command is known; rows may be missing.
-
-    If commands are recorded irregularly, each is assumed to be held until the next.
-    """
+    """Selects the times (n,) at which the command is known: not in gaps of regular rows."""
     span = np.diff(command.t)
     usual = float(np.median(span)) if len(span) else 0.0
     if not (span < LONG_STEP * usual).mean() > REGULAR:

@@ -137,10 +137,7 @@ def drift_growth(
 def _predicted(
     drive: Drive, calibration: Calibration, model: TaylorModel, chosen: Windows
 ) -> Array:
-    """Predicts end poses (W, 3) from the measured state if there is one, else from commands.
-
-    The unexplained part of the state's rates is thus not counted twice.
-    """
+    """Predicts end poses (W, 3) from the state, measured so that its drift is not counted twice."""
     state = drive.recording.state
     if state is None:
         return predict(model, calibration, drive, chosen)

@@ -25,11 +25,7 @@ END_TOLERANCE = 0.6  # from a window's end to the nearest sample, as a share of 
 
 @dataclass(frozen=True)
 class OpenLoop:
-    """Errors of open-loop predictions on a part of a drive.
-
-    A prediction starts at a measured pose, knows the commands, and is compared with the
-    measured pose at the end of the horizon, both of the tracked point.
-    """
+    """Errors of predictions that start at a measured pose, know the commands, and end at one."""
 
     horizon_s: float  # length of each prediction
     windows: int  # number of predictions
@@ -130,10 +126,10 @@ def _by_one_rollout(
 def _from_measured_states(
     model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
 ) -> tuple[Array, Array, Array, NDArray[np.intp], Array]:
-    """Rolls each window out from its own measured state.
+    """Returns roll-outs of windows, each from its own measured state.
 
-    Returns poses (W, T + 1, 3) from the origin, states (W, T + 1, S), commands (W, T, C), whole
-    steps (W,) to the end and the remaining fraction (W,) of one more.
+    Poses (W, T + 1, 3) from the origin, states (W, T + 1, S), commands (W, T, C), whole steps (W,)
+    to the end and the remaining fraction (W,) of one more.
     """
     start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
     steps = int(np.ceil(float((end - start).max()) / model.dt - 1e-6)) + 1
@@ -162,12 +158,9 @@ def open_loop_error(
     stop: float,
     horizon: float = HORIZON_S,
 ) -> OpenLoop:
-    """Predicts a part of a drive open-loop and compares the end poses.
+    """Predicts a part of a drive, from `start` to `stop` after the first pose [s], open-loop.
 
-    The part lasts from `start` to `stop` after the first pose [s]; windows start every 0.1 s.
-
-    Raises:
-        RecordingError: the part is too short for a window.
+    Windows start every 0.1 s. A part that is too short for any raises RecordingError.
     """
     chosen = windows(drive, calibration, start, stop, horizon, SPACING_S)
     if len(chosen.start_t) == 0:
@@ -194,8 +187,8 @@ def open_loop_error(
 class Course:
     """X over windows, step by step, of a drive whose state was measured.
 
-    State and commands are then known before the twist is. One pass through a window gives the pose
-    at its end and its derivatives by all coefficients of the twist.
+    One pass through a window gives the pose at its end and its derivatives by all coefficients of
+    the twist.
     """
 
     chosen: Windows  # the windows

@@ -85,7 +85,6 @@ def _without_jumps(drive: Drive) -> tuple[Drive, list[str]]:
 
 
 def _jumps_of_pose(drive: Drive) -> NDArray[np.bool_]:
-    """Selects the poses (T,) that jump in position or heading."""
     pose, spec, t = drive.recording.pose, drive.spec, drive.sample_t
     span = np.zeros(len(t))
     span[NEIGHBOURS:] = t[NEIGHBOURS:] - t[:-NEIGHBOURS]
@@ -98,7 +97,6 @@ def _jumps_of_pose(drive: Drive) -> NDArray[np.bool_]:
 
 
 def _jumps_of_state(state: Stream) -> NDArray[np.bool_]:
-    """Selects the states (T,) that jump in any component."""
     out = np.zeros(len(state.t), dtype=np.bool_)
     for column in state.values.T:
         low, high = np.percentile(column, (5.0, 95.0))
@@ -107,10 +105,7 @@ def _jumps_of_state(state: Stream) -> NDArray[np.bool_]:
 
 
 def _stands_out(values: Array, least: Array, turning: bool = False) -> NDArray[np.bool_]:
-    """Selects the values (T,) that differ from both sides, in the same direction.
-
-    By more than `least` (T,) and `STEPS` times the usual change; turning angles are wrapped.
-    """
+    """Selects values (T,) that differ alike from both sides, by `least` and `STEPS` changes."""
     if len(values) <= 2 * NEIGHBOURS:
         return np.zeros(len(values), dtype=np.bool_)
     back, ahead = _differences(values, turning)

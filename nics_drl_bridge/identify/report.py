@@ -125,7 +125,6 @@ def _pruning(alpha: Alpha) -> str:
 
 
 def _curve(curve: Curve) -> list[str]:
-    """Formats the error with 0, 1, 2... terms, in per cent of the size of the rates."""
     shown = min(max(CURVE_POINTS, curve.kept + 1), len(curve.error))
     points = [
         f"{n}{'*' if n == curve.kept else ''}: {100.0 * curve.share[n]:.3g} %" for n in range(shown)
@@ -269,7 +268,6 @@ def why_useless(identified: Identified, spec: RobotSpec, order: int = ORDER) -> 
 
 
 def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
-    """Returns the likely cause of a bad fit, and its remedy."""
     recording, unmoved = identified.recording, identified.fit.unmoved
     step, name = max(_steps(recording, spec, unmoved), default=(0.0, ""))
     rows = recording.pose if recording.state is None else recording.state

@@ -136,11 +136,7 @@ def about_responses(drive: Drive, calibration: Calibration, timing: TimingEstima
 
 
 def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
-    """Refuses a drive that did not move every input independently.
-
-    Raises:
-        FitError: names the inputs.
-    """
+    """Refuses a drive, with a FitError, that did not move every input independently."""
     still = excitation.unmoved
     commands = [c.name for c in spec.command]
     named = [name for name in still if name in commands] or still

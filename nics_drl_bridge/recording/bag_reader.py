@@ -79,7 +79,6 @@ def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recordin
 def _table(
     bag: BagFile, topic: str, messages: Sequence[Message], row: Callable[[Any], Row]
 ) -> TopicData:
-    """Converts a topic's messages to rows."""
     receive, header = times_of(messages)
     values = np.array([row(m.content) for m in messages], dtype=np.float64)
     for k in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
@@ -91,7 +90,6 @@ def _table(
 
 
 def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
-    """Reads the commands (T, C) of the robot."""
     if bag.types[topic] in (roles.ACKERMANN, roles.ACKERMANN_STAMPED):
         for variable in spec.command:
             if variable.turns and not variable.steers:
@@ -105,7 +103,6 @@ def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
 
 
 def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
-    """Reads the poses (T, 3) of the tracked body."""
     messages = bag.messages(topic)
     if bag.types[topic] in (roles.TRANSFORM, roles.TRANSFORMS):
         messages = _of_one_body(bag, topic, messages, mapping)

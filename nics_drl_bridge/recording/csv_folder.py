@@ -121,7 +121,6 @@ def _numbers(path: Path, line: int, row: list[str], columns: tuple[str, ...]) ->
 
 
 def _pose(path: Path, vrpn: Array) -> Array:
-    """Converts positions and quaternions to poses (T, 3)."""
     qx, qy, qz, qw = vrpn[:, 3:7].T
     norm = np.linalg.norm(vrpn[:, 3:7], axis=1)
     for k in np.flatnonzero(np.abs(norm - 1.0) > 0.05)[:1]:
@@ -134,10 +133,7 @@ def _pose(path: Path, vrpn: Array) -> Array:
 
 
 def _check_units(path: Path, tables: dict[str, Array]) -> None:
-    """Refuses files whose durations differ: motion capture is in ns, all else in s.
-
-    A difference alone does not show which file is wrong; commands that are seconds apart do.
-    """
+    """Refuses files whose durations differ; commands that are seconds apart show which is wrong."""
     times = tables["cmd.csv"][:, -1]
     seconds, step = np.ptp(times), np.median(np.diff(times)) if len(times) > 1 else 0.0
     for name, table in tables.items():
@@ -157,7 +153,6 @@ def _check_units(path: Path, tables: dict[str, Array]) -> None:
 
 
 def _wheels(tables: dict[str, Array]) -> Stream | None:
-    """Returns both wheels at the stamps of the left one."""
     if "L_wheel.csv" not in tables or "R_wheel.csv" not in tables:
         return None
     left, right = tables["L_wheel.csv"], tables["R_wheel.csv"]

@@ -218,10 +218,7 @@ class Exploration:
         return np.where(useful, reached / self._outermost, np.inf)
 
     def _least_harm(self, length: int) -> Array:
-        """Returns commands (T, C) towards the path back that leaves the circle least.
-
-        Among equals, it gets closest to the centre.
-        """
+        """Returns commands (T, C) towards the path back that leaves the circle least."""
         away = _distance(self._roll(self._emergency, WAY_STEP_S)[0])
         outside = np.maximum(away.max(axis=1) - self._outermost, 0.0)
         best = np.lexsort((away.min(axis=1), np.round(outside, 2)))[0]

@@ -95,10 +95,9 @@ class Samples:
 
 
 def samples_on_one_clock(t: Array, pose: Array, state: Array, command: Array) -> Samples:
-    """Builds Samples from poses of `base_link`, states and commands that share stamps (T,) [s].
+    """Builds Samples from poses of `base_link`, states and held commands with shared stamps [s].
 
-    Each command is held until the next stamp. There is a row for each of the T - 1 steps of about
-    the median length; gaps and repeated stamps are omitted.
+    There is a row for each step of about the median length; gaps and repeated stamps are omitted.
     """
     span = np.diff(t)
     dt = float(np.median(span[span > 0.0])) if (span > 0.0).any() else 0.0
@@ -257,7 +256,6 @@ def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
 
 
 def _check_seal(data: bytes, version: str) -> None:
-    """Raises ValueError unless the checksum of a file of this format fits its content."""
     if version == FORMAT:
         check_sealed(io.BytesIO(data))
     elif version == COMMENT_FORMAT and data[-64:] != sha256(data[:-64]).encode():

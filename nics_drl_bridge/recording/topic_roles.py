@@ -119,8 +119,6 @@ def assign(
 
 @dataclass(frozen=True)
 class _Topics:
-    """Topics of a bag."""
-
     types: Mapping[str, str]  # by name
     empty: Collection[str]
     place: str  # of the bag, for errors

@@ -78,8 +78,6 @@ class Salvage:
 
 @dataclass
 class _Found:
-    """Remaining contents of a bag's files."""
-
     kinds: dict[str, str] = field(default_factory=dict)  # type by topic
     definitions: dict[str, str] = field(default_factory=dict)  # text by type
     messages: list[tuple[str, int, bytes]] = field(default_factory=list)  # topic, receipt, data
@@ -212,7 +210,6 @@ def _read_mcap(file: Path, found: _Found) -> None:
 
 
 def _inside(record: Record) -> list[Record]:
-    """Returns the intact records of a chunk."""
     with suppress(DamageError):
         chunk = record.content
         span = chunk.message_start_time, chunk.message_end_time
@@ -272,7 +269,6 @@ def _looks_like_chunk(data: memoryview, place: int) -> bool:
 
 
 def _read_database(file: Path, found: _Found) -> None:
-    """Reads all readable rows of a database."""
     found.told = False
     with TemporaryDirectory() as folder:
         copy = Path(folder) / "bag.db3"
