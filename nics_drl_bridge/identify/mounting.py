@@ -132,17 +132,24 @@ def lateral_lever(motion: TwistIntervals, rotation: float, speed: Array) -> tupl
     return -float(beta[1]), float(standard_errors(chi, along - chi @ beta)[1])
 
 
-def mounting_by_commands(motion: TwistIntervals, response: Array) -> Mounting | None:
-    """Estimates the mounting on an omnidirectional robot from a response (n, 3) to its commands.
+def _by_commands(timing: TimingEstimate, drive: Drive, twists: TwistIntervals) -> Mounting | None:
+    """Estimates the mounting on an omnidirectional robot from its state, or else its commands.
 
-    That is the twist of `base_link` expected from state or commands, up to one factor. None unless
-    the robot moved along x and y and turned.
+    None unless the robot moved along x and y and turned.
     """
+    recording, spec = drive.recording, drive.spec
+    if spec.state:
+        expected = expected_states(drive, twists, timing)
+        command = _as_commands(expected, drive, timing.latency)
+    else:
+        begin = twists.start + timing.offset - timing.latency
+        command = held(recording.command, spec, begin, begin + twists.end - twists.start)
+    response = spec.to_cmd_vel(command)  # of base_link, up to one factor
     size = np.linalg.svd(response, compute_uv=False)
     if size[2] <= MIN_SECOND * size[0]:
         return None
-    gain, *_ = np.linalg.lstsq(response, motion.twist, rcond=None)
-    rest = motion.twist - response @ gain
+    gain, *_ = np.linalg.lstsq(response, twists.twist, rcond=None)
+    rest = twists.twist - response @ gain
     spread = np.stack([standard_errors(response, column) for column in rest.T], axis=1)
     rotation = float(np.arctan2(gain[0, 1] - gain[1, 0], gain[0, 0] + gain[1, 1]))
     across = rotate(gain[2, :2], -rotation) / gain[2, 2]  # (-lever_y, lever_x)
@@ -154,18 +161,6 @@ def mounting_by_commands(motion: TwistIntervals, response: Array) -> Mounting | 
         np.full(2, float(spread[2, 0] / abs(gain[2, 2]))),
         True,
     )
-
-
-def _by_commands(timing: TimingEstimate, drive: Drive, twists: TwistIntervals) -> Mounting | None:
-    """Estimates the mounting on an omnidirectional robot from its state, or else its commands."""
-    recording, spec = drive.recording, drive.spec
-    if spec.state:
-        expected = expected_states(drive, twists, timing)
-        command = _as_commands(expected, drive, timing.latency)
-    else:
-        begin = twists.start + timing.offset - timing.latency
-        command = held(recording.command, spec, begin, begin + twists.end - twists.start)
-    return mounting_by_commands(twists, spec.to_cmd_vel(command))
 
 
 def _as_commands(states: Array, drive: Drive, latency: float) -> Array:

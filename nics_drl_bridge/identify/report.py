@@ -30,47 +30,32 @@ ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
 def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     """Returns the report on a recording from a source as text for people."""
     model, total = identified.model, identified.fit.regression.terms_total
-    notes = identified.notes or ("Nothing had to be corrected.",)
-    kept = f"Kept {model.terms_kept} of {total} terms, step {model.dt:g} s "
-    held_out = f"Open loop, on data held out from the fit (after {identified.train_until_s:.1f} s):"
-    curves = (line for curve in identified.fit.curves for line in _curve(curve))
-    paragraphs = [
-        f"Fit report: robot {spec.name!r} from {source}",
-        _paragraph(
-            kept + f"(X = {', '.join(model.variables)}), with standard errors:",
-            equations_with_errors(model),
+    latency, until = identified.recording.latency.sentences(), identified.train_until_s
+    sections: dict[str, Iterable[str]] = {
+        f"Fit report: robot {spec.name!r} from {source}": (),
+        f"Kept {model.terms_kept} of {total} terms, step {model.dt:g} s "
+        f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(model),
+        fill(_pruning(identified.alpha), WIDTH): (),
+        "Cross-validated error against the number of terms, largest first, * for those kept:": (
+            line for curve in identified.fit.curves for line in _curve(curve)
         ),
-        fill(_pruning(identified.alpha), WIDTH),
-        _paragraph(
-            "Cross-validated error against the number of terms, largest first, * for those kept:",
-            curves,
+        "Error of the linear fit per degree of freedom, on the part it was fitted to:": _errors(
+            identified
         ),
-        _paragraph(
-            "Error of the linear fit per degree of freedom, on the part it was fitted to:",
-            _errors(identified),
+        f"Open loop, on data held out from the fit (after {until:.1f} s):": (
+            *_open_loop(identified.held_out),
+            *_held_out_rates(model),
         ),
-        _paragraph(held_out, [*_open_loop(identified.held_out), *_held_out_rates(model)]),
-        _paragraph("Valid where the drive was:", _box(model, spec)),
-        _paragraph(
-            "Calibration (standard uncertainties):",
-            (estimate.text for estimate in estimates(identified).values()),
+        "Valid where the drive was:": _box(model, spec),
+        "Calibration (standard uncertainties):": (e.text for e in estimates(identified).values()),
+        "Noise that the simulator and the estimator use (standard deviations):": (
+            identified.noise.sentences()
         ),
-        _paragraph(
-            "Noise that the simulator and the estimator use (standard deviations):",
-            identified.noise.sentences(),
-        ),
-        _paragraph(
-            "Latency of the device, which simulator_node has too:",
-            identified.recording.latency.sentences(),
-        ),
-        _paragraph("Found, and not learnt:", map(_item, notes)),
-    ]
-    return "\n\n".join(filter(None, paragraphs)) + "\n"
-
-
-def _paragraph(head: str, lines: Iterable[str]) -> str:
-    rows = [f"  {line}" for line in lines]
-    return "\n".join([head, *rows]) if rows else ""
+        **({"Latency of the device, which simulator_node has too:": latency} if latency else {}),
+        "Found, and not learnt:": map(_item, identified.notes or ("Nothing had to be corrected.",)),
+    }
+    paragraphs = ([head, *(f"  {line}" for line in lines)] for head, lines in sections.items())
+    return "\n\n".join("\n".join(lines) for lines in paragraphs) + "\n"
 
 
 def _item(note: str) -> str:
