@@ -79,7 +79,15 @@ class Drive:
     @cached_property
     def twists(self) -> TwistIntervals:
         """Twists of the tracked body over intervals as long as the pose noise requires."""
-        return twists_of(self.dated, self.bursts, self.pose_noise or (0.0, 0.0))
+        (t, pose), bursts = (self.dated.t, self.dated.values), self.bursts
+        stride = 1 if bursts is not None else _stride(t, pose, self.pose_noise or (0.0, 0.0))
+        limit = 1.8 * bursts.period_s if bursts is not None else MAX_GAP_S
+        t, pose = t[::stride], pose[::stride]
+        span = np.diff(t)
+        usable = (span > 0.0) & (span < max(limit, 3.0 * float(np.median(span))))
+        relative = geometry.between(pose[:-1], pose[1:])[usable]
+        twist = geometry.log(relative) / span[usable, None]
+        return TwistIntervals(t[:-1][usable], t[1:][usable], twist)
 
 
 @dataclass(frozen=True)
@@ -184,19 +192,6 @@ class TwistIntervals:
     def on_clock(self, offset: float) -> tuple[Array, Array]:
         """Returns start and end on a clock that is ahead of the pose's by an offset."""
         return self.start + offset, self.end + offset
-
-
-def twists_of(dated: Stream, bursts: Bursts | None, noise: tuple[float, float]) -> TwistIntervals:
-    """Returns twists over intervals long enough for the noise of position [m] and heading [rad]."""
-    t, pose = dated.t, dated.values
-    stride = 1 if bursts is not None else _stride(t, pose, noise)
-    limit = 1.8 * bursts.period_s if bursts is not None else MAX_GAP_S
-    t, pose = t[::stride], pose[::stride]
-    span = np.diff(t)
-    usable = (span > 0.0) & (span < max(limit, 3.0 * float(np.median(span))))
-    relative = geometry.between(pose[:-1], pose[1:])[usable]
-    twist = geometry.log(relative) / span[usable, None]
-    return TwistIntervals(t[:-1][usable], t[1:][usable], twist)
 
 
 def _stride(t: Array, pose: Array, noise: tuple[float, float]) -> int:

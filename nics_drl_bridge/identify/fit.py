@@ -141,22 +141,18 @@ def regress(
         used[d] = inliers(some / _scale(some), target, float(usual[d]))
         if not used[d].all():
             some, target = some[used[d]], target[used[d]]
-        beta[d, allowed] = _standardised(some / _scale(some), target, noisy)
+        unit, used_terms = some / _scale(some), np.flatnonzero(allowed)
+        if noisy:
+            candidates = significant(unit, target)
+            unit, used_terms = unit[:, candidates], used_terms[candidates]
+        if len(used_terms):
+            beta[d, used_terms] = np.linalg.lstsq(unit, target, rcond=None)[0]
     return Regression(
         samples, kept, chi, beta, used, moving, excitation,
         dependent=tuple(taylor.term_name(row, names) for row in powers[dependent]),
         terms_total=samples.dq.shape[1] * len(every),
         left_out=1.0 - float(believed.mean()),
     )  # fmt: skip
-
-
-def _standardised(unit: Array, target: Array, noisy: bool) -> Array:
-    """Returns coefficients (K,) of standardised features (T, K); insignificant ones are zero."""
-    beta = np.zeros(unit.shape[1])
-    candidates = significant(unit, target) if noisy else np.ones(len(beta), dtype=np.bool_)
-    if candidates.any():
-        beta[candidates] = np.linalg.lstsq(unit[:, candidates], target, rcond=None)[0]
-    return beta
 
 
 def _scale(chi: Array) -> Array:

@@ -13,7 +13,6 @@ import numpy as np
 
 from nics_drl_bridge.identify.fit import ORDER, Alpha
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.open_loop import OpenLoop
 from nics_drl_bridge.identify.statistics import Curve
 from nics_drl_bridge.identify.verdict import FAR_OFF
 from nics_drl_bridge.recording.recording import Recording
@@ -42,10 +41,7 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
         "Error of the linear fit per degree of freedom, on the part it was fitted to:": _errors(
             identified
         ),
-        f"Open loop, on data held out from the fit (after {until:.1f} s):": (
-            *_open_loop(identified.held_out),
-            *_held_out_rates(model),
-        ),
+        f"Open loop, on data held out from the fit (after {until:.1f} s):": _held_out(identified),
         "Valid where the drive was:": _box(model, spec),
         "Calibration (standard uncertainties):": (e.text for e in estimates(identified).values()),
         "Noise that the simulator and the estimator use (standard deviations):": (
@@ -129,29 +125,26 @@ def _errors(identified: Identified) -> list[str]:
     ]
 
 
-def _held_out_rates(model: TaylorModel) -> list[str]:
-    quality = model.quality
-    if quality is None or not quality.held_out_rmse:
-        return []
-    rows = zip(model.dof_units, quality.held_out_rmse.items(), strict=True)
-    return [
-        "the rates there:",
-        *(
-            f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {quality.held_out_r2[dof]:.6f}"
-            for unit, (dof, rmse) in rows
-        ),
-    ]
-
-
-def _open_loop(held_out: OpenLoop | None) -> list[str]:
+def _held_out(identified: Identified) -> Iterator[str]:
+    held_out, model, quality = identified.held_out, identified.model, identified.model.quality
     if held_out is None:
-        return ["the drive is too short to hold data out"]
-    return [
-        f"after {held_out.horizon_s:g} s: position error {held_out.mean_position_error_m:.3g} m "
-        f"on average, {held_out.max_position_error_m:.3g} m at most,",
-        f"heading error {held_out.mean_heading_error_rad:.3g} rad on average, over a mean path "
-        f"of {held_out.mean_path_m:.2f} m ({held_out.windows} windows)",
-    ]
+        yield "the drive is too short to hold data out"
+    else:
+        mean, most = held_out.mean_position_error_m, held_out.max_position_error_m
+        turn, path = held_out.mean_heading_error_rad, held_out.mean_path_m
+        yield (
+            f"after {held_out.horizon_s:g} s: position error {mean:.3g} m on average, "
+            f"{most:.3g} m at most,"
+        )
+        yield (
+            f"heading error {turn:.3g} rad on average, over a mean path of {path:.2f} m "
+            f"({held_out.windows} windows)"
+        )
+    if quality is not None and quality.held_out_rmse:
+        yield "the rates there:"
+        rows = zip(model.dof_units, quality.held_out_rmse.items(), strict=True)
+        for unit, (dof, rmse) in rows:
+            yield f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {quality.held_out_r2[dof]:.6f}"
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ def test_a_whole_bag_is_saved_whole(sealed, tmp_path):
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-@pytest.mark.parametrize("share", [0.3, 0.6, 0.8])
+@pytest.mark.parametrize("share", [0.5, 0.6, 0.8])
 def test_what_is_in_front_of_a_cut_is_saved_and_the_rest_is_counted(tmp_path, storage, share):
     bag = bags.write(tmp_path / "bag", bags.drive(), storage)
     before, file = held(bag), storage_file(bag)
