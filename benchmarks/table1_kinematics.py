@@ -192,7 +192,7 @@ def measure(name: str, control: str | None) -> dict[str, Any]:
         "rmse_heading_rad": float(step[2]),
         "rmse_twist": [float(value) for value in twist],
         "terms_kept": model.terms_kept,
-        "terms_total": found.terms_total,
+        "terms_total": found.regression.terms_total,
         "steps_per_s_single": single,
         "steps_per_s_batched": batched,
         "steps_per_s_batched_float32": batched_rate(model, np.float32, robot),

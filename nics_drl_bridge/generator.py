@@ -24,8 +24,7 @@ from nics_drl_bridge.files import (
 from nics_drl_bridge.identify import fit
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.identify import Identified, identify
-from nics_drl_bridge.identify.report import fit_report
-from nics_drl_bridge.identify.verdict import why_useless
+from nics_drl_bridge.identify.report import fit_report, why_useless
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar

@@ -16,7 +16,7 @@ from nics_drl_bridge.recording.messages import typestore
 STORE = typestore()
 START_S = 1_700_000_000.0
 STEP_S = 0.02
-DURATION_S = 30.0
+DURATION_S = 6.0
 
 Row = tuple[float, Any]
 """Time of receipt [s after START_S], and message."""
@@ -144,7 +144,7 @@ def poses(delay: float = 0.0, offset: float = 0.0) -> list[Row]:
 
 
 def drive(delay: float = 0.0) -> dict[str, list[Row]]:
-    """A drive of few topics, half a minute long."""
+    """A drive of few topics, 360 messages in six seconds."""
     return {"/cmd_vel": commands(delay), "/pose": poses(delay)}
 
 

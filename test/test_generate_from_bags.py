@@ -19,7 +19,8 @@ from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.recording.write import write_bag
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
-SECONDS = 30.0
+SECONDS = 20.0
+CAMPAIGN = pytest.mark.campaign
 SAME = 1e-6
 """Stamps are rounded to nanoseconds, and headings go through quaternions."""
 
@@ -51,7 +52,10 @@ def assert_alike(one: SimulatorModel, other: SimulatorModel, spec: RobotSpec) ->
     assert other.timing == one.timing
 
 
-@pytest.mark.parametrize("robot", ["ackermann", "differential", "mecanum"])
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "robot", ["ackermann", *(pytest.param(r, marks=CAMPAIGN) for r in ("differential", "mecanum"))]
+)
 def test_a_bag_gives_the_model_of_the_same_drive(tmp_path, robot):
     spec = load_robot(robot)
     drive = record(spec, np.random.default_rng(1), duration=SECONDS)
@@ -99,7 +103,8 @@ state:
 """
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.slow
+@pytest.mark.parametrize("storage", ["mcap", pytest.param("sqlite3", marks=CAMPAIGN)])
 def test_a_mapping_leads_to_the_same_model(tmp_path, storage):
     spec = load_robot("ackermann")
     drive = record(spec, np.random.default_rng(1), duration=SECONDS)
@@ -115,7 +120,8 @@ def test_a_mapping_leads_to_the_same_model(tmp_path, storage):
     assert np.abs(difference).max() < 0.01  # an AckermannDrive is of single precision
 
 
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.slow
+@pytest.mark.parametrize("storage", ["mcap", pytest.param("sqlite3", marks=CAMPAIGN)])
 def test_a_real_drive_with_two_clocks_gives_the_same_model(shared_recordings, tmp_path, storage):
     spec = load_robot("ackermann")
     drive = read_recording(shared_recordings / "xtark_ackermann" / "random_drive_45s")

@@ -26,7 +26,8 @@ from nics_drl_bridge.middleware.playback import EstimatedDrive, write_estimate
 from nics_drl_bridge.policy.contract import shipped
 from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.training_settings import load_training
-from nics_drl_bridge.recording.readers import load_csv_folder, read_recording
+from nics_drl_bridge.recording.csv_folder import load_csv_folder
+from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.recording.topic_roles import topic_roles

@@ -6,7 +6,7 @@ from robots import direct_model
 
 from nics_drl_bridge.commands.episodes import EvaluationOrder
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.recording.drive_plan import DrivePlan
+from nics_drl_bridge.recording.excite import DrivePlan
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.seeds import GREATEST_SEED, checked_seeds
 from nics_drl_bridge.sim.scenes import sample_scene

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.kinds import Textbook, textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
-
-Array = NDArray[np.float64]
 
 MIN_OPERATING_POINT = 1e-3
 DIFFERENCE = 1e-4
@@ -22,15 +20,8 @@ def assume_textbook(
 
     A fit at a constant input is a section through the whole model: `wz = c speed`, measured at
     the steering angle s0, becomes `wz = (c/s0) speed*steering`. At s0 = 0 the section shows
-    nothing of the input's effect, so the coefficient comes from the spec's parameters.
-
-    Args:
-        model: fitted to a drive.
-        spec: names the textbook kinematics and holds their parameters.
-        unmoved: variables of X that the drive never moved.
-
-    Returns:
-        The model, with the new terms listed in `assumed`, and a sentence per change.
+    nothing of the input's effect, so the coefficient comes from the spec's parameters. The model
+    lists the new terms in `assumed`; a sentence is returned per change.
 
     Raises:
         ConfigError: the spec names no textbook kinematics.

@@ -1,4 +1,4 @@
-"""Calibration: the relations of a recording's streams in time and space."""
+"""Calibration: the relations of a drive's streams in time and space, and its alignment by them."""
 
 from __future__ import annotations
 
@@ -10,59 +10,49 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import AllowInfNan, NonNegativeFloat
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify.drive import MAX_GAP_S, MIN_STAMPS, Drive
+from nics_drl_bridge.identify.signals import held, inferred_states, resample, unwrapped
+from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 
-Array = NDArray[np.float64]
+STEP_S = 0.01  # step of the samples where the pose's own step is not usable
+STEP_RANGE_S = (0.002, 0.02)
+SMOOTHING_S = 0.1
+SMOOTHING_BURSTS = 1.5
+UNIFORM = 1e-6
+SHARED = 0.5  # minimum share of rows with common stamps; only then are the other rows dropped
+STATE_GAP = 2.5  # rates are unknown between states that are this many median steps apart
 
 
 @dataclass(frozen=True)
 class Response:
-    """A state variable that was not measured and follows a command with a first-order lag.
-
-    Attributes:
-        state, command: names in the RobotSpec.
-        lag_s: time constant [s].
-        gain: state per command in steady state.
-    """
+    """A state variable that was not measured and follows a command with a first-order lag."""
 
     state: str
     command: str
     lag_s: NonNegativeFloat
-    gain: float = 1.0
+    gain: float = 1.0  # state per command in steady state
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Estimates of a recording's clocks, mounting and noise.
+    """Estimates of a recording's clocks, mounting and noise."""
 
-    Attributes:
-        clock_offset_s: added to the pose's stamps, gives the commands' clock [s].
-        command_latency_s: from a command's stamp to its effect [s].
-        rotation_rad: heading of `base_link` minus the heading of the tracked body.
-        lever_arm_m: (x, y) of the tracked point in `base_link` [m].
-        responses: of the state variables; empty if the state was measured.
-        burst_period_s: between the bursts in which poses arrived [s]; 0 without bursts.
-        position_noise_m: standard deviation of x and y of the pose [m].
-        heading_noise_rad: standard deviation of its heading [rad].
-        wheel_scale: speed per unit of the mean of both wheels [m/s]; None if unknown.
-        turn_scale: yaw rate per unit of right wheel minus left [rad/s]; None if unknown.
-        wheels_swapped: True if left and right wheel are interchanged; None if unknown.
-        uncertainty: standard uncertainty of each estimated value, by the names above.
-        notes: one sentence on each finding and on each value that could not be learnt.
-    """
-
-    clock_offset_s: float = 0.0
-    command_latency_s: float = 0.0
-    rotation_rad: float = 0.0
-    lever_arm_m: tuple[float, float] = (0.0, 0.0)
-    responses: tuple[Response, ...] = ()
-    burst_period_s: NonNegativeFloat = 0.0
-    position_noise_m: NonNegativeFloat = 0.0
+    clock_offset_s: float = 0.0  # added to the pose's stamps, gives the commands' clock
+    command_latency_s: float = 0.0  # from a command's stamp to its effect
+    rotation_rad: float = 0.0  # heading of `base_link` minus the heading of the tracked body
+    lever_arm_m: tuple[float, float] = (0.0, 0.0)  # (x, y) of the tracked point in `base_link`
+    responses: tuple[Response, ...] = ()  # of the state variables; empty if the state was measured
+    burst_period_s: NonNegativeFloat = 0.0  # between bursts of poses; 0 without bursts
+    position_noise_m: NonNegativeFloat = 0.0  # standard deviation of x and y of the pose
     heading_noise_rad: NonNegativeFloat = 0.0
-    wheel_scale: float | None = None
-    turn_scale: float | None = None
-    wheels_swapped: bool | None = None
+    wheel_scale: float | None = None  # speed per unit of the wheels' mean [m/s]; None if unknown
+    turn_scale: float | None = None  # yaw rate per unit of right wheel minus left [rad/s]
+    wheels_swapped: bool | None = None  # left and right interchanged; None if unknown
+    # Standard uncertainty of each estimated value, by the names above.
     uncertainty: dict[str, Annotated[float, AllowInfNan()]] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # a sentence on each finding, and on what could not be learnt
 
     @property
     def is_identity(self) -> bool:
@@ -91,3 +81,96 @@ class Calibration:
     def to_tracked(self, base: ArrayLike) -> Array:
         """Converts poses (..., 3) of `base_link` to poses of the tracked body."""
         return geometry.compose(base, self.mounting)
+
+
+def align(drive: Drive, calibration: Calibration) -> Samples:
+    """Puts a drive on one time axis, at `base_link` and on the clock of the commands.
+
+    A recording that needs no correction is used bit for bit. Otherwise the pose is smoothed by
+    local parabolas as far as its noise requires, and rows in gaps of the pose are dropped.
+
+    Raises:
+        RecordingError: the streams do not overlap in time.
+    """
+    recording = drive.recording
+    if calibration.is_identity and (shared := _shared_stamps(recording)) is not None:
+        return samples_on_one_clock(*shared)
+    grid = _grid(recording, calibration)
+    half_width = SMOOTHING_BURSTS * calibration.burst_period_s
+    if not half_width and (calibration.position_noise_m or calibration.heading_noise_rad):
+        half_width = SMOOTHING_S
+    t = drive.sample_t + calibration.clock_offset_s
+    tracked = resample(t, unwrapped(recording.pose.values), grid, half_width)
+    step = float(grid[1] - grid[0])
+    begin = grid - calibration.command_latency_s
+    samples = samples_on_one_clock(
+        grid,
+        calibration.to_base(tracked),
+        states_at(drive, calibration, grid),
+        held(recording.command, drive.spec, begin, begin + step),
+    )
+    known = _outside_gaps(samples.t, t, step)
+    if recording.state is not None:
+        known &= _outside_gaps(samples.t, recording.state.t, step, STATE_GAP, 0.0)
+    return samples.rows(known)
+
+
+def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
+    """Returns states (T, S), measured or inferred, at uniform times (T,) on the commands' clock."""
+    recording = drive.recording
+    if recording.state is not None:
+        columns = recording.state.values.T
+        return np.stack([np.interp(grid, recording.state.t, c) for c in columns], axis=1)
+    lags = np.array([r.lag_s for r in calibration.responses])
+    gains = np.array([r.gain for r in calibration.responses])
+    step = float(grid[1] - grid[0])
+    lead = int(np.ceil(max(0.0, grid[0] - recording.command.t[0]) / step)) + 1
+    longer = np.concatenate([grid[0] + step * np.arange(-lead, 0), grid])
+    latency = calibration.command_latency_s
+    return gains * inferred_states(recording.command, drive.spec, lags, latency, longer)[lead:]
+
+
+def _shared_stamps(recording: Recording) -> tuple[Array, Array, Array, Array] | None:
+    """Returns stamps (T,), poses, states, commands of the rows whose stamps share one grid."""
+    pose, state, command = recording.pose, recording.state, recording.command
+    if state is None or not (step := np.median(np.diff(pose.t))) > 0.0:
+        return None
+    since = [s.t - pose.t[0] for s in (pose, state, command)]
+    tick = [np.round(t / step) for t in since]
+    off = max(float(np.abs(t - n * step).max()) for t, n in zip(since, tick, strict=True))
+    if off > UNIFORM * max(1.0, float(pose.t[-1] - pose.t[0])):
+        return None
+    ticks, at_pose, at_state = np.intersect1d(tick[0], tick[1], return_indices=True)
+    ticks, both, at_command = np.intersect1d(ticks, tick[2], return_indices=True)
+    if len(ticks) < SHARED * max(map(len, tick)):
+        return None
+    at = at_pose[both]
+    return pose.t[at], pose.values[at], state.values[at_state[both]], command.values[at_command]
+
+
+def _grid(recording: Recording, calibration: Calibration) -> Array:
+    """Returns uniform times (T,) covered by pose, commands and state, on the commands' clock."""
+    pose = recording.pose.t + calibration.clock_offset_s
+    step = float(np.median(np.diff(pose)))
+    if calibration.burst_period_s > 0.0 or not STEP_RANGE_S[0] <= step <= STEP_RANGE_S[1]:
+        step = STEP_S
+    first = max(pose[0], recording.command.t[0] + calibration.command_latency_s)
+    last = pose[-1]
+    if recording.state is not None:
+        first, last = max(first, recording.state.t[0]), min(last, recording.state.t[-1])
+    count = int(np.floor((last - first) / step + 1e-6))
+    if count < MIN_STAMPS:
+        raise RecordingError(
+            f"{recording.source}: commands and poses overlap for {max(last - first, 0.0):.2f} s "
+            "only; check that they are of one drive."
+        )
+    return np.asarray(first + step * np.arange(count + 1))
+
+
+def _outside_gaps(
+    t: Array, samples: Array, step: float, usual: float = 3.0, least: float = MAX_GAP_S
+) -> NDArray[np.bool_]:
+    """Selects steps (T,) between samples less than `least` [s] or `usual` median steps apart."""
+    after = np.clip(np.searchsorted(samples, t + step / 2.0), 1, len(samples) - 1)
+    gap = samples[after] - samples[after - 1]
+    return np.asarray(gap < max(least, usual * float(np.median(np.diff(samples)))))

@@ -1,6 +1,6 @@
-"""Clocks: offset, latency and lags of a drive, from any stream that follows the commands.
+"""Clocks: offset, latency and lags of a drive; responses of states that were not measured.
 
-Each is the shift in time that makes a signal a function of the commands, by a separable least
+Each time is the shift that makes a signal a function of the commands, by a separable least
 squares: for a given delay (and lags) the best linear combination of the paper's features (Eq. 1)
 has a closed form, so the search is over the delay and the lags only.
 """
@@ -9,28 +9,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify import signals
+from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import MIN_STAMPS, Drive, TwistIntervals
-from nics_drl_bridge.identify.signals import (
-    followed,
-    held,
-    held_features,
-    inferred_states,
-    interval_means,
-    moved_commands,
-    nominal_lags,
-    speed_index,
+from nics_drl_bridge.identify.statistics import (
+    minimise,
+    standard_errors,
+    uncertainty,
+    unexplained,
 )
-from nics_drl_bridge.identify.statistics import minimise, uncertainty, unexplained
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
+Target = tuple[Array, Array, Array]  # start (n,), end (n,) of intervals, a signal's means (n, K)
 
 STEP_S = 0.01
 LEAD_S = 2.0  # for the states to forget their initial values
@@ -39,48 +37,40 @@ SEARCH_S = 5.0
 LAG_RANGE_S = (0.005, 2.0)
 MAX_ROWS = 2000
 EXACT = 1e-6
-LONG_STEP = 1.5
-"""A step longer than this many usual steps is a gap."""
+LONG_STEP = 1.5  # a step longer than this many usual steps is a gap
+WHEELS_EXPLAINED = 0.5  # the commands must explain this share of the wheels' variance
+# Wheel speeds are assumed to be means over the tick that ends at their stamp, but some drivers
+# report instantaneous ones: a time is uncertain by the spread of a uniform distribution.
+WITHIN_TICK = 12.0**-0.5
+MIN_TIME_S = 5e-4
+CERTAIN = 3.0  # a correction below this many standard uncertainties is not made
 
 
 @dataclass(frozen=True)
 class DelayEstimate:
-    """An estimated delay.
+    """A delay from the command's stamp to its effect, each on its own clock."""
 
-    Attributes:
-        value: from the command's stamp to its effect, each on its own clock [s].
-        sigma: its standard uncertainty [s].
-        lags: (S,) time constants of the inferred states [s].
-        lag_sigma: (S,) their standard uncertainty; NaN where not estimated.
-        explained: share of the signal's variance that the response explains.
-    """
-
-    value: float
-    sigma: float
-    lags: Array
-    lag_sigma: Array
-    explained: float
+    value: float  # [s]
+    sigma: float  # standard uncertainty [s]
+    lags: Array  # (S,) time constants of the inferred states [s]
+    lag_sigma: Array  # (S,) standard uncertainty; NaN where not estimated
+    explained: float  # share of the signal's variance that the response explains
 
 
 def delay_of_response(
     command: Stream,
     spec: RobotSpec,
-    target: tuple[Array, Array, Array],
+    target: Target,
     centers: tuple[float, ...] = (0.0,),
     lags: Array | None = None,
 ) -> DelayEstimate:
-    """Estimates the delay and the lags with which a signal follows the commands.
+    """Estimates the delay, searched around `centers` [s], with which a signal follows commands.
 
-    Args:
-        command: the commands.
-        spec: the robot; each of its state variables follows a command.
-        target: start (n,), end (n,) of intervals and the signal's mean (n, K) over each.
-        centers: of the search for the delay [s].
-        lags: (S,) known time constants; None to estimate those of the commands that moved.
+    Also the lags of the commands that moved, unless all `lags` (S,) are known.
     """
-    moved = moved_commands(command)[followed(spec)] if spec.state else moved_commands(command)
-    free = np.flatnonzero(moved[: len(spec.state)]) if lags is None else np.zeros(0, dtype=np.intp)
-    base = nominal_lags(spec) if lags is None else lags
+    moved = signals.moved_inputs(command, spec)[: len(spec.state)]
+    free = np.flatnonzero(moved if lags is None else [])
+    base = signals.nominal_lags(spec) if lags is None else lags
     left_over = response_residual(command, spec, target)
 
     def residual(theta: Array) -> Array:
@@ -88,29 +78,27 @@ def delay_of_response(
         tau[free] = np.exp(theta[1:])
         return left_over(tau, theta[0])
 
-    theta, sigma, explained = _search(residual, centers, np.log(base[free]))
-    found, spread = base.copy(), np.full(len(base), np.nan)
-    found[free] = np.exp(theta[1:])
-    spread[free] = sigma[1:] * found[free]
-    return DelayEstimate(float(theta[0]), float(sigma[0]), found, spread, explained)
+    found = _search(residual, centers, base[free])
+    tau, sigma = base.copy(), np.full(len(base), np.nan)
+    tau[free], sigma[free] = found.lags, found.lag_sigma
+    return replace(found, lags=tau, lag_sigma=sigma)
 
 
 def response_residual(
-    command: Stream, spec: RobotSpec, target: tuple[Array, Array, Array]
+    command: Stream, spec: RobotSpec, target: Target
 ) -> Callable[[Array, float], Array]:
     """Returns the residual of a signal explained by commands, given lags (S,) and a delay [s]."""
-    start, end, signal = target
-    moved = moved_commands(command)[followed(spec)] if spec.state else moved_commands(command)
+    (start, end, signal), moved = target, signals.moved_inputs(command, spec)
     powers = taylor.exponents(len(moved), 2)
     powers = powers[(powers[:, ~moved] == 0).all(axis=1)]
     grid = np.arange(start.min() - LEAD_S, end.max() + STEP_S, STEP_S)
 
     def residual(lags: Array, delay: float) -> Array:
         if not spec.state:
-            means = held_features(command, spec, powers, start - delay, end - delay)
+            means = signals.held_features(command, spec, powers, start - delay, end - delay)
             return unexplained(means, signal)
-        chi = taylor.evaluate(inferred_states(command, spec, lags, delay, grid), powers)
-        return unexplained(interval_means(grid, chi, start, end), signal)
+        chi = taylor.evaluate(signals.inferred_states(command, spec, lags, delay, grid), powers)
+        return unexplained(signals.interval_means(grid, chi, start, end), signal)
 
     return residual
 
@@ -126,21 +114,19 @@ def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Callable[
     middle = (state.values[keep + 1] + state.values[keep]) / 2.0
 
     def residual(theta: Array) -> Array:
-        u = held(command, spec, start - theta[0], end - theta[0])
+        u = signals.held(command, spec, start - theta[0], end - theta[0])
         return unexplained(np.concatenate([np.ones((len(u), 1)), middle, u], axis=1), rates)
 
     return residual
 
 
-def residual_by_shift(
-    state: Stream, target: tuple[Array, Array, Array]
-) -> Callable[[Array], Array]:
+def residual_by_shift(state: Stream, target: Target) -> Callable[[Array], Array]:
     """Returns the residual of the pose's rates, given a delay (1,) of the measured state [s]."""
     start, end, signal = target
     chi = taylor.evaluate(state.values, taylor.exponents(state.values.shape[1], 2))
 
     def residual(theta: Array) -> Array:
-        means = interval_means(state.t, chi, start - theta[0], end - theta[0])
+        means = signals.interval_means(state.t, chi, start - theta[0], end - theta[0])
         return unexplained(means, signal)
 
     return residual
@@ -150,74 +136,54 @@ def _search_or_zero(
     residual: Callable[[Array], Array], centers: tuple[float, ...] = (0.0,)
 ) -> DelayEstimate:
     """Estimates a delay; exactly zero if zero explains the signal to rounding."""
-    nothing = np.zeros(0)
     if np.sqrt((residual(np.zeros(1)) ** 2).mean()) < EXACT:
-        return DelayEstimate(0.0, 0.0, nothing, nothing, 1.0)
-    theta, sigma, explained = _search(residual, centers, nothing)
-    return DelayEstimate(float(theta[0]), float(sigma[0]), nothing, nothing, explained)
+        return DelayEstimate(0.0, 0.0, np.zeros(0), np.zeros(0), 1.0)
+    return _search(residual, centers, np.zeros(0))
 
 
 def _search(
-    residual: Callable[[Array], Array], centers: tuple[float, ...], log_lags: Array
-) -> tuple[Array, Array, float]:
-    """Returns delay and log lags of least residual, their uncertainty and the explained share.
-
-    The delay is searched on ever finer grids, then refined together with the lags.
-    """
-    around = np.array(centers)
+    residual: Callable[[Array], Array], centers: tuple[float, ...], lags: Array
+) -> DelayEstimate:
+    """Finds the delay on ever finer grids, then refines it together with the lags' logarithms."""
+    around, log_lags = np.array(centers), np.log(lags)
     for reach, step in zip((SEARCH_S, *STEPS_S[:-1]), STEPS_S, strict=True):
         tries = np.add.outer(around, np.arange(-reach, reach + step / 2.0, step)).ravel()
         cost = [float((residual(np.append(d, log_lags)) ** 2).sum()) for d in tries]
         around = tries[[int(np.argmin(cost))]]
     start = np.append(around, log_lags)
-    low = np.append(start[0] - 0.5, np.full(len(log_lags), np.log(LAG_RANGE_S[0])))
-    high = np.append(start[0] + 0.5, np.full(len(log_lags), np.log(LAG_RANGE_S[1])))
+    low, high = (
+        np.append(start[0] + reach, np.full(len(lags), np.log(least)))
+        for reach, least in zip((-0.5, 0.5), LAG_RANGE_S, strict=True)
+    )
     found, jacobian, rest = minimise(residual, start, np.full(len(start), 0.1), (low, high))
     if float((rest**2).sum()) >= min(cost):
         found, rest = start, residual(start)
-    return found, uncertainty(jacobian, rest), 1.0 - float((rest**2).mean())
-
-
-WHEELS_EXPLAINED = 0.5
-"""The commands must explain this share of the wheels' variance."""
-WITHIN_TICK = 12.0**-0.5
-"""Wheel speeds are assumed to be the mean over the tick that ends at their stamp, but some drivers
-report instantaneous speeds. A time is uncertain by the standard deviation of a uniform
-distribution over the tick."""
-MIN_TIME_S = 5e-4
-CERTAIN = 3.0
-"""A correction below this many standard uncertainties is not made."""
+    sigma, tau = uncertainty(jacobian, rest), np.exp(found[1:])
+    explained = 1.0 - float((rest**2).mean())
+    return DelayEstimate(float(found[0]), float(sigma[0]), tau, sigma[1:] * tau, explained)
 
 
 @dataclass(frozen=True)
 class TimingEstimate:
-    """Offset and latency as in `Calibration`, with lags and uncertainties.
+    """Offset and latency as in `Calibration`, with lags and uncertainties."""
 
-    Attributes:
-        offset, latency: [s].
-        sigma: standard uncertainty of each estimated value, by its name in `Calibration`.
-        lags: (S,) of the inferred states [s]; empty if the state was measured.
-        lag_sigma: (S,) [s]; NaN for a nominal lag.
-        separated: True if offset and latency could be separated.
-    """
-
-    offset: float
-    latency: float
-    sigma: dict[str, float]
-    lags: Array
-    lag_sigma: Array
-    separated: bool
+    offset: float  # [s]
+    latency: float  # [s]
+    sigma: dict[str, float]  # of each estimated value, by its name in `Calibration`
+    lags: Array  # (S,) of the inferred states [s]; empty if the state was measured
+    lag_sigma: Array  # (S,) [s]; NaN for a nominal lag
+    separated: bool  # True if offset and latency could be separated
 
 
 def timing_of(drive: Drive) -> TimingEstimate:
-    """Estimates clock offset, latency and lags as far as the recording allows.
-
-    Raises:
-        RecordingError: the state can't be known, or there are too few poses.
-    """
-    recording, spec = drive.recording, drive.spec
-    _require_state(recording, spec)
-    twists = drive.twists
+    """Estimates clock offset, latency and lags as far as the recording allows (RecordingError)."""
+    recording, spec, twists = drive.recording, drive.spec, drive.twists
+    missing = [v.name for v in spec.state if v.follows is None]
+    if recording.state is None and missing:
+        raise RecordingError(
+            f"{recording.source}: has no measured state, and {missing[0]!r} of robot {spec.name!r} "
+            "follows no command; record the state too, or add `follows:` to the robot's YAML file."
+        )
     if len(twists.start) < MIN_STAMPS:
         raise RecordingError(
             f"{recording.source}: pose: only {len(twists.start)} usable intervals; record a drive "
@@ -225,7 +191,7 @@ def timing_of(drive: Drive) -> TimingEstimate:
         )
     if recording.state is not None:
         return _timing_of_measured_state(drive, recording.state)
-    if not moved_commands(recording.command).any():
+    if not signals.moved_commands(recording.command).any():
         start = recording.command.t[0] - recording.pose.t[0]
         return nominal_timing(drive, float(start) if abs(start) > 60.0 else 0.0)
     target = (twists.start, twists.end, twists.twist)
@@ -238,23 +204,12 @@ def timing_of(drive: Drive) -> TimingEstimate:
 
 
 def nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:
-    """Returns a timing with nominal lags and no latency, of which nothing was estimated."""
-    lags = nominal_lags(drive.spec) if drive.recording.state is None else np.zeros(0)
+    """Returns nominal lags and no latency: nothing was estimated."""
+    lags = signals.nominal_lags(drive.spec) if drive.recording.state is None else np.zeros(0)
     return TimingEstimate(offset, 0.0, {}, lags, np.full(len(lags), np.nan), False)
 
 
-def _require_state(recording: Recording, spec: RobotSpec) -> None:
-    missing = [v.name for v in spec.state if v.follows is None]
-    if recording.state is None and missing:
-        raise RecordingError(
-            f"{recording.source}: has no measured state, and {missing[0]!r} of robot {spec.name!r} "
-            "follows no command; record the state too, or add `follows:` to the robot's YAML file."
-        )
-
-
-def _timing_of_two_clocks(
-    recording: Recording, spec: RobotSpec, target: tuple[Array, Array, Array]
-) -> TimingEstimate:
+def _timing_of_two_clocks(recording: Recording, spec: RobotSpec, target: Target) -> TimingEstimate:
     """Estimates offset and latency apart if the wheels follow the commands, else their sum."""
     centers, wheels = _likely_shifts(recording), _wheel_delay(recording, spec)
     delay = delay_of_response(
@@ -268,15 +223,14 @@ def _timing_of_two_clocks(
         "command_latency_s": wheels.sigma,
     }
     latency = max(wheels.value, 0.0)
-    return TimingEstimate(
-        latency - delay.value, latency, sigma, wheels.lags, wheels.lag_sigma, True
-    )
+    offset = latency - delay.value
+    return TimingEstimate(offset, latency, sigma, wheels.lags, wheels.lag_sigma, True)
 
 
 def _timing_of_measured_state(drive: Drive, state: Stream) -> TimingEstimate:
-    recording, twists, sigma = drive.recording, drive.twists, {}
-    latency, offset, nothing = 0.0, 0.0, np.zeros(0)
-    separated = bool(moved_commands(recording.command).any())
+    recording, twists = drive.recording, drive.twists
+    sigma, latency, offset = {}, 0.0, 0.0
+    separated = bool(signals.moved_commands(recording.command).any())
     if separated:
         found = _search_or_zero(state_residual(recording.command, state, drive.spec))
         sigma["command_latency_s"] = found.sigma
@@ -287,7 +241,7 @@ def _timing_of_measured_state(drive: Drive, state: Stream) -> TimingEstimate:
         delay = _search_or_zero(by_shift, _likely_shifts(recording))
         sigma["clock_offset_s"] = delay.sigma
         offset = -if_certain(delay.value, delay.sigma, MIN_TIME_S)
-    return TimingEstimate(offset, latency, sigma, nothing, nothing, separated)
+    return TimingEstimate(offset, latency, sigma, np.zeros(0), np.zeros(0), separated)
 
 
 def _likely_shifts(recording: Recording) -> tuple[float, ...]:
@@ -296,7 +250,7 @@ def _likely_shifts(recording: Recording) -> tuple[float, ...]:
 
 
 def _wheel_delay(recording: Recording, spec: RobotSpec) -> DelayEstimate | None:
-    """Returns the delay of the wheels; None on another clock or if they do not follow commands."""
+    """Returns the wheels' delay; None on another clock or if they do not follow the commands."""
     wheels = recording.wheels
     if wheels is None or wheels.clock != recording.command.clock:
         return None
@@ -316,13 +270,81 @@ def expected_states(drive: Drive, twists: TwistIntervals, timing: TimingEstimate
     """Returns the mean state (n, S) over the intervals of the twists; inferred ones at gain 1."""
     recording, (start, end) = drive.recording, twists.on_clock(timing.offset)
     if recording.state is not None:
-        return interval_means(recording.state.t, recording.state.values, start, end)
+        return signals.interval_means(recording.state.t, recording.state.values, start, end)
     grid = np.arange(min(start[0], recording.command.t[0]) - 1.0, end[-1] + 0.01, 0.01)
-    states = inferred_states(recording.command, drive.spec, timing.lags, timing.latency, grid)
-    return interval_means(grid, states, start, end)
+    states = signals.inferred_states(
+        recording.command, drive.spec, timing.lags, timing.latency, grid
+    )
+    return signals.interval_means(grid, states, start, end)
 
 
 def expected_speed(drive: Drive, timing: TimingEstimate) -> Array | None:
     """Returns the speed (n,) over the intervals of the twists, at gain 1; None if not unique."""
-    speed = speed_index(drive.spec)
+    speed = signals.speed_index(drive.spec)
     return None if speed is None else expected_states(drive, drive.twists, timing)[:, speed]
+
+
+def responses_of(
+    drive: Drive, calibration: Calibration, timing: TimingEstimate, expected: Array | None
+) -> tuple[Response, ...]:
+    """Returns the inferred states; a speed is scaled to that along the direction of travel.
+
+    `expected` (n,) is that speed over the intervals of the twists at gain 1; None if unknown.
+    """
+    spec = drive.spec
+    if drive.recording.state is not None:
+        return ()
+    gains, speed = np.ones(len(spec.state)), signals.speed_index(spec)
+    moved = signals.moved_inputs(drive.recording.command, spec)
+    if speed is not None and expected is not None and moved[speed]:
+        along = speed_along(drive, calibration)
+        gains[speed] = float(expected @ along / (expected @ expected))
+    return tuple(
+        Response(v.name, str(v.follows), float(lag), float(gain))
+        for v, lag, gain in zip(spec.state, timing.lags, gains, strict=True)
+    )
+
+
+def speed_along(drive: Drive, calibration: Calibration) -> Array:
+    """Returns the speed (n,) of `base_link` along x over the intervals of the twists."""
+    angle, (ux, uy, wz) = calibration.rotation_rad, drive.twists.twist.T
+    return np.asarray(np.cos(angle) * ux + np.sin(angle) * uy + calibration.lever_arm_m[1] * wz)
+
+
+def wheel_means(drive: Drive, calibration: Calibration) -> Array | None:
+    """Returns mean wheel speeds (n, 2) over the intervals of the twists; None without wheels."""
+    wheels = drive.recording.wheels
+    if wheels is None:
+        return None
+    start, end = drive.twists.on_clock(calibration.clock_offset_s)
+    return signals.interval_means(wheels.t, wheels.values, start, end)
+
+
+def with_wheels(drive: Drive, calibration: Calibration) -> Calibration:
+    """Adds the scales of the wheel speeds and interchanged wheels, as far as the drive shows them.
+
+    The left wheel of interchanged wheels is faster in left turns.
+    """
+    wheels = wheel_means(drive, calibration)
+    if wheels is None:
+        return calibration
+    difference, turn = wheels[:, 1] - wheels[:, 0], drive.twists.twist[:, 2]
+    size = float(np.sqrt((difference**2).mean() * (turn**2).mean()))
+    if size > 0.0:
+        agreement = float((difference * turn).mean()) / size
+        swapped = agreement < 0.0 if abs(agreement) > 0.5 else None
+        calibration = replace(calibration, wheels_swapped=swapped)
+    rows = {
+        "wheel_scale": (wheels.mean(axis=1), speed_along(drive, calibration)),
+        "turn_scale": (difference, turn),
+    }
+    for name, (units, moved) in rows.items():
+        if not float(units @ units) > 0.0:
+            continue
+        scale = float(units @ moved / (units @ units))
+        sigma = float(standard_errors(units[:, None], moved - scale * units)[0])
+        if abs(scale) > CERTAIN * sigma:
+            known: dict[str, Any] = {name: scale}
+            known["uncertainty"] = {**calibration.uncertainty, name: sigma}
+            calibration = replace(calibration, **known)
+    return calibration

@@ -1,8 +1,4 @@
-"""Drive: a recording of a robot, prepared: whatever several stages derive from it, derived once.
-
-Bursts: poses that a driver hands over together share an arrival time; their sample times are
-estimated. Twists: the motion of the tracked body, over intervals long enough for the pose's noise.
-"""
+"""Drive: a recording of a robot, and whatever several stages derive from it, derived once."""
 
 from __future__ import annotations
 
@@ -13,23 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.fit import ALPHA, ORDER, Alpha
-from nics_drl_bridge.identify.signals import (
-    DIFFERENCE,
-    DIFFERENCE_GAIN,
-    GAUSSIAN_MAD,
-    unwrapped,
-)
+from nics_drl_bridge.identify.signals import DIFFERENCE, DIFFERENCE_GAIN, GAUSSIAN_MAD, unwrapped
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
-
 MIN_STAMPS = 20
-BURSTY = 5.0
-"""In bursts the mean interval is more than this many times the 30th percentile."""
-WITHIN_BURST = 0.25
-"""Stamps less than this share of the period apart belong to one burst."""
+BURSTY = 5.0  # in bursts the mean interval is more than this many times the 30th percentile
+WITHIN_BURST = 0.25  # stamps less than this share of the period apart belong to one burst
 UNEVEN = 0.5
 LEAST_WHOLE = 0.1  # share of gap-free stretches from which on only those are used
 NEGLIGIBLE = 1e-6  # m, rad
@@ -42,33 +30,18 @@ MAX_GAP_S = 0.25
 
 @dataclass(frozen=True)
 class Settings:
-    """Options of an identification.
+    """Options of an identification."""
 
-    Attributes:
-        order: of the Taylor expansion (Eq. 1).
-        alpha: of the pruning (Eq. 2), or `auto`.
-        train_until_s: end of the part to learn from, from the first pose [s].
-        assume: completes the model by the textbook for inputs that never moved.
-        strict: refuses a drive that did not move every input independently, instead of returning
-            a model without those inputs.
-    """
-
-    order: int = ORDER
-    alpha: Alpha = ALPHA
-    train_until_s: float = float("inf")
-    assume: bool = False
-    strict: bool = False
+    order: int = ORDER  # of the Taylor expansion (Eq. 1)
+    alpha: Alpha = ALPHA  # of the pruning (Eq. 2), or `auto`
+    train_until_s: float = float("inf")  # end of the part to learn from, from the first pose
+    assume: bool = False  # completes the model by the textbook for inputs that never moved
+    strict: bool = False  # refuses a drive that did not move every input independently
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A recording of a robot, or a part of one; what is derived from it is computed on first use.
-
-    Attributes:
-        recording: the streams.
-        spec: the robot.
-        settings: of the identification.
-    """
+    """A recording of a robot, or a part of one; derived properties are computed on first use."""
 
     recording: Recording
     spec: RobotSpec
@@ -96,9 +69,7 @@ class Drive:
     @cached_property
     def dated(self) -> Stream:
         """Poses with the best known time: the newest of each burst, or all."""
-        pose = self.recording.pose
-        rows = newest(pose.t, self.bursts)
-        return replace(pose, t=pose.t[rows], values=pose.values[rows])
+        return self.recording.pose.rows(slice(None) if self.bursts is None else self.bursts.newest)
 
     @cached_property
     def pose_noise(self) -> tuple[float, float] | None:
@@ -108,24 +79,25 @@ class Drive:
     @cached_property
     def twists(self) -> TwistIntervals:
         """Twists of the tracked body over intervals as long as the pose noise requires."""
-        return twists_of(self.dated, self.bursts, self.pose_noise or (0.0, 0.0))
+        (t, pose), bursts = (self.dated.t, self.dated.values), self.bursts
+        stride = 1 if bursts is not None else _stride(t, pose, self.pose_noise or (0.0, 0.0))
+        limit = 1.8 * bursts.period_s if bursts is not None else MAX_GAP_S
+        t, pose = t[::stride], pose[::stride]
+        span = np.diff(t)
+        usable = (span > 0.0) & (span < max(limit, 3.0 * float(np.median(span))))
+        relative = geometry.between(pose[:-1], pose[1:])[usable]
+        twist = geometry.log(relative) / span[usable, None]
+        return TwistIntervals(t[:-1][usable], t[1:][usable], twist)
 
 
 @dataclass(frozen=True)
 class Bursts:
-    """Bursts of arrivals.
+    """Samples that a driver hands over together, and so with one time of arrival."""
 
-    Attributes:
-        period_s: usual time between two bursts [s].
-        size: usual number of samples per burst.
-        of: (T,) index of the burst of each sample.
-        newest: (K,) index of the last sample of each burst, the freshest on arrival.
-    """
-
-    period_s: float
-    size: float
-    of: NDArray[np.intp]
-    newest: NDArray[np.intp]
+    period_s: float  # usual time between two bursts
+    size: float  # usual number of samples per burst
+    of: NDArray[np.intp]  # (T,) burst of each sample
+    newest: NDArray[np.intp]  # (K,) last sample of each burst, the freshest on arrival
 
 
 def find_bursts(t: Array) -> Bursts | None:
@@ -159,28 +131,19 @@ def spread(t: Array, bursts: Bursts | None) -> Array:
     return np.asarray(arrival[bursts.of] - span[bursts.of] * behind / count[bursts.of])
 
 
-def newest(t: Array, bursts: Bursts | None) -> NDArray[np.intp]:
-    """Returns indices of the samples with the best known time: the newest per burst, or all."""
-    return np.arange(len(t)) if bursts is None else bursts.newest
-
-
 def pose_noise(pose: Stream, bursts: Bursts | None) -> tuple[float, float] | None:
     """Returns standard deviations of position [m] and heading [rad] of poses.
 
-    They come from sixth differences, in which smooth motion vanishes, over gap-free stretches. In
-    bursts, whose sample times are not known well enough, they come from the stretches in which
-    the robot stood still. None if there are none.
+    They come from sixth differences, in which smooth motion vanishes; in bursts, whose sample
+    times are not known well enough, from stretches at rest. None if there are none.
     """
     if bursts is None:
         rest = _high_differences(pose)
-        if len(rest) < DIFFERENCE:
-            return None
-        sigma = np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD
+        sigma = np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD if len(rest) >= DIFFERENCE else None
     else:
-        found = _spread_at_rest(unwrapped(pose.values))
-        if found is None:
-            return None
-        sigma = found
+        sigma = _spread_at_rest(unwrapped(pose.values))
+    if sigma is None:
+        return None
     sigma = np.where(sigma < NEGLIGIBLE, 0.0, sigma)
     return float(np.hypot(sigma[0], sigma[1]) / np.sqrt(2.0)), float(sigma[2])
 
@@ -205,7 +168,7 @@ def _high_differences(pose: Stream) -> Array:
 
 
 def _spread_at_rest(pose: Array) -> Array | None:
-    """Returns the spread (3,) in stretches whose two halves do not differ; None if too few."""
+    """Returns the spread (3,) in stretches whose halves do not differ; None if too few."""
     count = len(pose) // REST_SAMPLES
     blocks = pose[: count * REST_SAMPLES].reshape(count, REST_SAMPLES, 3)
     spread = blocks.std(axis=1, ddof=1)
@@ -220,53 +183,24 @@ def _spread_at_rest(pose: Array) -> Array | None:
 
 @dataclass(frozen=True)
 class TwistIntervals:
-    """Twists of the tracked body over intervals.
+    """Twists of the tracked body, in its frame, over intervals on the pose's clock [s]."""
 
-    Attributes:
-        start, end: (n,) of the intervals, on the pose's clock [s].
-        twist: (n, 3) constant twist whose arc joins the poses at both ends, in the frame of the
-            tracked body.
-    """
-
-    start: Array
-    end: Array
-    twist: Array
+    start: Array  # (n,)
+    end: Array  # (n,)
+    twist: Array  # (n, 3) constant twist whose arc joins the poses at both ends
 
     def on_clock(self, offset: float) -> tuple[Array, Array]:
-        """Returns start (n,) and end (n,) on a clock that is ahead of the pose's by an offset."""
+        """Returns start and end on a clock that is ahead of the pose's by an offset."""
         return self.start + offset, self.end + offset
-
-
-def twists_of(dated: Stream, bursts: Bursts | None, noise: tuple[float, float]) -> TwistIntervals:
-    """Returns twists of the tracked body over intervals long enough for the noise.
-
-    Args:
-        dated: (T, 3) poses, of each burst only the newest.
-        bursts: of the stream.
-        noise: of position [m] and heading [rad].
-    """
-    t, pose = dated.t, dated.values
-    stride = 1 if bursts is not None else _stride(t, pose, noise)
-    limit = 1.8 * bursts.period_s if bursts is not None else MAX_GAP_S
-    t, pose = t[::stride], pose[::stride]
-    span = np.diff(t)
-    usable = (span > 0.0) & (span < max(limit, 3.0 * float(np.median(span))))
-    relative = geometry.between(pose[:-1], pose[1:])[usable]
-    return TwistIntervals(
-        t[:-1][usable], t[1:][usable], geometry.log(relative) / span[usable, None]
-    )
 
 
 def _stride(t: Array, pose: Array, noise: tuple[float, float]) -> int:
     """Returns the number of samples between poses that makes motion stand out of the noise."""
     dt = float(np.median(np.diff(t)))
     coarse = max(1, round(MAX_SPAN_S / dt))
-    far = geometry.log(geometry.between(pose[:-coarse:coarse], pose[coarse::coarse])) / (
-        coarse * dt
-    )
+    far = geometry.log(geometry.between(pose[:-coarse:coarse], pose[coarse::coarse]))
+    far = far / (coarse * dt)
     speed = float(np.sqrt((far[:, :2] ** 2).sum(axis=1).mean())) if len(far) else 0.0
     turn = float(np.sqrt((far[:, 2] ** 2).mean())) if len(far) else 0.0
-    needed = max(
-        noise[0] / max(SLOPE_NOISE * speed, 1e-9), noise[1] / max(SLOPE_NOISE * turn, 1e-9)
-    )
+    needed = max(n / max(SLOPE_NOISE * v, 1e-9) for n, v in zip(noise, (speed, turn), strict=True))
     return int(np.clip(np.ceil(np.sqrt(2.0) * needed / dt), 1, coarse))

@@ -1,11 +1,8 @@
 """Excitation: what a drive moved, and moved independently, and so what a fit can learn from it.
 
-Outliers: the rows that it can't. Least trimmed squares with concentration steps finds the bulk
-(Rousseeuw, Van Driessen: Computing LTS regression for large data sets). Rows far from it are
-dropped and the rest is fitted by ordinary least squares: reweighted least squares with weights of
-0 and 1. Without outliers, the fit is plain least squares.
-
-Coverage: the range of motion of each command in a drive, computed before any fit.
+Outliers are the rows that it can't learn from: least trimmed squares with concentration steps
+finds the bulk (Rousseeuw, Van Driessen: Computing LTS regression for large data sets), and rows
+far from it are dropped. Coverage is the range of each command, known before any fit.
 """
 
 from __future__ import annotations
@@ -17,52 +14,48 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from nics_drl_bridge.errors import FitError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.signals import GAUSSIAN_MAD, white_noise
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
-
-STILL = 1e-3
-"""A variable whose spread is below this share of its range did not move."""
-NOISE_ONLY = 1.5
-"""Nor did a measured state whose spread is below this multiple of its noise, if its command did
-not move."""
-DEPENDENT = 1e-7
-"""A normalised feature whose component orthogonal to those before it is below this is a copy."""
-TOGETHER = 1e-3
-"""Commands are linearly dependent if a normalised combination of them is smaller than this."""
+STILL = 1e-3  # a variable whose spread is below this share of its range did not move
+NOISE_ONLY = 1.5  # nor did a state below this multiple of its noise whose command did not move
+DEPENDENT = 1e-7  # a normalised feature with a smaller part orthogonal to those before is a copy
+TOGETHER = 1e-3  # commands are linearly dependent if a normalised combination is smaller
 MIN_SAMPLES_PER_TERM = 5
-NEGLIGIBLE = 1e-3
-"""A velocity component below this share of the other one is modelled as zero."""
-NOISY = 5e-4
-"""A measured state is noisy if its noise exceeds this share of its range."""
+NEGLIGIBLE = 1e-3  # a velocity component below this share of the other one is modelled as zero
+NOISY = 5e-4  # a measured state is noisy if its noise exceeds this share of its range
+BULK = 0.75  # share of the rows used in the initial fit
+CONCENTRATIONS = 12
+FAR = 8.0  # an outlier is this many standard deviations of the bulk away
+LEAST = 1e-6  # rates below this, in SI units, are rounding errors and never outliers
+USUAL = (5.0, 95.0)  # percentiles that bound the usual range; jumps in 5 % of the rows lie outside
+MOST = 0.2  # a larger share of rows is not outliers but a misfit of the model
+BEYOND = 0.5  # a value beyond its limits by this share of its range is a sensor fault
+# If there are outliers, the misfit of the rest is estimated from its tail, not from its median.
+BULK_PERCENTILE, GAUSSIAN_BULK = 90.0, 1.645
+GRID_S = 0.05
+ENDS = (2.0, 98.0)  # percentiles that bound the range of a command
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """Excitation of a robot's variables by a drive.
+    """Excitation of a robot's variables by a drive."""
 
-    Attributes:
-        unmoved: variables that the drive never moved, so that no term contains them.
-        together: commands that moved, but were linearly dependent.
-        levels: number of different values of each command, at most 10.
-    """
+    unmoved: tuple[str, ...]  # variables that the drive never moved, so that no term contains them
+    together: tuple[str, ...]  # commands that moved, but were linearly dependent
+    levels: dict[str, int]  # number of different values of each command, at most 10
 
-    unmoved: tuple[str, ...]
-    together: tuple[str, ...]
-    levels: dict[str, int]
-
-
-def excitation_of(samples: Samples, spec: RobotSpec) -> Excitation:
-    """Returns the excitation of the variables by a drive."""
-    return Excitation(
-        unmoved_variables(samples, spec), commands_together(samples, spec), levels(samples, spec)
-    )
+    @classmethod
+    def of(cls, samples: Samples, spec: RobotSpec) -> Excitation:
+        """Returns the excitation by a drive."""
+        together = commands_together(samples, spec)
+        return cls(unmoved_variables(samples, spec), together, levels(samples, spec))
 
 
 def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
-    """Returns the names of the variables of X that stayed constant for the whole drive.
+    """Returns the variables of X that stayed constant for the whole drive.
 
     A state whose command never moved did not move either if it shows nothing but noise.
     """
@@ -78,7 +71,7 @@ def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
 
 
 def commands_together(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
-    """Returns the names of the commands that moved, but were linearly dependent."""
+    """Returns the commands that moved, but were linearly dependent."""
     moved = [
         i
         for i, c in enumerate(spec.command, start=len(spec.state))
@@ -107,12 +100,8 @@ def levels(samples: Samples, spec: RobotSpec) -> dict[str, int]:
 def independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Splits columns into an independent set and copies; earlier, low-order ones are kept first."""
     unit = chi / np.linalg.norm(chi, axis=0)
-    independent: list[int] = []
-    dependent: list[int] = []
-    r = np.abs(np.diag(qr(unit, mode="r")[0]))  # no pivoting: each against its predecessors
-    for k in range(chi.shape[1]):
-        (independent if k < len(r) and r[k] > DEPENDENT else dependent).append(k)
-    return np.array(independent, dtype=np.intp), np.array(dependent, dtype=np.intp)
+    apart = np.abs(np.diag(qr(unit, mode="r")[0])) > DEPENDENT  # no pivoting: from predecessors
+    return np.flatnonzero(apart), np.flatnonzero(~apart)
 
 
 def moved_terms(
@@ -146,11 +135,7 @@ def terms_through_state(
 
 
 def moving_dofs(dq: Array) -> tuple[int, ...]:
-    """Returns the indices of the dofs that move: of vx and vy the non-negligible, and all others.
-
-    Args:
-        dq: (T, D) rates.
-    """
+    """Returns the indices of the rates (T, D) that move: vx, vy if not negligible, the others."""
     size = np.sqrt((dq**2).mean(axis=0))
     moves = np.ones(len(size), dtype=np.bool_)
     moves[:2] = size[:2] > NEGLIGIBLE * size[:2].max()
@@ -166,38 +151,15 @@ def states_are_noisy(samples: Samples, spec: RobotSpec) -> bool:
     return bool((white_noise(samples.x[:, :size]) > NOISY * width).any())
 
 
-BULK = 0.75
-"""Share of the rows used in the initial fit."""
-CONCENTRATIONS = 12
-FAR = 8.0
-"""An outlier is this many standard deviations of the bulk away,"""
-LARGE = 1.0
-"""and rows are searched only if some residual also exceeds this share of the rates' usual range,
-more than any misfit of the model."""
-LEAST = 1e-6
-"""Rates below this, in SI units, are rounding errors and never outliers."""
-USUAL = (5.0, 95.0)
-"""Percentiles that bound the usual range; jumps in 5 % of the rows lie outside."""
-MOST = 0.2
-"""A larger share of rows is not outliers but a misfit of the model."""
-BEYOND = 0.5
-"""A value beyond its limits by this share of its range is a sensor fault."""
-BULK_PERCENTILE, GAUSSIAN_BULK = 90.0, 1.645
-"""If there are outliers, the misfit of the rest is estimated from its tail, not from its median."""
-
-
 def inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
-    """Selects the rows (T,) of a regression of a target on features that are not outliers.
+    """Selects the rows of a regression of a target (T,) on features (T, K) that are no outliers.
 
-    Args:
-        chi: (T, K).
-        target: (T,).
-        usual: width of the usual range of such rates, see `usual_ranges`.
+    They are searched for if a residual exceeds the usual range of such rates (`usual_ranges`),
+    more than any misfit of the model.
     """
     everything = np.ones(len(target), dtype=np.bool_)
-    least = LARGE * usual
-    plain = np.abs(target - chi @ _solve(chi, target))
-    if not (plain > max(FAR / 2.0 * _sigma(plain), least)).any():
+    plain = _left(chi, target)
+    if not (plain > max(FAR / 2.0 * float(np.median(plain)) / GAUSSIAN_MAD, usual)).any():
         return everything
     count = max(int(BULK * len(target)), min(len(target), chi.shape[1] + 1))
     bulk = np.argsort(np.abs(target - np.median(target)), kind="stable")[:count]
@@ -220,14 +182,19 @@ def plausible(x: Array, spec: RobotSpec) -> NDArray[np.bool_]:
 
 def _concentrated(chi: Array, target: Array, chosen: NDArray[np.intp]) -> Array:
     """Returns absolute residuals (T,) of the fit to the best fitting rows, found from `chosen`."""
-    rest = np.abs(target - chi @ _solve(chi[chosen], target[chosen]))
+    rest = _left(chi, target, chosen)
     for _ in range(CONCENTRATIONS):
         again = np.argsort(rest, kind="stable")[: len(chosen)]
         if np.array_equal(np.sort(again), np.sort(chosen)):
             break
         chosen = again
-        rest = np.abs(target - chi @ _solve(chi[chosen], target[chosen]))
+        rest = _left(chi, target, chosen)
     return rest
+
+
+def _left(chi: Array, target: Array, rows: NDArray[np.intp] | slice = slice(None)) -> Array:
+    """Returns absolute residuals (T,) of the least squares on some rows."""
+    return np.abs(target - chi @ np.linalg.lstsq(chi[rows], target[rows], rcond=None)[0])
 
 
 def usual_ranges(dq: Array) -> Array:
@@ -238,44 +205,21 @@ def usual_ranges(dq: Array) -> Array:
     return np.asarray(width)
 
 
-def _solve(chi: Array, target: Array) -> Array:
-    return np.asarray(np.linalg.lstsq(chi, target, rcond=None)[0])
-
-
-def _sigma(rest: Array) -> float:
-    return float(np.median(rest)) / GAUSSIAN_MAD
-
-
-GRID_S = 0.05
-ENDS = (2.0, 98.0)
-"""Percentiles that bound the range of a command."""
-
-
 @dataclass(frozen=True)
 class CommandCoverage:
-    """Coverage of one command by a drive.
-
-    Attributes:
-        name: of the command.
-        unit: its unit.
-        low, high: its range, without 2 % at each end.
-        share: of the range that the robot's limits allow.
-        own: share of its spread that the other commands do not explain.
-        levels: number of different values; more than ten count as ten.
-        fault: why nothing can be learnt about it; empty if something can.
-    """
+    """Coverage of one command by a drive."""
 
     name: str
     unit: str
-    low: float
+    low: float  # its range, without 2 % at each end
     high: float
-    share: float
-    own: float
-    levels: int
-    fault: str
+    share: float  # of the range that the robot's limits allow
+    own: float  # share of its spread that the other commands do not explain
+    levels: int  # number of different values; more than ten count as ten
+    fault: str  # why nothing can be learnt about it; empty if something can
 
     def line(self) -> str:
-        """Returns a human-readable line."""
+        """Returns one line for people."""
         if self.fault:
             return f"{self.name}: {self.fault}"
         return (
@@ -285,32 +229,21 @@ class CommandCoverage:
 
 
 def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ...]:
-    """Measures the coverage of a recording's commands, by the same rules as a fit.
-
-    Args:
-        recording: of the robot.
-        spec: the robot.
-
-    Returns:
-        One per command, in the order of the spec.
-    """
+    """Measures the coverage of each command of a recording, by the same rules as a fit."""
     t, row = recording.command.t, recording.command.values
     grid = np.arange(t[0], t[-1], GRID_S)
     command = row[np.searchsorted(t, grid, side="right") - 1]
-    none = np.zeros((len(grid), 0))
-    samples = samples_on_one_clock(grid, np.zeros((len(grid), 3)), none, command)
-    stateless = spec.model_copy(update={"state": ()})
-    still = unmoved_variables(samples, stateless)
-    together = commands_together(samples, stateless)
-    count, own = levels(samples, stateless), _own(samples.x)
+    nothing = np.zeros((len(grid), 3))
+    samples = samples_on_one_clock(grid, nothing, nothing[:, :0], command)
+    found, own = Excitation.of(samples, spec.model_copy(update={"state": ()})), _own(samples.x)
     low, high = np.percentile(command, ENDS, axis=0)
     share = (high - low) / (spec.command_high - spec.command_low)
     return tuple(
         CommandCoverage(
             c.name, c.unit, float(low[i]), float(high[i]), float(share[i]), float(own[i]),
-            count[c.name],
-            "never moved" if c.name in still
-            else "moved only together with others" if c.name in together
+            found.levels[c.name],
+            "never moved" if c.name in found.unmoved
+            else "moved only together with others" if c.name in found.together
             else "",
         )
         for i, c in enumerate(spec.command)

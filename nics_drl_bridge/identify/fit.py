@@ -6,6 +6,7 @@ the coefficients of all, and `pruned` keeps those of Eq. 2 and estimates them an
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -13,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.excitation import (
     Excitation,
-    excitation_of,
     independent_columns,
     inliers,
     moved_terms,
@@ -40,60 +41,42 @@ from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.threads import one_blas_thread
 
-Array = NDArray[np.float64]
 Alpha = float | Literal["auto"]
 
 ALPHA: Alpha = 0.99
 ORDER = 2
-ROUNDING = 1e-9
-"""Standardised coefficients below this share of the rates are rounding errors."""
+ROUNDING = 1e-9  # standardised coefficients below this share of the rates are rounding errors
 SAME_STEP, ROUNDING_S = 1e-3, 1e-6
 
 
 def parse_alpha(text: str) -> Alpha:
-    """Parses a pruning threshold of Eq. 2: a number from 0 to 1, or `auto`.
+    """Parses a pruning threshold of Eq. 2.
 
     Raises:
-        ConfigError: it is neither.
+        ConfigError: it is neither a number from 0 to 1 nor `auto`.
     """
     if text == "auto":
         return "auto"
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not 0.0 <= value <= 1.0:
-        raise ConfigError(f"alpha is {text!r}; it must be a number from 0 to 1, or auto.")
-    return value
+    with suppress(ValueError):
+        if 0.0 <= (value := float(text)) <= 1.0:
+            return value
+    raise ConfigError(f"alpha is {text!r}; it must be a number from 0 to 1, or auto.")
 
 
 @dataclass(frozen=True)
 class Regression:
-    """Least squares of dQ/dt on all features (Eq. 1).
+    """Least squares of dQ/dt on all features (Eq. 1)."""
 
-    Attributes:
-        samples: T rows, without implausible ones.
-        powers: (K, V) exponents of the features of variables that moved, without copies.
-        chi: (T, K) features.
-        beta: (D, K) standardised coefficients; zero where not allowed or insignificant.
-        inliers: (D, T) mask of the rows that are no outliers.
-        moving: indices of the degrees of freedom that move; the others have no terms.
-        excitation: of the variables by the drive.
-        dependent: terms that are copies of others on this drive.
-        terms_total: D x K before anything was left out.
-        left_out: share of the rows that were implausible.
-    """
-
-    samples: Samples
-    powers: NDArray[np.int64]
-    chi: Array
-    beta: Array
-    inliers: NDArray[np.bool_]
-    moving: tuple[int, ...]
-    excitation: Excitation
-    dependent: tuple[str, ...]
-    terms_total: int
-    left_out: float
+    samples: Samples  # T rows, without implausible ones
+    powers: NDArray[np.int64]  # (K, V) exponents of the features that moved, without copies
+    chi: Array  # (T, K) features
+    beta: Array  # (D, K) standardised coefficients; zero where not allowed or insignificant
+    inliers: NDArray[np.bool_]  # (D, T) rows that are no outliers
+    moving: tuple[int, ...]  # degrees of freedom that move; the others have no terms
+    excitation: Excitation  # of the variables by the drive
+    dependent: tuple[str, ...]  # terms that are copies of others on this drive
+    terms_total: int  # D x K before anything was left out
+    left_out: float  # share of the rows that were implausible
 
     def rows(self, d: int) -> tuple[Array, Array]:
         """Returns features (n, K) and rates (n,) of a degree of freedom without its outliers."""
@@ -103,45 +86,25 @@ class Regression:
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted model and its goodness of fit.
+    """A fitted model and its goodness of fit."""
 
-    Attributes:
-        model: the pruned model, with standard errors.
-        rmse: (D,) root mean square residual of dQ/dt, in the dof's unit, without outliers.
-        r2: (D,) share of the variance explained; 1 if the dof does not move.
-        terms_total: D x K before pruning.
-        excitation: of the variables by the drive.
-        dependent: terms that are copies of others on this drive.
-        curves: accuracy against the number of terms, for the dofs that move.
-        outliers: (D,) share of the rows that were dropped as outliers.
-        condition: (D,) condition number of the standardised kept features.
-        samples: number of rows.
-    """
-
-    model: TaylorModel
-    rmse: Array
-    r2: Array
-    terms_total: int
-    excitation: Excitation
-    dependent: tuple[str, ...]
-    curves: tuple[Curve, ...]
-    outliers: Array
-    condition: Array
-    samples: int
+    model: TaylorModel  # the pruned model, with standard errors
+    regression: Regression  # on all features
+    rmse: Array  # (D,) root mean square residual of dQ/dt, in the dof's unit, without outliers
+    r2: Array  # (D,) share of the variance explained; 1 if the dof does not move
+    curves: tuple[Curve, ...]  # accuracy against the number of terms, for the dofs that move
+    outliers: Array  # (D,) share of the rows that were dropped as outliers
+    condition: Array  # (D,) condition number of the standardised kept features
 
     @property
     def unmoved(self) -> tuple[str, ...]:
         """Variables that the drive never moved, so that no term contains them."""
-        return self.excitation.unmoved
+        return self.regression.excitation.unmoved
 
 
 @one_blas_thread
 def fit(
-    samples: Samples,
-    spec: RobotSpec,
-    order: int = ORDER,
-    alpha: Alpha = ALPHA,
-    noisy: bool = False,
+    samples: Samples, spec: RobotSpec, order: int = ORDER, alpha: Alpha = ALPHA, noisy: bool = False
 ) -> Fit:
     """Fits and prunes a Taylor model; see `regress` and `pruned` for arguments and errors."""
     return pruned(regress(samples, spec, order, noisy), spec, alpha)
@@ -150,24 +113,19 @@ def fit(
 def regress(
     samples: Samples, spec: RobotSpec, order: int = ORDER, noisy: bool = False
 ) -> Regression:
-    """Finds the coefficients of all features by least squares (Eq. 1).
+    """Finds the coefficients of all features by least squares (Eq. 1); outliers are dropped.
 
-    Args:
-        samples: (t, Q, X, dQ) on one time axis. Rows that jump are dropped as outliers.
-        spec: gives names, units and limits.
-        order: of the expansion, 1 to 4; the paper's is 2.
-        noisy: True for any recording but an exact one. Insignificant terms are dropped before
-            Eq. 2 is applied to the rest. The body twist is then modelled as a function of the
-            state alone, if there is a state, and as zero at zero speed, if the speed moved:
-            within a step a command acts through the state, and in noise the two are
-            indistinguishable.
+    The order of the expansion is 1 to 4; the paper's is 2. `noisy` is any recording but an exact
+    one: insignificant terms are dropped before Eq. 2 is applied to the rest, and the body twist is
+    a function of the state alone, if there is one, and zero at zero speed, if the speed moved.
+    For within a step a command acts through the state, and in noise the two can't be told apart.
 
     Raises:
         FitError: too few samples, or nothing moved.
     """
     believed = plausible(samples.x, spec)
     samples = samples.rows(believed)
-    excitation, names = excitation_of(samples, spec), spec.variable_names
+    excitation, names = Excitation.of(samples, spec), spec.variable_names
     every = taylor.exponents(len(names), order)
     powers = moved_terms(samples, every, names, excitation.unmoved)
     chi = taylor.evaluate(samples.x, powers)
@@ -183,22 +141,18 @@ def regress(
         used[d] = inliers(some / _scale(some), target, float(usual[d]))
         if not used[d].all():
             some, target = some[used[d]], target[used[d]]
-        beta[d, allowed] = _standardised(some / _scale(some), target, noisy)
+        unit, used_terms = some / _scale(some), np.flatnonzero(allowed)
+        if noisy:
+            candidates = significant(unit, target)
+            unit, used_terms = unit[:, candidates], used_terms[candidates]
+        if len(used_terms):
+            beta[d, used_terms] = np.linalg.lstsq(unit, target, rcond=None)[0]
     return Regression(
         samples, kept, chi, beta, used, moving, excitation,
         dependent=tuple(taylor.term_name(row, names) for row in powers[dependent]),
         terms_total=samples.dq.shape[1] * len(every),
         left_out=1.0 - float(believed.mean()),
     )  # fmt: skip
-
-
-def _standardised(unit: Array, target: Array, noisy: bool) -> Array:
-    """Returns coefficients (K,) of standardised features (T, K); insignificant ones are zero."""
-    beta = np.zeros(unit.shape[1])
-    candidates = significant(unit, target) if noisy else np.ones(len(beta), dtype=np.bool_)
-    if candidates.any():
-        beta[candidates] = np.linalg.lstsq(unit[:, candidates], target, rcond=None)[0]
-    return beta
 
 
 def _scale(chi: Array) -> Array:
@@ -218,8 +172,7 @@ def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.boo
     """Selects the standardised coefficients (K,) to keep (Eq. 2).
 
     In order of size, coefficients are kept while their sum stays below the share `alpha` of the
-    total, and also the one that crosses it. Those up to `noise_floor` are rounding errors and
-    never count.
+    total, and also the one that crosses it. Those up to `noise_floor` are rounding errors.
     """
     order = by_weight(beta, noise_floor)
     size = np.abs(beta[order])
@@ -231,14 +184,10 @@ def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.boo
 def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit:
     """Prunes a regression (Eq. 2) and estimates the coefficients of the kept terms anew.
 
-    Args:
-        regression: on all features.
-        spec: the robot.
-        alpha: the share of the summed standardised coefficients that the kept terms of each
-            degree of freedom reach (Eq. 2). The term that crosses the threshold is kept too:
-            with a literal Eq. 2 a differential robot, whose wheels have equal weight, would
-            lose one of them. `auto` keeps as many terms, in the same order, as improve the
-            cross-validated error (`statistics.knee`).
+    `alpha` is the share of the summed standardised coefficients that the kept terms of each
+    degree of freedom reach. The term that crosses the threshold is kept too: with a literal Eq. 2
+    a differential robot, whose wheels have equal weight, would lose one. `auto` keeps as many
+    terms, in the same order, as improve the cross-validated error (`statistics.knee`).
     """
     samples, shape = regression.samples, regression.beta.shape
     coefficients, errors, conditions = np.zeros(shape), np.zeros(shape), np.ones(shape[0])
@@ -257,19 +206,18 @@ def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit
             _reestimate(coefficients[d], errors[d], d, regression, len(spec.state))
         conditions[d] = condition(chi[:, keep])
         curves.append(found)
-    model = _model(regression, spec, coefficients, errors)
+    used = np.abs(coefficients).sum(axis=0) > 0.0
+    model = TaylorModel(
+        spec.variable_names, spec.dof_names, spec.dof_units, regression.powers[used],
+        coefficients[:, used], samples.dt, samples.x.min(axis=0), samples.x.max(axis=0),
+        std_errors=errors[:, used],
+    )  # fmt: skip
     rmse, r2 = errors_of(model, samples)
     for d in regression.moving:
-        if not regression.inliers[d].all():
-            some = errors_of(model, samples.rows(regression.inliers[d]))
-            rmse[d], r2[d] = some[0][d], some[1][d]
-    return Fit(
-        model, rmse, r2, regression.terms_total, regression.excitation, regression.dependent,
-        curves=tuple(curves),
-        outliers=1.0 - (1.0 - regression.left_out) * regression.inliers.mean(axis=1),
-        condition=conditions,
-        samples=len(samples.t),
-    )  # fmt: skip
+        if not (inside := regression.inliers[d]).all():
+            rmse[d], r2[d] = (each[d] for each in errors_of(model, samples.rows(inside)))
+    outliers = 1.0 - (1.0 - regression.left_out) * regression.inliers.mean(axis=1)
+    return Fit(model, regression, rmse, r2, tuple(curves), outliers, conditions)
 
 
 def _kept(
@@ -281,12 +229,12 @@ def _kept(
     order = by_weight(beta, floor)
     names = (taylor.term_name(row, spec.variable_names) for row in regression.powers[order])
     found = curve(spec.dof_names[d], tuple(names), unit[:, order], target)
-    if alpha == "auto":
-        keep = np.zeros(len(beta), dtype=np.bool_)
-        keep[order[: found.kept]] = True
-    else:
+    if alpha != "auto":
         keep = prune(beta, alpha, floor)
-    return keep, replace(found, kept=int(keep.sum()))
+        return keep, replace(found, kept=int(keep.sum()))
+    keep = np.zeros(len(beta), dtype=np.bool_)
+    keep[order[: found.kept]] = True
+    return keep, found
 
 
 def _reestimate(
@@ -309,21 +257,3 @@ def _reestimate(
     found = instrumental(chi, instruments, samples.dq[now, d])
     if found is not None:
         coefficients[kept], errors[kept] = found
-
-
-def _model(
-    regression: Regression, spec: RobotSpec, coefficients: Array, errors: Array
-) -> TaylorModel:
-    """Builds a TaylorModel of the terms that any degree of freedom keeps."""
-    samples, used = regression.samples, np.abs(coefficients).sum(axis=0) > 0.0
-    return TaylorModel(
-        variables=spec.variable_names,
-        dofs=spec.dof_names,
-        dof_units=spec.dof_units,
-        powers=regression.powers[used],
-        coefficients=coefficients[:, used],
-        dt=samples.dt,
-        low=samples.x.min(axis=0),
-        high=samples.x.max(axis=0),
-        std_errors=errors[:, used],
-    )

@@ -7,44 +7,83 @@ with its own added. `STAGES` is the whole road from a recording to a model.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
 
 import numpy as np
 
 from nics_drl_bridge.errors import FitError, RecordingError
-from nics_drl_bridge.identify.align import align
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify import verdict
 from nics_drl_bridge.identify.assume import assume_textbook
-from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.clocks import SEARCH_S, expected_speed, nominal_timing, timing_of
+from nics_drl_bridge.identify.calibration import Calibration, align
+from nics_drl_bridge.identify.clocks import (
+    SEARCH_S,
+    TimingEstimate,
+    expected_speed,
+    nominal_timing,
+    responses_of,
+    timing_of,
+    with_wheels,
+)
 from nics_drl_bridge.identify.drive import Drive, Settings
-from nics_drl_bridge.identify.findings import Findings, Identified, known, sentences
-from nics_drl_bridge.identify.fit import ALPHA, ORDER, Alpha, Fit, pruned, regress
-from nics_drl_bridge.identify.mounting import mounted, mounting_of
+from nics_drl_bridge.identify.fit import ALPHA, ORDER, Alpha, Fit, Regression, pruned, regress
+from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
+from nics_drl_bridge.identify.open_loop import OpenLoop
 from nics_drl_bridge.identify.refine import refined
 from nics_drl_bridge.identify.repair import check_axes, check_units, repaired
-from nics_drl_bridge.identify.responses import responses_of, with_wheels
-from nics_drl_bridge.identify.verdict import (
-    doubts,
-    mirror_note,
-    refuse_unexcited,
-    tried,
-    unlearnt,
-    unseen_samples,
-    with_quality,
-)
-from nics_drl_bridge.recording.recording import Recording, Stream, check
+from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
+from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.threads import one_blas_thread
 
-__all__ = ["STAGES", "Identified", "begun", "calibrate", "cut", "identify", "run"]
+T = TypeVar("T")
 
 TRAIN_SHARE = 2.0 / 3.0
-PRUNED = "the pruned fit"
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Findings of the stages, in their order; None, empty or the default until they have run.
+
+    What a stage could not learn is None too, and a sentence in the notes.
+    """
+
+    training: Drive  # the part of the drive to learn from; repaired by `repair`
+    whole: Drive  # repaired by `repair`
+    timing: TimingEstimate  # of `clocks`; nominal before
+    repairs: tuple[str, ...] = ()  # sentences of `repair`
+    speed: Array | None = None  # (n,) expected over the training part's twists, of `mounting`
+    mounting: Mounting | None = None  # of `mounting`
+    # Of `clocks`, `mounting`, `responses` and `noise`; then of `refine`.
+    calibration: Calibration = field(default_factory=Calibration)
+    noise: Noise = field(default_factory=Noise)  # the pose sensor's of `noise`; the rest of `judge`
+    samples: Samples | None = None  # of the training part on one time axis, of `fit`
+    regression: Regression | None = None  # on all features (Eq. 1), of `fit`
+    linear: Fit | None = None  # the pruned fit (Eq. 2), of `prune`
+    model: TaylorModel | None = None  # of `prune`; then of `refine` and `complete`
+    refinement: tuple[str, ...] = ()  # sentences of `refine`
+    assumptions: tuple[str, ...] = ()  # sentences of `complete`
+    unseen: Samples | None = None  # of the part that the fit did not see, of `judge`
+    held_out: OpenLoop | None = None  # open-loop errors on that part, of `judge`
+    notes: tuple[str, ...] = ()  # all sentences, of `judge`
+
 
 Stage = Callable[[Drive, Findings], Findings]
+
+
+def known(found: T | None, name: str, stage: str) -> T:
+    """Returns a finding that a later stage can't do without, else raises FitError."""
+    if found is None:
+        raise FitError(f"{name} is missing; put the stage {stage!r} before those that need it.")
+    return found
+
+
+def _fitted(findings: Findings) -> tuple[Fit, TaylorModel]:
+    name = "the pruned fit"
+    return known(findings.linear, name, "prune"), known(findings.model, name, "prune")
 
 
 def repair(drive: Drive, findings: Findings) -> Findings:
@@ -59,15 +98,15 @@ def repair(drive: Drive, findings: Findings) -> Findings:
 
 def clocks(drive: Drive, findings: Findings) -> Findings:
     """Finds the period of bursts, the offset between clocks, the latency of commands, and lags."""
-    training, timing = findings.training, timing_of(findings.training)
+    training, found = findings.training, timing_of(findings.training)
     calibration = replace(
         findings.calibration,
-        clock_offset_s=timing.offset,
-        command_latency_s=timing.latency,
+        clock_offset_s=found.offset,
+        command_latency_s=found.latency,
         burst_period_s=training.bursts.period_s if training.bursts else 0.0,
-        uncertainty=timing.sigma,
+        uncertainty=found.sigma,
     )
-    return replace(findings, timing=timing, calibration=calibration)
+    return replace(findings, timing=found, calibration=calibration)
 
 
 def mounting(drive: Drive, findings: Findings) -> Findings:
@@ -106,7 +145,7 @@ def fit(drive: Drive, findings: Findings) -> Findings:
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
     if settings.strict:
-        refuse_unexcited(regression.excitation, spec)
+        verdict.refuse_unexcited(regression.excitation, spec)
     return replace(findings, samples=samples, regression=regression)
 
 
@@ -140,10 +179,10 @@ def judge(drive: Drive, findings: Findings) -> Findings:
     linear, model = _fitted(findings)
     spec, whole, calibration = drive.spec, findings.whole, findings.calibration
     samples = align(whole, calibration)
-    unseen = unseen_samples(samples, whole, calibration)
-    held_out, trial = tried(model, calibration, whole)
-    calibration = replace(calibration, notes=sentences(findings))
-    judged = with_quality(model, linear, unseen, held_out, spec)
+    unseen = verdict.unseen_samples(samples, whole, calibration)
+    held_out, trial = verdict.tried(model, calibration, whole)
+    calibration = replace(calibration, notes=_sentences(findings))
+    judged = verdict.with_quality(model, linear, unseen, held_out, spec)
     return replace(
         findings,
         calibration=calibration,
@@ -156,17 +195,23 @@ def judge(drive: Drive, findings: Findings) -> Findings:
             *findings.repairs,
             *calibration.notes,
             *findings.refinement,
-            *mirror_note(known(findings.samples, "the training part", "fit"), spec),
-            *unlearnt(linear, calibration, spec),
-            *doubts(linear, held_out, calibration.is_exact),
+            *verdict.mirror_note(known(findings.samples, "the training part", "fit"), spec),
+            *verdict.unlearnt(linear, calibration, spec),
+            *verdict.doubts(linear, held_out, calibration.is_exact),
             *trial,
             *findings.assumptions,
         ),
     )
 
 
-def _fitted(findings: Findings) -> tuple[Fit, TaylorModel]:
-    return known(findings.linear, PRUNED, "prune"), known(findings.model, PRUNED, "prune")
+def _sentences(found: Findings) -> tuple[str, ...]:
+    drive, calibration = found.training, found.calibration
+    return (
+        *verdict.about_stamps(drive),
+        *verdict.about_clocks(drive, calibration, found.timing),
+        *verdict.about_mounting(drive, calibration, found.mounting),
+        *verdict.about_responses(drive, calibration, found.timing),
+    )
 
 
 STAGES: tuple[Stage, ...] = (
@@ -188,6 +233,37 @@ def run(stages: Sequence[Stage], drive: Drive) -> Findings:
     for stage in stages:
         findings = stage(drive, findings)
     return findings
+
+
+@dataclass(frozen=True)
+class Identified:
+    """Result of an identification."""
+
+    drive: Drive  # the whole drive, repaired
+    model: TaylorModel  # refined and, on request, completed; with standard errors and quality
+    calibration: Calibration
+    fit: Fit  # the linear fit, before refinement
+    samples: Samples  # that the fit used
+    unseen: Samples | None  # of the part that the fit did not see; None if there are too few
+    held_out: OpenLoop | None  # open-loop errors on that part; None if it was too short
+    noise: Noise  # of sensors and motion, each level measured or assumed
+    findings: Findings  # of all stages
+    notes: tuple[str, ...]  # sentences on findings, on what was not learnt, and on assumptions
+
+    @property
+    def recording(self) -> Recording:
+        """The whole recording, repaired."""
+        return self.drive.recording
+
+    @property
+    def train_until_s(self) -> float:
+        """End of the training part, from the drive's first pose [s]."""
+        return self.drive.settings.train_until_s
+
+    @property
+    def alpha(self) -> Alpha:
+        """Threshold of the pruning; `auto` for the knee of the accuracy curve."""
+        return self.drive.settings.alpha
 
 
 @one_blas_thread
@@ -223,15 +299,13 @@ def identify(
 
 @one_blas_thread
 def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
-    """Estimates the corrections that the streams of a recording need before a fit.
-
-    It is the identity for a recording that needs none.
+    """Estimates the corrections that a recording needs before a fit; the identity if none.
 
     Raises:
         RecordingError: the recording can't be used for this robot.
     """
     found = run(CALIBRATION, Drive(check(recording, spec), spec))
-    return replace(found.calibration, notes=sentences(found))
+    return replace(found.calibration, notes=_sentences(found))
 
 
 def cut(recording: Recording, until: float) -> Recording:
@@ -245,8 +319,7 @@ def cut(recording: Recording, until: float) -> Recording:
     def part(stream: Stream, margin: float = 0.0) -> Stream:
         overlap = stream.t[0] < pose[-1] and stream.t[-1] > pose[0]
         origin = max(stream.t[0], pose[0]) if overlap else stream.t[0]
-        keep = stream.t <= origin + until + margin
-        return replace(stream, t=stream.t[keep], values=stream.values[keep])
+        return stream.rows(stream.t <= origin + until + margin)
 
     if not until > 0.0:
         raise RecordingError(

@@ -8,8 +8,7 @@ import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 
-SMALL_TURN = 0.3
-"""Below this angle the series of sin(a)/a is exact to the last digits [rad]."""
+SMALL_TURN = 0.3  # below this angle the series of sin(a)/a is exact to the last digits [rad]
 
 
 @kernel(allocates=True)
@@ -22,7 +21,6 @@ def _product(row, factors, count):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _sinc(half):  # type: ignore[no-untyped-def]
-    """Returns sin(a) / a."""
     if abs(half) > SMALL_TURN:
         return math.sin(half) / half
     square = half * half
@@ -57,14 +55,13 @@ def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-un
     """Integrates body twists along courses of X that do not depend on the coefficients.
 
     Each step is the exact arc of its twist, as in the simulator. Shapes: W windows, T steps, V
-    variables, K terms of the twist, P free coefficients.
+    variables, P free coefficients.
 
     Args:
         ends: (W, 3) output: end poses relative to the starts, headings unwrapped.
         moved: (W, 3, P) output: their derivatives by the free coefficients. P = 0 skips them.
         x: (W, T, V + 1) X during each step, and a last entry of 1.
-        steps: (W,) whole steps to the end.
-        share: (W,) remaining fraction of one more step.
+        steps, share: (W,) whole steps to the end, and the remaining fraction of one more.
         terms: of the twist, see `robot.kernels.Terms`.
         free: (P,) indices of the free terms.
         dt: length of a step [s].

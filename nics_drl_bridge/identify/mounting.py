@@ -1,20 +1,21 @@
 """Mounting: position and rotation of the tracked body on the robot.
 
-The uncertainty on an omnidirectional robot is that of the delete-one-block jackknife (Efron,
-Tibshirani: An Introduction to the Bootstrap, ch. 11). It covers what least-squares formulas miss:
-wheel slip that is correlated over seconds, and errors of the regressors themselves.
+Its uncertainty on an omnidirectional robot is that of the delete-one-block jackknife (Efron,
+Tibshirani: An Introduction to the Bootstrap, ch. 11), which covers what least-squares formulas
+miss: wheel slip that is correlated over seconds, and errors of the regressors themselves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.geometry import rotate, wrap_angle
+from nics_drl_bridge.geometry import Array, rotate, wrap_angle
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import (
     LONG_STEP,
@@ -27,14 +28,9 @@ from nics_drl_bridge.identify.signals import followed, held
 from nics_drl_bridge.identify.statistics import standard_errors
 from nics_drl_bridge.recording.recording import Stream
 
-Array = NDArray[np.float64]
-
-TURN_SCALE_M = 0.2
-"""Weighs yaw rates against speeds: a yaw rate counts as the speed at this distance."""
-DISTINCT = 4.0
-"""The second direction of motion must exceed the noise by this factor."""
-MIN_SECOND = 0.05
-"""It must have at least this share of the size of the first."""
+TURN_SCALE_M = 0.2  # a yaw rate counts as the speed at this distance
+DISTINCT = 4.0  # the second direction of motion must exceed the noise by this factor
+MIN_SECOND = 0.05  # it must have at least this share of the size of the first
 STILL = 1e-3
 MIN_LENGTH = 1e-4  # m, rad
 REGULAR = 0.8
@@ -43,68 +39,47 @@ BLOCKS = 8
 
 @dataclass(frozen=True)
 class Mounting:
-    """Rotation and lever arm, as in `Calibration`, with standard uncertainty.
+    """Rotation and lever arm, as in `Calibration`, with standard uncertainty."""
 
-    Attributes:
-        rotation: heading of `base_link` minus that of the tracked body [rad].
-        lever: (2,) position of the tracked point in `base_link` [m].
-        rotation_sigma: [rad].
-        lever_sigma: (2,) [m]; NaN for a component that could not be learnt.
-        turns: True if the robot turned at all.
-    """
-
-    rotation: float
-    lever: Array
-    rotation_sigma: float
-    lever_sigma: Array
-    turns: bool
+    rotation: float  # heading of `base_link` minus that of the tracked body [rad]
+    lever: Array  # (2,) position of the tracked point in `base_link` [m]
+    rotation_sigma: float  # [rad]
+    lever_sigma: Array  # (2,) [m]; NaN for a component that could not be learnt
+    turns: bool  # True if the robot turned at all
 
 
 def mounting_of(drive: Drive, timing: TimingEstimate, speed: Array | None) -> Mounting | None:
     """Estimates the mounting as far as the drive shows it; None if it does not.
 
-    `speed` (n,) is expected along the direction of travel over the intervals of the twists, up to
-    one factor; None if unknown.
+    The speed (n,) along the direction of travel is expected over the intervals of the twists, up to
+    one factor.
     """
     spec, twists = drive.spec, drive.twists
     if spec.moves_sideways:
-        return jackknifed(
-            drive, twists, timing.offset, lambda part, rows: _by_commands(part, rows, timing)
-        )
+        return jackknifed(drive, twists, timing.offset, partial(_by_commands, timing))
     start, end = twists.on_clock(timing.offset)
     command = held(drive.recording.command, spec, start - timing.latency, end - timing.latency)
     found = mounting_without_lateral_motion(twists, spec.to_cmd_vel(command)[:, 0])
     if found is None or speed is None or np.isnan(found.lever_sigma[0]):
         return found
-    lever_y, sigma = lateral_lever(twists, found.rotation, speed)
-    return replace(
-        found,
-        lever=np.array([found.lever[0], lever_y]),
-        lever_sigma=np.array([found.lever_sigma[0], sigma]),
-    )
+    found.lever[1], found.lever_sigma[1] = lateral_lever(twists, found.rotation, speed)
+    return found
 
 
 def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
     """Adds those parts of a mounting that are significant, and all uncertainties."""
     if mounting is None:
         return calibration
-    rotation = if_certain(mounting.rotation, mounting.rotation_sigma, MIN_LENGTH)
-    known = ~np.isnan(mounting.lever_sigma)
-    x, y = (
-        if_certain(float(value), float(sigma), MIN_LENGTH) if k else 0.0
-        for value, sigma, k in zip(mounting.lever, mounting.lever_sigma, known, strict=True)
-    )
-    sigma = {"rotation_rad": mounting.rotation_sigma}
-    sigma |= {
-        f"lever_arm_{axis}_m": float(s)
-        for axis, s, k in zip("xy", mounting.lever_sigma, known, strict=True)
-        if k
-    }
+    names = ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
+    values = map(float, (mounting.rotation, *mounting.lever))
+    sigmas = tuple(map(float, (mounting.rotation_sigma, *mounting.lever_sigma)))
+    rotation, x, y = (if_certain(v, s, MIN_LENGTH) for v, s in zip(values, sigmas, strict=True))
+    learnt = {n: s for n, s in zip(names, sigmas, strict=True) if not np.isnan(s)}
     return replace(
         calibration,
         rotation_rad=rotation,
         lever_arm_m=(x, y),
-        uncertainty={**calibration.uncertainty, **sigma},
+        uncertainty={**calibration.uncertainty, **learnt},
     )
 
 
@@ -113,63 +88,40 @@ def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> M
 
     The lateral speed of the tracked point is then yaw rate x lever arm:
     `cos(rotation) uy - sin(rotation) ux - lever_x wz = 0`, the direction in which the twists
-    have no extent. If the path has a single curvature, rotation and lever arm can't be
-    separated, and the lever arm is set to zero.
+    have no extent. On a path of a single curvature, rotation and lever arm can't be separated,
+    and the lever arm is set to zero. The lever arm along y remains unknown. None if nothing moved.
 
-    Args:
-        motion: twists of the tracked body.
-        forward: (n,) commanded or measured forward speed; only its sign matters.
-
-    Returns:
-        The mounting, with unknown lever arm along y. None if nothing moved.
+    Of the commanded or measured forward speed (n,) only the sign matters.
     """
     rows = motion.twist * np.array([1.0, 1.0, TURN_SCALE_M])
     size, axes = np.linalg.svd(rows, full_matrices=False)[1:]
     size = size / np.sqrt(len(rows))
     if size[0] < STILL:
         return None
-    turns = bool(np.abs(rows[:, 2]).mean() > STILL)
+    turns, lever, lever_sigma = bool(np.abs(rows[:, 2]).mean() > STILL), 0.0, np.nan
     if size[1] < max(DISTINCT * size[2], MIN_SECOND * size[0]):
-        direction = axes[0, :2]
         sigma = size[1] / size[0] / np.sqrt(len(rows))
-        travel = float(np.arctan2(direction[1], direction[0]))
-        return _facing(motion, forward, travel, (0.0, np.nan), sigma, turns)
-    normal = axes[2]
-    flat = float(np.hypot(normal[0], normal[1]))
-    sigma = size[2] / size[1] / np.sqrt(len(rows)) / flat
-    travel = float(np.arctan2(-normal[0], normal[1]))
-    lever = -float(normal[2]) * TURN_SCALE_M / flat
-    return _facing(motion, forward, travel, (lever, sigma * TURN_SCALE_M), sigma, turns)
-
-
-def _facing(
-    motion: TwistIntervals,
-    forward: Array,
-    travel: float,
-    lever_x: tuple[float, float],
-    sigma: float,
-    turns: bool,
-) -> Mounting:
-    """Resolves forward and backward; `travel` is the direction of travel in the tracked frame."""
-    lever, lever_sigma = lever_x
+        travel = float(np.arctan2(axes[0, 1], axes[0, 0]))
+    else:
+        normal = axes[2]
+        flat = float(np.hypot(normal[0], normal[1]))
+        sigma = size[2] / size[1] / np.sqrt(len(rows)) / flat
+        travel = float(np.arctan2(-normal[0], normal[1]))
+        lever, lever_sigma = -float(normal[2]) * TURN_SCALE_M / flat, sigma * TURN_SCALE_M
     along = motion.twist[:, :2] @ np.array([np.cos(travel), np.sin(travel)])
     if float(along @ forward) < 0.0:
         travel, lever = travel + np.pi, -lever
     return Mounting(
-        float(wrap_angle(travel)),
-        np.array([lever, 0.0]),
-        float(sigma),
-        np.array([lever_sigma, np.nan]),
-        turns,
-    )
+        float(wrap_angle(travel)), np.array([lever, 0.0]),
+        float(sigma), np.array([lever_sigma, np.nan]), turns,
+    )  # fmt: skip
 
 
 def lateral_lever(motion: TwistIntervals, rotation: float, speed: Array) -> tuple[float, float]:
     """Estimates the lever arm along y and its uncertainty [m] from a speed (n,).
 
-    The speed is measured or inferred from commands. The tracked point is faster than `base_link`
-    on the outside of a curve: `ux = gain speed - lever_y wz`. The uncertainty is NaN if all
-    curves were alike.
+    The tracked point is faster than `base_link` on the outside of a curve: `ux = gain speed -
+    lever_y wz`. The uncertainty is NaN if all curves were alike.
     """
     along = rotate(motion.twist[:, :2], -rotation)[:, 0]
     chi = np.stack([speed, motion.twist[:, 2]], axis=1)
@@ -180,21 +132,24 @@ def lateral_lever(motion: TwistIntervals, rotation: float, speed: Array) -> tupl
     return -float(beta[1]), float(standard_errors(chi, along - chi @ beta)[1])
 
 
-def mounting_by_commands(motion: TwistIntervals, response: Array) -> Mounting | None:
-    """Estimates the mounting on an omnidirectional robot.
+def _by_commands(timing: TimingEstimate, drive: Drive, twists: TwistIntervals) -> Mounting | None:
+    """Estimates the mounting on an omnidirectional robot from its state, or else its commands.
 
-    Args:
-        motion: twists of the tracked body.
-        response: (n, 3) twist of `base_link` expected from state or commands, up to one factor.
-
-    Returns:
-        The mounting, or None unless the robot moved along x and y and turned.
+    None unless the robot moved along x and y and turned.
     """
+    recording, spec = drive.recording, drive.spec
+    if spec.state:
+        expected = expected_states(drive, twists, timing)
+        command = _as_commands(expected, drive, timing.latency)
+    else:
+        begin = twists.start + timing.offset - timing.latency
+        command = held(recording.command, spec, begin, begin + twists.end - twists.start)
+    response = spec.to_cmd_vel(command)  # of base_link, up to one factor
     size = np.linalg.svd(response, compute_uv=False)
     if size[2] <= MIN_SECOND * size[0]:
         return None
-    gain, *_ = np.linalg.lstsq(response, motion.twist, rcond=None)
-    rest = motion.twist - response @ gain
+    gain, *_ = np.linalg.lstsq(response, twists.twist, rcond=None)
+    rest = twists.twist - response @ gain
     spread = np.stack([standard_errors(response, column) for column in rest.T], axis=1)
     rotation = float(np.arctan2(gain[0, 1] - gain[1, 0], gain[0, 0] + gain[1, 1]))
     across = rotate(gain[2, :2], -rotation) / gain[2, 2]  # (-lever_y, lever_x)
@@ -206,18 +161,6 @@ def mounting_by_commands(motion: TwistIntervals, response: Array) -> Mounting | 
         np.full(2, float(spread[2, 0] / abs(gain[2, 2]))),
         True,
     )
-
-
-def _by_commands(drive: Drive, twists: TwistIntervals, timing: TimingEstimate) -> Mounting | None:
-    """Estimates the mounting on an omnidirectional robot from its state, or from its commands."""
-    recording, spec = drive.recording, drive.spec
-    if spec.state:
-        expected = expected_states(drive, twists, timing)
-        command = _as_commands(expected, drive, timing.latency)
-    else:
-        begin = twists.start + timing.offset - timing.latency
-        command = held(recording.command, spec, begin, begin + twists.end - twists.start)
-    return mounting_by_commands(twists, spec.to_cmd_vel(command))
 
 
 def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
@@ -242,10 +185,7 @@ def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
 
 
 def _fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
-    """Returns a mask of the times (n,) at which the command is known; rows may be missing.
-
-    If commands are recorded irregularly, each is assumed to be held until the next.
-    """
+    """Selects the times (n,) at which the command is known: not in gaps of regular rows."""
     span = np.diff(command.t)
     usual = float(np.median(span)) if len(span) else 0.0
     if not (span < LONG_STEP * usual).mean() > REGULAR:
@@ -262,22 +202,13 @@ def jackknifed(
 ) -> Mounting | None:
     """Estimates a mounting, with at least the uncertainty of the delete-one-block jackknife.
 
-    Args:
-        drive: the drive.
-        twists: of the tracked body.
-        offset: of the pose's clock, as in `Calibration` [s].
-        estimate: estimates the mounting from a drive and its twists.
-
-    Returns:
-        The mounting from the whole drive; None if it can't be estimated.
+    The clock of the twists is `offset` [s] behind that of the drive's other streams.
     """
     whole = estimate(drive, twists)
     if whole is None:
         return None
     edges = np.linspace(twists.start[0], twists.end[-1], BLOCKS + 1)
-    parts = [
-        estimate(*_without(drive, twists, offset, begin, end)) for begin, end in pairwise(edges)
-    ]
+    parts = (estimate(*_without(drive, twists, offset, *ends)) for ends in pairwise(edges))
     found = [part for part in parts if part is not None]
     if len(found) < BLOCKS:
         return whole
@@ -305,5 +236,4 @@ def _without(
     if state is None:
         return drive, kept
     outside = (state.t < begin + offset) | (state.t > end + offset)
-    cut = replace(state, t=state.t[outside], values=state.values[outside])
-    return drive.part(replace(drive.recording, state=cut)), kept
+    return drive.part(replace(drive.recording, state=state.rows(outside))), kept

@@ -1,4 +1,4 @@
-"""Measurement of sensor noise, and of the motion that a model leaves unexplained.
+"""Noise of the sensors, and the motion that a model leaves unexplained.
 
 The drift is measured over a second: systematic errors of a model grow faster than noise, so over
 a longer horizon the same model seems to drift more. The noise of the odometry is the deviation of
@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, find_bursts, pose_noise
 from nics_drl_bridge.identify.open_loop import (
@@ -28,23 +28,17 @@ from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.noise import ASSUMED_STATE_DRIFT, MEASURED, Level, Noise, assumed
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-Array = NDArray[np.float64]
-
 HORIZON_S = 1.0
 SPACING_S = 0.25
 GROWTH_S = (0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
 STATE_HORIZON_S = 0.1
 MIN_WINDOWS = 20
-OUTLYING = 10.0
-"""A window whose error is more than this many times the median contains a jump."""
-RUN_AWAY_M = 1e4
-"""A larger error of a prediction over a second is divergence, not drift."""
+OUTLYING = 10.0  # a window whose error is more than this many times the median contains a jump
+RUN_AWAY_M = 1e4  # a larger error of a prediction over a second is divergence, not drift
 BLOCKS = 8
 TINY = 1e-9
-NEGLIGIBLE = 1e-4
-"""A smaller level is rounding: a tenth of a millimetre after a second."""
-WITHIN_SIGMA = 68.27
-"""Percentage of a normal distribution within one standard deviation."""
+NEGLIGIBLE = 1e-4  # a smaller level is rounding: a tenth of a millimetre after a second
+WITHIN_SIGMA = 68.27  # percentage of a normal distribution within one standard deviation
 MIN_ROWS = 40
 
 
@@ -53,10 +47,7 @@ def sensor_noise(drive: Drive) -> Noise:
     pose, whole = drive.recording.pose, drive.pose_noise
     if whole is None:
         return Noise()
-    blocks = (
-        replace(pose, t=pose.t[rows], values=pose.values[rows])
-        for rows in np.array_split(np.arange(len(pose.t)), BLOCKS)
-    )
+    blocks = map(pose.rows, np.array_split(np.arange(len(pose.t)), BLOCKS))
     parts = [pose_noise(block, find_bursts(block.t)) for block in blocks]
     known = np.array([part for part in parts if part is not None])
     spread = known.std(axis=0, ddof=1) / np.sqrt(len(known)) if len(known) > 1 else [None, None]
@@ -70,16 +61,18 @@ def sensor_noise(drive: Drive) -> Noise:
 def motion_noise(
     sensor: Noise, drive: Drive, calibration: Calibration, model: TaylorModel, samples: Samples
 ) -> Noise:
-    """Adds odometry noise and drift to the noise of the pose sensor.
+    """Adds drift and the noise of the odometry, measured or assumed, to that of the pose sensor.
 
-    Each level is marked as measured or assumed.
+    The odometry's is that of the recorded one; else of the wheels, if their scale is known.
     """
-    linear, angular = odometry_noise(drive, calibration, model, samples)
     measured: dict[str, Level | dict[str, Level]] = {
-        "odom_linear": linear,
-        "odom_angular": angular,
-        "state_drift": _state_drift(drive, model, samples),
+        "state_drift": _state_drift(drive, model, samples)
     }
+    rest = odometry_residual(drive, calibration, model, samples)
+    if rest is not None:
+        linear = (_level(rest[:, i], "m/s") for i in (0, 1))
+        measured["odom_linear"] = max(linear, key=lambda found: found.std)
+        measured["odom_angular"] = _level(rest[:, 2], "rad/s")
     drift = _pose_drift(sensor, drive, calibration, model)
     if drift is not None:
         measured |= {"position_drift": drift[0], "heading_drift": drift[1]}
@@ -89,16 +82,16 @@ def motion_noise(
 def level(variances: Array, unit: str) -> Level:
     """Returns a measured level from squares (n,) in order of time, sensor noise subtracted.
 
-    The uncertainty is that of the mean over blocks of the drive.
+    The uncertainty comes from blocks of the drive.
     """
     variance = max(float(variances.mean()), 0.0)
     means = np.array([part.mean() for part in np.array_split(variances, BLOCKS)])
     spread = float(means.std(ddof=1) / np.sqrt(BLOCKS))
     std = float(np.sqrt(variance))
     if std < NEGLIGIBLE:
-        std = 0.0
-    uncertainty = spread / (2.0 * std) if std**2 > spread else float(np.sqrt(max(spread, 0.0)))
-    return Level(std=std, unit=unit, source=MEASURED, uncertainty=uncertainty if std else 0.0)
+        return Level(std=0.0, unit=unit, source=MEASURED, uncertainty=0.0)
+    uncertainty = spread / (2.0 * std) if std**2 > spread else float(np.sqrt(spread))
+    return Level(std=std, unit=unit, source=MEASURED, uncertainty=uncertainty)
 
 
 def _pose_drift(
@@ -126,32 +119,25 @@ def _pose_drift(
 def drift_growth(
     drive: Drive, calibration: Calibration, model: TaylorModel
 ) -> tuple[Array, Array, Array] | None:
-    """Returns the growth of prediction errors: horizons [s], position [m], heading [rad], all (n,).
+    """Returns horizons [s] and root mean square errors of position per axis [m] and heading [rad].
 
-    The errors are root mean squares, of the position per axis. None if the drive is too short.
+    None if the drive is too short.
     """
     rows = []
     for horizon in GROWTH_S:
         chosen = windows(drive, calibration, 0.0, drive.duration_s, horizon, SPACING_S)
         if len(chosen.start_t) < MIN_WINDOWS:
             break
-        ends = _predicted(drive, calibration, model, chosen)
-        error = geometry.between(ends, chosen.end)
+        error = geometry.between(_predicted(drive, calibration, model, chosen), chosen.end)
         square = np.mean(error**2, axis=0)
         rows.append((horizon, np.sqrt(0.5 * (square[0] + square[1])), np.sqrt(square[2])))
-    if not rows:
-        return None
-    horizons, position, heading = np.array(rows).T
-    return horizons, position, heading
+    return tuple(np.array(rows).T) if rows else None
 
 
 def _predicted(
     drive: Drive, calibration: Calibration, model: TaylorModel, chosen: Windows
 ) -> Array:
-    """Predicts end poses (W, 3) from the measured state if there is one, else from commands.
-
-    The unexplained part of the state's rates is thus not counted twice.
-    """
+    """Predicts end poses (W, 3) from the state, measured so that its drift is not counted twice."""
     state = drive.recording.state
     if state is None:
         return predict(model, calibration, drive, chosen)
@@ -161,7 +147,7 @@ def _predicted(
     for i, column in enumerate(state.values.T):
         x[:, :, i] = np.interp(t, state.t, column)
     course = replace(course, x=x)
-    return tracked_ends(course, calibration, relative_ends(course, model)[0])
+    return tracked_ends(course.chosen, calibration, relative_ends(course, model)[0])
 
 
 def _state_drift(drive: Drive, model: TaylorModel, samples: Samples) -> dict[str, Level]:
@@ -192,22 +178,6 @@ def _state_drift(drive: Drive, model: TaylorModel, samples: Samples) -> dict[str
     return found
 
 
-def odometry_noise(
-    drive: Drive, calibration: Calibration, model: TaylorModel, samples: Samples
-) -> tuple[Level, Level]:
-    """Returns linear and angular noise relative to the twist of the fitted model.
-
-    It comes from the recorded odometry; else from the wheels, if the calibration knows their
-    scale; else it is the assumed noise of `Noise`.
-    """
-    default = Noise()
-    rest = odometry_residual(drive, calibration, model, samples)
-    if rest is None:
-        return default.odom_linear, default.odom_angular
-    linear = max((_level(rest[:, i], "m/s") for i in (0, 1)), key=lambda found: found.std)
-    return linear, _level(rest[:, 2], "rad/s")
-
-
 def odometry_residual(
     drive: Drive, calibration: Calibration, model: TaylorModel, samples: Samples
 ) -> Array | None:
@@ -236,14 +206,9 @@ def odometry_residual(
 
 def _level(rest: Array, unit: str) -> Level:
     """Returns a level that is robust against single outliers."""
-    parts = np.array([_sigma(part) for part in np.array_split(rest, BLOCKS)])
-    return Level(
-        std=_sigma(rest),
-        unit=unit,
-        source=MEASURED,
-        uncertainty=float(parts.std(ddof=1) / np.sqrt(BLOCKS)),
+    std, *parts = (
+        float(np.percentile(np.abs(part - np.median(part)), WITHIN_SIGMA))
+        for part in (rest, *np.array_split(rest, BLOCKS))
     )
-
-
-def _sigma(rest: Array) -> float:
-    return float(np.percentile(np.abs(rest - np.median(rest)), WITHIN_SIGMA))
+    uncertainty = float(np.std(parts, ddof=1) / np.sqrt(BLOCKS))
+    return Level(std=std, unit=unit, source=MEASURED, uncertainty=uncertainty)

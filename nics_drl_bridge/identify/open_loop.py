@@ -9,66 +9,43 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.identify.align import states_at
-from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify.calibration import Calibration, states_at
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.kernels import follow
 from nics_drl_bridge.identify.signals import followed, held
 from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-Array = NDArray[np.float64]
-
 HORIZON_S = 5.0
 SPACING_S = 0.1
-SETTLE_S = 1.0
-"""Windows start no sooner than this after the first command if the state is inferred."""
-END_TOLERANCE = 0.6
-"""A window ends at the sample nearest to its horizon, if within this share of the period."""
+SETTLE_S = 1.0  # windows start no sooner than this after the first command if the state is inferred
+END_TOLERANCE = 0.6  # from a window's end to the nearest sample, as a share of the period
 
 
 @dataclass(frozen=True)
 class OpenLoop:
-    """Errors of open-loop predictions on a part of a drive.
+    """Errors of predictions that start at a measured pose, know the commands, and end at one."""
 
-    A prediction starts at a measured pose, knows the commands, and is compared with the
-    measured pose at the end of the horizon, both of the tracked point.
-
-    Attributes:
-        horizon_s: length of each prediction [s].
-        windows: number of predictions.
-        mean_position_error_m, median_position_error_m, max_position_error_m: at the end [m].
-        mean_heading_error_rad: mean absolute error of the heading at the end [rad].
-        mean_path_m: mean length of the measured path in the horizon [m].
-        median_displacement_m: median distance from the start to the end of that path [m], the
-            position error of predicting that the robot stands still.
-    """
-
-    horizon_s: float
-    windows: int
+    horizon_s: float  # length of each prediction
+    windows: int  # number of predictions
     mean_position_error_m: float
     median_position_error_m: float
     max_position_error_m: float
-    mean_heading_error_rad: float
-    mean_path_m: float
-    median_displacement_m: float
+    mean_heading_error_rad: float  # absolute
+    mean_path_m: float  # length of the measured path in the horizon
+    median_displacement_m: float  # from start to end: the error of predicting a standstill
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Pairs of measured poses, one `horizon` apart.
+    """Pairs of measured poses, one `horizon` apart."""
 
-    Attributes:
-        start_t, end_t: (W,) on the pose's clock [s].
-        start, end: (W, 3) poses of the tracked body.
-        path: (W,) length of the measured path between them [m].
-    """
-
-    start_t: Array
-    end_t: Array
-    start: Array
-    end: Array
-    path: Array
+    start_t: Array  # (W,) on the pose's clock [s]
+    end_t: Array  # (W,)
+    start: Array  # (W, 3) poses of the tracked body
+    end: Array  # (W, 3)
+    path: Array  # (W,) length of the measured path between them [m]
 
 
 def windows(
@@ -79,15 +56,9 @@ def windows(
     horizon: float,
     spacing: float,
 ) -> Windows:
-    """Selects the windows between two times, counted from the first pose.
+    """Selects the windows of a part of a drive, from `start` to `stop` after the first pose [s].
 
-    Args:
-        drive: the drive.
-        calibration: of this drive.
-        start: start of the part of the drive that contains the windows [s].
-        stop: its end [s].
-        horizon: length of a window [s].
-        spacing: minimum time between two starts [s].
+    They are `horizon` long and their starts at least `spacing` apart [s].
     """
     t, pose = drive.dated.t, drive.dated.values
     origin, period = drive.recording.pose.t[0], float(np.median(np.diff(t)))
@@ -120,10 +91,18 @@ def predict(model: TaylorModel, calibration: Calibration, drive: Drive, chosen: 
 
     The state at the start is the measured one, or follows from the commands before it.
     """
-    base = calibration.to_base(chosen.start)
-    by = _by_one_rollout if drive.recording.state is None else _by_windows
-    relative = by(model, calibration, drive, chosen)
-    return calibration.to_tracked(geometry.compose(base, relative))
+    if drive.recording.state is None:
+        relative = _by_one_rollout(model, calibration, drive, chosen)
+    else:
+        poses, *_, step, share = _from_measured_states(model, calibration, drive, chosen)
+        row, share = np.arange(len(step)), share[:, None]
+        relative = (1.0 - share) * poses[row, step] + share * poses[row, step + 1]
+    return tracked_ends(chosen, calibration, relative)
+
+
+def tracked_ends(chosen: Windows, calibration: Calibration, relative: Array) -> Array:
+    """Returns poses (W, 3) of the tracked body after `base_link` moved by relative ones."""
+    return calibration.to_tracked(geometry.compose(calibration.to_base(chosen.start), relative))
 
 
 def _by_one_rollout(
@@ -147,11 +126,10 @@ def _by_one_rollout(
 def _from_measured_states(
     model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
 ) -> tuple[Array, Array, Array, NDArray[np.intp], Array]:
-    """Rolls each window out from its own measured state.
+    """Returns roll-outs of windows, each from its own measured state.
 
-    Returns:
-        Poses (W, T + 1, 3) from the origin, states (W, T + 1, S), commands (W, T, C), whole steps
-        (W,) to the end and the remaining fraction (W,) of one more.
+    Poses (W, T + 1, 3) from the origin, states (W, T + 1, S), commands (W, T, C), whole steps (W,)
+    to the end and the remaining fraction (W,) of one more.
     """
     start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
     steps = int(np.ceil(float((end - start).max()) / model.dt - 1e-6)) + 1
@@ -163,20 +141,8 @@ def _from_measured_states(
     return poses, states, command, step, np.clip(exact - step, 0.0, 1.0)
 
 
-def _by_windows(
-    model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
-) -> Array:
-    """Returns relative poses (W, 3), each window started from its measured state."""
-    poses, _, _, step, share = _from_measured_states(model, calibration, drive, chosen)
-    row, share = np.arange(len(step)), share[:, None]
-    return np.asarray((1.0 - share) * poses[row, step] + share * poses[row, step + 1])
-
-
 def _roll(model: TaylorModel, state: Array, command: Array) -> tuple[Array, Array]:
-    """Rolls out poses (W, T + 1, 3) from the origin and states (W, T + 1, S).
-
-    The commands are (W, T, C). Headings are unwrapped.
-    """
+    """Rolls commands (W, T, C) out to unwrapped poses (W, T + 1, 3) from the origin, and states."""
     count, steps = command.shape[:2]
     poses, states = np.zeros((count, steps + 1, 3)), np.empty((count, steps + 1, state.shape[1]))
     states[:, 0] = state
@@ -192,13 +158,9 @@ def open_loop_error(
     stop: float,
     horizon: float = HORIZON_S,
 ) -> OpenLoop:
-    """Predicts a part of a drive open-loop and compares the end poses.
+    """Predicts a part of a drive, from `start` to `stop` after the first pose [s], open-loop.
 
-    The part lasts from `start` to `stop`, counted from the first pose [s]. Windows of length
-    `horizon` [s] start every 0.1 s.
-
-    Raises:
-        RecordingError: the part is too short for a window.
+    Windows start every 0.1 s. A part that is too short for any raises RecordingError.
     """
     chosen = windows(drive, calibration, start, stop, horizon, SPACING_S)
     if len(chosen.start_t) == 0:
@@ -225,21 +187,14 @@ def open_loop_error(
 class Course:
     """X over windows, step by step, of a drive whose state was measured.
 
-    State and commands of a window are then known before the twist is: the model of the state's
-    rates stays as fitted. One pass through a window gives the pose at its end and its derivatives
-    by all coefficients of the twist.
-
-    Attributes:
-        chosen: the windows.
-        x: (W, T, V + 1) X during each step, and a last entry of 1.
-        steps: (W,) whole steps to the end of each window.
-        share: (W,) remaining fraction of one more step.
+    One pass through a window gives the pose at its end and its derivatives by all coefficients of
+    the twist.
     """
 
-    chosen: Windows
-    x: Array
-    steps: NDArray[np.intp]
-    share: Array
+    chosen: Windows  # the windows
+    x: Array  # (W, T, V + 1) X during each step, and a last entry of 1
+    steps: NDArray[np.intp]  # (W,) whole steps to the end of each window
+    share: Array  # (W,) remaining fraction of one more step
 
 
 def course_of(
@@ -255,33 +210,21 @@ def course_of(
 def relative_ends(
     course: Course, model: TaylorModel, free: NDArray[np.bool_] | None = None
 ) -> tuple[Array, Array]:
-    """Returns the end poses relative to the starts, and their derivatives by coefficients.
+    """Returns end poses (W, 3) relative to the starts, unwrapped, and their derivatives (W, 3, P).
 
-    Args:
-        course: of the windows.
-        model: its body twist is integrated.
-        free: (D, K) coefficients to differentiate by, even where they are zero.
-
-    Returns:
-        (W, 3) with unwrapped headings, and (W, 3, P).
+    These are by the `free` coefficients (D, K) of the body twist, even where they are zero.
     """
-    asked = np.zeros(model.coefficients.shape, dtype=np.bool_) if free is None else free
-    used = (model.coefficients != 0.0) | asked
+    free = np.zeros(model.coefficients.shape, dtype=np.bool_) if free is None else free
+    used = (model.coefficients != 0.0) | free
     used[3:] = False
     dofs, places = np.nonzero(used)
     terms = term_arrays(replace(model, coefficients=used.astype(np.float64)))
     terms = terms._replace(coefficient=model.coefficients[dofs, places])
-    moving = np.flatnonzero(asked[dofs, places]).astype(np.int64)
+    moving = np.flatnonzero(free[dofs, places]).astype(np.int64)
     ends = np.zeros((len(course.steps), 3))
     moved = np.zeros((len(course.steps), 3, len(moving)))
     follow(ends, moved, course.x, course.steps, course.share, terms, moving, model.dt)
     return ends, moved
-
-
-def tracked_ends(course: Course, calibration: Calibration, ends: Array) -> Array:
-    """Returns poses (W, 3) of the tracked body after `base_link` moved by `ends` (W, 3)."""
-    base = calibration.to_base(course.chosen.start)
-    return calibration.to_tracked(geometry.compose(base, ends))
 
 
 def tracked_slopes(course: Course, calibration: Calibration, ends: Array, moved: Array) -> Array:

@@ -14,90 +14,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.problem import (
-    HORIZONS_S,
-    Problem,
-    free_coefficients,
-    free_time,
-    lag_is_measured,
-    linear_term,
-    may_turn,
-    prediction_errors,
-    prediction_slopes,
-    problem_of,
+from nics_drl_bridge.identify.open_loop import (
+    Course,
+    Windows,
+    course_of,
+    predict,
+    relative_ends,
+    tracked_ends,
+    tracked_slopes,
+    windows,
 )
 from nics_drl_bridge.identify.statistics import clustered_errors, minimise, uncertainty
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-Array = NDArray[np.float64]
-
-DIVERGED = 1e3
-LEAST_SCALE = 0.05
-WITHIN = 12.0**-0.5
-"""A model uses the values at the start of a step, so a time is uncertain by the standard deviation
-of a uniform distribution over the step."""
-WORTH = 0.1
-"""Terms are removed while the error rises by less than this share in total."""
+Mask = NDArray[np.bool_]
 Errors = Mapping[str, Mapping[str, float]]
 
-
-@dataclass(frozen=True)
-class Refined:
-    """A refined model.
-
-    Attributes:
-        model: the model.
-        calibration: with refined offset (or latency), rotation, lags and gains.
-        error: root mean square of the open-loop errors on the training part [m].
-        std_errors: (D, K) standard errors of the refined coefficients; NaN for the others.
-    """
-
-    model: TaylorModel
-    calibration: Calibration
-    error: float
-    std_errors: Array
-
-
-@dataclass(frozen=True)
-class _Free:
-    """Free parameters: coefficients (D, K), a time of the calibration, its rotation."""
-
-    coefficients: NDArray[np.bool_]
-    time: str | None
-    turn: bool
-
-    @property
-    def count(self) -> int:
-        """Number of free coefficients."""
-        return int(self.coefficients.sum())
-
-
-def by_definition(
-    model: TaylorModel, calibration: Calibration, spec: RobotSpec
-) -> tuple[TaylorModel, Calibration]:
-    """Scales an inferred speed so that vx = 1 speed, and treats lateral motion as noise.
-
-    `base_link` of a robot without a lateral command is the point without lateral motion.
-    """
-    coefficients = model.coefficients.copy()
-    if not spec.moves_sideways:
-        coefficients[1] = 0.0
-    responses = list(calibration.responses)
-    speeds = [i for i, v in enumerate(spec.state) if v.unit == "m/s"]
-    if responses and len(speeds) == 1:
-        i = speeds[0]
-        alone = np.array([v == spec.state[i].name for v in spec.variable_names], dtype=np.int64)
-        scale = float(coefficients[0] @ (model.powers == alone).all(axis=1))
-        if scale > 0.0:
-            coefficients = coefficients / scale ** model.powers[:, i]
-            coefficients[3 + i] *= scale
-            responses[i] = replace(responses[i], gain=responses[i].gain * scale)
-            coefficients[0, (model.powers == alone).all(axis=1)] = 1.0
-    model = replace(model, coefficients=coefficients)
-    return model, replace(calibration, responses=tuple(responses))
+HORIZONS_S = (1.0, 2.5, 5.0)
+SPACING_S = 0.25
+MIN_WINDOWS = 10
+HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
+OUTLYING = 10.0  # a window whose error is this many times the median contains a jump,
+OUTLYING_SHARE = 0.25  # if the error is also more than this share of the longest path
+MOST_OUTLIERS = 0.3
+STEEPEST = 1e100  # slopes of a diverging model are clipped, so that their scaling stays finite
+TURN_RAD = 1e-5  # step of the finite difference by the rotation
+DIVERGED = 1e3
+LEAST_SCALE = 0.05
+# A model uses the values at the start of a step: a time is uncertain by the standard deviation of
+# a uniform distribution over the step.
+WITHIN = 12.0**-0.5
+WORTH = 0.1  # terms are removed while the error rises by less than this share in total
 
 
 def refined(
@@ -105,8 +56,7 @@ def refined(
 ) -> tuple[TaylorModel, Calibration, str]:
     """Refines a linear fit by its predictions of the training part, and removes terms.
 
-    Returns:
-        Model and calibration, and a sentence on what was done, or why it could not be.
+    The sentence returned says what was done, or why it could not be.
     """
     model, calibration = by_definition(linear.with_errors({}), calibration, drive.spec)
     problem = problem_of(model, calibration, drive)
@@ -129,55 +79,221 @@ def refined(
     )  # fmt: skip
 
 
+def by_definition(
+    model: TaylorModel, calibration: Calibration, spec: RobotSpec
+) -> tuple[TaylorModel, Calibration]:
+    """Scales an inferred speed so that vx = 1 speed, and treats lateral motion as noise.
+
+    `base_link` of a robot without a lateral command is the point without lateral motion.
+    """
+    coefficients = model.coefficients.copy()
+    if not spec.moves_sideways:
+        coefficients[1] = 0.0
+    responses = list(calibration.responses)
+    speeds = [i for i, v in enumerate(spec.state) if v.unit == "m/s"]
+    if responses and len(speeds) == 1:
+        i = speeds[0]
+        alone = linear_term(model, spec, spec.state[i].name)
+        scale = 0.0 if alone is None else float(coefficients[0, alone])
+        if scale > 0.0:
+            coefficients = coefficients / scale ** model.powers[:, i]
+            coefficients[3 + i] *= scale
+            responses[i] = replace(responses[i], gain=responses[i].gain * scale)
+            coefficients[0, alone] = 1.0
+    model = replace(model, coefficients=coefficients)
+    return model, replace(calibration, responses=tuple(responses))
+
+
 def merged(model: TaylorModel, linear: TaylorModel, refined: Errors) -> TaylorModel:
     """Returns the model with the standard errors of its coefficients.
 
     Rows that are unchanged from the linear fit keep its errors; a refined coefficient has the
     larger of both.
     """
-    first = linear.named_errors
-    own = {dof: row for dof, row in first.items() if _same_row(model, linear, dof)}
-    refined = {
-        dof: {term: max(error, first.get(dof, {}).get(term, 0.0)) for term, error in row.items()}
-        for dof, row in refined.items()
-    }
-    rows = {dof: {**own.get(dof, {}), **refined.get(dof, {})} for dof in model.dofs}
+    first, rows = linear.named_errors, {}
+    for d, dof in enumerate(model.dofs):
+        before = dict(zip(linear.term_names, linear.coefficients[d], strict=True))
+        after = zip(model.term_names, model.coefficients[d], strict=True)
+        known = first.get(dof, {})
+        rows[dof] = dict(known) if all(before.get(k, 0.0) == v for k, v in after) else {}
+        for term, error in refined.get(dof, {}).items():
+            rows[dof][term] = max(error, known.get(term, 0.0))
     return model.with_errors(rows)
 
 
-def _same_row(model: TaylorModel, linear: TaylorModel, dof: str) -> bool:
-    d = model.dofs.index(dof)
-    before = dict(zip(linear.term_names, linear.coefficients[d], strict=True))
-    after = dict(zip(model.term_names, model.coefficients[d], strict=True))
-    return all(before.get(name, 0.0) == value for name, value in after.items())
+@dataclass(frozen=True)
+class Problem:
+    """Prediction problem of a refinement: windows of one drive, the same for every trial model."""
+
+    drive: Drive
+    chosen: tuple[Windows, ...]  # of each horizon, without those that contain a jump of the pose
+    courses: tuple[Course, ...]  # of X over them if the state was measured, else empty
+
+
+def problem_of(model: TaylorModel, calibration: Calibration, drive: Drive) -> Problem | None:
+    """Selects the windows of a training part to predict; None if it is too short."""
+    until = drive.settings.train_until_s
+    found = (windows(drive, calibration, 0.0, until, h, SPACING_S) for h in HORIZONS_S)
+    chosen = tuple(
+        _without_outliers(w, predict(model, calibration, drive, w) - w.end)
+        for w in found
+        if len(w.start_t) >= MIN_WINDOWS
+    )
+    if not chosen:
+        return None
+    measured = drive.recording.state is not None
+    courses = (course_of(model, calibration, drive, w) for w in chosen if measured)
+    return Problem(drive, chosen, tuple(courses))
+
+
+def _without_outliers(chosen: Windows, error: Array) -> Windows:
+    """Drops windows that contain a jump of the pose, or have one at an end."""
+    size = np.hypot(error[:, 0], error[:, 1])
+    far = max(OUTLYING * float(np.median(size)), OUTLYING_SHARE * float(chosen.path.max()))
+    inside = size <= far
+    if inside.all() or inside.mean() < 1.0 - MOST_OUTLIERS or inside.sum() < MIN_WINDOWS:
+        return chosen
+    return Windows(*(values[inside] for values in vars(chosen).values()))
+
+
+def prediction_errors(problem: Problem, model: TaylorModel, calibration: Calibration) -> Array:
+    """Returns the errors (n,) of all predictions: x, y and heading of each window [m]."""
+    parts = []
+    with np.errstate(all="ignore"):  # a trial step may diverge; it is then rejected
+        for k, chosen in enumerate(problem.chosen):
+            if problem.courses:
+                ends = relative_ends(problem.courses[k], model)[0]
+                predicted = tracked_ends(chosen, calibration, ends)
+            else:
+                predicted = predict(model, calibration, problem.drive, chosen)
+            error = predicted - chosen.end
+            error[:, 2] = HEADING_ARM_M * geometry.wrap_angle(error[:, 2])
+            parts.append(error.ravel())
+    finite = np.nan_to_num(np.concatenate(parts), nan=DIVERGED)
+    return np.asarray(np.clip(finite, -DIVERGED, DIVERGED))
+
+
+def prediction_slopes(
+    problem: Problem, model: TaylorModel, calibration: Calibration, free: _Free
+) -> Array:
+    """Returns the derivatives (n, P) of `prediction_errors` for a measured state."""
+    parts = []
+    for course in problem.courses:
+        ends, moved = relative_ends(course, model, free.coefficients)
+        slope = tracked_slopes(course, calibration, ends, moved)
+        if free.turn:
+            turned = [
+                tracked_ends(course.chosen, replace(calibration, rotation_rad=angle), ends)
+                for angle in calibration.rotation_rad + np.array([-TURN_RAD, TURN_RAD])
+            ]
+            aside = (turned[1] - turned[0])[:, :, None]
+            aside[:, 2] = geometry.wrap_angle(aside[:, 2])
+            slope = np.concatenate([slope, aside / (2.0 * TURN_RAD)], axis=2)
+        slope[:, 2] *= HEADING_ARM_M
+        parts.append(slope.reshape(-1, slope.shape[2]))
+    slopes = np.nan_to_num(np.concatenate(parts), nan=0.0)
+    return np.clip(slopes, -STEEPEST, STEEPEST)
+
+
+@dataclass(frozen=True)
+class _Free:
+    """Free parameters: coefficients (D, K), a time of the calibration, its rotation."""
+
+    coefficients: Mask
+    time: str | None
+    turn: bool
+
+    @classmethod
+    def of(cls, model: TaylorModel, calibration: Calibration, spec: RobotSpec) -> _Free:
+        """Returns what is fixed neither by definition nor by measurement.
+
+        A time estimated from a measured state is fixed. The rotation is defined by the direction in
+        which a robot can't move: an omnidirectional robot can be described equally well in any
+        other frame, with other coefficients.
+        """
+        known, time = calibration.uncertainty, None
+        if calibration.responses and "clock_offset_s" in known:
+            time = "clock_offset_s"
+        elif calibration.responses and calibration.command_latency_s > 0.0:
+            time = "command_latency_s"
+        turn = "rotation_rad" in known and not calibration.is_exact and not spec.moves_sideways
+        return cls(free_coefficients(model, calibration, spec), time, turn)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the free fields of the calibration."""
+        return ([self.time] if self.time else []) + (["rotation_rad"] if self.turn else [])
+
+
+def free_coefficients(model: TaylorModel, calibration: Calibration, spec: RobotSpec) -> Mask:
+    """Selects the free coefficients (D, K): kept, and not fixed by the definition of a state.
+
+    An inferred speed is by definition the speed along the direction of travel, so that
+    vx = 1 speed; its lag is fixed if the wheels showed it.
+    """
+    free = model.coefficients != 0.0
+    if not calibration.responses:
+        free[3:] = False  # the rates of a measured state were fitted to that state itself
+    for i, response in enumerate(calibration.responses):
+        alone = linear_term(model, spec, response.state)
+        if alone is None:
+            continue
+        if model.coefficients[0, alone] == 1.0:
+            free[0, alone] = False
+        else:  # the scale of this state is arbitrary, so its gain is fixed
+            free[3 + i, linear_term(model, spec, response.command)] = False
+        if lag_is_measured(calibration):
+            free[3 + i, alone] = False
+    return np.asarray(free)
+
+
+def lag_is_measured(calibration: Calibration) -> bool:
+    """True if both offset and latency are known: only the wheels' response separates them."""
+    return {"clock_offset_s", "command_latency_s"} <= set(calibration.uncertainty)
+
+
+def linear_term(model: TaylorModel, spec: RobotSpec, name: str | None) -> int | None:
+    """Returns the column of the term that is one variable alone; None without such a term."""
+    wanted = np.array([v == name for v in spec.variable_names], dtype=np.int64)
+    hits = np.flatnonzero((model.powers == wanted).all(axis=1))
+    return int(hits[0]) if len(hits) else None
+
+
+@dataclass(frozen=True)
+class Refined:
+    """A refined model."""
+
+    model: TaylorModel
+    calibration: Calibration  # with refined offset (or latency), rotation, lags and gains
+    error: float  # root mean square of the open-loop errors on the training part [m]
+    std_errors: Array  # (D, K) of the refined coefficients; NaN for the others
 
 
 def refine(problem: Problem, model: TaylorModel, calibration: Calibration) -> Refined:
     """Adjusts coefficients and calibration to the least open-loop error; no term is added."""
-    free = _Free(
-        free_coefficients(model, calibration, problem.drive.spec),
-        free_time(calibration),
-        may_turn(calibration, problem.drive.spec),
-    )
-    theta = _pack(free, model, calibration)
+    free = _Free.of(model, calibration, problem.drive.spec)
+    first = model.coefficients[free.coefficients]
+    theta = np.append(first, [float(getattr(calibration, name)) for name in free.names])
     scale = np.maximum(np.abs(theta), LEAST_SCALE)
-    scale[free.count :] = LEAST_SCALE  # s, rad
+    scale[len(first) :] = LEAST_SCALE  # s, rad
 
     def residual(value: Array) -> Array:
-        there = _unpack(problem, free, model, calibration, value)
-        return _bounded(prediction_errors(problem, *there))
+        return prediction_errors(problem, *_unpack(problem, free, model, calibration, value))
 
     def jacobian(value: Array) -> Array:
         there = _unpack(problem, free, model, calibration, value)
-        return prediction_slopes(problem, *there, free.coefficients, free.turn)
+        return prediction_slopes(problem, *there, free)
 
     theta, slope, rest = minimise(
         residual, theta, scale, jacobian=jacobian if problem.courses else None
     )
-    sigma = uncertainty(slope, rest)
-    refined = _unpack(problem, free, model, calibration, theta, sigma)
+    model, moved = _unpack(problem, free, model, calibration, theta)
+    sigma = uncertainty(slope, rest)[len(first) :]
+    calibration = _with_uncertainty(problem, free, model, moved, sigma)
     error = float(np.sqrt(np.mean(rest**2)))
-    return Refined(*refined, error, _coefficient_errors(problem, free, slope, rest, refined[0]))
+    return Refined(
+        model, calibration, error, _coefficient_errors(problem, free, slope, rest, model)
+    )
 
 
 def _coefficient_errors(
@@ -187,9 +303,10 @@ def _coefficient_errors(
     starts = np.concatenate([np.repeat(w.start_t, 3) for w in problem.chosen])
     cluster = np.floor((starts - starts.min()) / max(HORIZONS_S)).astype(np.intp)
     errors = np.full(model.coefficients.shape, np.nan)
-    errors[free.coefficients] = clustered_errors(jacobian, rest, cluster)[: free.count]
+    count = int(free.coefficients.sum())
+    errors[free.coefficients] = clustered_errors(jacobian, rest, cluster)[:count]
     for state in problem.drive.spec.state:
-        tied = [linear_term(model, problem.drive.spec, n) for n in (state.name, str(state.follows))]
+        tied = [linear_term(model, problem.drive.spec, n) for n in (state.name, state.follows)]
         d = model.dofs.index(f"d_{state.name}")
         if None in tied or not free.coefficients[d, tied[0]] or free.coefficients[d, tied[1]]:
             continue
@@ -198,46 +315,38 @@ def _coefficient_errors(
     return errors
 
 
-def _pack(free: _Free, model: TaylorModel, calibration: Calibration) -> Array:
-    tail = [] if free.time is None else [float(getattr(calibration, free.time))]
-    tail += [calibration.rotation_rad] if free.turn else []
-    return np.append(model.coefficients[free.coefficients], tail)
-
-
 def _unpack(
-    problem: Problem,
-    free: _Free,
-    model: TaylorModel,
-    calibration: Calibration,
-    theta: Array,
-    sigma: Array | None = None,
+    problem: Problem, free: _Free, model: TaylorModel, calibration: Calibration, theta: Array
 ) -> tuple[TaylorModel, Calibration]:
-    coefficients = model.coefficients.copy()
-    coefficients[free.coefficients] = theta[: free.count]
+    """Returns model and calibration with the free parameters; fixed gains follow their lags."""
+    coefficients, count = model.coefficients.copy(), int(free.coefficients.sum())
+    coefficients[free.coefficients] = theta[:count]
     for i, response in enumerate(calibration.responses):
         own, command = (
             linear_term(model, problem.drive.spec, n) for n in (response.state, response.command)
         )
         if own is not None and command is not None and not free.coefficients[3 + i, command]:
             coefficients[3 + i, command] = -response.gain * coefficients[3 + i, own]
-    model = replace(model, coefficients=coefficients)
-    names = ([free.time] if free.time else []) + (["rotation_rad"] if free.turn else [])
-    values = dict(zip(names, map(float, theta[free.count :]), strict=True))
-    if sigma is None:
-        return model, replace(calibration, **values)  # type: ignore[arg-type]
-    if "rotation_rad" in values:
-        values["rotation_rad"] = float(geometry.wrap_angle(values["rotation_rad"]))
-    spread = dict(zip(names, map(float, sigma[free.count :]), strict=True))
+    values = dict(zip(free.names, map(float, theta[count:]), strict=True))
+    return replace(model, coefficients=coefficients), replace(calibration, **values)  # type: ignore[arg-type]
+
+
+def _with_uncertainty(
+    problem: Problem, free: _Free, model: TaylorModel, calibration: Calibration, sigma: Array
+) -> Calibration:
+    """Completes a refined calibration by uncertainties, and by the responses of the model."""
+    known = calibration.uncertainty
+    spread = dict(zip(free.names, map(float, sigma), strict=True))
     if free.time:
         spread[free.time] = float(np.hypot(spread[free.time], WITHIN * model.dt))
     if lag_is_measured(calibration) and "clock_offset_s" in spread:
-        spread["clock_offset_s"] = float(
-            np.hypot(spread["clock_offset_s"], calibration.uncertainty["command_latency_s"])
-        )
-    return model, replace(
+        both = np.hypot(spread["clock_offset_s"], known["command_latency_s"])
+        spread["clock_offset_s"] = float(both)
+    rotation = calibration.rotation_rad
+    return replace(
         calibration,
-        **values,  # type: ignore[arg-type]
-        uncertainty={**calibration.uncertainty, **spread},
+        rotation_rad=float(geometry.wrap_angle(rotation)) if free.turn else rotation,
+        uncertainty={**known, **spread},
         responses=tuple(_response(model, problem.drive.spec, r) for r in calibration.responses),
     )
 
@@ -251,11 +360,6 @@ def _response(model: TaylorModel, spec: RobotSpec, response: Response) -> Respon
     rate = -float(model.coefficients[d, own])
     lag = -model.dt / float(np.log1p(-rate * model.dt))
     return replace(response, lag_s=lag, gain=float(model.coefficients[d, command]) / rate)
-
-
-def _bounded(error: Array) -> Array:
-    finite = np.nan_to_num(error, nan=DIVERGED)
-    return np.asarray(np.clip(finite, -DIVERGED, DIVERGED))
 
 
 def simplify(problem: Problem, refined: Refined) -> Refined:
@@ -279,11 +383,8 @@ def simplify(problem: Problem, refined: Refined) -> Refined:
         if again.error < limit:
             best = again
     used = np.abs(best.model.coefficients).sum(axis=0) > 0.0
-    model = replace(
-        best.model,
-        powers=best.model.powers[used],
-        coefficients=np.ascontiguousarray(best.model.coefficients[:, used]),
-    )
+    coefficients = np.ascontiguousarray(best.model.coefficients[:, used])
+    model = replace(best.model, powers=best.model.powers[used], coefficients=coefficients)
     return replace(best, model=model, std_errors=best.std_errors[:, used])
 
 
@@ -296,8 +397,7 @@ def _weakest(
     reach = np.maximum(np.abs(model.low), np.abs(model.high))
     size = np.abs(model.coefficients[:3]) * np.prod(reach**model.powers, axis=1)
     size = size / np.maximum(size.sum(axis=1, keepdims=True), 1e-12)
-    order = np.argsort(np.where(free, size, np.inf), axis=None)
-    for flat in order:
+    for flat in np.argsort(np.where(free, size, np.inf), axis=None):
         d, k = divmod(int(flat), size.shape[1])
         if free[d, k] and (d, k) not in tried:
             return d, k

@@ -14,48 +14,31 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.signals import interval_means
 from nics_drl_bridge.identify.statistics import unexplained
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import RobotSpec, Variable
 
-Array = NDArray[np.float64]
-
-NEIGHBOURS = 3
-"""A jump is measured by the median difference from this many samples on either side."""
-STEPS = 6.0
-"""It is larger than this many usual changes from sample to sample,"""
-USUAL = 60.0
-"""(the percentile of changes that counts as usual: jumps in 20 % of the rows spoil 40 % of them)"""
-REACH = 1.5
-"""than this many times the distance that the robot's greatest command allows in that time,"""
-HEADING_REACH = 0.1
-"""than this angle [rad], for a heading,"""
-STATE_SHARE = 0.2
-"""and than this share of the usual range, for a state."""
-MOST = 0.15
-"""Jumps in more than this share of the rows are not faults of single samples."""
-EXCESS = 0.01
-"""Commands may exceed their limits by this share of their range."""
-WRONG_UNIT = 5.0
-"""Values this many times the limit are in another unit: degrees are 57, rpm 9.5 times larger."""
+NEIGHBOURS = 3  # a jump is measured by the median difference from this many samples on either side
+STEPS = 6.0  # it is larger than this many usual changes from sample to sample,
+USUAL = 60.0  # (percentile that counts as usual: jumps in 20 % of the rows spoil 40 % of them)
+REACH = 1.5  # than this many times the distance that the greatest command allows in that time,
+HEADING_REACH = 0.1  # than this angle [rad], for a heading,
+STATE_SHARE = 0.2  # and than this share of the usual range, for a state
+MOST = 0.15  # jumps in more than this share of the rows are not faults of single samples
+EXCESS = 0.01  # commands may exceed their limits by this share of their range
+WRONG_UNIT = 5.0  # times the limit is another unit: degrees are 57, rpm 9.5 times larger
 UNIT_PERCENTILE = 75.0
-TRAVEL_SHARE = 0.1
-"""Directions of travel are measured over at least this share of the footprint's radius."""
+TRAVEL_SHARE = 0.1  # of the footprint's radius: least distance to measure a direction of travel
 MIN_DIRECTIONS = 30
-MIN_TURN = 1.0
-"""A reversed axis does not show in a drive that turned by less than this [rad]."""
-CONSISTENT, INCONSISTENT = 0.9, 0.6
-"""Consistency of the direction of travel in the body frame; 1 is perfect."""
+MIN_TURN = 1.0  # a reversed axis does not show in a drive that turned by less than this [rad]
+CONSISTENT, INCONSISTENT = 0.9, 0.6  # direction of travel in the body frame; 1 is perfect
 
 
 def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
-    """Drops repeated rows and jumps, and clips commands to the robot's limits.
-
-    Returns:
-        The drive, and one sentence per kind of fault.
-    """
+    """Drops repeated rows and jumps, and clips commands; returns one sentence per kind of fault."""
     recording, repeated = _without_repetitions(drive.recording)
     drive, jumps = _without_jumps(drive.part(recording))
     recording, beyond = _within_limits(drive.recording, drive.spec)
@@ -63,9 +46,7 @@ def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
 
 
 def _with_rows(recording: Recording, name: str, keep: NDArray[np.bool_]) -> Recording:
-    """Returns the recording with only the rows `keep` (T,) of one stream."""
-    stream = recording.streams[name]
-    some: Any = {name: replace(stream, t=stream.t[keep], values=stream.values[keep])}
+    some: Any = {name: recording.streams[name].rows(keep)}
     return replace(recording, **some)
 
 
@@ -104,11 +85,7 @@ def _without_jumps(drive: Drive) -> tuple[Drive, list[str]]:
 
 
 def _jumps_of_pose(drive: Drive) -> NDArray[np.bool_]:
-    """Selects the poses (T,) that jump in position or heading."""
-    pose, spec = drive.recording.pose, drive.spec
-    if len(pose.t) <= 2 * NEIGHBOURS:
-        return np.zeros(len(pose.t), dtype=np.bool_)
-    t = drive.sample_t
+    pose, spec, t = drive.recording.pose, drive.spec, drive.sample_t
     span = np.zeros(len(t))
     span[NEIGHBOURS:] = t[NEIGHBOURS:] - t[:-NEIGHBOURS]
     span[:-NEIGHBOURS] = np.maximum(span[:-NEIGHBOURS], t[NEIGHBOURS:] - t[:-NEIGHBOURS])
@@ -120,10 +97,7 @@ def _jumps_of_pose(drive: Drive) -> NDArray[np.bool_]:
 
 
 def _jumps_of_state(state: Stream) -> NDArray[np.bool_]:
-    """Selects the states (T,) that jump in any component."""
     out = np.zeros(len(state.t), dtype=np.bool_)
-    if len(state.t) <= 2 * NEIGHBOURS:
-        return out
     for column in state.values.T:
         low, high = np.percentile(column, (5.0, 95.0))
         out |= _stands_out(column, np.full(len(column), max(STATE_SHARE * (high - low), 1e-9)))
@@ -131,13 +105,9 @@ def _jumps_of_state(state: Stream) -> NDArray[np.bool_]:
 
 
 def _stands_out(values: Array, least: Array, turning: bool = False) -> NDArray[np.bool_]:
-    """Selects the values (T,) that differ from both sides, in the same direction.
-
-    Args:
-        values: (T,) of one component.
-        least: (T,) minimum difference, in addition to `STEPS` times the usual change.
-        turning: True for angles, whose differences are wrapped.
-    """
+    """Selects values (T,) that differ alike from both sides, by `least` and `STEPS` changes."""
+    if len(values) <= 2 * NEIGHBOURS:
+        return np.zeros(len(values), dtype=np.bool_)
     back, ahead = _differences(values, turning)
     usual = float(np.percentile(np.abs(back[0][1:]), USUAL))
     before, after = np.median(back, axis=0), np.median(ahead, axis=0)
@@ -158,12 +128,12 @@ def _differences(values: Array, turning: bool) -> tuple[Array, Array]:
 
 def _within_limits(recording: Recording, spec: RobotSpec) -> tuple[Recording, list[str]]:
     """Clips commands to the robot's limits, unless it followed them beyond."""
-    command, margin = recording.command, EXCESS * (spec.command_high - spec.command_low)
-    values = command.values
-    beyond = (values < spec.command_low - margin) | (values > spec.command_high + margin)
+    low, high, values = spec.command_low, spec.command_high, recording.command.values
+    margin = EXCESS * (high - low)
+    beyond = (values < low - margin) | (values > high + margin)
     if not beyond.any():
         return recording, []
-    clipped = np.where(beyond, np.clip(values, spec.command_low, spec.command_high), values)
+    clipped = np.where(beyond, np.clip(values, low, high), values)
     if _rates_left(recording, values) < _rates_left(recording, clipped):
         return recording, [
             "Commands were beyond the limits in the robot's YAML file, and the robot followed them "
@@ -175,14 +145,11 @@ def _within_limits(recording: Recording, spec: RobotSpec) -> tuple[Recording, li
         for c, share in zip(spec.command, beyond.mean(axis=0), strict=True)
         if share > 0.0
     ]
-    return replace(recording, command=replace(command, values=clipped)), notes
+    return replace(recording, command=replace(recording.command, values=clipped)), notes
 
 
 def _rates_left(recording: Recording, command: Array) -> float:
-    """Returns the share of the state's rates that commands (T, C) leave unexplained.
-
-    0 without a measured state.
-    """
+    """Returns the share of the state's rates that commands leave unexplained; 0 without state."""
     state = recording.state
     if state is None or len(state.t) < 2:
         return 0.0
@@ -197,11 +164,7 @@ def _rates_left(recording: Recording, command: Array) -> float:
 
 
 def check_units(drive: Drive) -> None:
-    """Refuses states and commands that only another unit can explain.
-
-    Raises:
-        RecordingError: a variable is too large; with its value and its limit.
-    """
+    """Refuses states and commands, with a RecordingError, that only another unit can explain."""
     recording, spec = drive.recording, drive.spec
     streams: list[tuple[Stream, tuple[Variable, ...]]] = [(recording.command, spec.command)]
     if recording.state is not None:
@@ -219,14 +182,11 @@ def check_units(drive: Drive) -> None:
 
 
 def check_axes(drive: Drive) -> None:
-    """Refuses poses whose heading turns against the direction of travel.
+    """Refuses poses, with a RecordingError, whose heading turns against the direction of travel.
 
     In its own frame, a robot without sideways motion always travels in the same direction; that
     of an omnidirectional robot depends on its state. If this is true only with the heading
     mirrored, then x, y or heading is reversed.
-
-    Raises:
-        RecordingError: one axis of the pose is reversed.
     """
     recording = drive.recording
     t, pose = _far_apart(drive.dated, TRAVEL_SHARE * drive.spec.footprint_radius)
@@ -264,10 +224,7 @@ def _steadiness(pose: Array) -> float:
 
 
 def _explained(t: Array, pose: Array, state: Stream) -> float:
-    """Returns the share (0 to 1) of the velocity between poses (n, 3) that the state explains.
-
-    The body velocity is linear in the state.
-    """
+    """Returns the share (0 to 1) of the body velocity between poses that the state explains."""
     span = np.diff(t)
     keep = span > 0.0
     velocity = geometry.log(geometry.between(pose[:-1], pose[1:]))[keep, :2] / span[keep, None]

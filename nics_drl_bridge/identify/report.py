@@ -5,74 +5,63 @@ Every estimate of a calibration is listed: value and uncertainty, or why there i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from textwrap import fill
 
 import numpy as np
 
-from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.fit import Alpha
+from nics_drl_bridge.identify.fit import ORDER, Alpha
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.mounting import Mounting
-from nics_drl_bridge.identify.open_loop import OpenLoop
 from nics_drl_bridge.identify.statistics import Curve
+from nics_drl_bridge.identify.verdict import FAR_OFF
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 WIDTH = 96
 CURVE_POINTS = 8
+MOST_LEFT = 0.5  # share of the error of standing still above which a model is hardly better
+COARSE = 2.0 / 3.0  # share of a state's range between two rows that is sampled too coarsely
+ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
 
 
 def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
-    """Returns the report as human-readable text.
-
-    Args:
-        source: where the recording came from.
-        spec: the robot.
-        identified: the result of the identification.
-    """
-    model = identified.model
-    lines = [
-        f"Fit report: robot {spec.name!r} from {source}",
-        "",
-        f"Kept {model.terms_kept} of {identified.fit.terms_total} terms, step {model.dt:g} s "
-        f"(X = {', '.join(model.variables)}), with standard errors:",
-        *(f"  {equation}" for equation in equations_with_errors(model)),
-        "",
-        *_pruning(identified.alpha),
-        "",
-        "Cross-validated error against the number of terms, largest first, * for those kept:",
-        *(f"  {line}" for curve in identified.fit.curves for line in _curve(curve)),
-        "",
-        "Error of the linear fit per degree of freedom, on the part it was fitted to:",
-        *_errors(identified),
-        "",
-        f"Open loop, on data held out from the fit (after {identified.train_until_s:.1f} s):",
-        *_open_loop(identified.held_out),
-        *_held_out_rates(model),
-        "",
-        "Valid where the drive was:",
-        *_box(model, spec),
-        "",
-        "Calibration (standard uncertainties):",
-        *_calibration(identified),
-        "",
-        "Noise that the simulator and the estimator use (standard deviations):",
-        *(f"  {line}" for line in identified.noise.sentences()),
-        "",
-        *_latency(identified),
-        "Found, and not learnt:",
-        *(_item(note) for note in identified.notes or ("Nothing had to be corrected.",)),
-    ]
-    return "\n".join(lines) + "\n"
+    """Returns the report on a recording from a source as text for people."""
+    model, total = identified.model, identified.fit.regression.terms_total
+    latency, until = identified.recording.latency.sentences(), identified.train_until_s
+    sections: dict[str, Iterable[str]] = {
+        f"Fit report: robot {spec.name!r} from {source}": (),
+        f"Kept {model.terms_kept} of {total} terms, step {model.dt:g} s "
+        f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(model),
+        fill(_pruning(identified.alpha), WIDTH): (),
+        "Cross-validated error against the number of terms, largest first, * for those kept:": (
+            line for curve in identified.fit.curves for line in _curve(curve)
+        ),
+        "Error of the linear fit per degree of freedom, on the part it was fitted to:": _errors(
+            identified
+        ),
+        f"Open loop, on data held out from the fit (after {until:.1f} s):": _held_out(identified),
+        "Valid where the drive was:": _box(model, spec),
+        "Calibration (standard uncertainties):": (e.text for e in estimates(identified).values()),
+        "Noise that the simulator and the estimator use (standard deviations):": (
+            identified.noise.sentences()
+        ),
+        **({"Latency of the device, which simulator_node has too:": latency} if latency else {}),
+        "Found, and not learnt:": map(_item, identified.notes or ("Nothing had to be corrected.",)),
+    }
+    paragraphs = ([head, *(f"  {line}" for line in lines)] for head, lines in sections.items())
+    return "\n\n".join("\n".join(lines) for lines in paragraphs) + "\n"
 
 
-def _latency(identified: Identified) -> list[str]:
-    lines = identified.recording.latency.sentences()
-    head = "Latency of the device, which simulator_node has too:"
-    return [head, *(f"  {line}" for line in lines), ""] if lines else []
+def _item(note: str) -> str:
+    return fill(note, WIDTH - 2, initial_indent="- ", subsequent_indent="    ")
+
+
+def _box(model: TaylorModel, spec: RobotSpec) -> Iterator[str]:
+    units = dict(zip(spec.variable_names, spec.variable_units, strict=True))
+    for name, low, high in zip(model.variables, model.low, model.high, strict=True):
+        yield f"{name:<24} {low:.4g} to {high:.4g} {units[name]}"
 
 
 def equations_with_errors(model: TaylorModel) -> list[str]:
@@ -103,23 +92,20 @@ def with_error(value: float, error: float | None) -> str:
     return f"({value:.{digits}f} +- {error:.{digits}f})"
 
 
-def _pruning(alpha: Alpha) -> list[str]:
+def _pruning(alpha: Alpha) -> str:
     if alpha == "auto":
-        text = (
+        return (
             "Pruned (Eq. 2) per degree of freedom at the knee of its accuracy curve: the fewest "
             "terms, largest standardised coefficient first, whose cross-validated error can't be "
             "told from the least."
         )
-    else:
-        text = (
-            f"Pruned by Eq. 2 at alpha = {alpha:g}, for each degree of freedom on its own; the "
-            "term that crosses the threshold is kept too."
-        )
-    return [fill(text, WIDTH)]
+    return (
+        f"Pruned by Eq. 2 at alpha = {alpha:g}, for each degree of freedom on its own; the "
+        "term that crosses the threshold is kept too."
+    )
 
 
 def _curve(curve: Curve) -> list[str]:
-    """Formats the error with 0, 1, 2... terms, in per cent of the size of the rates."""
     shown = min(max(CURVE_POINTS, curve.kept + 1), len(curve.error))
     points = [
         f"{n}{'*' if n == curve.kept else ''}: {100.0 * curve.share[n]:.3g} %" for n in range(shown)
@@ -129,74 +115,47 @@ def _curve(curve: Curve) -> list[str]:
     return fill(text, WIDTH, subsequent_indent=" " * 15).splitlines()
 
 
-def _calibration(identified: Identified) -> list[str]:
-    return [f"  {estimate.text}" for estimate in estimates(identified).values()]
-
-
-def _item(note: str) -> str:
-    return fill(note, WIDTH, initial_indent="  - ", subsequent_indent="    ")
-
-
 def _errors(identified: Identified) -> list[str]:
     fit, model = identified.fit, identified.model
     return [
-        f"  {dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}, condition number {number:.3g}"
+        f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}, condition number {number:.3g}"
         for dof, unit, rmse, r2, number in zip(
             model.dofs, model.dof_units, fit.rmse, fit.r2, fit.condition, strict=True
         )
     ]
 
 
-def _held_out_rates(model: TaylorModel) -> list[str]:
-    quality = model.quality
-    if quality is None or not quality.held_out_rmse:
-        return []
-    units = dict(zip(model.dofs, model.dof_units, strict=True))
-    return [
-        "  the rates there:",
-        *(
-            f"  {dof:<24} RMSE {rmse:.3g} {units[dof]}, R2 {quality.held_out_r2[dof]:.6f}"
-            for dof, rmse in quality.held_out_rmse.items()
-        ),
-    ]
-
-
-def _box(model: TaylorModel, spec: RobotSpec) -> list[str]:
-    units: Mapping[str, str] = dict(zip(spec.variable_names, spec.variable_units, strict=True))
-    return [
-        f"  {name:<24} {low:.4g} to {high:.4g} {units[name]}"
-        for name, low, high in zip(model.variables, model.low, model.high, strict=True)
-    ]
-
-
-def _open_loop(held_out: OpenLoop | None) -> list[str]:
+def _held_out(identified: Identified) -> Iterator[str]:
+    held_out, model, quality = identified.held_out, identified.model, identified.model.quality
     if held_out is None:
-        return ["  the drive is too short to hold data out"]
-    return [
-        f"  after {held_out.horizon_s:g} s: position error {held_out.mean_position_error_m:.3g} m "
-        f"on average, {held_out.max_position_error_m:.3g} m at most,",
-        f"  heading error {held_out.mean_heading_error_rad:.3g} rad on average, over a mean path "
-        f"of {held_out.mean_path_m:.2f} m ({held_out.windows} windows)",
-    ]
+        yield "the drive is too short to hold data out"
+    else:
+        mean, most = held_out.mean_position_error_m, held_out.max_position_error_m
+        turn, path = held_out.mean_heading_error_rad, held_out.mean_path_m
+        yield (
+            f"after {held_out.horizon_s:g} s: position error {mean:.3g} m on average, "
+            f"{most:.3g} m at most,"
+        )
+        yield (
+            f"heading error {turn:.3g} rad on average, over a mean path of {path:.2f} m "
+            f"({held_out.windows} windows)"
+        )
+    if quality is not None and quality.held_out_rmse:
+        yield "the rates there:"
+        rows = zip(model.dof_units, quality.held_out_rmse.items(), strict=True)
+        for unit, (dof, rmse) in rows:
+            yield f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {quality.held_out_r2[dof]:.6f}"
 
 
 @dataclass(frozen=True)
 class CalibratedValue:
-    """One estimate.
+    """One estimate; without a value if it could not be made."""
 
-    Attributes:
-        name: in words.
-        value: None if it could not be estimated.
-        sigma: standard uncertainty; None if there is none.
-        unit: of both.
-        remark: why it could not be estimated, or its meaning.
-    """
-
-    name: str
+    name: str  # in words
     value: float | None
-    sigma: float | None
-    unit: str
-    remark: str = ""
+    sigma: float | None  # standard uncertainty; None if there is none
+    unit: str  # of both
+    remark: str = ""  # why it could not be estimated, or its meaning
 
     @property
     def text(self) -> str:
@@ -212,71 +171,116 @@ class CalibratedValue:
 
 def estimates(identified: Identified) -> dict[str, CalibratedValue]:
     """Returns all estimates of the calibration by their names in `Calibration`."""
-    recording, calibration = identified.recording, identified.calibration
-    return {
-        **_timing(recording, calibration),
-        **_mounting(calibration, identified.findings.mounting),
-        **_wheels(recording, calibration),
-    }
-
-
-def _timing(recording: Recording, calibration: Calibration) -> dict[str, CalibratedValue]:
-    sigma = calibration.uncertainty
-    offset = CalibratedValue("clock offset", None, None, "s", "pose and commands are on one clock")
+    recording, found = identified.recording, identified.calibration
+    sigma, mounting = found.uncertainty, identified.findings.mounting
+    clocks = "pose and commands are on one clock"
+    if recording.pose.clock != recording.command.clock:
+        clocks = "no command changed"
+    latency = "no command changed"
     if "clock_offset_s" in sigma:
-        value = calibration.clock_offset_s
-        offset = CalibratedValue("clock offset", value, sigma["clock_offset_s"], "s")
-    elif recording.pose.clock != recording.command.clock:
-        offset = CalibratedValue("clock offset", None, None, "s", "no command changed")
-    why = "no command changed"
-    if "clock_offset_s" in sigma:
-        why = "only its sum with the clock offset is known"
-    latency = CalibratedValue("command latency", None, None, "s", why)
-    if "command_latency_s" in sigma:
-        value = calibration.command_latency_s
-        latency = CalibratedValue("command latency", value, sigma["command_latency_s"], "s")
-    bursts = CalibratedValue(
-        "period of bursts", None, None, "s", "the poses are stamped one by one"
-    )
-    if calibration.burst_period_s > 0.0:
-        bursts = CalibratedValue("period of bursts", calibration.burst_period_s, None, "s")
-    return {"clock_offset_s": offset, "command_latency_s": latency, "burst_period_s": bursts}
-
-
-def _mounting(calibration: Calibration, found: Mounting | None) -> dict[str, CalibratedValue]:
-    names = {
-        "rotation_rad": ("rotation of base_link", calibration.rotation_rad, "rad"),
-        "lever_arm_x_m": ("lever arm x", calibration.lever_arm_m[0], "m"),
-        "lever_arm_y_m": ("lever arm y", calibration.lever_arm_m[1], "m"),
+        latency = "only its sum with the clock offset is known"
+    turns = "the drive shows too few directions of motion"
+    if mounting is not None and not mounting.turns:
+        turns = "the robot never turned"
+    wheels = "the wheels do not show it"
+    if recording.wheels is None:
+        wheels = "no wheel speeds were recorded"
+    rows = {
+        "clock_offset_s": ("clock offset", found.clock_offset_s, "s", clocks),
+        "command_latency_s": ("command latency", found.command_latency_s, "s", latency),
+        "burst_period_s": ("period of bursts", None, "s", "the poses are stamped one by one"),
+        "rotation_rad": ("rotation of base_link", found.rotation_rad, "rad", turns),
+        "lever_arm_x_m": ("lever arm x", found.lever_arm_m[0], "m", turns),
+        "lever_arm_y_m": ("lever arm y", found.lever_arm_m[1], "m", turns),
+        "wheel_scale": ("wheel scale", found.wheel_scale, "m/s per unit", wheels),
+        "turn_scale": ("turn scale", found.turn_scale, "rad/s per unit", wheels),
     }
-    why = "the drive shows too few directions of motion"
-    if found is not None and not found.turns:
-        why = "the robot never turned"
     values = {}
-    for key, (name, value, unit) in names.items():
-        sigma = calibration.uncertainty.get(key)
-        if sigma is None:
-            values[key] = CalibratedValue(name, None, None, unit, why)
-        else:
-            remark = "below its uncertainty: taken as zero" if value == 0.0 else ""
-            values[key] = CalibratedValue(name, value, sigma, unit, remark)
+    for key, (name, value, unit, why) in rows.items():
+        values[key] = CalibratedValue(name, None, None, unit, why)
+        if key in sigma:
+            zero = value == 0.0 and key in ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
+            remark = "below its uncertainty: taken as zero" if zero else ""
+            values[key] = CalibratedValue(name, value, sigma[key], unit, remark)
+    if found.burst_period_s > 0.0:
+        period = CalibratedValue("period of bursts", found.burst_period_s, None, "s")
+        values["burst_period_s"] = period
+    swapped = found.wheels_swapped
+    meaning = {None: wheels, True: "left and right are interchanged", False: "as named"}[swapped]
+    known = None if swapped is None else float(swapped)
+    values["wheels_swapped"] = CalibratedValue("swapped wheels", known, None, "", meaning)
     return values
 
 
-def _wheels(recording: Recording, calibration: Calibration) -> dict[str, CalibratedValue]:
-    why = "no wheel speeds were recorded"
-    if recording.wheels is not None:
-        why = "the wheels do not show it"
-    rows = {
-        "wheel_scale": ("wheel scale", calibration.wheel_scale, "m/s per unit"),
-        "turn_scale": ("turn scale", calibration.turn_scale, "rad/s per unit"),
-    }
-    found = {}
-    for key, (name, value, unit) in rows.items():
-        sigma = calibration.uncertainty.get(key)
-        found[key] = CalibratedValue(name, value, sigma, unit, why if value is None else "")
-    swapped = calibration.wheels_swapped
-    known = None if swapped is None else float(swapped)
-    meaning = {None: why, True: "left and right are interchanged", False: "as named"}[swapped]
-    found["wheels_swapped"] = CalibratedValue("swapped wheels", known, None, "", meaning)
-    return found
+def is_useless(error: float, standing: float, path: float, radius: float) -> bool:
+    """True if predictions are hardly better than assuming that the robot stands still.
+
+    Given are the median errors of the predictions (NaN or inf if they diverge) and of standing
+    still, the mean length of the path and the robot's radius [m]. Persistence is the usual baseline
+    of a forecast (Murphy: Skill scores based on the mean square error, Monthly Weather Review,
+    1988). A robot that drives in circles or turns on the spot returns to its start: there the path
+    and the robot's size set the scale.
+    """
+    return not error <= max(MOST_LEFT * standing, FAR_OFF * path, radius)
+
+
+def why_useless(identified: Identified, spec: RobotSpec, order: int = ORDER) -> str:
+    """Returns one sentence on why a model is useless; empty if it is useful or untested.
+
+    The median counts: a single permanent jump of the pose spoils only some of the predictions.
+    """
+    held_out, recording = identified.held_out, identified.recording
+    if held_out is None:
+        return ""
+    error, standing = held_out.median_position_error_m, held_out.median_displacement_m
+    if not np.isfinite(held_out.mean_position_error_m):
+        error = np.inf
+    if not is_useless(error, standing, held_out.mean_path_m, spec.footprint_radius):
+        return ""
+    end = f"end {error:.3g} m off" if np.isfinite(error) else "have run away"
+    return (
+        f"{recording.source}: the fitted model is of no use: on unseen data its predictions {end} "
+        f"after {held_out.horizon_s:g} s and a path of {held_out.mean_path_m:.2f} m, where a robot "
+        f"that stood still would be {standing:.2f} m off; {_suspicion(identified, spec, order)}."
+    )
+
+
+def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
+    recording, unmoved = identified.recording, identified.fit.unmoved
+    step, name = max(_steps(recording, spec, unmoved), default=(0.0, ""))
+    rows = recording.pose if recording.state is None else recording.state
+    apart = f"{np.median(np.diff(rows.t)):.2g} s apart"
+    if step > COARSE:
+        return (
+            f"{name} changes by {step:.0%} of its range between rows that are {apart}, so record "
+            "at a higher rate"
+        )
+    if unmoved:
+        return (
+            f"{', '.join(unmoved)} never moved in its first {identified.train_until_s:.0f} s, from "
+            "which it is learnt, so change it from the beginning on"
+        )
+    if identified.alpha != "auto" or order < ORDER:
+        return f"it may lack terms, so leave the order at {ORDER} and alpha at `auto`"
+    return (
+        "the recording does not show why, so make sure that nothing held the robot up, that it got "
+        f"each command, that its pose did not jump and that rows {apart} show how it responds, and "
+        "record anew"
+    )
+
+
+def _steps(
+    recording: Recording, spec: RobotSpec, unmoved: tuple[str, ...]
+) -> list[tuple[float, str]]:
+    """Returns the step between rows, as a share of its range, of each measured state that moved."""
+    if recording.state is None:
+        return []
+    moved = [i for i, v in enumerate(spec.state) if v.name not in unmoved]
+    values = recording.state.values[:, moved]
+    spread = np.ptp(np.percentile(values, ENDS, axis=0), axis=0)
+    steps = np.percentile(np.abs(np.diff(values, axis=0)), ENDS[1], axis=0)
+    return [
+        (float(step / size), spec.state[i].name)
+        for i, step, size in zip(moved, steps, spread, strict=True)
+        if size > 0.0
+    ]

@@ -7,11 +7,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.signal import lfilter
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
-
-Array = NDArray[np.float64]
 
 SMOOTHING_BATCH = 64
 DEFAULT_LAG_S = 0.1
@@ -21,63 +20,51 @@ GAUSSIAN_MAD = 0.6745
 
 
 def held(command: Stream, spec: RobotSpec, start: Array, end: Array) -> Array:
-    """Returns the mean of a held command over intervals.
+    """Returns the mean (..., C) of held commands over intervals (...) on the commands' clock [s].
 
     Before its first command a robot stands still: commands that ever change are zero then.
     A command that never changes is assumed to have had that value before.
-
-    Args:
-        command: (T, C) commands, each held until the next.
-        spec: gives the limits of the commands.
-        start: (...) of the intervals, on the commands' clock [s].
-        end: (...) [s].
-
-    Returns:
-        (..., C).
     """
-    values = np.concatenate([_before(command, spec)[None], command.values])
-    return _means_of_held(command.t, values, start, end)
+    return _means_of_held(command.t, _since_ever(command, spec), start, end)
 
 
 def held_features(
     command: Stream, spec: RobotSpec, powers: NDArray[np.int64], start: Array, end: Array
 ) -> Array:
     """Returns means (..., K) of features (K, C) of held commands over intervals, as in `held`."""
-    values = np.concatenate([_before(command, spec)[None], command.values])
-    return _means_of_held(command.t, taylor.evaluate(values, powers), start, end)
+    features = taylor.evaluate(_since_ever(command, spec), powers)
+    return _means_of_held(command.t, features, start, end)
 
 
-def _before(command: Stream, spec: RobotSpec) -> Array:
-    """Returns the command (C,) in effect before the first one."""
+def _since_ever(command: Stream, spec: RobotSpec) -> Array:
+    """Returns commands (T + 1, C), first that in effect before the first one."""
     still = np.clip(0.0, spec.command_low, spec.command_high)
-    return np.asarray(np.where(moved_commands(command), still, command.values[0]))
+    before = np.where(moved_commands(command), still, command.values[0])
+    return np.concatenate([before[None], command.values])
 
 
 def _means_of_held(t: Array, values: Array, start: Array, end: Array) -> Array:
     """Returns means (..., K) over intervals of values (T + 1, K) that change at times (T,)."""
     low, high = min(start.min(), t[0]) - 1.0, max(end.max(), t[-1]) + 1.0
     edges = np.concatenate([[low], t, [high]])
-    area = np.concatenate(
-        [np.zeros((1, values.shape[1])), np.cumsum(values * np.diff(edges)[:, None], 0)]
-    )
-    mean = [
-        (np.interp(end, edges, column) - np.interp(start, edges, column)) / (end - start)
+    return _means(edges, values * np.diff(edges)[:, None], start, end)
+
+
+def _means(t: Array, parts: Array, start: Array, end: Array) -> Array:
+    """Returns means (..., K) over intervals of what has the integrals (T, K) between times."""
+    area = np.concatenate([np.zeros((1, parts.shape[1])), np.cumsum(parts, axis=0)])
+    means = [
+        (np.interp(end, t, column) - np.interp(start, t, column)) / (end - start)
         for column in area.T
     ]
-    return np.stack(mean, axis=-1)
+    return np.stack(means, axis=-1) if means else np.zeros((*start.shape, 0))
 
 
 def lagged(signal: Array, lags: Array, dt: float, initial: Array) -> Array:
-    """Returns first-order responses to a signal that is constant over each step.
+    """Returns first-order responses (T, S) to signals (T, S) that are constant over each step [s].
 
-    Args:
-        signal: (T, S) input of each response.
-        lags: (S,) time constants [s].
-        dt: step [s].
-        initial: (S,) response at the start.
-
-    Returns:
-        (T, S) response at the start of each step.
+    Given are the time constants (S,) [s] and the responses (S,) at the start; returned are those at
+    the start of each step.
     """
     decay = np.exp(-dt / np.maximum(lags, 1e-6))
     columns = [
@@ -90,6 +77,12 @@ def lagged(signal: Array, lags: Array, dt: float, initial: Array) -> Array:
 def moved_commands(command: Stream) -> NDArray[np.bool_]:
     """Returns a mask (C,) of the commands that ever changed."""
     return np.asarray(np.ptp(command.values, axis=0) > 0.0)
+
+
+def moved_inputs(command: Stream, spec: RobotSpec) -> NDArray[np.bool_]:
+    """Returns a mask (S,) of the states whose command changed, or (C,) without any state."""
+    moved = moved_commands(command)
+    return moved[followed(spec)] if spec.state else moved
 
 
 def followed(spec: RobotSpec) -> NDArray[np.intp]:
@@ -105,7 +98,7 @@ def speed_index(spec: RobotSpec) -> int | None:
 
 
 def nominal_lags(spec: RobotSpec) -> Array:
-    """Returns the spec's time constants (S,), `NAME_lag`, else a typical one [s]."""
+    """Returns the spec's time constants (S,) `NAME_lag` [s], else a typical one."""
     return np.array([spec.parameters.get(f"{v.name}_lag", DEFAULT_LAG_S) for v in spec.state])
 
 
@@ -114,7 +107,7 @@ def inferred_states(
 ) -> Array:
     """Infers states (T, S) at uniform times (T,) on the commands' clock, with gain one.
 
-    Each state follows its command; if the command never changes, the state keeps its value.
+    Each follows its command; if the command never changes, the state keeps its value.
     """
     dt = float(grid[1] - grid[0])
     target = held(command, spec, grid - latency, grid + dt - latency)[:, followed(spec)]
@@ -125,13 +118,7 @@ def inferred_states(
 
 def interval_means(t: Array, values: Array, start: Array, end: Array) -> Array:
     """Returns means (n, K) over intervals (n,) of values (T, K), linear between stamps (T,)."""
-    steps = np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2.0
-    area = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
-    means = [
-        (np.interp(end, t, column) - np.interp(start, t, column)) / (end - start)
-        for column in area.T
-    ]
-    return np.stack(means, axis=1) if means else np.zeros((len(start), 0))
+    return _means(t, np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2.0, start, end)
 
 
 def white_noise(values: Array) -> Array:
@@ -148,13 +135,9 @@ def unwrapped(pose: Array) -> Array:
 
 
 def resample(t: Array, pose: Array, at: Array, half_width: float) -> Array:
-    """Resamples unwrapped poses (T, 3) at times (T,), never decreasing, to poses (n, 3).
+    """Resamples poses (T, 3) with unwrapped headings at times (n,); stamps (T,) never decrease.
 
-    Args:
-        t: (T,) sample times [s].
-        pose: (T, 3), heading unwrapped.
-        at: (n,) times [s].
-        half_width: of a local parabola fitted to noisy samples [s]; 0 interpolates.
+    `half_width` [s] is that of a local parabola fitted to noisy samples; 0 interpolates.
     """
     distinct = np.concatenate([[True], np.diff(t) > 0.0])
     t, pose = t[distinct], pose[distinct]

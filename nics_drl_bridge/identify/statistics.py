@@ -11,31 +11,23 @@ from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 from scipy.optimize import least_squares
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.taylor import TaylorModel
 
-Array = NDArray[np.float64]
-
-UNLIKE = 0.05
-"""Correlation below which residuals are assumed to be independent."""
-LONGEST = 0.1
-"""Longest correlation of residuals, as a share of the rows."""
-CERTAIN = 3.0
-"""A term of a noisy fit must be this many times its standard error."""
-WEAK = 1e4
-"""Instruments are too weak if the condition number of their products with the features is
-larger."""
-DIFFERENCE, TOLERANCE, MAX_STEPS = 1e-4, 1e-7, 40
-"""Relative step, tolerance and steps of `minimise`."""
+UNLIKE = 0.05  # correlation below which residuals are assumed to be independent
+LONGEST = 0.1  # longest correlation of residuals, as a share of the rows
+CERTAIN = 3.0  # a term of a noisy fit must be this many times its standard error
+WEAK = 1e4  # condition number of instruments x features above which instruments are too weak
+DIFFERENCE, TOLERANCE, MAX_STEPS = 1e-4, 1e-7, 40  # relative step and end of `minimise`
 BLOCKS = 5
-WORTH = 1e-3
-"""Terms that lower the error by less than this share of the rates' size are not kept."""
+WORTH = 1e-3  # terms that lower the error by less than this share of the rates' size are not kept
 
 
 def unexplained(chi: Array, signal: Array) -> Array:
     """Returns the residual of a signal (n, D) on features (n, K) by least squares, flattened.
 
-    It is a share of each component's spread.
+    It is in units of each component's spread.
     """
     spread = signal.std(axis=0)
     scaled = (signal - signal.mean(axis=0)) / np.where(spread > 1e-9, spread, 1e9)
@@ -52,17 +44,10 @@ def minimise(
     bounds: tuple[Array, Array] | None = None,
     jacobian: Callable[[Array], Array] | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Minimises a residual by least squares, in steps of each parameter's scale.
+    """Minimises a residual of parameters (P,), which change by about `scale`, within bounds (P,).
 
-    Args:
-        residual: function of parameters (P,).
-        start: (P,).
-        scale: (P,) expected change of each parameter, whatever its value.
-        bounds: least and greatest parameters (P,).
-        jacobian: of the residual (n, P); by finite differences when None.
-
-    Returns:
-        Parameters (P,), and Jacobian (n, P) and residual (n,) there.
+    Returns the parameters, and Jacobian (n, P) and residual (n,) there. The Jacobian comes from
+    finite differences if none is given.
     """
     low, high = bounds or (np.full(len(start), -np.inf), np.full(len(start), np.inf))
     slope: Any = "2-point"
@@ -82,10 +67,7 @@ def minimise(
 
 
 def uncertainty(jacobian: Array, residual: Array) -> Array:
-    """Returns the standard uncertainty (P,) of least squares.
-
-    It is widened for autocorrelated residuals.
-    """
+    """Returns standard uncertainties (P,) of least squares, widened for correlated residuals."""
     rest = residual - residual.mean()
     power = float((rest**2).sum())
     rho = float((rest[1:] * rest[:-1]).sum()) / power if power > 0.0 else 0.0
@@ -98,12 +80,9 @@ def uncertainty(jacobian: Array, residual: Array) -> Array:
 def standard_errors(chi: Array, residual: Array) -> Array:
     """Returns standard errors (K,) of least squares for unequal and correlated residuals.
 
-    Newey, West: A simple, positive semi-definite, heteroskedasticity and autocorrelation
-    consistent covariance matrix, Econometrica 1987.
-
-    Args:
-        chi: (T, K) features.
-        residual: (T,) residual of the fit, in order of time.
+    The residual (T,) of the fit to features (T, K) is in order of time. Newey, West: A simple,
+    positive semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix,
+    Econometrica 1987.
     """
     count, terms = chi.shape
     if terms == 0 or count <= terms:
@@ -130,8 +109,8 @@ def long_run(chi: Array, residual: Array) -> Array:
 def clustered_errors(jacobian: Array, residual: Array, cluster: NDArray[np.intp]) -> Array:
     """Returns standard errors (P,) of least squares with residuals correlated within clusters (n,).
 
-    Cameron, Miller: A practitioner's guide to cluster-robust inference, 2015, with their
-    correction for few clusters.
+    Cameron, Miller: A practitioner's guide to cluster-robust inference, 2015; corrected for few
+    clusters.
     """
     groups = np.unique(cluster)
     count, terms = jacobian.shape
@@ -186,7 +165,7 @@ def errors_of(model: TaylorModel, samples: Samples) -> tuple[Array, Array]:
 def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
     """Selects the significant features (K,) of a noisy target (T,).
 
-    The least certain feature is removed until each coefficient is at least `CERTAIN` times its
+    The least certain one is removed until each coefficient is at least `CERTAIN` times its
     standard error, which is widened for autocorrelated residuals.
     """
     rest = target - chi @ np.linalg.lstsq(chi, target, rcond=None)[0]
@@ -209,13 +188,9 @@ def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
 def instrumental(chi: Array, instruments: Array, target: Array) -> tuple[Array, Array] | None:
     """Returns coefficients (K,) by instrumental variables, and their standard errors (K,).
 
-    Soederstroem, Stoica: Instrumental variable methods for system identification, 1983; two-stage
-    least squares. None if the instruments are too weak.
-
-    Args:
-        chi: (T, K) features with noise.
-        instruments: (T, K) the same features of variables whose noise is independent.
-        target: (T,).
+    The instruments (T, K) are the noisy features (T, K) of variables whose noise is independent;
+    None if they are too weak. Two-stage least squares (Soederstroem, Stoica: Instrumental variable
+    methods for system identification, 1983).
     """
     scale, size = np.linalg.norm(chi, axis=0), np.linalg.norm(instruments, axis=0)
     chi, instruments = chi / scale, instruments / size
@@ -230,20 +205,12 @@ def instrumental(chi: Array, instruments: Array, target: Array) -> tuple[Array, 
 
 @dataclass(frozen=True)
 class Curve:
-    """Cross-validated error of one degree of freedom against its number of terms.
-
-    Attributes:
-        dof: name.
-        terms: (n,) terms in the order of Eq. 2, the largest weight first.
-        error: (n + 1,) RMSE of the first 0..n terms on blocks held out of their fit, in the unit
-            of the rate.
-        kept: number of terms in the model.
-    """
+    """Cross-validated error of one degree of freedom against its number of terms."""
 
     dof: str
-    terms: tuple[str, ...]
-    error: Array
-    kept: int
+    terms: tuple[str, ...]  # n in the order of Eq. 2, the largest weight first
+    error: Array  # (n + 1,) RMSE of the first 0..n terms on blocks held out of their fit
+    kept: int  # number of terms in the model
 
     @property
     def share(self) -> Array:
@@ -254,11 +221,7 @@ class Curve:
 def curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array) -> Curve:
     """Returns the curve of one degree of freedom; `kept` is its knee.
 
-    Args:
-        dof: name.
-        terms: (n,) names.
-        chi: (T, n) standardised features, the largest weight first.
-        target: (T,) rates.
+    The standardised features (T, n) of the n terms come with the largest weight first.
     """
     squares = cross_validated(chi, target)
     error = np.sqrt(squares.mean(axis=0))
@@ -280,8 +243,8 @@ def knee(error: Array, sigma: Array) -> int:
 def cross_validated(chi: Array, target: Array) -> Array:
     """Returns mean squared errors (B, n + 1) of the first 0..n features on B blocks in time.
 
-    Each block is predicted by a fit to the others. The blocks are first compressed to triangles
-    (QR), so that all numbers of terms share one factorisation.
+    Each block is predicted by a fit to the others. Blocks are compressed to triangles (QR) first,
+    so that all numbers of terms share one factorisation.
     """
     rows = np.array_split(np.arange(len(target)), BLOCKS)
     both = np.concatenate([chi, target[:, None]], axis=1)

@@ -28,7 +28,7 @@ from sensor_msgs.msg import Imu, JointState, LaserScan
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.lidar.sectors import Reader, reader_beside
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, from_device, to_device
-from nics_drl_bridge.recording.joints import POSITION_UNITS
+from nics_drl_bridge.recording.messages import POSITION_UNITS
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]

@@ -25,9 +25,8 @@ from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import EXIT_BAD_INPUT, declare, last_word, run_node, steadily
-from nics_drl_bridge.recording.drive_plan import DrivePlan
-from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S
-from nics_drl_bridge.recording.joints import JointMessage, gather, state_of, wheels_of
+from nics_drl_bridge.recording.bag_reader import JointMessage, gather, state_of, wheels_of
+from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
 from nics_drl_bridge.recording.messages import imu_row, pose_row, stamp, twist_row
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.recording.stamping import TopicData, streams

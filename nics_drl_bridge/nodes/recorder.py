@@ -15,7 +15,7 @@ import numpy as np
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.identify.excitation import coverage
-from nics_drl_bridge.recording.drive_plan import DrivePlan
+from nics_drl_bridge.recording.excite import DrivePlan
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.recording.topic_roles import topic_roles
 from nics_drl_bridge.recording.write import check_out

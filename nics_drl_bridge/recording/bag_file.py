@@ -1,25 +1,27 @@
 """Opens a rosbag2 recording and verifies that it is complete.
 
-Bag readers return what they still find in a damaged bag, often silently. So the database is
-checked page by page, and the messages of each topic are compared with the bag's summary. Data
-without a checksum, such as a flipped bit inside a number, can't be verified.
+Bag readers return what they still find in a damaged bag, often silently. So its files are checked
+whole, and the messages of each topic are compared with the bag's summary. Data without a
+checksum, such as a flipped bit inside a number, can't be verified.
 """
 
 from __future__ import annotations
 
 import sqlite3
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from nics_drl_bridge.config import no_device, parse_yaml, read_text
 from nics_drl_bridge.errors import LONGEST_NAME, BridgeError, RecordingError, shortened
-from nics_drl_bridge.recording.messages import Offer, check_libraries, offers_of, typestore
-from nics_drl_bridge.recording.packing import check_message, unpack_file
+from nics_drl_bridge.recording.messages import Offer, check_libraries, offers_of, stamp, typestore
+from nics_drl_bridge.recording.stamping import Nanoseconds
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -35,15 +37,10 @@ CURE = "save the rest with `nics bag salvage`, try `ros2 bag reindex`, or record
 
 @dataclass(frozen=True)
 class Message:
-    """A message of a bag.
+    """A message of a bag."""
 
-    Attributes:
-        receive_ns: time of receipt by the recorder [ns].
-        content: the decoded message, with the fields of its type.
-    """
-
-    receive_ns: int
-    content: Any
+    receive_ns: int  # time of receipt by the recorder [ns]
+    content: Any  # the decoded message, with the fields of its type
 
 
 def is_bag(path: str | Path) -> bool:
@@ -62,14 +59,11 @@ def is_storage(path: Path) -> bool:
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[BagFile]:
-    """Opens a bag; any exception that a damaged bag causes in rosbags becomes one sentence.
-
-    Args:
-        path: the bag's folder, or its only file.
+    """Opens a bag, given its folder or its only file.
 
     Raises:
         RecordingError: there is no such bag, it is damaged, empty or was not closed, or a library
-            is not installed.
+            is not installed; any exception of rosbags on a damaged bag becomes one sentence.
     """
     path = Path(path)
     check_libraries(path, "reading")
@@ -77,7 +71,12 @@ def opened(path: str | Path) -> Iterator[BagFile]:
 
     try:
         place = _place(path)
-        _check_name(place)
+        # rosbags opens databases by URI, which these characters cut.
+        sign = next((sign for sign in URI_SIGNS if sign in str(place)), None)
+        if sign and any(DATABASE in p.suffixes for p in (place, *place.glob(f"*{DATABASE}*"))):
+            raise RecordingError(
+                f"{place}: SQLite can't open what has {sign!r} in its path; rename the folder."
+            )
         for file in (place, *(place.iterdir() if place.is_dir() else ())):
             no_device(file)
         with TemporaryDirectory() as room:  # before rosbags, which unpacks chunks of any size
@@ -105,16 +104,6 @@ def _reason(error: object) -> str:
     return text if len(text) <= 200 else f"{text[:200]}..."
 
 
-def _check_name(path: Path) -> None:
-    """Refuses paths with characters at which rosbags, which opens databases by URI, cuts them."""
-    name = str(path)
-    if DATABASE in path.suffixes or (path.is_dir() and any(path.glob(f"*{DATABASE}*"))):
-        for sign in (one for one in URI_SIGNS if one in name):
-            raise RecordingError(
-                f"{path}: SQLite can't open what has {sign!r} in its path; rename the folder."
-            )
-
-
 def _place(path: Path) -> Path:
     """Returns what to open: the folder if it has metadata, which give the expected counts."""
     if not path.exists():
@@ -140,8 +129,7 @@ def _place(path: Path) -> Path:
 def metadata_of(folder: Path) -> dict[str, Any]:
     """Returns a bag's metadata, read within the limits of `parse_yaml`, which rosbags lacks.
 
-    Raises:
-        ValueError: they are not YAML, exceed the limits, or lack the part that rosbag2 writes.
+    Raises ValueError if they are not such YAML, or lack the part that rosbag2 writes.
     """
     try:
         about = parse_yaml(read_text(folder / METADATA), METADATA).get(ABOUT)
@@ -159,6 +147,8 @@ def _listed(folder: Path, room: Path) -> list[Path]:
     files = [file for file in listed if file.is_file()]
     if str(about.get("compression_mode", "")).lower() != "file":
         return files
+    from nics_drl_bridge.recording.mcap import unpack_file
+
     return [unpack_file(file, room / file.stem) for file in files]
 
 
@@ -168,8 +158,7 @@ def _storages(reader: Reader) -> list[Any]:
 
 
 def _check_storage(path: Path, file: Path) -> None:
-    from nics_drl_bridge.recording.mcap import DamageError
-    from nics_drl_bridge.recording.mcap_check import check_mcap
+    from nics_drl_bridge.recording.mcap import DamageError, check_mcap
 
     if file.suffix == DATABASE:
         _check_database(path, file)
@@ -209,21 +198,18 @@ def _check_summary(path: Path, reader: Reader) -> None:
 
 def _check_topics(path: Path, reader: Reader) -> None:
     """Compares the topics of a bag's summary with those of its files."""
-    told: Counter[tuple[str, str]] = Counter()
-    held: Counter[tuple[str, str]] = Counter()
-    for connection in reader.connections:
-        if not (isinstance(connection.topic, str) and connection.topic):
-            raise _damaged(path, "its summary has lost the name of a topic")
-        told[connection.topic, connection.msgtype] += connection.msgcount
-    for storage in _storages(reader):
-        for connection in storage.connections:
-            held[connection.topic, connection.msgtype] += connection.msgcount
-    for topic, kind in sorted(set(told + held), key=str):
-        if told[topic, kind] != held[topic, kind]:
+    from nics_drl_bridge.recording.mcap import check_message
+
+    if not all(isinstance(c.topic, str) and c.topic for c in reader.connections):
+        raise _damaged(path, "its summary has lost the name of a topic")
+    summary, held = _counts(reader), sum(map(_counts, _storages(reader)), Counter())
+    for topic, kind in sorted(set(summary + held), key=str):
+        if summary[topic, kind] != held[topic, kind]:
+            names = (repr(shortened(str(name), LONGEST_NAME)) for name in (topic, kind))
             raise _damaged(
                 path,
-                f"topic {_short(topic)} of type {_short(kind)} has {held[topic, kind]} messages in "
-                f"its files, {told[topic, kind]} by its summary",
+                f"topic {' of type '.join(names)} has {held[topic, kind]} messages in its files, "
+                f"{summary[topic, kind]} by its summary",
             )
     if reader.compression_mode == "message":
         for storage in _storages(reader):
@@ -231,8 +217,19 @@ def _check_topics(path: Path, reader: Reader) -> None:
                 check_message(data)
 
 
-def _short(name: object) -> str:
-    return repr(shortened(str(name), LONGEST_NAME))
+def _counts(reader: Any) -> Counter[tuple[str, str]]:
+    counts: Counter[tuple[str, str]] = Counter()
+    for connection in reader.connections:
+        counts[connection.topic, connection.msgtype] += connection.msgcount
+    return counts
+
+
+def times_of(messages: Sequence[Message]) -> tuple[Nanoseconds, Nanoseconds | None]:
+    """Returns times of receipt and header stamps (T,) [ns]; None if there are no headers."""
+    receive = np.array([m.receive_ns for m in messages], dtype=np.int64)
+    if not messages or not hasattr(messages[0].content, "header"):
+        return receive, None
+    return receive, np.array([stamp(m.content) for m in messages], dtype=np.int64)
 
 
 class BagFile:
@@ -249,13 +246,9 @@ class BagFile:
         self._connections: dict[str, list[Connection]] = {}
         for connection in reader.connections:
             self._connections.setdefault(connection.topic, []).append(connection)
-        self.types = {
-            topic: " and ".join(sorted({c.msgtype for c in some}))
-            for topic, some in self._connections.items()
-        }
-        self.empty = frozenset(
-            topic for topic, some in self._connections.items() if not sum(c.msgcount for c in some)
-        )
+        topics = self._connections.items()
+        self.types = {t: " and ".join(sorted({c.msgtype for c in some})) for t, some in topics}
+        self.empty = frozenset(t for t, some in topics if not sum(c.msgcount for c in some))
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -272,10 +265,10 @@ class BagFile:
         return self.types[topic] in self._store.fielddefs
 
     def messages(self, topic: str) -> list[Message]:
-        """Returns all messages of a topic; count and time span are checked by the bag's summary.
+        """Returns all messages of a topic.
 
         Raises:
-            RecordingError: messages are missing, outside of the time span, or damaged.
+            RecordingError: messages are missing, outside of the bag's time span, or damaged.
         """
         raw = self._raw(topic)
         return [Message(ns, self._decoded(topic, k, t, d)) for k, (t, ns, d) in enumerate(raw)]

@@ -1,24 +1,26 @@
 """Reads a drive from a rosbag2 recording, SQLite or MCAP, without ROS.
 
-Latency in a bag: the delay from a message's stamp to its receipt.
+State and wheel speeds come from joint messages; latency is the delay from stamp to receipt.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.errors import RecordingError, nearest
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import S_PER_NS
-from nics_drl_bridge.recording import topic_roles
-from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
-from nics_drl_bridge.recording.joints import JointMessage, gather, state_of, wheels_of
+from nics_drl_bridge.recording import topic_roles as roles
+from nics_drl_bridge.recording.bag_file import BagFile, Message, opened, times_of
 from nics_drl_bridge.recording.messages import (
+    POSITION_UNITS,
+    WHEELS,
     Row,
     command_row,
     frames,
@@ -29,31 +31,29 @@ from nics_drl_bridge.recording.messages import (
     twist_row,
 )
 from nics_drl_bridge.recording.recording import Recording, check
-from nics_drl_bridge.recording.stamping import SAME_CLOCK_S, TopicData, streams
-from nics_drl_bridge.recording.topic_roles import ODOMETRY, TopicRoles, assign
+from nics_drl_bridge.recording.stamping import SAME_CLOCK_S, Nanoseconds, TopicData, streams
+from nics_drl_bridge.recording.topic_roles import JointSource, TopicRoles
 from nics_drl_bridge.robot.noise import Delay, Latency
-from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.spec import RobotSpec, StateVariable
 
 QUATERNION_TOLERANCE = 0.05
+SCAN = "sensor_msgs/msg/LaserScan"
+LEAST_MESSAGES = 20
+PERCENTILES = (5.0, 50.0, 95.0)
+SPANNED = 0.9  # share of a uniform distribution between the first and last of these percentiles
 
 
 def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recording:
-    """Reads a drive of a robot from a bag.
+    """Reads a drive of a robot from a bag: its folder or its only file.
 
-    Args:
-        path: the bag's folder, or its only file.
-        mapping: roles of the topics; missing roles are guessed.
-        spec: the robot.
-
-    Returns:
-        The recording; for its clocks see `stamping.streams`.
+    Missing roles of topics are guessed; for the clocks see `stamping.streams`.
 
     Raises:
         RecordingError: the bag is damaged or incomplete, a topic is missing or ambiguous, or
             the data can't be used for this robot; one sentence with place and fix.
     """
     with opened(path) as bag:
-        topics = assign(mapping, bag.types, bag.empty, bag.place)
+        topics = roles.assign(mapping, bag.types, bag.empty, bag.place)
         data = {
             "command": _command(bag, topics["cmd_vel"], spec),
             "pose": _pose(bag, topics.get("pose") or topics["odom"], mapping),
@@ -62,7 +62,12 @@ def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recordin
             odometry = bag.messages(topics["odom"])
             data["odometry"] = _table(bag, topics["odom"], odometry, twist_row)
         if "joint_states" in topics:
-            data |= _joints(bag, topics["joint_states"], spec, mapping)
+            joints = gather(
+                topics["joint_states"], map(_joints, bag.messages(topics["joint_states"]))
+            )
+            state = state_of(joints, spec, mapping, bag.place)
+            wheels = wheels_of(joints, mapping, bag.place)
+            data |= {n: d for n, d in (("state", state), ("wheels", wheels)) if d is not None}
         if "imu" in topics:
             data["imu"] = _table(bag, topics["imu"], bag.messages(topics["imu"]), imu_row)
         latency = latency_of(bag, topics.get("odom"))
@@ -74,11 +79,7 @@ def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recordin
 def _table(
     bag: BagFile, topic: str, messages: Sequence[Message], row: Callable[[Any], Row]
 ) -> TopicData:
-    """Converts a topic's messages to rows."""
-    receive = np.array([m.receive_ns for m in messages], dtype=np.int64)
-    header = None
-    if hasattr(messages[0].content, "header"):
-        header = np.array([stamp(m.content) for m in messages], dtype=np.int64)
+    receive, header = times_of(messages)
     values = np.array([row(m.content) for m in messages], dtype=np.float64)
     for k in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
         raise RecordingError(
@@ -89,8 +90,7 @@ def _table(
 
 
 def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
-    """Reads the commands (T, C) of the robot."""
-    if bag.types[topic] in (topic_roles.ACKERMANN, topic_roles.ACKERMANN_STAMPED):
+    if bag.types[topic] in (roles.ACKERMANN, roles.ACKERMANN_STAMPED):
         for variable in spec.command:
             if variable.turns and not variable.steers:
                 raise RecordingError(
@@ -103,10 +103,9 @@ def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
 
 
 def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
-    """Reads the poses (T, 3) of the tracked body."""
     messages = bag.messages(topic)
-    if bag.types[topic] in (topic_roles.TRANSFORM, topic_roles.TRANSFORMS):
-        messages = _of_one_body(bag, topic, _transforms(messages), mapping)
+    if bag.types[topic] in (roles.TRANSFORM, roles.TRANSFORMS):
+        messages = _of_one_body(bag, topic, messages, mapping)
     quaternions = np.array([quaternion(m.content) for m in messages])
     with np.errstate(over="ignore"):
         length = np.linalg.norm(quaternions, axis=1)
@@ -118,72 +117,168 @@ def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
     return _table(bag, topic, messages, pose_row)
 
 
-def _transforms(messages: Sequence[Message]) -> list[Message]:
-    """Splits messages into one per transform."""
-    return [
-        Message(message.receive_ns, transform)
-        for message in messages
-        for transform in getattr(message.content, "transforms", (message.content,))
-    ]
-
-
 def _of_one_body(
     bag: BagFile, topic: str, messages: Sequence[Message], mapping: TopicRoles
 ) -> list[Message]:
     """Returns the transforms between the two frames of the mapping, or the only two frames."""
-    wanted = (mapping.frame, mapping.child_frame)
+    single = [
+        (frames(transform), Message(message.receive_ns, transform))
+        for message in messages
+        for transform in getattr(message.content, "transforms", (message.content,))
+    ]
+    wanted, there = (mapping.frame, mapping.child_frame), {pair for pair, _ in single}
     pairs = {
         pair
-        for pair in {frames(m.content) for m in messages}
+        for pair in there
         if all(w is None or w.strip("/") == f for w, f in zip(wanted, pair, strict=True))
     }
     if len(pairs) == 1:
-        return [m for m in messages if frames(m.content) in pairs]
-    there = ", ".join(sorted({f"{a} -> {b}" for a, b in (frames(m.content) for m in messages)}))
+        return [message for pair, message in single if pair in pairs]
     named = " with the given names" if any(wanted) else ""
     problem = "several transforms" if pairs else "no transform"
     raise RecordingError(
         f"{bag.place}: topic {topic!r} holds {problem}{named}; write those of the robot into the "
         f"topics file, as in `frame: world` and `child_frame: base_link`; it holds "
-        f"{there or 'none'}."
+        f"{', '.join(sorted(f'{a} -> {b}' for a, b in there)) or 'none'}."
     )
 
 
-def _joints(bag: BagFile, topic: str, spec: RobotSpec, mapping: TopicRoles) -> dict[str, TopicData]:
-    """Reads measured state and wheel speeds, if the joints report them."""
-    joints = gather(
-        topic,
-        [
-            JointMessage(
-                m.receive_ns, stamp(m.content), m.content.name, m.content.position,
-                m.content.velocity,
+class Joints(NamedTuple):
+    """Messages about J joints, in one table; NaN if missing in a message."""
+
+    topic: str
+    receive_ns: Nanoseconds  # (T,)
+    header_ns: Nanoseconds  # (T,)
+    names: tuple[str, ...]
+    position: Array  # (T, J) [rad or m]
+    velocity: Array  # (T, J) [rad/s or m/s]
+
+
+class JointMessage(NamedTuple):
+    """One message; positions or velocities may be empty."""
+
+    receive_ns: int
+    header_ns: int
+    names: Sequence[str]
+    position: Sequence[float]
+    velocity: Sequence[float]
+
+
+def _joints(message: Message) -> JointMessage:
+    found = message.content
+    return JointMessage(
+        message.receive_ns, stamp(found), found.name, found.position, found.velocity
+    )
+
+
+def gather(topic: str, messages: Iterable[JointMessage]) -> Joints:
+    """Collects messages, which may contain different joints, in one table."""
+    messages = list(messages)
+    names = tuple(dict.fromkeys(name for message in messages for name in message.names))
+    position, velocity = np.full((2, len(messages), len(names)), np.nan)
+    for row, message in enumerate(messages):
+        columns = [names.index(name) for name in message.names]
+        for table, values in ((position, message.position), (velocity, message.velocity)):
+            if len(values) == len(columns):
+                table[row, columns] = values
+    receive = np.array([m.receive_ns for m in messages], dtype=np.int64)
+    header = np.array([m.header_ns for m in messages], dtype=np.int64)
+    return Joints(topic, receive, header, names, position, velocity)
+
+
+def state_of(joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str) -> TopicData | None:
+    """Returns the measured state (T, S), from the messages that contain all of it.
+
+    None if joints of some state variables are missing, but each follows a command.
+
+    Raises:
+        RecordingError: a named joint does not exist, or a required state was not measured.
+    """
+    known = [v.name for v in spec.state]
+    for name in mapping.state:
+        if name not in known:
+            raise RecordingError(
+                f"{place}: topics: robot {spec.name!r} has no state {name!r}; "
+                f"{nearest(name, known)}"
             )
-            for m in bag.messages(topic)
-        ],
-    )  # fmt: skip
-    state = state_of(joints, spec, mapping, bag.place)
-    wheels = wheels_of(joints, mapping, bag.place)
-    return {n: d for n, d in (("state", state), ("wheels", wheels)) if d is not None}
+    sources = {v.name: _source(joints, v, mapping, place) for v in spec.state}
+    found = [source for source in sources.values() if source is not None]
+    if spec.state and len(found) == len(sources):
+        columns = [_column(joints, v, s) for v, s in zip(spec.state, found, strict=True)]
+        return _complete(joints, np.stack(columns, axis=1), [s.joint for s in found], place)
+    if mapping.state or any(v.follows is None for v in spec.state):
+        missing = next(name for name, source in sources.items() if source is None)
+        raise RecordingError(
+            f"{place}: no joint is known for the state {missing!r}; the joints of "
+            f"{joints.topic!r} are {', '.join(joints.names) or 'none'}: name it in the topics "
+            f"file, as in state: {{{missing}: JOINT}}."
+        )
+    return None
 
 
-SCAN = "sensor_msgs/msg/LaserScan"
-LEAST_MESSAGES = 20
-PERCENTILES = (5.0, 50.0, 95.0)
-SPANNED = 0.9
-"""The share of a uniform distribution between the first and the last of these percentiles."""
+def wheels_of(joints: Joints, mapping: TopicRoles, place: str) -> TopicData | None:
+    """Returns the speeds (T, 2) of the left and right wheel; None without such joints."""
+    guesses = (_alike(joints.names, wheel) for wheel in WHEELS)
+    chosen = list(mapping.wheels or (name for name in guesses if name is not None))
+    if len(chosen) < len(WHEELS):
+        return None
+    values = joints.velocity[:, [_index(joints, name, place) for name in chosen]]
+    if mapping.wheels is None and not np.isfinite(values).all(axis=1).any():
+        return None
+    return _complete(joints, values, chosen, place)
+
+
+def _source(
+    joints: Joints, variable: StateVariable, mapping: TopicRoles, place: str
+) -> JointSource | None:
+    named = mapping.state.get(variable.name)
+    if named is None:
+        guess = _alike(joints.names, variable.name)
+        return None if guess is None else JointSource(joint=guess)
+    source = JointSource(joint=named) if isinstance(named, str) else named
+    _index(joints, source.joint, place)
+    return source
+
+
+def _index(joints: Joints, name: str, place: str) -> int:
+    if name not in joints.names:
+        raise RecordingError(
+            f"{place}: topic {joints.topic!r} has no joint {name!r}; {nearest(name, joints.names)}"
+        )
+    return joints.names.index(name)
+
+
+def _alike(names: Iterable[str], wanted: str) -> str | None:
+    """Returns the only joint whose name has all words of the wanted name, in any order."""
+    words = set(wanted.split("_"))
+    found = [name for name in names if words <= set(re.split(r"[^a-z]+", name.lower()))]
+    return wanted if wanted in found else found[0] if len(found) == 1 else None
+
+
+def _column(joints: Joints, variable: StateVariable, source: JointSource) -> Array:
+    usual = "position" if variable.unit in POSITION_UNITS else "velocity"
+    table = joints.position if (source.field or usual) == "position" else joints.velocity
+    return np.asarray(source.scale * table[:, joints.names.index(source.joint)])
+
+
+def _complete(joints: Joints, values: Array, names: Sequence[str], place: str) -> TopicData:
+    """Drops the messages about other joints."""
+    keep = np.asarray(np.isfinite(values).all(axis=1))
+    if not keep.any():
+        raise RecordingError(
+            f"{place}: topic {joints.topic!r}: no message tells the position or velocity that is "
+            f"needed of {', '.join(names)}; check what the joints' driver publishes."
+        )
+    return TopicData(joints.topic, joints.receive_ns, joints.header_ns, values).rows(keep)
 
 
 def latency_of(bag: BagFile, odom: str | None = None) -> Latency:
-    """Measures the delays of scan and odometry in a bag.
+    """Measures the delays of scan and odometry in a bag, by stamps of the recorder's own clock.
 
-    Only stamps of the recorder's own clock show them. If a topic is missing, has too few messages
-    or is stamped by another clock, its delay is unknown.
-
-    Args:
-        bag: an open bag.
-        odom: the odometry topic; by default the one of that type or name.
+    If a topic is missing, has too few messages or is stamped by another clock, its delay is
+    unknown. The odometry topic is by default the one of that type or name.
     """
-    scan, odom = _topic(bag, SCAN, "scan"), odom or _topic(bag, ODOMETRY, "odom")
+    scan, odom = _topic(bag, SCAN, "scan"), odom or _topic(bag, roles.ODOMETRY, "odom")
     return Latency(
         scan=None if scan is None else _delay(bag.messages(scan)),
         odom=None if odom is None else _delay(bag.messages(odom)),
@@ -202,19 +297,19 @@ def _delay(messages: Sequence[Message]) -> Delay | None:
     """Fits a uniform distribution to the delays of stamped messages."""
     if len(messages) < LEAST_MESSAGES:
         return None
-    stamps = np.array([stamp(m.content) for m in messages], dtype=np.int64)
-    late = (np.array([m.receive_ns for m in messages], dtype=np.int64) - stamps) * S_PER_NS
-    late = late - np.array([_sweep(m) for m in messages])
+    receive, stamps = times_of(messages)
+    if stamps is None or not stamps.all():
+        return None
+    late = (receive - stamps) * S_PER_NS - np.array([_sweep(m.content) for m in messages])
     low, middle, high = np.percentile(late, PERCENTILES)
-    if not stamps.all() or not SAME_CLOCK_S[0] <= middle <= SAME_CLOCK_S[1]:
+    if not SAME_CLOCK_S[0] <= middle <= SAME_CLOCK_S[1]:
         return None
     jitter = float(high - low) / SPANNED
     return Delay(least=max(0.0, float(middle) - jitter / 2.0), jitter=jitter)
 
 
-def _sweep(message: Message) -> float:
+def _sweep(scan: Any) -> float:
     """Returns the time from a scan's stamp, that of beam 0, to its last beam [s]; else 0."""
-    scan = message.content
     if not hasattr(scan, "ranges"):
         return 0.0
     return max(0.0, float(scan.time_increment)) * max(0, len(scan.ranges) - 1)

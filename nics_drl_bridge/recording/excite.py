@@ -1,4 +1,4 @@
-"""Exploration: commands that excite a robot's whole motion and keep it within a circle.
+"""Excitation of a robot: a drive whose commands show its whole motion within a circle.
 
 A drive is a sequence of segments. At the end of each, the next is drawn at random: new levels for
 one or more commands, reached smoothly and held for a random time (amplitude-modulated
@@ -6,16 +6,13 @@ pseudo-random steps; Nelles: Nonlinear System Identification, ch. 21). A segment
 if the expected path stays within the circle and the robot can still turn back from its end. Rarely
 used levels are preferred, so that each command covers its range independently of the others, and
 so are end points from which a path leads close to the centre.
-
-Pattern: the expected course of a drive, before the robot moves.
-
-Prediction of the motion of a robot that has no fitted model yet.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -23,47 +20,41 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.recording.joints import POSITION_UNITS
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.recording.messages import POSITION_UNITS
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec
-
-Array = NDArray[np.float64]
+from nics_drl_bridge.seeds import checked_seeds
 
 PERIOD_S = 0.05
-STILL_S = 1.0
-"""Standstill at both ends of a drive [s]."""
+STILL_S = 1.0  # standstill at both ends of a drive [s]
 RAMP_S = 0.25
 SEGMENT_S = (0.4, 1.6)
 CANDIDATES = 12
-ALONE, REDRAWN = 0.5, 0.6
-"""Probability that a segment changes a single command; otherwise, that it changes each further
-command."""
+ALONE, REDRAWN = 0.5, 0.6  # probability to change a single command; else, each further one
 BINS = 4
-CENTRED = 2.0
-"""Weight of the distance from the centre against the familiarity of a command."""
+CENTRED = 2.0  # weight of the distance from the centre against the familiarity of a command
+# The path stays inside the circle by a margin plus the way of a reaction at top speed.
 MARGIN_M, REACTION_S, TOLERANCE_M = 0.05, 0.2, 0.005
-"""The path stays inside the circle by this margin plus the distance driven in this time at top
-speed; tolerance of that limit."""
+# Turning back uses shares of the greatest commands, as a reserve for a robot that turns worse.
 TURNING_SPEED, TURNING = 0.5, 0.8
-"""Commands for turning back, as shares of the greatest: less than possible, as a reserve for a
-robot that turns worse than expected."""
 WAY_S, WAY_STEP_S = (3.0, 20.0), 0.1
+# A path back starts within a share of the circle's radius, or reaches a share of its initial
+# distance from the centre, or turns by half a turn.
 NEAR, NEARER = 0.25, 0.6
-"""A path back starts within this share of the circle's radius, or reaches this share of its
-initial distance from the centre, or turns by half a turn."""
 LOST = 8
+SHORTEST_S, LONGEST_S = 20.0, 3600.0
+SPREAD = 0.17  # least standard deviation of a command as a share of its range (0.29 if uniform)
+ALIKE = 0.6  # greatest correlation of two commands
+ATTEMPTS = 8
 
 
 class Exploration:
     """Generator of a robot's commands, one per period, that tracks the robot's pose.
 
-    Args:
-        spec: the robot.
-        bound: radius of the circle around the start that contains the whole robot [m].
-        duration: of the drive [s], including 1 s of standstill at both ends.
-        rng: draws the segments.
-        speed: share of the greatest speeds and rates to use, above 0, up to 1; angles use their
-            full range.
+    It drives within a circle of radius `bound` [m] around the start, which contains the whole
+    robot, for a duration [s] including 1 s of standstill at both ends, at up to a share `speed` of
+    the greatest speeds and rates; angles use their full range.
     """
 
     def __init__(
@@ -104,7 +95,7 @@ class Exploration:
         return self._lost >= LOST
 
     def see(self, pose: Array) -> None:
-        """Observes the robot's pose (3,) at the start of the current period, in the start frame."""
+        """Observes the pose (3,) at the start of the current period, in the start frame."""
         self.pose = geometry.compose(pose, geometry.between(self._before, self.pose))
         self._before, self._seen = np.asarray(pose, dtype=np.float64), True
 
@@ -137,11 +128,11 @@ class Exploration:
         self._visits[self._cells(command)] += 1.0
         self._tick += 1
 
-    def _roll(self, commands: Array) -> tuple[Array, Array]:
+    def _roll(self, commands: Array, period: float = PERIOD_S) -> tuple[Array, Array]:
         """Rolls out commands (K, T, C) from the present pose and state."""
         many = len(commands)
         pose, state = np.repeat(self.pose[None], many, 0), np.repeat(self._state[None], many, 0)
-        return self._motion.roll(pose, state, commands, PERIOD_S)
+        return self._motion.roll(pose, state, commands, period)
 
     def _cells(self, command: Array) -> tuple[NDArray[np.intp], ...]:
         """Returns the cell indices of commands (..., C), by dimension."""
@@ -193,10 +184,7 @@ class Exploration:
         return np.asarray(self._command + share[None, :, None] * (levels - self._command)[:, None])
 
     def _ways_back(self, factor: Array) -> Array:
-        """Returns constant commands (E, T, C) for turning back.
-
-        They last long enough for half a turn by the one that turns fastest.
-        """
+        """Returns constant commands (E, T, C) for turning back: half a turn by the fastest one."""
         ends = [
             sorted({low, rest, high})
             for low, rest, high in zip(
@@ -206,18 +194,16 @@ class Exploration:
         ]  # fmt: skip
         ways = np.array(list(product(*ends)))[:, None]
         first, last = round(WAY_S[0] / WAY_STEP_S), round(1.0 / WAY_STEP_S)
-        start = np.zeros((len(ways), 3)), np.zeros((len(ways), self._motion.size))
-        poses, _ = self._motion.roll(*start, np.repeat(ways, first, axis=1), WAY_STEP_S)
+        poses, _ = self._roll(np.repeat(ways, first, axis=1), WAY_STEP_S)
         heading = np.unwrap(poses[..., 2], axis=1)
         turned = float(np.abs(heading[:, -1] - heading[:, -1 - last]).max())
         needed = float(np.clip(np.pi / max(turned, 1e-6) + 1.0, *WAY_S))
         return np.repeat(ways, round(needed / WAY_STEP_S), axis=1)
 
     def _way_to_centre(self, pose: Array, state: Array, limit: float) -> Array:
-        """Returns how close paths back from poses (K, 3) get to the centre, over the radius.
+        """Returns the least distance from the centre, over the radius, of ways back from (K, 3).
 
-        Infinite if no path stays within `limit` and turns the robot by half a turn or brings it
-        back.
+        Infinite if none stays within `limit` and turns the robot by half a turn or brings it back.
         """
         many = len(self._ways)
         start = np.repeat(pose, many, 0), np.repeat(state, many, 0)
@@ -232,13 +218,8 @@ class Exploration:
         return np.where(useful, reached / self._outermost, np.inf)
 
     def _least_harm(self, length: int) -> Array:
-        """Returns commands (T, C) towards the least harmful path back.
-
-        That path leaves the circle least, and among equals gets closest to its centre.
-        """
-        start = np.repeat(self.pose[None], len(self._emergency), 0)
-        state = np.repeat(self._state[None], len(self._emergency), 0)
-        away = _distance(self._motion.roll(start, state, self._emergency, WAY_STEP_S)[0])
+        """Returns commands (T, C) towards the path back that leaves the circle least."""
+        away = _distance(self._roll(self._emergency, WAY_STEP_S)[0])
         outside = np.maximum(away.max(axis=1) - self._outermost, 0.0)
         best = np.lexsort((away.min(axis=1), np.round(outside, 2)))[0]
         return np.asarray(self._towards(self._emergency[[best], 0], length)[0])
@@ -251,21 +232,13 @@ def _distance(pose: Array) -> Array:
 
 @dataclass(frozen=True)
 class Pattern:
-    """The expected course of a drive; the robot starts at the origin and faces along x.
+    """The expected course of a drive; the robot starts at the origin and faces along x."""
 
-    Attributes:
-        period: time for which each command is held [s].
-        command: (T, C).
-        pose: (T + 1, 3) at the start of each period, and at the end.
-        bound: radius of the circle around the start that contains the whole robot [m].
-        footprint: radius of the robot [m].
-    """
-
-    period: float
-    command: Array
-    pose: Array
-    bound: float
-    footprint: float
+    period: float  # time for which each command is held [s]
+    command: Array  # (T, C)
+    pose: Array  # (T + 1, 3) at the start of each period, and at the end
+    bound: float  # radius of the circle around the start that contains the whole robot [m]
+    footprint: float  # radius of the robot [m]
 
     @property
     def duration(self) -> float:
@@ -310,29 +283,16 @@ class Pattern:
 
 @dataclass(frozen=True)
 class ExpectedMotion:
-    """Expected motion of a robot.
+    """Expected motion of a robot."""
 
-    Attributes:
-        size: S, the size of the state.
-        respond: gives the state (K, S) after a command (K, C) was held for some time [s].
-        twist: gives the body twist (K, 3) for a state (K, S) and a command (K, C).
-    """
-
-    size: int
-    respond: Callable[[Array, Array, float], Array]
-    twist: Callable[[Array, Array], Array]
+    size: int  # S, of the state
+    respond: Callable[[Array, Array, float], Array]  # state, command, time held [s] -> state
+    twist: Callable[[Array, Array], Array]  # state, command -> body twist
 
     def roll(self, pose: Array, state: Array, command: Array, period: float) -> tuple[Array, Array]:
-        """Rolls out commands, one arc per command at the state in the middle of its period.
+        """Rolls out commands (K, T, C), one arc each at the state in the middle of its period [s].
 
-        Args:
-            pose: (K, 3).
-            state: (K, S).
-            command: (K, T, C), each held for a period.
-            period: [s].
-
-        Returns:
-            Poses (K, T + 1, 3) and states (K, T + 1, S), the given ones first.
+        Returns poses (K, T + 1, 3) and states (K, T + 1, S), the given ones first.
         """
         poses, states = [pose], [state]
         for n in range(command.shape[1]):
@@ -367,3 +327,77 @@ def expected_motion(spec: RobotSpec) -> ExpectedMotion:
     return ExpectedMotion(
         len(spec.state), lambda state, *_: state, lambda _, command: spec.to_cmd_vel(command)
     )
+
+
+@dataclass(frozen=True)
+class DrivePlan:
+    """Options of a drive; a value out of its range raises ConfigError."""
+
+    robot: RobotSpec  # the robot that drives
+    bound: float = 2.0  # radius of the circle around the start that contains the whole robot [m]
+    duration: float = 60.0  # [s]
+    speed: float = 1.0  # share of the greatest speeds and rates to use
+    seed: int = 0  # of the pattern
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "bound": (self.robot.footprint_radius, 1000.0),
+            "duration": (SHORTEST_S, LONGEST_S),
+            "speed": (0.05, 1.0),
+        }
+        checked_seeds(self.seed)
+        for name, (low, high) in ranges.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ConfigError(f"{name} {value:g}: must be from {low:g} to {high:g}.")
+
+    def begin(self) -> Exploration:
+        """Returns the previewed drive, at its start; raises ConfigError as `preview` does."""
+        return self._attempt(self._found[0])
+
+    def preview(self) -> Pattern:
+        """Returns the pattern of the drive under the expected motion.
+
+        Raises:
+            ConfigError: the circle is too small for the robot to show its motion in it.
+        """
+        return self._found[1]
+
+    def _attempt(self, number: int) -> Exploration:
+        rng = np.random.default_rng([self.seed, number])
+        return Exploration(self.robot, self.bound, self.duration, rng, self.speed)
+
+    @cached_property
+    def _found(self) -> tuple[int, Pattern]:
+        """Number and pattern of the first attempt that varies all commands within the circle."""
+        for number in range(ATTEMPTS):
+            drive = self._attempt(number)
+            if drive.keep_within <= 0.0:
+                break
+            pattern = _driven(drive, self.bound, self.robot.footprint_radius)
+            if pattern is not None and pattern.reach <= self.bound and _varied(pattern, drive):
+                return number, pattern
+        raise ConfigError(
+            f"bound {self.bound:g}: a circle of {self.bound:g} m around the start is too small "
+            f"for robot {self.robot.name!r} to show its motion within {self.duration:g} s; give "
+            "it more space, less speed, or more time."
+        )
+
+
+def _driven(drive: Exploration, bound: float, footprint: float) -> Pattern | None:
+    """Returns the expected pattern of a drive; None if it finds no way back into its circle."""
+    poses, commands = [drive.pose], []
+    while not drive.done:
+        commands.append(drive.next())
+        poses.append(drive.pose)
+        if drive.stuck:
+            return None
+    return Pattern(PERIOD_S, np.array(commands), np.array(poses), bound, footprint)
+
+
+def _varied(pattern: Pattern, drive: Exploration) -> bool:
+    """True if every command covers its range and no two are correlated."""
+    if (pattern.command.std(axis=0) < SPREAD * (drive.high - drive.low)).any():
+        return False
+    alike = np.corrcoef(pattern.command, rowvar=False).reshape(len(drive.low), -1)
+    return bool((np.abs(alike - np.eye(len(alike))) < ALIKE).all())

@@ -25,6 +25,8 @@ ACKERMANN_DEFINITION = (
 )
 ACKERMANN_STAMPED_DEFINITION = "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
 LIBRARIES = ("rosbags", "mcap")
+POSITION_UNITS = ("rad", "m")  # of states that a JointState reports as positions
+WHEELS = ("left_wheel", "right_wheel")
 
 
 def check_libraries(path: Path, what: str, instead: str = "") -> None:
@@ -102,17 +104,11 @@ def imu_row(message: Any) -> Row:
 
 @dataclass(frozen=True)
 class Offer:
-    """Quality of service that a publisher offers, as far as it decides which subscribers match.
+    """Quality of service that a publisher offers, as far as it decides which subscribers match."""
 
-    Attributes:
-        depth: of its history.
-        reliable: False for best effort.
-        transient_local: late subscribers get earlier messages; False for volatile.
-    """
-
-    depth: int = 10
-    reliable: bool = True
-    transient_local: bool = False
+    depth: int = 10  # of its history
+    reliable: bool = True  # False for best effort
+    transient_local: bool = False  # late subscribers get earlier messages; False for volatile
 
 
 def offers_of(profiles: Sequence[Qos]) -> tuple[Offer, ...]:

@@ -1,61 +1,66 @@
-"""Reader for recordings of any supported format.
-
-Reader of a folder of CSV files: a car's drive under a motion-capture system.
-"""
+"""Readers of recordings: `FORMATS` recognises a recording and names the function that reads it."""
 
 from __future__ import annotations
 
-import csv
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.bag_file import is_bag
 from nics_drl_bridge.recording.bag_reader import load_bag
-from nics_drl_bridge.recording.recording import (
-    SLOWEST_SAMPLING_S,
-    Recording,
-    Stream,
-    load_recording,
-)
+from nics_drl_bridge.recording.csv_folder import load_csv_folder
+from nics_drl_bridge.recording.recording import Recording, load_recording
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import RobotSpec
 
 ROS_1 = ".bag"
 
 
+class Format(NamedTuple):
+    """A format of recordings; the reader gets path, robot and roles of topics."""
+
+    name: str
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path, RobotSpec | None, TopicRoles], Recording]
+    has_topics: bool = False
+
+
+def _load_bag(path: Path, spec: RobotSpec | None, topics: TopicRoles) -> Recording:
+    if spec is None:
+        raise RecordingError(f"{path}: is a bag; say of which robot, with a RobotSpec.")
+    return load_bag(path, topics, spec)
+
+
+FORMATS = (
+    Format("a rosbag2", lambda path: path.exists() and is_bag(path), _load_bag, has_topics=True),
+    Format("a folder of CSV files", Path.is_dir, lambda path, *_: load_csv_folder(path)),
+    Format(
+        "an .npz file", lambda path: path.suffix == ".npz", lambda path, *_: load_recording(path)
+    ),
+)
+"""The first that recognises a path reads it."""
+
+
 def read_recording(
     path: str | Path, spec: RobotSpec | None = None, topics: TopicRoles | None = None
 ) -> Recording:
-    """Reads a recording: an `.npz` of this package, a rosbag2, or a folder of CSV files.
+    """Reads a recording of any of `FORMATS`.
 
-    Args:
-        path: the file or the folder.
-        spec: the robot, which defines the meaning of a bag's `cmd_vel` and joints.
-        topics: roles of a bag's topics; guessed by default.
-
-    Returns:
-        The recording.
+    The robot defines the meaning of a bag's `cmd_vel` and joints; the roles of its topics are
+    guessed by default.
 
     Raises:
         RecordingError: there is no recording, or it can't be read.
     """
-    path = Path(path)
-    if path.exists() and is_bag(path):
-        if spec is None:
-            raise RecordingError(f"{path}: is a bag; say of which robot, with a RobotSpec.")
-        return load_bag(path, topics or TopicRoles(), spec)
-    if topics is not None and topics != TopicRoles():
+    path, topics = Path(path), topics or TopicRoles()
+    found = next((each for each in FORMATS if each.recognises(path)), None)
+    if topics != TopicRoles() and not (found and found.has_topics):
         raise RecordingError(
             f"{path}: is no bag; leave out --topics and --topic, which are for bags only."
         )
-    if path.is_dir():
-        return load_csv_folder(path)
-    if path.suffix == ".npz":
-        return load_recording(path)
+    if found is not None:
+        return found.read(path, spec, topics)
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder; check the path.")
     if path.suffix == ROS_1:
@@ -63,172 +68,5 @@ def read_recording(
             f"{path}: is a bag of ROS 1; make a rosbag2 of it with `rosbags-convert --src "
             f"{path.name} --dst {path.stem}`."
         )
-    raise RecordingError(
-        f"{path}: is neither an .npz file nor a folder of CSV files nor a rosbag2; give one of "
-        "these."
-    )
-
-
-Array = NDArray[np.float64]
-
-COLUMNS = {
-    "cmd.csv": ("linear.x", "angular.z", "time [s]"),
-    "vrpn.csv": ("x", "y", "z", "qx", "qy", "qz", "qw", "time [ns]"),
-    "L_wheel.csv": ("wheel speed", "time [s]"),
-    "R_wheel.csv": ("wheel speed", "time [s]"),
-    "acceleration.csv": ("ax", "ay", "az", "time [s]"),
-}
-"""Files of a folder and their columns; none has a header line."""
-
-REQUIRED = ("cmd.csv", "vrpn.csv")
-ROBOT_CLOCK, POSE_CLOCK = "robot", "mocap"
-MAX_DURATION_S = 1e6
-MAX_DURATION_RATIO = 100.0
-MOST_BYTES = 64 * 2**20
-MOST_ROWS = 500_000
-LONGEST_ROW = 1000
-"""In characters."""
-
-
-def load_csv_folder(path: str | Path) -> Recording:
-    """Reads a drive of a car, recorded as up to five CSV files without header lines.
-
-    `cmd.csv` and `vrpn.csv` are required; wheels are read if both files exist. The heading is
-    the yaw of the quaternion. Commands and wheels are stamped by the robot's clock, the pose by
-    that of the motion capture; calibration estimates the offset between them.
-
-    Args:
-        path: the folder.
-
-    Returns:
-        The recording: command (T, 2) as linear.x and angular.z, pose (T, 3), wheels (T, 2).
-
-    Raises:
-        RecordingError: a file is missing, empty, or contains an unusable row; one sentence with
-            the file, the row and the fix.
-    """
-    path = Path(path)
-    if not path.is_dir():
-        raise RecordingError(f"{path}: no such folder; check the path.")
-    for name in REQUIRED:
-        if not (path / name).is_file():
-            raise RecordingError(
-                f"{path}: the file {name!r} is missing; a folder needs {REQUIRED}."
-            )
-    tables = {name: _read(path / name) for name in COLUMNS if (path / name).exists()}
-    command, vrpn = tables["cmd.csv"], tables["vrpn.csv"]
-    _check_units(path, tables)
-    return Recording(
-        command=Stream(command[:, 2], command[:, :2], ROBOT_CLOCK),
-        pose=Stream(vrpn[:, 7] * 1e-9, _pose(path / "vrpn.csv", vrpn), POSE_CLOCK),
-        wheels=_wheels(tables),
-        source=str(path),
-    )
-
-
-def _read(path: Path) -> Array:
-    """Reads the numbers of a file and checks them row by row; time is the last column."""
-    columns = COLUMNS[path.name]
-    try:
-        text = _lines(path)
-        rows = [(line, row) for line, row in enumerate(csv.reader(text), 1) if row]
-    except UnicodeDecodeError:
-        raise RecordingError(
-            f"{path}: is not UTF-8 text; it must hold comma-separated numbers."
-        ) from None
-    except (OSError, csv.Error) as error:
-        raise RecordingError(f"{path}: can't be read ({error}).") from None
-    if not rows:
-        raise RecordingError(f"{path}: is empty; record the drive anew.")
-    table = np.array([_numbers(path, line, row, columns) for line, row in rows])
-    for k in np.flatnonzero(np.diff(table[:, -1]) < 0.0)[:1]:
-        raise RecordingError(
-            f"{path}: row {rows[k + 1][0]}: time runs backwards ({table[k, -1]:.6f}, then "
-            f"{table[k + 1, -1]:.6f}); sort the rows, or cut the file there."
-        )
-    return table
-
-
-def _lines(path: Path) -> list[str]:
-    """Reads the lines of a file; refuses files and lines larger than those of any drive."""
-    size = no_device(path).stat().st_size
-    if size > MOST_BYTES:
-        raise RecordingError(
-            f"{path}: is larger than {MOST_BYTES // 2**20} MB, which no drive is; cut it."
-        )
-    lines = path.read_bytes().split(b"\n")
-    if len(lines) > MOST_ROWS:
-        raise RecordingError(
-            f"{path}: has {len(lines)} rows, and a drive at most {MOST_ROWS}; cut it."
-        )
-    for k, line in enumerate(lines, 1):
-        if len(line) > LONGEST_ROW:
-            raise RecordingError(
-                f"{path}: row {k} has {len(line)} characters, which no row has; remove it."
-            )
-    return [str(line, "utf-8") for line in lines]
-
-
-def _numbers(path: Path, line: int, row: list[str], columns: tuple[str, ...]) -> list[float]:
-    if len(row) != len(columns):
-        raise RecordingError(
-            f"{path}: row {line} has {len(row)} columns where {len(columns)} are needed "
-            f"({', '.join(columns)}); mend the row, or remove it."
-        )
-    values = []
-    for name, text in zip(columns, row, strict=True):
-        try:
-            values.append(float(text))
-        except ValueError:
-            raise RecordingError(
-                f"{path}: row {line}: {name} is {text[:40]!r}, which is no number; "
-                "mend the row, or remove it (these files have no header)."
-            ) from None
-    if not np.isfinite(values).all():
-        raise RecordingError(f"{path}: row {line} holds NaN or inf; remove the row.")
-    return values
-
-
-def _pose(path: Path, vrpn: Array) -> Array:
-    """Converts positions and quaternions to poses (T, 3)."""
-    qx, qy, qz, qw = vrpn[:, 3:7].T
-    norm = np.linalg.norm(vrpn[:, 3:7], axis=1)
-    for k in np.flatnonzero(np.abs(norm - 1.0) > 0.05)[:1]:
-        raise RecordingError(
-            f"{path}: row {k + 1}: the quaternion has the length {norm[k]:.3f} and not 1; check "
-            "the order of the columns (x, y, z, qx, qy, qz, qw, time)."
-        )
-    heading = np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy**2 + qz**2))
-    return np.stack([vrpn[:, 0], vrpn[:, 1], heading], axis=1)
-
-
-def _check_units(path: Path, tables: dict[str, Array]) -> None:
-    """Refuses files whose durations differ: motion capture is in ns, all else in s.
-
-    A difference alone does not show which file is wrong; commands that are seconds apart do.
-    """
-    times = tables["cmd.csv"][:, -1]
-    seconds, step = np.ptp(times), np.median(np.diff(times)) if len(times) > 1 else 0.0
-    for name, table in tables.items():
-        unit, factor = ("nanoseconds", 1e-9) if name == "vrpn.csv" else ("seconds", 1.0)
-        lasted = np.ptp(table[:, -1]) * factor
-        alike = seconds == 0.0 or 1 / MAX_DURATION_RATIO < lasted / seconds < MAX_DURATION_RATIO
-        if seconds > MAX_DURATION_S or (not alike and step > SLOWEST_SAMPLING_S):
-            raise RecordingError(
-                f"{path / 'cmd.csv'}: lasts {seconds:.3g} s, with {step:.3g} s from one command to "
-                "the next; its stamps must be in seconds."
-            )
-        if not alike:
-            raise RecordingError(
-                f"{path / name}: lasts {lasted:.3g} s where the commands last {seconds:.3g} s; "
-                f"its stamps must be in {unit}."
-            )
-
-
-def _wheels(tables: dict[str, Array]) -> Stream | None:
-    """Returns both wheels at the stamps of the left one."""
-    if "L_wheel.csv" not in tables or "R_wheel.csv" not in tables:
-        return None
-    left, right = tables["L_wheel.csv"], tables["R_wheel.csv"]
-    at_left = np.interp(left[:, 1], right[:, 1], right[:, 0])
-    return Stream(left[:, 1], np.stack([left[:, 0], at_left], axis=1), ROBOT_CLOCK)
+    names = " nor ".join(each.name for each in FORMATS)
+    raise RecordingError(f"{path}: is neither {names}; give one of these.")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,123 +27,77 @@ from nics_drl_bridge.files import (
     sha256,
     write_bytes,
 )
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.noise import Latency
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
 FORMAT = "nics_drl_bridge/recording/3"
-COMMENT_FORMAT = "nics_drl_bridge/recording/2"
-"""Format of files with a checksum in the comment of the archive, which can still be read,"""
-UNSEALED_FORMAT = "nics_drl_bridge/recording/1"
-"""and of those without a checksum."""
-LARGEST_TURN = 1.5
-"""A larger turn between neighbouring samples [rad] is implausible,"""
-TOO_FAST = 20.0
-"""and so is a speed of more than this many times the greatest command."""
+COMMENT_FORMAT = "nics_drl_bridge/recording/2"  # checksum in the comment of the archive
+UNSEALED_FORMAT = "nics_drl_bridge/recording/1"  # without checksum; both can still be read
+STREAMS = ("command", "pose", "state", "wheels", "imu", "odometry")
+LARGEST_TURN = 1.5  # a larger turn between neighbouring samples [rad] is implausible,
+TOO_FAST = 20.0  # and so is a speed of more than this many times the greatest command
 SPEED_OVER_S = 0.5
 SLOWEST_SAMPLING_S = 2.0
-IRREGULAR = 0.5
-"""A step whose length differs from the median by this share is a gap or a repetition."""
-JITTER = 1e-4
-ROUNDING_S = 1e-6
-"""Steps whose lengths differ by less are equally long, apart from rounding of their stamps."""
+IRREGULAR = 0.5  # share of the median by which a step differs if it is a gap or a repetition
+JITTER, ROUNDING_S = 1e-4, 1e-6  # steps that differ by less are equally long, but for rounding
 
 
 @dataclass(frozen=True)
 class Stream:
-    """Values with stamps.
+    """Values with stamps of a named clock; between two clocks there is an unknown offset."""
 
-    Attributes:
-        t: (T,) stamps [s], never decreasing.
-        values: (T, D).
-        clock: name of the clock of the stamps. Streams of one clock share an origin; between two
-            clocks there is an unknown offset.
-    """
-
-    t: Array
-    values: Array
+    t: Array  # (T,) stamps [s], never decreasing
+    values: Array  # (T, D)
     clock: str = "robot"
+
+    def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Stream:
+        """Returns the rows selected by a mask (T,), indices or a slice."""
+        return replace(self, t=self.t[keep], values=self.values[keep])
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A drive of a robot.
+    """A drive of a robot."""
 
-    Attributes:
-        command: (T, C) commands, in the order of the RobotSpec.
-        pose: (T, 3) x [m], y [m], heading [rad] of the tracked body, in a fixed frame.
-        state: (T, S) measured state in the order of the RobotSpec, if any.
-        wheels: (T, 2) left and right wheel speed in the encoder's units, if any.
-        imu: (T, 3) acceleration along x and y [m/s^2] and yaw rate [rad/s] of the sensor, if any.
-        odometry: (T, 3) body twist reported by the wheels, vx, vy [m/s] and yaw rate [rad/s], if
-            it was recorded in addition to a separate pose.
-        source: origin of the recording, for reports and errors.
-        variables: names of X = [state, command] of the recorded robot, if known.
-        latency: of its scan and odometry, if the recording shows it.
-    """
-
-    command: Stream
-    pose: Stream
-    state: Stream | None = None
-    wheels: Stream | None = None
-    imu: Stream | None = None
-    odometry: Stream | None = None
-    source: str = "recording"
-    variables: tuple[str, ...] = ()
-    latency: Latency = field(default_factory=Latency)
+    command: Stream  # (T, C) in the order of the RobotSpec
+    pose: Stream  # (T, 3) x [m], y [m], heading [rad] of the tracked body, in a fixed frame
+    state: Stream | None = None  # (T, S) measured, in the order of the RobotSpec
+    wheels: Stream | None = None  # (T, 2) left and right wheel speed in the encoder's units
+    imu: Stream | None = None  # (T, 3) acceleration along x, y [m/s^2], yaw rate [rad/s]
+    odometry: Stream | None = None  # (T, 3) vx, vy [m/s], yaw rate [rad/s] of the wheels
+    source: str = "recording"  # its origin, for reports and errors
+    variables: tuple[str, ...] = ()  # names of X = [state, command] of the recorded robot, if known
+    latency: Latency = field(default_factory=Latency)  # of scan and odometry, if it shows
 
     @property
     def streams(self) -> dict[str, Stream]:
         """Available streams, by name."""
-        named = {"command": self.command, "pose": self.pose}
-        if self.state is not None:
-            named["state"] = self.state
-        if self.wheels is not None:
-            named["wheels"] = self.wheels
-        if self.imu is not None:
-            named["imu"] = self.imu
-        if self.odometry is not None:
-            named["odometry"] = self.odometry
-        return named
+        named = ((name, getattr(self, name)) for name in STREAMS)
+        return {name: stream for name, stream in named if stream is not None}
 
 
 @dataclass(frozen=True)
 class Samples:
-    """The paper's data: one row per time step.
+    """The paper's data: one row per time step."""
 
-    Attributes:
-        t: (T,) start of each step [s].
-        q: (T, 3 + S) pose of `base_link` and state at the start of the step.
-        x: (T, S + C) X = [state, command] during the step.
-        dq: (T, 3 + S) dQ/dt: the constant body twist whose exact arc leads from this pose to
-            the next (`geometry.log`), and the mean rate of the state.
-        dt: length of a step [s].
-    """
-
-    t: Array
-    q: Array
-    x: Array
+    t: Array  # (T,) start of each step [s]
+    q: Array  # (T, 3 + S) pose of `base_link` and state at the start of the step
+    x: Array  # (T, S + C) X = [state, command] during the step
+    # (T, 3 + S) dQ/dt: the constant body twist whose exact arc leads from this pose to the next
+    # (`geometry.log`), and the mean rate of the state.
     dq: Array
-    dt: float
-    notes: tuple[str, ...] = field(default=())
+    dt: float  # length of a step [s]
 
     def rows(self, keep: NDArray[np.bool_]) -> Samples:
         """Returns the samples of the steps for which `keep` (T,) is true."""
-        return Samples(self.t[keep], self.q[keep], self.x[keep], self.dq[keep], self.dt, self.notes)
+        return Samples(self.t[keep], self.q[keep], self.x[keep], self.dq[keep], self.dt)
 
 
 def samples_on_one_clock(t: Array, pose: Array, state: Array, command: Array) -> Samples:
-    """Builds Samples from series that share stamps.
+    """Builds Samples from poses of `base_link`, states and held commands with shared stamps [s].
 
-    Args:
-        t: (T,) stamps [s], uniform apart from gaps, repetitions and jitter.
-        pose: (T, 3) pose of `base_link` at each stamp.
-        state: (T, S) state at each stamp.
-        command: (T, C) command held from each stamp to the next.
-
-    Returns:
-        A row for each of the T - 1 steps of about the median length; gaps and repeated stamps
-        are omitted.
+    There is a row for each step of about the median length; gaps and repeated stamps are omitted.
     """
     span = np.diff(t)
     dt = float(np.median(span[span > 0.0])) if (span > 0.0).any() else 0.0
@@ -162,10 +116,7 @@ def samples_on_one_clock(t: Array, pose: Array, state: Array, command: Array) ->
 
 
 def check(recording: Recording, spec: RobotSpec) -> Recording:
-    """Verifies that a recording can be used for a robot.
-
-    Returns:
-        The recording.
+    """Returns a recording that can be used for a robot.
 
     Raises:
         RecordingError: it is of another robot, a stream is empty, contains NaN, runs backwards or
@@ -305,7 +256,6 @@ def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
 
 
 def _check_seal(data: bytes, version: str) -> None:
-    """Raises ValueError unless the checksum of a file of this format fits its content."""
     if version == FORMAT:
         check_sealed(io.BytesIO(data))
     elif version == COMMENT_FORMAT and data[-64:] != sha256(data[:-64]).encode():

@@ -14,45 +14,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.recording.topic_roles import Stamps
 
-Array = NDArray[np.float64]
 Nanoseconds = NDArray[np.int64]
 
 RECEIVE, HEADER = "receive", "header"
-SAME_CLOCK_S = (-0.001, 0.05)
-"""Range of the median delay from header to receipt [s] if both are of the recorder's clock."""
-MAX_WANDER_S = 1.0
-"""The delay from headers of one clock to their receipt varies by less than this [s]."""
-STALLED = 2.0
-"""Percentage of messages that a stalled recorder may have received even later,"""
-MAX_STALL_S = 30.0
-"""but by no more than this [s]."""
-MAX_LATE = 0.01
-"""Share of messages that may arrive after one with a later stamp."""
-MAX_UNSTAMPED = 0.05
-"""Share of messages at the start that may lack a stamp: a simulation has no time yet."""
-ROBOT_STREAMS = ("command", "state", "wheels", "imu")
-"""Streams from the robot's own computer, which must share a clock."""
+SAME_CLOCK_S = (-0.001, 0.05)  # median delay from header to receipt on the recorder's own clock
+MAX_WANDER_S = 1.0  # the delay from headers of one clock to their receipt varies by less
+STALLED = 2.0  # percentage of messages that a stalled recorder may have received even later,
+MAX_STALL_S = 30.0  # but by no more than this
+MAX_LATE = 0.01  # share of messages that may arrive after one with a later stamp
+MAX_UNSTAMPED = 0.05  # share that may lack a stamp at the start: a simulation has no time yet
+ROBOT_STREAMS = ("command", "state", "wheels", "imu")  # of one computer, and so of one clock
 
 
 @dataclass(frozen=True)
 class TopicData:
-    """Data read from a topic.
-
-    Attributes:
-        topic: its name.
-        receive_ns: (T,) times of receipt [ns].
-        header_ns: (T,) stamps of the headers [ns]; None if the type has no header.
-        values: (T, D).
-    """
+    """Data read from a topic."""
 
     topic: str
-    receive_ns: Nanoseconds
-    header_ns: Nanoseconds | None
-    values: Array
+    receive_ns: Nanoseconds  # (T,) times of receipt
+    header_ns: Nanoseconds | None  # (T,) stamps of the headers; None if the type has no header
+    values: Array  # (T, D)
 
     def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> TopicData:
         """Returns the messages selected by `keep`, a mask (T,) or indices."""
@@ -61,7 +47,7 @@ class TopicData:
 
 
 def streams(data: Mapping[str, TopicData], stamps: Stamps, place: str) -> dict[str, Stream]:
-    """Assigns a time axis to each stream.
+    """Assigns a time axis, which begins near 0, to each stream with messages.
 
     With `auto`, a stream is stamped by its headers if it has any. Headers less than 50 ms before
     their receipt are of the recorder's clock, which also stamps streams without header (clock
@@ -70,41 +56,26 @@ def streams(data: Mapping[str, TopicData], stamps: Stamps, place: str) -> dict[s
     put on one clock, by receipt if need be. The few messages that arrived after one with a later
     stamp are sorted, and those before a simulation's first time are dropped.
 
-    Args:
-        data: messages by stream name; empty ones are not allowed.
-        stamps: which of the two times to use, see `TopicRoles`.
-        place: the recording's name, for errors.
-
-    Returns:
-        Streams by name; their times begin near 0.
-
     Raises:
         RecordingError: headers are missing, of several clocks, or run backwards.
     """
+    if stamps != "receive":
+        data = {name: _in_order(part, place) for name, part in data.items()}
+    origin = min(int(part.receive_ns.min()) for part in data.values())
     if stamps == "receive":
-        return _by_receipt(data, _origin(data))
-    data = {name: _in_order(part, place) for name, part in data.items()}
+        return {name: _by_receipt(part, origin) for name, part in data.items()}
     headers = {name: _header(part, stamps, place) for name, part in data.items()}
     if stamps == "header":
-        origin = min(int(ns.min()) for ns in headers.values() if ns is not None)
-        return {
-            name: Stream(_seconds(ns - origin), data[name].values, HEADER)
-            for name, ns in headers.items()
-            if ns is not None
-        }
-    return _auto(data, headers, place)
-
-
-def _auto(
-    data: Mapping[str, TopicData], headers: Mapping[str, Nanoseconds | None], place: str
-) -> dict[str, Stream]:
-    clocks = _clocks(data, headers, place)
+        first = min(int(ns.min()) for ns in headers.values() if ns is not None)
+        clocks = dict.fromkeys(data, (HEADER, origin - first))
+    else:
+        clocks = _clocks(data, headers, place)
     robot = {clocks[name][0] for name in ROBOT_STREAMS if name in data}
-    origin, made = _origin(data), {}
+    made = {}
     for name, part in data.items():
         ns, (clock, shift) = headers[name], clocks[name]
         if ns is None or (len(robot) > 1 and name in ROBOT_STREAMS):
-            made.update(_by_receipt({name: part}, origin))
+            made[name] = _by_receipt(part, origin)
         else:
             made[name] = Stream(_seconds(ns + shift - origin), part.values, clock)
     return made
@@ -182,17 +153,9 @@ def _in_order(part: TopicData, place: str) -> TopicData:
     return part.rows(np.argsort(ns, kind="stable"))
 
 
-def _origin(data: Mapping[str, TopicData]) -> int:
-    return min(int(part.receive_ns.min()) for part in data.values())
-
-
-def _by_receipt(data: Mapping[str, TopicData], origin: int) -> dict[str, Stream]:
-    made = {}
-    for name, part in data.items():
-        order = np.argsort(part.receive_ns, kind="stable")
-        t = _seconds(part.receive_ns[order] - origin)
-        made[name] = Stream(t, part.values[order], RECEIVE)
-    return made
+def _by_receipt(part: TopicData, origin: int) -> Stream:
+    order = np.argsort(part.receive_ns, kind="stable")
+    return Stream(_seconds(part.receive_ns[order] - origin), part.values[order], RECEIVE)
 
 
 def _seconds(ns: Nanoseconds) -> Array:

@@ -1,39 +1,26 @@
-"""Drives of textbook robots, the source of synthetic recordings.
-
-The kinematics themselves are those of the robot's kind, see `robot.kinds`.
-"""
+"""Drives of textbook robots, the source of synthetic recordings; see `robot.kinds`."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.kinds import Textbook, textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
 INTEGRATION_STEP_S = 1e-3
 
 
 def integrate(
     book: Textbook, pose: Array, state: Array, command: Array, dt: float
 ) -> tuple[Array, Array]:
-    """Moves robots for `dt` under a constant command.
+    """Moves robots with poses (..., 3) and states (..., S) under constant commands (..., C).
 
-    The state is exact. The pose follows arcs of at most 1 ms by the Magnus expansion of fourth
-    order (Iserles, Norsett 1999), whose error is below 1e-11 m even over seconds.
-
-    Args:
-        book: the kinematics.
-        pose: (..., 3).
-        state: (..., S).
-        command: (..., C).
-        dt: duration [s].
-
-    Returns:
-        Pose (..., 3) and state (..., S) after `dt`.
+    For `dt` [s]; returns pose and state. The state is exact. The pose follows arcs of at most 1 ms
+    by the Magnus expansion of fourth order (Iserles, Norsett 1999): its error is below 1e-11 m even
+    over seconds.
     """
     steps = max(1, int(np.ceil(dt / INTEGRATION_STEP_S - 1e-9)))
     h, goal = dt / steps, book.target(command)
@@ -49,14 +36,8 @@ def _arc(book: Textbook, state: Array, goal: Array, since: Array | float, h: flo
         for sign in (-1.0, 1.0)
     )
     wa, wb = early[..., 2], late[..., 2]
-    bracket = np.stack(
-        [
-            wb * early[..., 1] - wa * late[..., 1],
-            wa * late[..., 0] - wb * early[..., 0],
-            np.zeros_like(wa),
-        ],
-        axis=-1,
-    )
+    bx, by = wb * early[..., 1] - wa * late[..., 1], wa * late[..., 0] - wb * early[..., 0]
+    bracket = np.stack([bx, by, np.zeros_like(wa)], axis=-1)
     return np.asarray((early + late) * (h / 2.0) + bracket * (np.sqrt(3.0) / 12.0 * h * h))
 
 
@@ -67,17 +48,9 @@ def record(
     dt: float = 0.01,
     hold: float = 0.5,
 ) -> Recording:
-    """Drives a textbook robot with random commands and records it.
+    """Drives a textbook robot for a duration [s] and records command, pose and state without noise.
 
-    Args:
-        spec: the robot.
-        rng: draws the commands, uniform within their limits, every `hold` seconds.
-        duration: of the drive [s].
-        dt: sample period [s].
-        hold: time for which each command is held [s].
-
-    Returns:
-        Command, pose and state on one clock, without noise.
+    Commands, uniform within their limits, are drawn every `hold` [s], and sampled every `dt` [s].
     """
     book = textbook(spec)
     inner = max(1, int(np.ceil(dt / INTEGRATION_STEP_S - 1e-9)))

@@ -17,15 +17,12 @@ Stamps = Literal["auto", "header", "receive"]
 NONE = "none"
 ROLES = ("cmd_vel", "pose", "odom", "joint_states", "imu")
 REQUIRED = "cmd_vel"
-MOST_LISTED = 20
-"""Maximum number of topics listed in an error."""
+MOST_LISTED = 20  # maximum number of topics listed in an error
 TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 ACKERMANN = "ackermann_msgs/msg/AckermannDrive"
 ACKERMANN_STAMPED = f"{ACKERMANN}Stamped"
-POSE, POSE_COVARIANCE = (
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-)
+POSE = "geometry_msgs/msg/PoseStamped"
+POSE_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TRANSFORM, TRANSFORMS = "geometry_msgs/msg/TransformStamped", "tf2_msgs/msg/TFMessage"
 ODOMETRY = "nav_msgs/msg/Odometry"
 JOINTS, IMU = "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu"
@@ -37,9 +34,7 @@ TYPES = {
     "imu": (IMU,),
 }
 """Allowed message types of each role."""
-NEVER_GUESSED = {"pose": (ODOMETRY, TRANSFORMS)}
-"""Types that have a role only if the user assigns it."""
-
+NEVER_GUESSED = {"pose": (ODOMETRY, TRANSFORMS)}  # only if the user assigns the role
 USUAL = {
     "cmd_vel": (r"/cmd_vel$", r"/cmd_vel_stamped$", r"/(ackermann_cmd|drive)$"),
     "pose": (r"(vrpn|mocap|optitrack|vicon|qualisys)", r"/pose$"),
@@ -51,60 +46,40 @@ USUAL = {
 
 
 class JointSource(Schema):
-    """Source of a state variable in joint messages.
+    """Source of a state variable in joint messages."""
 
-    Attributes:
-        joint: name of the joint.
-        field: `velocity` or `position`; by default chosen by the variable's unit.
-        scale: factor from the message's unit to the variable's.
-    """
-
-    joint: str
+    joint: str  # name of the joint
+    # `velocity` or `position`; by default chosen by the variable's unit
     field: Literal["velocity", "position"] | None = None
-    scale: float = 1.0
+    scale: float = 1.0  # factor from the message's unit to the variable's
 
 
 class TopicRoles(Schema):
-    """Roles of topics. Missing roles are guessed by type and usual names; `none` disables one.
+    """Roles of topics. Missing roles are guessed by type and usual names; `none` disables one."""
 
-    Attributes:
-        cmd_vel: the commands: Twist, TwistStamped, AckermannDrive or AckermannDriveStamped.
-        pose: of motion capture or localisation: PoseStamped, PoseWithCovarianceStamped,
-            TransformStamped; or TFMessage and Odometry if named here. Has priority over `odom`.
-        odom: Odometry; its pose is used if there is no `pose`. If named in addition to a `pose`,
-            its twist shows the noise of the odometry.
-        joint_states: JointState, for measured state and wheel speeds.
-        imu: Imu.
-        frame: parent of the transforms to use, for a `pose` topic with several.
-        child_frame: their child, the robot.
-        state: joint of each state variable; by default guessed by the joints' names.
-        wheels: left and right joint whose velocities are the wheel speeds; likewise.
-        stamps: `header` takes all times from the messages' headers, `receive` from their receipt
-            by the bag, `auto` from the header if there is one.
-    """
-
+    # the commands: Twist, TwistStamped, AckermannDrive or AckermannDriveStamped
     cmd_vel: str | None = None
+    # of motion capture or localisation: PoseStamped, PoseWithCovarianceStamped, TransformStamped;
+    # or TFMessage and Odometry if named here. Has priority over `odom`.
     pose: str | None = None
+    # Odometry; its pose is used if there is no `pose`. If named in addition to a `pose`, its twist
+    # shows the noise of the odometry.
     odom: str | None = None
-    joint_states: str | None = None
-    imu: str | None = None
-    frame: str | None = None
-    child_frame: str | None = None
+    joint_states: str | None = None  # JointState, for measured state and wheel speeds
+    imu: str | None = None  # Imu
+    frame: str | None = None  # parent of the transforms to use, for a `pose` topic with several
+    child_frame: str | None = None  # their child, the robot
+    # joint of each state variable; by default guessed by the joints' names
     state: dict[str, JointSource | str] = Field(default_factory=dict)
+    # left and right joint whose velocities are the wheel speeds; likewise
     wheels: tuple[str, str] | None = None
+    # `header` takes all times from the messages' headers, `receive` from their receipt by the bag,
+    # `auto` from the header if there is one
     stamps: Stamps = "auto"
 
 
 def topic_roles(file: str | Path | None = None, options: Iterable[str] = ()) -> TopicRoles:
-    """Reads roles from a YAML file and the command-line options `ROLE=TOPIC`.
-
-    Args:
-        file: with the keys of `TopicRoles`.
-        options: override the file.
-
-    Raises:
-        ConfigError: the file, a role or a value is wrong.
-    """
+    """Reads roles from a YAML file and options `ROLE=TOPIC`, which override it (ConfigError)."""
     roles = load_yaml(file, TopicRoles) if file else TopicRoles()
     given: dict[str, str] = {}
     for option in options:
@@ -122,16 +97,7 @@ def topic_roles(file: str | Path | None = None, options: Iterable[str] = ()) -> 
 def assign(
     roles: TopicRoles, types: Mapping[str, str], empty: Collection[str], place: str
 ) -> dict[str, str]:
-    """Assigns topics to roles.
-
-    Args:
-        roles: as given by the user.
-        types: message type of each topic.
-        empty: topics without messages, which have no role.
-        place: the recording's name, for errors.
-
-    Returns:
-        role -> topic. There is a `cmd_vel`, and a `pose` or an `odom` or both.
+    """Assigns topics to roles: a `cmd_vel`, and a `pose` or an `odom` or both.
 
     Raises:
         RecordingError: a topic is missing, of a wrong type, or several fit a role; one sentence
@@ -153,11 +119,9 @@ def assign(
 
 @dataclass(frozen=True)
 class _Topics:
-    """Topics of a bag."""
-
-    types: Mapping[str, str]
+    types: Mapping[str, str]  # by name
     empty: Collection[str]
-    place: str
+    place: str  # of the bag, for errors
 
     def choose(self, role: str, wanted: str | None) -> str | None:
         """Returns the topic of a role: the wanted one, or a guess."""
@@ -166,15 +130,10 @@ class _Topics:
         if wanted is None:
             return self._guess(role)
         topic = wanted if wanted.startswith("/") else f"/{wanted}"
-        if topic not in self.types:
-            raise RecordingError(
-                f"{self.place}: has no topic {topic!r} ({role}); {self._listed((role,))}"
-            )
-        if topic in self.empty:
-            raise RecordingError(
-                f"{self.place}: holds no messages of the topic {topic!r} ({role}); "
-                f"{self._listed((role,))}"
-            )
+        if topic not in self.types or topic in self.empty:
+            lack = "holds no messages of the" if topic in self.empty else "has no"
+            listed = self._listed((role,))
+            raise RecordingError(f"{self.place}: {lack} topic {topic!r} ({role}); {listed}")
         if self.types[topic] not in TYPES[role]:
             raise RecordingError(
                 f"{self.place}: the topic {topic!r} is of type {self.types[topic]}; {role} must "

@@ -1,6 +1,6 @@
-"""Output of a drive: an `.npz` file, or the folder of a rosbag2.
+"""Output of a drive: an `.npz` file, or the folder of a rosbag2, written without ROS.
 
-A rosbag2 is written without ROS, message by message: complete at the end, salvageable before.
+A bag is written message by message: complete at the end, salvageable before.
 """
 
 from __future__ import annotations
@@ -14,14 +14,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.files import check_above, sync_folder
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import topic_roles
-from nics_drl_bridge.recording.joints import POSITION_UNITS, WHEELS
-from nics_drl_bridge.recording.messages import Offer, check_libraries, profile_of, typestore
+from nics_drl_bridge.recording.messages import (
+    POSITION_UNITS,
+    WHEELS,
+    Offer,
+    check_libraries,
+    profile_of,
+    typestore,
+)
 from nics_drl_bridge.recording.recording import Recording, Stream, save_recording
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -30,7 +36,14 @@ if TYPE_CHECKING:
     from rosbags.rosbag2 import Writer
     from rosbags.typesys.store import Typestore
 
+Make = Callable[[Any, Array], Any]
+Storage = Literal["mcap", "sqlite3"]
+
 NPZ = ".npz"
+START_NS = 1_700_000_000 * NS_PER_S  # time stamp of second 0 of the commands' clock
+FRAMES = ("odom", "base_link")
+NO_HASH = f"RIHS01_{'0' * 64}"  # of a type that is known only by its text
+CHUNK_BYTES = 1 << 16  # damage costs a whole chunk, since each checksum covers a whole chunk
 
 
 def check_out(path: str | Path) -> Path:
@@ -54,45 +67,21 @@ def check_out(path: str | Path) -> Path:
 
 
 def write_drive(recording: Recording, path: str | Path, spec: RobotSpec) -> None:
-    """Writes a recording, completely or not at all: `.npz`, or else a rosbag2 in MCAP.
-
-    Raises:
-        RecordingError: it can't be written.
-    """
+    """Writes a recording, completely or not at all: `.npz`, or else a rosbag2 in MCAP."""
     if Path(path).suffix == NPZ:
         save_recording(recording, path)
     else:
         write_bag(recording, path, spec)
 
 
-Array = NDArray[np.float64]
-Make = Callable[[Any, Array], Any]
-
-START_NS = 1_700_000_000 * NS_PER_S
-"""Time stamp of second 0 of the commands' clock."""
-FRAMES = ("odom", "base_link")
-
-
 def write_bag(
-    recording: Recording,
-    path: str | Path,
-    spec: RobotSpec,
-    storage: Storage = "mcap",
+    recording: Recording, path: str | Path, spec: RobotSpec, storage: Storage = "mcap"
 ) -> None:
-    """Writes a recording as a bag that `load_bag` reads back.
+    """Writes a recording as a bag, in a folder to create, that `load_bag` reads back.
 
     Commands become `/cmd_vel`, the pose `/odom`; or `/pose` if it has a separate clock or if
     there is odometry, whose twist is then in `/odom`. State, or else wheels, become
-    `/joint_states`, the IMU `/imu`. Headers contain the streams' stamps.
-
-    Args:
-        recording: of the robot.
-        path: folder to create.
-        spec: the robot.
-        storage: format of the file in the folder.
-
-    Raises:
-        RecordingError: the folder exists already, or a library is not installed.
+    `/joint_states`, the IMU `/imu`. Headers contain the streams' stamps. For errors see `bag_sink`.
     """
     with bag_sink(path, storage) as sink:
         messages = _Messages(store := sink.store)
@@ -195,19 +184,8 @@ class _Messages:
         )
 
 
-Storage = Literal["mcap", "sqlite3"]
-
-NO_HASH = f"RIHS01_{'0' * 64}"
-"""Hash of a type that is known only by its text."""
-CHUNK_BYTES = 1 << 16
-"""Damage costs a whole chunk, since each checksum covers a whole chunk."""
-
-
 class BagSink:
-    """An open bag, created by `bag_sink`.
-
-    Args:
-        writer: open writer of rosbags.
+    """An open bag, created by `bag_sink` with an open writer of rosbags.
 
     Attributes:
         store: known message types.
@@ -227,14 +205,10 @@ class BagSink:
         texts: Mapping[str, str] | None = None,
         definition: str | None = None,
     ) -> None:
-        """Adds a topic.
+        """Adds a topic with messages of a type such as `nav_msgs/msg/Odometry`.
 
-        Args:
-            topic: its name.
-            kind: type of its messages, such as `nav_msgs/msg/Odometry`.
-            offers: of its publishers.
-            texts: `.msg` texts of the type and its component types, if unknown to rosbags.
-            definition: complete definition of the type as stored in a bag, instead.
+        A type that rosbags does not know needs the `.msg` texts of it and its components, or its
+        complete definition as stored in a bag.
         """
         from rosbags.typesys import get_types_from_msg
 
@@ -270,20 +244,14 @@ class BagSink:
 
 @contextmanager
 def bag_sink(path: str | Path, storage: Storage = "mcap") -> Iterator[BagSink]:
-    """Yields a bag to write to, which is moved to `path` when the block ends without error.
+    """Yields a bag to write to, a folder made at `path` when the block ends without error.
 
     It is written to a hidden folder `.NAME.*` next to `path`. After an error nothing is left; a
     killed process or a full disk leaves that folder, from which `salvage` recovers the flushed
-    messages.
-
-    Args:
-        path: folder to create.
-        storage: format of the file in the folder. MCAP has checksums, so that any damage is
-            found; SQLite has none.
+    messages. MCAP has checksums, so that any damage is found; SQLite has none.
 
     Raises:
-        RecordingError: the folder exists already or can't be written, or a library is not
-            installed.
+        RecordingError: the folder exists already or can't be written, or a library is missing.
     """
     path = Path(path)
     check_libraries(path, "writing")

@@ -13,12 +13,17 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.clocks import residual_by_shift, response_residual, state_residual
+from nics_drl_bridge.identify.clocks import (
+    residual_by_shift,
+    response_residual,
+    speed_along,
+    state_residual,
+    wheel_means,
+)
 from nics_drl_bridge.identify.drive import Drive, pose_residual
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.noise import drift_growth, odometry_residual
 from nics_drl_bridge.identify.report import CalibratedValue, estimates
-from nics_drl_bridge.identify.responses import speed_along, wheel_means
 from nics_drl_bridge.identify.signals import moved_commands, nominal_lags
 from nics_drl_bridge.report.page import DARK, MEASURED, MODEL, OTHER, png
 from nics_drl_bridge.robot.noise import Level

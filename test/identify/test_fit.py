@@ -61,8 +61,8 @@ def test_a_polynomial_of_second_order_is_found_with_its_own_terms_only():
     assert term(result.model, "vy", "1") == pytest.approx(0.3, abs=1e-12)
     assert result.rmse.max() < 1e-12
     assert result.r2.min() > 1.0 - 1e-12
-    assert result.terms_total == 18
-    assert (result.unmoved, result.dependent) == ((), ())
+    assert result.regression.terms_total == 18
+    assert (result.unmoved, result.regression.dependent) == ((), ())
 
 
 @pytest.mark.parametrize(
@@ -127,7 +127,7 @@ def test_commands_that_always_move_together_are_told():
     x = random_x()
     x[:, 1] = -2.0 * x[:, 0]
     result = fit(samples_of(x, rates_of(x)), PAIR)
-    assert "b" in result.dependent
+    assert "b" in result.regression.dependent
     assert np.abs(result.model.coefficients).max() < 10.0
     assert result.rmse.max() < 1e-9
 

@@ -7,9 +7,8 @@ import pytest
 
 from identify.drives import drive
 from nics_drl_bridge.errors import FitError, RecordingError
-from nics_drl_bridge.identify.align import align
 from nics_drl_bridge.identify.assume import assume_textbook
-from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.calibration import Calibration, align
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import cut, identify

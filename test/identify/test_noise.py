@@ -80,7 +80,8 @@ def levels(noise: Noise) -> np.ndarray:
     return np.array([*noise.odometry, noise.position_drift.std, noise.heading_drift.std])
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.campaign)])
 def test_a_drive_of_known_noise_gives_it_back_and_so_does_its_simulator(differential, seed):
     found = identify(drifting(differential, seed), differential)
     known = np.array([*ODOMETRY, *DRIFT])
@@ -90,6 +91,7 @@ def test_a_drive_of_known_noise_gives_it_back_and_so_does_its_simulator(differen
     assert levels(again.noise) == pytest.approx(levels(found.noise), rel=TOLERANCE)
 
 
+@pytest.mark.campaign
 def test_the_uncertainty_of_a_level_covers_its_error(differential):
     found = [identify(drifting(differential, seed, 90.0), differential) for seed in range(3)]
     for name, known in (("position_drift", DRIFT[0]), ("heading_drift", DRIFT[1])):

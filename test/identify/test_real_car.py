@@ -15,6 +15,7 @@ from nics_drl_bridge.identify.identify import calibrate, identify
 from nics_drl_bridge.identify.open_loop import open_loop_error
 from nics_drl_bridge.recording.readers import read_recording
 
+CAMPAIGN = pytest.mark.campaign
 BENCHMARK = Path(__file__).resolve().parents[2] / "benchmarks" / "real_robot.py"
 
 
@@ -34,7 +35,9 @@ def test_its_recordings_show_bursts_offset_rotation_and_swapped_wheels(real_driv
     assert any("steering_command never changed" in note for note in calibration.notes)
 
 
-@pytest.mark.parametrize("until", [10.0, 20.0, 30.0, 38.0])
+@pytest.mark.parametrize(
+    "until", [*(pytest.param(t, marks=CAMPAIGN) for t in (10.0, 20.0, 38.0)), 30.0]
+)
 def test_its_model_predicts_five_seconds_of_unseen_drive_to_three_centimetres(
     real_drives, car, until
 ):
@@ -71,6 +74,8 @@ def test_a_drive_of_constant_command_is_refused(real_drives, car):
         identify(read_recording(real_drives / "constant_drive_51s"), car)
 
 
+@pytest.mark.process
+@CAMPAIGN
 def test_the_benchmark_prints_one_json_object(real_drives):
     run = subprocess.run(
         [sys.executable, BENCHMARK, "--json", "--train-until", "25"],
@@ -84,7 +89,7 @@ def test_the_benchmark_prints_one_json_object(real_drives):
     assert {"mean_heading_error_rad", "mean_path_m"} <= set(result)
 
 
-@pytest.mark.parametrize("ahead", [7.0, -7.0, 1.7e9])
+@pytest.mark.parametrize("ahead", [*(pytest.param(t, marks=CAMPAIGN) for t in (7.0, -7.0)), 1.7e9])
 def test_its_errors_do_not_depend_on_what_the_motion_capture_calls_zero(real_drives, car, ahead):
     recording = read_recording(real_drives / "random_drive_45s")
     pose = replace(recording.pose, t=recording.pose.t + ahead)

@@ -11,8 +11,7 @@ from identify.drives import drive
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify import drive as prepared
 from nics_drl_bridge.identify.drive import Drive, Settings
-from nics_drl_bridge.identify.findings import Findings
-from nics_drl_bridge.identify.identify import STAGES, begun, identify, run
+from nics_drl_bridge.identify.identify import STAGES, Findings, begun, identify, run
 from nics_drl_bridge.robot.spec import RobotSpec
 
 NAMES = tuple(stage.__name__ for stage in STAGES)
@@ -31,8 +30,11 @@ ADDED = {
 SETTINGS = Settings(train_until_s=14.0, assume=True)
 
 
-def without(name: str):
-    return tuple(stage for stage in STAGES if stage.__name__ != name)
+def rest(drive: Drive, found: Findings, name: str) -> Findings:
+    """The findings when the row goes on after a stage."""
+    for stage in STAGES[NAMES.index(name) + 1 :]:
+        found = stage(drive, found)
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -55,14 +57,20 @@ def test_the_row_is_the_road_from_a_recording_to_a_model():
     assert tuple(ADDED) == NAMES
 
 
-def test_a_stage_adds_what_it_says_and_leaves_the_rest(disturbed):
-    before = begun(disturbed)
+@pytest.fixture(scope="module")
+def road(disturbed) -> list[Findings]:
+    """The findings before each stage, and after the last."""
+    found = [begun(disturbed)]
     for stage in STAGES:
-        after = stage(disturbed, before)
+        found.append(stage(disturbed, found[-1]))
+    return found
+
+
+def test_a_stage_adds_what_it_says_and_leaves_the_rest(road):
+    for name, before, after in zip(NAMES, road, road[1:], strict=False):
         names = {f.name for f in fields(Findings)}
         changed = {n for n in names if getattr(after, n) is not getattr(before, n)}
-        assert changed == ADDED[stage.__name__]
-        before = after
+        assert changed == ADDED[name]
 
 
 @pytest.mark.parametrize(
@@ -77,11 +85,20 @@ def test_a_stage_adds_what_it_says_and_leaves_the_rest(disturbed):
         ("judge", lambda found: found.notes == () and found.model.quality is None),
     ],
 )
-def test_without_a_stage_its_finding_is_missing_and_the_rest_is_there(disturbed, name, missing):
-    assert not missing(run(STAGES, disturbed))
-    found = run(without(name), disturbed)
+def test_without_a_stage_its_finding_is_missing_and_the_rest_is_there(
+    disturbed, road, name, missing
+):
+    assert not missing(road[-1])
+    found = rest(disturbed, road[NAMES.index(name)], name)
     assert missing(found)
     assert found.model.terms_kept > 0
+
+
+@pytest.fixture(scope="module")
+def inferred(car) -> tuple[Drive, Findings]:
+    """A drive whose state was not measured, and its findings up to the mounting."""
+    driven = Drive(drive(car, duration=21.0, measured_state=False), car, SETTINGS)
+    return driven, run(STAGES[: NAMES.index("responses")], driven)
 
 
 @pytest.mark.parametrize(
@@ -92,10 +109,10 @@ def test_without_a_stage_its_finding_is_missing_and_the_rest_is_there(disturbed,
         ("prune", "the pruned fit is missing; put the stage 'prune' before"),
     ],
 )
-def test_without_a_stage_that_others_need_the_row_says_which(car, name, sentence):
-    inferred = Drive(drive(car, duration=21.0, measured_state=False), car, SETTINGS)
+def test_without_a_stage_that_others_need_the_row_says_which(inferred, name, sentence):
+    driven, found = inferred
     with pytest.raises(FitError, match=sentence):
-        run(without(name), inferred)
+        rest(driven, found, name)
 
 
 def test_the_bursts_of_a_drive_are_found_once(differential, monkeypatch):

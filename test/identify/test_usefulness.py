@@ -11,7 +11,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.open_loop import open_loop_error
-from nics_drl_bridge.identify.verdict import is_useless, why_useless
+from nics_drl_bridge.identify.report import is_useless, why_useless
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import RobotSpec

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.recording.readers import load_csv_folder, read_recording
+from nics_drl_bridge.recording.csv_folder import load_csv_folder
+from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import Recording, Stream, save_recording
 
 
@@ -137,7 +138,7 @@ def test_the_reader_is_chosen_by_what_lies_there(folder, tmp_path):
     [
         ("nowhere", "no such file or folder"),
         ("nowhere.npz", "no such file"),
-        ("cmd.csv", "is neither an .npz file nor a folder"),
+        ("cmd.csv", "is neither a rosbag2 nor a folder of CSV files nor an .npz file; give one"),
     ],
 )
 def test_a_path_that_holds_no_recording_is_refused(folder, name, sentence):

@@ -1,22 +1,32 @@
 from __future__ import annotations
 
-import struct
-import zlib
-
 import pytest
-import yaml
 
 pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 pytest.importorskip("mcap", reason="needs the extra 'bags'")
 
+import struct
+import zlib
+
+import lz4.frame
+import yaml
 from mcap.writer import CompressionType, IndexType, Writer
 
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.extras.bags.salvage import salvage
-from nics_drl_bridge.recording import messages, packing
+from nics_drl_bridge.recording import mcap, messages
 from nics_drl_bridge.recording.bag_file import opened
-from nics_drl_bridge.recording.mcap import MAGIC, PREFIX, DamageError, records, seal
-from nics_drl_bridge.recording.mcap_check import check_mcap
+from nics_drl_bridge.recording.mcap import (
+    MAGIC,
+    PREFIX,
+    DamageError,
+    check_mcap,
+    check_message,
+    records,
+    seal,
+    unpack,
+    unpack_file,
+)
 
 TWIST, COUNT = "geometry_msgs/msg/Twist", 200
 DATA = b"\x00\x01\x00\x00" + struct.pack("<6d", 1.0, 0.0, 0.0, 0.0, 0.0, 0.5)
@@ -113,7 +123,7 @@ def test_a_record_that_is_shorter_than_its_fields_is_refused(record, said):
 def test_a_chunk_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
     """Also in a file without summary, whose chunks rosbags unpacks when it opens it."""
     path = written(tmp_path / "drive.mcap", size=2**22, data=DATA + bytes(2**14), **FORMS["zstd"])
-    monkeypatch.setattr(packing, "MOST_UNPACKED", 2**20)
+    monkeypatch.setattr(mcap, "MOST_UNPACKED", 2**20)
     for data in (path.read_bytes(), without_summary(path.read_bytes())):
         path.write_bytes(data)
         with pytest.raises(RecordingError, match="more than 1048576 bytes"), opened(path):
@@ -125,7 +135,7 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused_before_it_is_unpacked(tmp_p
 
 def packed_as_a_whole(folder, data):
     folder.mkdir(exist_ok=True)
-    (folder / "drive.mcap.zstd").write_bytes(packing._zstd().compress(data))
+    (folder / "drive.mcap.zstd").write_bytes(mcap._zstd().compress(data))
     about = {"compression_mode": "FILE", "relative_file_paths": ["drive.mcap.zstd"]}
     text = yaml.safe_dump({"rosbag2_bagfile_information": about})
     (folder / "metadata.yaml").write_text(text, encoding="utf-8")
@@ -172,3 +182,48 @@ def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):
     said = r"library mcap; .*nics_drl_bridge\[bags\]"
     with pytest.raises(RecordingError, match=said), opened(path):
         pass
+
+
+ZSTD = mcap._zstd()
+PACK = {"zstd": ZSTD.compress, "lz4": lz4.frame.compress}
+PLAIN = bytes(range(256)) * 40
+
+
+@pytest.mark.parametrize("kind", PACK)
+def test_what_was_packed_comes_out(kind):
+    assert unpack(PACK[kind](PLAIN), kind, len(PLAIN)) == PLAIN
+    assert unpack(PACK[kind](PLAIN), kind) == PLAIN
+
+
+@pytest.mark.parametrize("kind", PACK)
+def test_more_than_was_said_or_is_allowed_is_refused(kind, monkeypatch):
+    with pytest.raises(ValueError, match="more than 10239 bytes"):
+        unpack(PACK[kind](PLAIN), kind, len(PLAIN) - 1)
+    monkeypatch.setattr(mcap, "MOST_UNPACKED", 1000)
+    with pytest.raises(ValueError, match="more than 1000 bytes"):
+        unpack(PACK[kind](PLAIN), kind, 10**18)
+
+
+@pytest.mark.parametrize("kind", PACK)
+def test_what_is_cut_off_is_refused(kind):
+    with pytest.raises(ValueError, match="cut off"):
+        unpack(PACK[kind](PLAIN)[:-5], kind)
+
+
+def test_a_file_of_zeros_that_unpacks_to_thousands_of_times_its_length_is_refused(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(mcap, "MOST_UNPACKED", 2**20)
+    path = tmp_path / "bag.db3.zst"
+    path.write_bytes(ZSTD.compress(bytes(2**26)))
+    with pytest.raises(ValueError, match="1000 times"):
+        unpack_file(path, tmp_path / "bag.db3")
+    path.write_bytes(ZSTD.compress(PLAIN))
+    assert unpack_file(path, tmp_path / "bag.db3").read_bytes() == PLAIN
+
+
+def test_a_message_has_to_say_how_long_it_is(monkeypatch):
+    check_message(ZSTD.compress(PLAIN))
+    monkeypatch.setattr(mcap, "MOST_UNPACKED", 1000)
+    with pytest.raises(ValueError, match="10240 bytes"):
+        check_message(ZSTD.compress(PLAIN))

@@ -13,7 +13,7 @@ from PIL import Image
 
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.policy.evaluation import Episode
-from nics_drl_bridge.recording.drive_plan import DrivePlan
+from nics_drl_bridge.recording.excite import DrivePlan
 from nics_drl_bridge.report.page import Code, Picture, Table, page
 from nics_drl_bridge.report.pictures import (
     Point,

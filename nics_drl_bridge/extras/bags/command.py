@@ -46,7 +46,7 @@ def record(
     with one_sentence():
         kind = _storage(storage)
         with needs_ros("nics bag record"):
-            from nics_drl_bridge.extras.bags.record import BagOrder, record_bag
+            from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
         order = BagOrder(
             out, tuple(topics or ()), everything, namespace, duration, kind, use_sim_time
         )
@@ -112,7 +112,7 @@ def replay(
             _estimate(whole, model, topic or [], out)
             return
         with needs_ros("nics bag replay"):
-            from nics_drl_bridge.extras.bags.play import PlayOrder, play_bag
+            from nics_drl_bridge.extras.bags.live import PlayOrder, play_bag
         order = PlayOrder(whole, tuple(topics or ()), rate, loop, clock, namespace, lockstep)
         sent = play_bag(order, lambda line: typer.echo(line, err=True))
         typer.echo(f"{sent} messages were published")

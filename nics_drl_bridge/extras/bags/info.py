@@ -6,82 +6,48 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.interface import S_PER_NS
-from nics_drl_bridge.recording.bag_file import BagFile, opened
-from nics_drl_bridge.recording.messages import stamp
-from nics_drl_bridge.recording.stamping import MAX_WANDER_S, SAME_CLOCK_S
+from nics_drl_bridge.recording.bag_file import BagFile, opened, times_of
+from nics_drl_bridge.recording.stamping import MAX_WANDER_S, SAME_CLOCK_S, Nanoseconds
 
-Nanoseconds = NDArray[np.int64]
-
-GAP = 3.0
-"""A silence longer than this many usual periods is a gap."""
+GAP = 3.0  # a silence longer than this many usual periods is a gap
 NO_HEADER, UNSTAMPED, UNKNOWN = "no header", "never stamped", "unknown type"
 RECORDER, FOREIGN, SEVERAL = "recorder's", "another", "several"
 
 
 @dataclass(frozen=True)
 class BagTopic:
-    """A topic of a bag.
-
-    Attributes:
-        topic: its name.
-        type: of its messages.
-        count: number of messages.
-        rate_hz: inverse of the median time between receipts [Hz]; None for fewer than two
-            messages.
-        first_s, last_s: receipt of the first and last message, from the start of the bag [s].
-        gaps: number of silences of more than three usual periods.
-        longest_gap_s: longest time between two messages [s].
-        clock: of the header stamps: the recorder's, another one or several; otherwise why there
-            are no stamps.
-        delay_s: median of receipt minus stamp [s]; None without stamps.
-        jitter_s: from the 5 % to the 95 % quantile of that delay [s].
-        backwards: number of stamps earlier than their predecessor.
-    """
+    """A topic of a bag."""
 
     topic: str
     type: str
-    count: int
-    rate_hz: float | None = None
-    first_s: float | None = None
+    count: int  # number of messages
+    rate_hz: float | None = None  # from the median time between receipts
+    first_s: float | None = None  # receipt of the first message, from the start of the bag
     last_s: float | None = None
-    gaps: int = 0
+    gaps: int = 0  # number of silences of more than three usual periods
     longest_gap_s: float | None = None
-    clock: str = UNKNOWN
-    delay_s: float | None = None
-    jitter_s: float | None = None
-    backwards: int = 0
+    clock: str = UNKNOWN  # of the header stamps, or why there are none
+    delay_s: float | None = None  # median of receipt minus stamp; None without stamps
+    jitter_s: float | None = None  # from the 5 % to the 95 % quantile of that delay
+    backwards: int = 0  # number of stamps earlier than their predecessor
 
 
 @dataclass(frozen=True)
 class BagInfo:
-    """Contents of a bag.
-
-    Attributes:
-        path: of the bag.
-        size_bytes: of all its files.
-        start_ns: receipt of the first message, on the recorder's clock [ns].
-        duration_s: from that to the receipt of the last message [s].
-        messages: number of messages.
-        topics: by name.
-    """
+    """Contents of a bag."""
 
     path: str
-    size_bytes: int
-    start_ns: int
-    duration_s: float
-    messages: int
+    size_bytes: int  # of all its files
+    start_ns: int  # receipt of the first message, on the recorder's clock
+    duration_s: float  # from that to the receipt of the last message
+    messages: int  # number of messages
     topics: tuple[BagTopic, ...]
 
 
 def bag_info(path: str | Path) -> BagInfo:
-    """Reads a whole bag and describes its contents.
-
-    Raises:
-        RecordingError: it is damaged.
-    """
+    """Reads a whole bag and describes its contents; a damaged one raises RecordingError."""
     path = Path(path)
     with opened(path) as bag:
         received = {topic: _received(bag, topic) for topic in sorted(bag.types)}
@@ -100,11 +66,9 @@ def _received(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]
     """Returns times of receipt [ns], and receipt minus stamp [ns] or why there are no stamps."""
     if not bag.knows(topic):
         return np.array([ns for ns, _ in bag.serialized(topic)], dtype=np.int64), UNKNOWN
-    messages = bag.messages(topic)
-    receive = np.array([m.receive_ns for m in messages], dtype=np.int64)
-    if not messages or not hasattr(messages[0].content, "header"):
+    receive, stamps = times_of(bag.messages(topic))
+    if stamps is None:
         return receive, NO_HEADER
-    stamps = np.array([stamp(m.content) for m in messages], dtype=np.int64)
     return receive, receive - stamps if stamps.any() else UNSTAMPED
 
 

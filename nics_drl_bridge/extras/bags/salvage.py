@@ -30,31 +30,27 @@ from nics_drl_bridge.recording.mcap import (
     Record,
     mapped,
     records,
+    unpack,
     unpacked,
 )
 from nics_drl_bridge.recording.messages import typestore
-from nics_drl_bridge.recording.packing import unpack
 from nics_drl_bridge.recording.write import Storage, bag_sink
 
-ZSTD = b"\x28\xb5\x2f\xfd"
-"""First bytes of an individually compressed message; a plain ROS message begins with 0."""
+ZSTD = b"\x28\xb5\x2f\xfd"  # begins a message compressed on its own; a plain one begins with 0
 LATEST_NS = 1 << 62
+SMALLEST_ROW = 16  # minimum size of a message [bytes], which bounds their number
+SMALLEST_PAGE = 512
+BESIDE = ("-wal", "-journal")  # next to an unclosed database; SQLite needs them to recover it
 CHUNK_OP = bytes([Opcode.CHUNK])
 
 
 @dataclass(frozen=True)
 class Salvage:
-    """Result of a salvage.
+    """Result of a salvage."""
 
-    Attributes:
-        kept: number of saved messages by topic.
-        promised: original number of messages by topic; None if unknown.
-        span_s: from the first saved message to the last one [s].
-    """
-
-    kept: Mapping[str, int]
-    promised: Mapping[str, int] | None
-    span_s: float
+    kept: Mapping[str, int]  # number of saved messages by topic
+    promised: Mapping[str, int] | None  # original number of messages by topic; None if unknown
+    span_s: float  # from the first saved message to the last one [s]
 
     @property
     def lost(self) -> int | None:
@@ -82,34 +78,19 @@ class Salvage:
 
 @dataclass
 class _Found:
-    """Remaining contents of a bag's files.
-
-    Attributes:
-        kinds: type by topic.
-        definitions: text by type.
-        messages: topic, time of receipt [ns], data.
-        promised: original number of messages by topic.
-        told: False if a file does not contain that number.
-    """
-
-    kinds: dict[str, str] = field(default_factory=dict)
-    definitions: dict[str, str] = field(default_factory=dict)
-    messages: list[tuple[str, int, bytes]] = field(default_factory=list)
-    promised: Counter[str] = field(default_factory=Counter)
-    told: bool = True
+    kinds: dict[str, str] = field(default_factory=dict)  # type by topic
+    definitions: dict[str, str] = field(default_factory=dict)  # text by type
+    messages: list[tuple[str, int, bytes]] = field(default_factory=list)  # topic, receipt, data
+    promised: Counter[str] = field(default_factory=Counter)  # original number of messages by topic
+    told: bool = True  # False if a file does not contain that number
 
 
 def salvage(path: str | Path, out: str | Path, storage: Storage = "mcap") -> Salvage:
-    """Writes the intact messages of a bag to a new bag.
+    """Writes the intact messages of a bag to a new bag in a folder to create.
 
     From an MCAP file these are all chunks with a correct checksum, or, in chunks without one, all
     messages before the damage; from an SQLite file all readable rows. Messages that can't be
     decoded are dropped. The hidden folder that a killed recorder leaves is accepted too.
-
-    Args:
-        path: folder or file of the damaged bag.
-        out: folder to create.
-        storage: format of the new bag.
 
     Raises:
         RecordingError: nothing is intact, or `out` exists already.
@@ -158,7 +139,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _number(file: Path) -> tuple[int, str]:
-    """Returns a sort key that orders `drive_10` after `drive_9`."""
+    """Sorts `drive_10` after `drive_9`."""
     digits = file.stem.rpartition("_")[2]
     return int(digits) if digits.isdecimal() else -1, str(file)
 
@@ -190,11 +171,7 @@ def _promised(path: Path) -> dict[str, int] | None:
 
 
 def _read_mcap(file: Path, found: _Found) -> None:
-    """Reads all intact messages of an MCAP file.
-
-    A chunk with a checksum is kept as a whole or not at all; a chunk without one is kept up to its
-    damage. After damage the file is searched for the next chunk.
-    """
+    """Reads all intact messages of an MCAP file; after damage it is searched for the next chunk."""
     told, waiting, promised = McapSummary(), list[Record](), dict[int, int]()
     data = mapped(file) if file.stat().st_size else memoryview(b"")
     place = len(MAGIC)
@@ -233,7 +210,6 @@ def _read_mcap(file: Path, found: _Found) -> None:
 
 
 def _inside(record: Record) -> list[Record]:
-    """Returns the intact records of a chunk."""
     with suppress(DamageError):
         chunk = record.content
         span = chunk.message_start_time, chunk.message_end_time
@@ -292,15 +268,7 @@ def _looks_like_chunk(data: memoryview, place: int) -> bool:
     return bool(packed + letters + 40 == length <= len(data) - place - PREFIX)
 
 
-SMALLEST_ROW = 16
-"""Minimum size of a message [bytes], which bounds their number."""
-SMALLEST_PAGE = 512
-BESIDE = ("-wal", "-journal")
-"""Suffixes of the files next to an unclosed database, which SQLite needs to recover it."""
-
-
 def _read_database(file: Path, found: _Found) -> None:
-    """Reads all readable rows of a database."""
     found.told = False
     with TemporaryDirectory() as folder:
         copy = Path(folder) / "bag.db3"

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -35,12 +36,17 @@ def held(bag):
         return {topic: whole.serialized(topic) for topic in whole.types}
 
 
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory):
+    bag = tmp_path_factory.mktemp("pristine") / "sealed"
+    write_bag(textbook.record(CAR, np.random.default_rng(0), duration=4.0), bag, CAR)
+    return bag
+
+
 @pytest.fixture
-def sealed(tmp_path):
+def sealed(pristine, tmp_path):
     """A bag with checksums."""
-    drive = textbook.record(CAR, np.random.default_rng(0), duration=20.0)
-    write_bag(drive, tmp_path / "sealed", CAR)
-    return tmp_path / "sealed"
+    return shutil.copytree(pristine, tmp_path / "sealed")
 
 
 def test_a_whole_bag_is_saved_whole(sealed, tmp_path):
@@ -51,7 +57,7 @@ def test_a_whole_bag_is_saved_whole(sealed, tmp_path):
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-@pytest.mark.parametrize("share", [0.3, 0.6, 0.8])
+@pytest.mark.parametrize("share", [0.5, 0.6, 0.8])
 def test_what_is_in_front_of_a_cut_is_saved_and_the_rest_is_counted(tmp_path, storage, share):
     bag = bags.write(tmp_path / "bag", bags.drive(), storage)
     before, file = held(bag), storage_file(bag)
@@ -64,8 +70,8 @@ def test_what_is_in_front_of_a_cut_is_saved_and_the_rest_is_counted(tmp_path, st
     assert all(set(rows) <= set(before[topic]) for topic, rows in after.items())
     found = sum(map(len, after.values()))
     assert found > 0
-    assert kept.lost == 1800 - found > 0
-    assert f"{kept.lost} of 1800 are lost" in kept.lines()[0]
+    assert kept.lost == 360 - found > 0
+    assert f"{kept.lost} of 360 are lost" in kept.lines()[0]
 
 
 def test_a_flipped_bit_costs_the_chunk_that_it_is_in(sealed, tmp_path):
@@ -82,7 +88,10 @@ def test_a_flipped_bit_costs_the_chunk_that_it_is_in(sealed, tmp_path):
     assert 0 < kept.lost < 0.5 * sum(map(len, before.values()))
 
 
-@pytest.mark.parametrize("seed", range(60))
+MANY = (pytest.param(seed, marks=pytest.mark.campaign) for seed in range(5, 60))
+
+
+@pytest.mark.parametrize("seed", [*range(5), *MANY])
 def test_any_flipped_bit_of_a_sealed_file_is_found(sealed, seed):
     file = storage_file(sealed)
     data = bytearray(file.read_bytes())
@@ -158,7 +167,7 @@ def test_nothing_is_salvaged_unless_asked_for(sealed):
 
 
 def test_info_tells_rates_gaps_and_clocks(tmp_path):
-    poses = [row for row in bags.poses(offset=100.0) if not 10.0 < row[0] < 12.0]
+    poses = [row for row in bags.poses(offset=100.0) if not 2.0 < row[0] < 4.0]
     bag = bags.write(tmp_path / "bag", {"/cmd_vel": bags.commands(), "/pose": poses})
     told = {topic.topic: topic for topic in bag_info(bag).topics}
     command, pose = told["/cmd_vel"], told["/pose"]
@@ -172,7 +181,7 @@ def test_info_tells_rates_gaps_and_clocks(tmp_path):
 
 
 def test_stamps_of_several_clocks_are_told(tmp_path):
-    poses = [(t, bags.pose_stamped(t + 50.0 * (t > 15.0), 0.0, 0.0, 0.0)) for t in bags.times()]
+    poses = [(t, bags.pose_stamped(t + 50.0 * (t > 3.0), 0.0, 0.0, 0.0)) for t in bags.times()]
     bag = bags.write(tmp_path / "bag", {"/pose": poses})
     (pose,) = bag_info(bag).topics
     assert pose.clock == "several"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from identify.drives import in_bursts
-from nics_drl_bridge.identify.drive import find_bursts, newest, spread
+from nics_drl_bridge.identify.drive import find_bursts, spread
 
 
 def test_uniform_stamps_are_not_bursts_and_stay_as_they_are():
@@ -31,9 +31,8 @@ def test_samples_of_bursts_get_back_their_times(size):
 def test_the_newest_of_each_burst_is_dated_at_its_arrival():
     arrival = in_bursts(np.arange(1, 201) * 0.02, 0.1)
     bursts = find_bursts(arrival)
-    chosen = newest(arrival, bursts)
-    assert len(chosen) == 40
-    assert np.abs(spread(arrival, bursts)[chosen] - np.arange(1, 41) * 0.1).max() < 1e-3
+    assert len(bursts.newest) == 40
+    assert np.abs(spread(arrival, bursts)[bursts.newest] - np.arange(1, 41) * 0.1).max() < 1e-3
 
 
 def test_after_a_gap_a_burst_fills_one_period_only():

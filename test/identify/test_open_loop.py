@@ -34,7 +34,7 @@ def courses(request):
 
 def test_a_course_ends_where_the_prediction_does(courses):
     model, driven, chosen, course = courses
-    ends = tracked_ends(course, MOUNTING, relative_ends(course, model)[0])
+    ends = tracked_ends(course.chosen, MOUNTING, relative_ends(course, model)[0])
     expected = predict(model, MOUNTING, driven, chosen)
     assert ends == pytest.approx(expected, abs=1e-9)
 
@@ -53,7 +53,9 @@ def test_the_derivatives_are_those_of_finite_differences(courses):
             coefficients = model.coefficients.copy()
             coefficients[d, k] += sign * STEP
             changed = replace(model, coefficients=coefficients)
-            sides.append(tracked_ends(course, MOUNTING, relative_ends(course, changed, free)[0]))
+            sides.append(
+                tracked_ends(course.chosen, MOUNTING, relative_ends(course, changed, free)[0])
+            )
         difference = sides[1] - sides[0]
         difference[:, 2] = (difference[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
         assert slope[:, :, p] == pytest.approx(difference / (2.0 * STEP), rel=1e-3, abs=2e-3)

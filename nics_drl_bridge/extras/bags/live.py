@@ -1,0 +1,352 @@
+"""Bags over ROS 2: what a robot publishes is recorded as sent, and played back as recorded."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rcl_interfaces.srv import GetParameters
+from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from rosgraph_msgs.msg import Clock as ClockMessage
+
+from nics_drl_bridge.errors import BackendError, RecordingError, nearest
+from nics_drl_bridge.nodes import conversions
+from nics_drl_bridge.nodes.conversions import message_texts, message_type
+from nics_drl_bridge.nodes.qos import QosWatch, offer_of, profile_of
+from nics_drl_bridge.nodes.runner import DELIVERY_S, open_context, run_node
+from nics_drl_bridge.recording.bag_file import BagFile, opened
+from nics_drl_bridge.recording.messages import Offer
+from nics_drl_bridge.recording.write import BagSink, Storage, bag_sink
+
+ROBOT = (
+    "scan", "odom", "cmd_vel", "cmd_vel_raw", "joint_states", "imu", "pose", "ground_truth",
+    "odometry/filtered", "e_stop",
+)  # fmt: skip
+"""Topics of a robot, in its namespace."""
+SHARED = ("/tf", "/tf_static", "/clock", "/diagnostics")
+LOOK_S = 0.25  # period of the search for new topics [s]
+FLUSH_S = 1.0  # greatest span that is lost if the process is killed [s]
+QUEUE = 1000
+CLOCK = "/clock"
+CLOCK_PERIOD_NS = 10_000_000  # of wall time between messages; `/clock` also precedes each
+USUAL_DEPTH = 100  # for a topic whose publishers' quality of service is not in the bag
+NAP_S = 0.05
+PATIENCE_S = 60.0
+DISCOVERY_S = 1.0  # time for subscribers to discover the topics before the first message [s]
+ALONE_S = 5.0  # longest wait for a first subscriber; after it, the bag is played without one [s]
+
+
+@dataclass(frozen=True)
+class BagOrder:
+    """Topics to record, and options."""
+
+    out: Path  # folder of the bag
+    topics: tuple[str, ...] = ()  # their names; those of `ROBOT` and `SHARED` if empty
+    everything: bool = False  # records every topic; with a namespace, all of it and `SHARED`
+    namespace: str = ""  # of the robot; prefix of topic names without a leading slash
+    duration: float | None = None  # stops after this time [s]; None for never
+    storage: Storage = "mcap"  # format of the file
+    use_sim_time: bool = False  # takes times of receipt from `/clock`
+
+    def wants(self, topic: str) -> bool:
+        """True if a topic is to be recorded."""
+        space = f"/{self.namespace.strip('/')}" if self.namespace.strip("/") else ""
+        if self.everything:
+            return not space or topic.startswith(f"{space}/") or topic in SHARED
+        names = self.topics or (*ROBOT, *SHARED)
+        return topic in {name if name.startswith("/") else f"{space}/{name}" for name in names}
+
+
+class BagRecorder(QosWatch):
+    """Writes the messages of all wanted topics into a bag, serialised as received.
+
+    A subscription requests the best quality of service that all publishers of its topic offer, so
+    that none of them is left out; their offers are stored in the bag. `say` is called with a
+    sentence when a topic begins or can't be recorded.
+    """
+
+    def __init__(
+        self, context: Context, order: BagOrder, sink: BagSink, say: Callable[[str], None]
+    ) -> None:
+        given = [Parameter("use_sim_time", value=order.use_sim_time)]
+        super().__init__(
+            "bag_recorder", context=context, parameter_overrides=given,
+            start_parameter_services=False,
+        )  # fmt: skip
+        self._order, self._sink, self._say = order, sink, say
+        self._heard: dict[str, tuple[Offer, Subscription[Any]]] = {}
+        self.skipped: dict[str, str] = {}
+        self._began = self._flushed = time.monotonic()
+        self.create_timer(LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._look()
+
+    def _look(self) -> None:
+        now = time.monotonic()
+        if now - self._flushed >= FLUSH_S:
+            self._flushed = now
+            self._sink.flush()
+        if self._order.duration is not None and now - self._began >= self._order.duration:
+            self.context.try_shutdown()
+            return
+        for topic, kinds in self.get_topic_names_and_types():
+            if self._order.wants(topic):
+                self._listen(topic, kinds)
+
+    def _listen(self, topic: str, kinds: Sequence[str]) -> None:
+        """Subscribes to a topic, or again if a new publisher offers less."""
+        publishers = self.get_publishers_info_by_topic(topic)
+        if not publishers or topic in self.skipped:
+            return
+        offers = [offer_of(info.qos_profile) for info in publishers]
+        wanted = Offer(
+            QUEUE, all(o.reliable for o in offers), all(o.transient_local for o in offers)
+        )
+        known = self._heard.get(topic)
+        if known is not None and known[0] in (wanted, Offer(QUEUE, False)):
+            return
+        kind = message_type(kinds[0])
+        if len(kinds) > 1 or kind is None:
+            self._skip(topic, kinds)
+            return
+        if known is None:
+            self._sink.add_topic(topic, kinds[0], offers, message_texts(kinds[0]))
+            self._say(f"{topic} ({kinds[0]})")
+        else:
+            self.destroy_subscription(known[1])
+        subscription = self.create_subscription(
+            kind, topic, self._taker(topic), profile_of(wanted), raw=True
+        )
+        self._heard[topic] = wanted, subscription
+
+    def _skip(self, topic: str, kinds: Sequence[str]) -> None:
+        if len(kinds) > 1:
+            why = f"has publishers of {' and '.join(kinds)}; end those of the wrong type"
+        else:
+            why = f"is of {kinds[0]}, whose package is not installed; install it to record it"
+        self.skipped[topic] = f"{topic} {why}."
+        self._say(f"not recorded: {self.skipped[topic]}")
+
+    def _taker(self, topic: str) -> Callable[[Any, Any], None]:
+        def take(data: bytes, info: Any) -> None:
+            received = self._received_ns(info)
+            if received > 0:
+                self._sink.write(topic, received, data)
+
+        return take
+
+    def _received_ns(self, info: Any) -> int:
+        if self._order.use_sim_time:
+            return int(self.get_clock().now().nanoseconds)
+        return int(info.get("received_timestamp") or time.time_ns())
+
+
+def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
+    """Records until the duration is over, SIGINT or SIGTERM; returns the messages by topic.
+
+    `say` is called with a sentence when a topic begins or can't be recorded.
+
+    Raises:
+        BackendError: nothing was received.
+        RecordingError: the bag can't be written.
+    """
+    nodes: list[BagRecorder] = []
+    with bag_sink(order.out, order.storage) as sink:
+
+        def make(context: Context) -> BagRecorder:
+            nodes.append(BagRecorder(context, order, sink, say))
+            return nodes[-1]
+
+        run_node(make, ["nics"])
+        skipped = nodes[-1].skipped.values() if nodes else ()
+        if not sum(sink.counts.values()):
+            raise BackendError(
+                "nothing was heard on any of the topics, so no bag is written; start the robot, "
+                "or correct --topics, --namespace or ROS_DOMAIN_ID."
+                + (f" Not recorded: {' '.join(skipped)}" if skipped else "")
+            )
+    return sink.counts
+
+
+@dataclass(frozen=True)
+class PlayOrder:
+    """Bag to play, and options."""
+
+    bag: Path  # folder or file of the bag
+    topics: tuple[str, ...] = ()  # to play; all if empty
+    rate: float = 1.0  # seconds of the bag per second of wall time
+    loop: bool = False  # starts again at the end; time on `/clock` then jumps back
+    clock: bool = True  # publishes `/clock`; the bag's own is then not played
+    namespace: str = ""  # put in front of the topics' names, except `/clock`, `/tf`, `/tf_static`
+    lockstep: str | None = None  # a node that must take each message before the next one is sent
+    domain_id: int | None = None  # DDS domain; the environment's by default
+
+
+Timed = tuple[int, int, str, bytes]  # receipt [ns], rank of the topic at equal times, topic, data
+
+
+class _Player:
+    """Publishes messages one after another, when they are due."""
+
+    def __init__(self, node: Node, order: PlayOrder, stopping: threading.Event) -> None:
+        self._node, self._order, self._stopping = node, order, stopping
+        self._publishers: dict[str, Publisher] = {}
+        self._clock = node.create_publisher(ClockMessage, CLOCK, 10) if order.clock else None
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+        self._barrier = None
+        if order.lockstep:
+            service = f"/{order.lockstep.strip('/')}/get_parameters"
+            self._barrier = node.create_client(GetParameters, service)
+
+    def offer(self, topic: str, kind: str, offers: tuple[Offer, ...]) -> bool:
+        """Opens a topic; returns False if its type is not installed."""
+        found = message_type(kind)
+        if found is None:
+            return False
+        space = self._order.namespace.strip("/")
+        shared = topic in (CLOCK, "/tf", "/tf_static")
+        name = topic if shared or not space else f"/{space}{topic}"
+        best = Offer(  # matches any subscriber of one of the publishers
+            max((offer.depth for offer in offers), default=USUAL_DEPTH),
+            not offers or any(offer.reliable for offer in offers),
+            any(offer.transient_local for offer in offers),
+        )
+        self._publishers[topic] = self._node.create_publisher(found, name, profile_of(best))
+        return True
+
+    def ready(self) -> None:
+        """Waits for the node in lock-step, or a while for subscribers."""
+        publishers = self._publishers.values()
+        self._stopping.wait(DISCOVERY_S)
+        self._wait(lambda: any(each.get_subscription_count() for each in publishers), ALONE_S)
+        self._wait(lambda: all(map(self._matched, publishers)), PATIENCE_S)
+        if self._barrier is None or self._wait(self._barrier.service_is_ready, PATIENCE_S):
+            return
+        raise BackendError(
+            f"node {self._order.lockstep!r}: not found within {PATIENCE_S:g} s; start it, or "
+            "correct its name, namespace or ROS_DOMAIN_ID."
+        )
+
+    def _matched(self, publisher: Publisher) -> bool:
+        """True if all known subscribers have found a topic."""
+        there = self._node.count_subscribers(publisher.topic_name)
+        return bool(publisher.get_subscription_count() >= there)
+
+    def _wait(self, condition: Callable[[], bool], patience_s: float) -> bool:
+        """Waits for a condition; returns False if it did not come true in time."""
+        until = time.monotonic() + patience_s
+        while not (condition() or self._stopping.is_set()):
+            if time.monotonic() > until:
+                return False
+            self._stopping.wait(NAP_S)
+        return True
+
+    def finish(self) -> None:
+        """Waits for delivery: messages are lost if their publisher goes before."""
+        for each in self._publishers.values():
+            each.wait_for_all_acked(Duration(seconds=DELIVERY_S))
+
+    def play(self, messages: list[Timed]) -> int:
+        """Publishes all messages; returns their number, fewer if it is stopped."""
+        first, began, sent = messages[0][0], time.monotonic_ns(), 0
+        now = first
+        for due, _, topic, data in messages:
+            while self._order.lockstep is None and now < due and not self._stopping.is_set():
+                now = min(due, now + round(CLOCK_PERIOD_NS * self._order.rate))
+                at = began + round((now - first) / self._order.rate)
+                self._stopping.wait(max(at - time.monotonic_ns(), 0) * 1e-9)
+                self._tick(now)
+            if self._stopping.is_set():
+                break
+            if self._order.lockstep is not None:
+                self._tick(due)
+            self._publishers[topic].publish(data)
+            sent += 1
+            self._wait_for_peer()
+        return sent
+
+    def _tick(self, now_ns: int) -> None:
+        if self._clock is not None:
+            self._clock.publish(ClockMessage(clock=conversions.stamp_to_ros(now_ns)))
+
+    def _wait_for_peer(self) -> None:
+        """Waits for the peer's answer: a node takes messages before requests that arrive later."""
+        if self._barrier is None:
+            return
+        future = self._barrier.call_async(GetParameters.Request(names=["use_sim_time"]))
+        self._executor.spin_until_future_complete(future, timeout_sec=PATIENCE_S)
+        if not future.done():
+            raise BackendError(
+                f"node {self._order.lockstep!r}: has not answered for {PATIENCE_S:g} s; it hangs "
+                "or has ended: start it anew."
+            )
+
+
+def play_bag(order: PlayOrder, say: Callable[[str], None]) -> int:
+    """Publishes a bag until its end, SIGINT or SIGTERM; returns the number of published messages.
+
+    They are published as recorded, with the quality of service that their publishers offered.
+    `/clock` gives the times of receipt, as with `ros2 bag play --clock`. `say` is called with a
+    sentence about each topic that is left out.
+
+    Raises:
+        RecordingError: the bag is damaged, lacks a topic, or none of its types is installed.
+        BackendError: the peer in lock-step does not answer.
+    """
+    stopping = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopping.set())
+    with opened(order.bag) as bag:
+        kinds = {topic: bag.types[topic] for topic in _wanted(bag, order)}
+        offers = {topic: bag.offers(topic) for topic in kinds}
+        messages = {topic: bag.serialized(topic) for topic in kinds}
+    context = open_context([], order.domain_id)
+    node = Node("bag_player", context=context, start_parameter_services=False)
+    try:
+        player = _Player(node, order, stopping)
+        played = {t: m for t, m in messages.items() if player.offer(t, kinds[t], offers[t])}
+        for topic in sorted(kinds.keys() - played.keys()):
+            say(f"left out: {topic} is of {kinds[topic]}, whose package is not installed.")
+        timed = _in_order(played)
+        if not timed:
+            raise RecordingError(f"{order.bag}: holds nothing that can be played here.")
+        player.ready()
+        sent = player.play(timed)
+        while order.loop and not stopping.is_set():
+            sent += player.play(timed)
+        player.finish()
+        return sent
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def _wanted(bag: BagFile, order: PlayOrder) -> list[str]:
+    names = [name if name.startswith("/") else f"/{name}" for name in order.topics]
+    for name in names:
+        if name not in bag.types:
+            raise RecordingError(f"{bag.place}: has no topic {name!r}; {nearest(name, bag.types)}")
+    return [
+        topic
+        for topic in sorted(names or bag.types)
+        if topic not in bag.empty and not (order.clock and topic == CLOCK)
+    ]
+
+
+def _in_order(messages: Mapping[str, list[tuple[int, bytes]]]) -> list[Timed]:
+    """Returns all messages in the order of receipt, at equal times in that of their topics."""
+    ranked = enumerate(sorted(messages.items()))
+    timed = [(ns, rank, topic, data) for rank, (topic, some) in ranked for ns, data in some]
+    return sorted(timed, key=lambda one: one[:2])

@@ -1,0 +1,235 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from robots import DIRECT
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.identify.excitation import commands_together, levels, unmoved_variables
+from nics_drl_bridge.recording.excite import (
+    PERIOD_S,
+    STILL_S,
+    DrivePlan,
+    Exploration,
+    Pattern,
+    expected_motion,
+)
+from nics_drl_bridge.recording.recording import samples_on_one_clock
+from nics_drl_bridge.recording.textbook import integrate
+from nics_drl_bridge.robot.kinds import textbook
+from nics_drl_bridge.robot.spec import load_robot
+
+ROBOTS = [load_robot(name) for name in ("ackermann", "differential", "mecanum")] + [DIRECT]
+STILL = round(STILL_S / PERIOD_S)
+
+CAMPAIGN = pytest.mark.campaign
+SEEDS = [0, *(pytest.param(seed, marks=CAMPAIGN) for seed in (1, 2))]
+PREVIEWS: dict = {}
+
+robots = pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
+
+
+def preview(robot, duration=60.0, speed=1.0, seed=0) -> Pattern:
+    """The pattern of a drive, made once."""
+    key = (robot.name, duration, speed, seed)
+    if key not in PREVIEWS:
+        PREVIEWS[key] = DrivePlan(robot, 2.0, duration, speed, seed).preview()
+    return PREVIEWS[key]
+
+
+@robots
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_whole_robot_keeps_within_its_circle(robot, seed):
+    pattern = preview(robot, seed=seed)
+    away = np.hypot(*pattern.pose[:, :2].T) + robot.footprint_radius
+    assert 0.8 < away.max() <= 2.0
+
+
+@robots
+def test_it_begins_and_ends_at_rest(robot):
+    pattern = preview(robot)
+    assert len(pattern.command) == 60.0 / PERIOD_S
+    assert (pattern.command[:STILL] == 0.0).all()
+    assert np.abs(pattern.command[-STILL:]).max() < 1e-12
+    assert np.abs(pattern.twist[-1]).max() < 1e-3
+
+
+@robots
+@pytest.mark.parametrize("speed", [1.0, pytest.param(0.5, marks=CAMPAIGN)])
+def test_commands_stay_within_a_share_of_the_limits_that_leaves_angles_alone(robot, speed):
+    command = preview(robot, speed=speed).command
+    share = np.array([1.0 if c.unit == "rad" else speed for c in robot.command])
+    assert (command >= share * robot.command_low - 1e-12).all()
+    assert (command <= share * robot.command_high + 1e-12).all()
+    width = share * (robot.command_high - robot.command_low)
+    assert (np.ptp(command, axis=0) > 0.8 * width).all()
+
+
+@robots
+@pytest.mark.parametrize("duration", [20.0, 60.0])
+def test_every_command_is_moved_by_the_rules_that_a_fit_judges_a_drive_by(robot, duration):
+    pattern = preview(robot, duration)
+    t = pattern.period * np.arange(len(pattern.command))
+    none = np.zeros((len(t), 0))
+    stateless = robot.model_copy(update={"state": ()})
+    samples = samples_on_one_clock(t, pattern.pose[:-1], none, pattern.command)
+    assert unmoved_variables(samples, stateless) == ()
+    assert commands_together(samples, stateless) == ()
+    assert set(levels(samples, stateless).values()) == {10}
+    # Each also changes while the others are held: on its own.
+    changes = np.abs(np.diff(pattern.command, axis=0)) > 1e-9
+    alone = changes & (changes.sum(axis=1) == 1)[:, None]
+    assert alone.any(axis=0).all()
+    assert (changes.sum(axis=1) == len(robot.command)).any()
+
+
+def test_a_robot_that_can_reverse_does():
+    command = preview(load_robot("mecanum")).command
+    assert (command.min(axis=0) < -0.5).all()
+
+
+def test_a_seed_tells_a_drive():
+    one, other = (preview(ROBOTS[0], 20.0, seed=seed).command for seed in (0, 1))
+    same = DrivePlan(ROBOTS[0], 2.0, 20.0).preview().command
+    assert np.array_equal(one, same)
+    assert not np.array_equal(one, other)
+
+
+def drive_another(robot, really, gain, seed):
+    """Greatest distance of a robot that moves otherwise than expected, and is watched."""
+    drive = DrivePlan(robot, bound=2.0, duration=60.0, seed=seed).begin()
+    motion = expected_motion(really)
+    pose, state, away = np.zeros((1, 3)), np.zeros((1, motion.size)), 0.0
+    while not drive.done:
+        command = gain * drive.next()
+        poses, states = motion.roll(pose, state, command[None, None], PERIOD_S)
+        pose, state = poses[:, -1], states[:, -1]
+        drive.see(pose[0])
+        away = max(away, float(np.hypot(*pose[0, :2])))
+    return away + robot.footprint_radius
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "changes", "gain"),
+    [
+        ("ackermann", {"wheelbase": 0.24, "speed_lag": 0.2}, (1.1, 1.0)),
+        ("ackermann", {"wheelbase": 0.17, "steering_lag": 0.2}, (0.8, 1.0)),
+        ("differential", {"track": 0.25, "wheel_lag": 0.2}, (1.1, 0.9)),
+        ("mecanum", {"wheel_lag": 0.2}, (1.2, 0.8, 1.2)),
+    ],
+)
+def test_a_robot_that_moves_otherwise_than_expected_is_kept_within_too(name, changes, gain, seed):
+    robot = load_robot(name)
+    really = robot.model_copy(update={"parameters": {**robot.parameters, **changes}})
+    assert drive_another(robot, really, np.array(gain), seed) <= 2.0
+
+
+@pytest.mark.slow
+def test_without_being_watched_such_a_robot_would_leave(monkeypatch):
+    robot = load_robot("ackermann")
+    really = robot.model_copy(update={"parameters": {**robot.parameters, "wheelbase": 0.24}})
+    monkeypatch.setattr(Exploration, "see", lambda *_: None)
+    assert any(drive_another(robot, really, np.array([1.1, 1.0]), seed) > 2.0 for seed in range(3))
+
+
+def test_what_is_seen_moves_the_expected_pose():
+    drive = DrivePlan(ROBOTS[1]).begin()
+    while not np.hypot(*drive.pose[:2]) > 0.1:
+        before = drive.pose
+        drive.next()
+    step = geometry.between(before, drive.pose)
+    drive.see(np.array([5.0, 0.0, 1.0]))
+    assert geometry.between([5.0, 0.0, 1.0], drive.pose) == pytest.approx(step)
+
+
+CAR = load_robot("ackermann")
+
+
+def test_the_drive_that_begins_is_the_one_that_was_previewed():
+    plan = DrivePlan(CAR, bound=1.2, duration=20.0, seed=1)
+    drive = plan.begin()
+    commands = [drive.next() for _ in plan.preview().command]
+    assert drive.done
+    assert np.array_equal(commands, plan.preview().command)
+
+
+@pytest.mark.parametrize("bound", [0.2, pytest.param(0.6, marks=pytest.mark.slow)])
+def test_a_circle_in_which_a_car_can_not_turn_is_refused(bound):
+    with pytest.raises(ConfigError, match=f"bound {bound}.*too small.*more space"):
+        DrivePlan(CAR, bound=bound).preview()
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"bound": 0.1}, "bound 0.1: must be from 0.15 to 1000"),
+        ({"bound": float("nan")}, "bound nan: must be from"),
+        ({"duration": 5.0}, "duration 5: must be from 20 to 3600"),
+        ({"speed": 0.0}, "speed 0: must be from 0.05 to 1"),
+        ({"speed": 1.5}, "speed 1.5: must be from"),
+        ({"seed": -1}, "seed -1: must be a whole number from 0"),
+    ],
+)
+def test_a_value_out_of_range_is_named_with_its_range(changes, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        DrivePlan(CAR, **changes)
+
+
+@pytest.fixture
+def quarter_circle():
+    """A turn to the left of radius 2 m at 1 m/s, within pi seconds."""
+    turn = np.tile([1.0, 0.0, 0.5], (100, 1))
+    poses = [np.zeros(3)]
+    for twist in turn:
+        poses.append(geometry.compose(poses[-1], geometry.exp(twist * np.pi / 100)))
+    return Pattern(np.pi / 100, turn[:, [0, 2]], np.array(poses), bound=3.5, footprint=0.5)
+
+
+def test_it_tells_duration_path_speeds_and_space(quarter_circle):
+    assert quarter_circle.duration == pytest.approx(np.pi)
+    assert quarter_circle.speed == pytest.approx(np.ones(100))
+    assert quarter_circle.twist[:, 2] == pytest.approx(np.full(100, 0.5))
+    assert quarter_circle.box == pytest.approx(np.array([[-0.5, -0.5], [2.5, 2.5]]))
+    assert quarter_circle.reach == pytest.approx(2.0 * np.sqrt(2.0) + 0.5)
+
+
+def test_its_lines_hold_what_somebody_has_to_know(quarter_circle):
+    drive, space, bound = quarter_circle.lines()
+    assert "3 s: a path of 3.1 m, up to 1.00 m/s and 0.50 rad/s" in drive
+    assert "x -0.50 to +2.50 m and y -0.50 to +2.50 m" in space
+    assert "circle of 3.5 m" in bound
+
+
+PERIOD_S = 0.05
+
+
+@pytest.mark.parametrize("name", ["ackermann", "differential", "mecanum"])
+def test_it_is_the_textbook_but_for_a_centimetre(name):
+    spec = load_robot(name)
+    rng = np.random.default_rng(0)
+    held = rng.uniform(spec.command_low, spec.command_high, (3, 10, len(spec.command)))
+    command = np.repeat(held, 8, axis=1)
+    pose, state = np.zeros((3, 3)), np.zeros((3, len(spec.state)))
+    poses, states = expected_motion(spec).roll(pose, state, command, PERIOD_S)
+    assert poses.shape == (3, 81, 3)
+    for n in range(80):
+        pose, state = integrate(textbook(spec), pose, state, command[:, n], PERIOD_S)
+        assert states[:, n + 1] == pytest.approx(state)
+    assert np.hypot(*(poses[:, -1] - pose)[:, :2].T).max() < 0.01
+
+
+def test_without_a_textbook_cmd_vel_is_the_twist():
+    poses, states = expected_motion(DIRECT).roll(
+        np.zeros((1, 3)), np.zeros((1, 0)), np.tile([1.0, -0.5, 0.0], (1, 20, 1)), PERIOD_S
+    )
+    assert poses[0, -1] == pytest.approx([1.0, -0.5, 0.0])
+    assert states.shape == (1, 21, 0)
+
+
+def test_a_steering_angle_without_a_textbook_can_not_be_predicted():
+    car = load_robot("ackermann").model_copy(update={"textbook": None})
+    with pytest.raises(ConfigError, match=r"'steering_command' in rad.*add `textbook:`"):
+        expected_motion(car)
