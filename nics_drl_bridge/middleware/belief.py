@@ -1,7 +1,4 @@
-"""State of the filter at a time, and its prediction.
-
-Bounds on the motion of a robot while none of its data could be used.
-"""
+"""State of the filter at a time, and bounds on motion that none of a robot's data showed."""
 
 from __future__ import annotations
 
@@ -16,16 +13,16 @@ from nics_drl_bridge.generator import SimulatorModel
 
 Array = NDArray[np.float64]
 
+JITTER_S = 0.2
+"""Uncertainty of the unobserved time: transmission takes longer now and then [s]."""
+MARGIN = 1.2
+"""Factor by which odometry, through noise or slip, may exceed the greatest speed."""
+LEVELS, MOST_CORNERS = 3, 4096
+"""Values tried per variable for the greatest speed, and greatest number of combinations."""
+
 
 class Anchor(NamedTuple):
-    """The newest odometry, and the state of the filter after it.
-
-    Attributes:
-        time_ns: of the odometry [ns].
-        odom: (3,) its pose in `odom`.
-        mean: (3 + S,) see `Belief`.
-        covariance: (3 + S, 3 + S).
-    """
+    """The newest odometry: time [ns], pose in `odom` (3,), mean and covariance after it."""
 
     time_ns: int
     odom: Array
@@ -74,24 +71,15 @@ def parted(covariance: Array) -> Array:
     return copied
 
 
-JITTER_S = 0.2
-"""Uncertainty of the unobserved time: transmission takes longer now and then [s]."""
-MARGIN = 1.2
-"""Factor by which odometry, through noise or slip, may exceed the greatest speed."""
-LEVELS, MOST_CORNERS = 3, 4096
-"""Values tried per variable for the greatest speed, and greatest number of combinations."""
-
-
 def greatest_twist(model: SimulatorModel) -> tuple[float, float]:
     """Greatest speed [m/s] and turn rate [rad/s] of a model within the ranges of its RobotSpec."""
     ranges = [(v.min, v.max) for v in (*model.robot.state, *model.robot.command)]
     levels = LEVELS if LEVELS ** len(ranges) <= MOST_CORNERS else 2
-    values = [np.linspace(low, high, levels) for low, high in ranges]
     if levels ** len(ranges) > MOST_CORNERS:
         low, high = np.array(ranges).T
         tried = np.random.default_rng(0).uniform(low, high, (MOST_CORNERS, len(ranges)))
     else:
-        tried = np.array(list(product(*values)))
+        tried = np.array(list(product(*(np.linspace(*each, levels) for each in ranges))))
     twist = model.kinematics.rates(tried)[:, :3]
     return float(np.hypot(twist[:, 0], twist[:, 1]).max()), float(np.abs(twist[:, 2]).max())
 
@@ -103,7 +91,7 @@ class Unseen:
         model: of the robot.
         process: (3 + S, 3 + S) growth of the filter's covariance per second.
         noise: (3, 3) of the twist that odometry measures.
-        news: (3 + S,) variance of the state after possible news, see `Outcome`; 0 for the pose.
+        news: (3 + S,) variance of the state after possible news, see `Acceptance`; 0 for the pose.
 
     Attributes:
         walk: (3,) variance that a pose by odometry gains in a second [m^2, m^2, rad^2].
@@ -133,12 +121,7 @@ class Unseen:
         return doubted
 
     def bridged(self, anchor: Anchor, odom: Array, seconds: float) -> tuple[Array, Array] | None:
-        """Bridges unobserved motion by odometry.
-
-        Args:
-            anchor: the odometry and estimate before.
-            odom: (3,) pose in `odom` now.
-            seconds: between the two [s].
+        """Bridges unobserved motion from an anchor to the pose (3,) in `odom` some time later [s].
 
         Returns:
             Pose (3,) and its covariance (3, 3); None if the motion is beyond reach: odometry was

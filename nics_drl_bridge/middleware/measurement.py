@@ -1,7 +1,4 @@
-"""Measurements of a robot's sensors, and the estimator's verdicts on them.
-
-Health of a robot's topics, as reported by the diagnostics.
-"""
+"""Measurements of a robot's sensors, the estimator's verdicts on them, and health of the topics."""
 
 from __future__ import annotations
 
@@ -63,12 +60,9 @@ class Acceptance(IntEnum):
 
 
 class Judgement(NamedTuple):
-    """The estimator's verdict on a measurement.
+    """The estimator's verdict on a measurement, with its squared, normalised innovation.
 
-    Attributes:
-        distance: squared, normalised innovation; close to the number of components of the value
-            if the filter is consistent.
-        outcome: whether and how it was used.
+    That distance is close to the number of components of the value if the filter is consistent.
     """
 
     distance: float
@@ -76,15 +70,10 @@ class Judgement(NamedTuple):
 
 
 def checked_covariance(covariance: ArrayLike | None, size: int, least_std: float) -> Array | None:
-    """Returns a covariance (size, size) that the filter can use.
+    """Returns a covariance (size, size) that the filter can use; None if it is unknown.
 
-    Args:
-        covariance: as given by the sensor. All zeros means unknown, as in ROS messages.
-        size: number of measured components.
-        least_std: lower bound on the standard deviation in any direction.
-
-    Returns:
-        The covariance, or None if it is unknown.
+    All zeros means unknown, as in ROS messages. The standard deviation in any direction is raised
+    to `least_std`.
 
     Raises:
         ValueError: it is not a covariance.
@@ -120,8 +109,7 @@ class TopicHealth:
         received: number of accepted data.
         rate_hz: rate of arrivals [1/s]; 0 before the second datum.
         age_s: time since the latest arrival [s], on the clock of the receiver.
-        innovation: squared, normalised innovation of the newest measurement, close to its number
-            of components if the filter is consistent; NaN for topics that correct nothing.
+        innovation: distance of the newest `Judgement`; NaN for topics that correct nothing.
     """
 
     received: int

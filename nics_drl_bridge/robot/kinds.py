@@ -1,4 +1,4 @@
-"""Kinds of robots: textbook kinematics and a drawing for each, found by name, see `registry`."""
+"""Kinds of robots: textbook kinematics and a drawing for each; `spec` finds them by name."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.robot.registry import find_kind, kind_names
-from nics_drl_bridge.robot.spec import RobotSpec, StateVariable
+from nics_drl_bridge.robot.spec import RobotSpec, StateVariable, find_kind, kind_names
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -51,12 +50,9 @@ class Textbook:
 
 @dataclass(frozen=True)
 class Pivot:
-    """A vertical axis about which a wheel is steered.
+    """Vertical axis about which a wheel is steered: its link and joint, and the steering angle.
 
-    Attributes:
-        link: name of the link that carries the wheel.
-        joint: name of its joint; another one than the variable's follows the variable's joint.
-        angle: state variable of the steering angle [rad].
+    A joint of another name than the variable's follows the variable's joint.
     """
 
     link: str
@@ -66,14 +62,14 @@ class Pivot:
 
 @dataclass(frozen=True)
 class Wheel:
-    """A wheel of a drawing; it stands on the ground.
+    """A wheel that stands on the ground.
 
     Attributes:
         name: of its joint.
         place: x, y of its centre in `base_link` [m].
         radius: [m].
-        turns: True if its joint turns, as the state variable of that name tells.
-        pivot: by which it is steered; None for a wheel that is not.
+        turns: True if its joint turns by the state variable of that name.
+        pivot: None for a wheel that is not steered.
     """
 
     name: str
@@ -100,12 +96,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class RobotKind:
-    """A kind of robot. Both functions raise KeyError for a parameter that the spec lacks.
-
-    Attributes:
-        kinematics: gives the textbook kinematics of a robot.
-        drawing: gives the looks of a robot.
-    """
+    """A kind of robot. Both functions raise KeyError for a parameter that the spec lacks."""
 
     kinematics: Callable[[RobotSpec], Textbook]
     drawing: Callable[[RobotSpec], Drawing]

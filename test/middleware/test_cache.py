@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from nics_drl_bridge.middleware.cache import TopicCache
+from nics_drl_bridge.middleware.middleware import TopicCache
 
 
 def test_only_newer_data_replace_the_newest():

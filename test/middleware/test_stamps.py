@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from nics_drl_bridge.middleware.cache import CLOCK_JUMP, FUTURE_NS, Stamps
+from nics_drl_bridge.middleware.timeline import CLOCK_JUMP, FUTURE_NS, Stamps
 
 SECOND = 1_000_000_000
 
