@@ -9,11 +9,17 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env.actions import check_action, check_command, still, team_space
-from nics_drl_bridge.env.guard import check_options, check_reset, halts_on_error
+from nics_drl_bridge.env.guard import (
+    check_action,
+    check_command,
+    check_reset,
+    give,
+    halts_on_error,
+    override,
+)
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.sim_backend import completed, make_backend
-from nics_drl_bridge.env.task import Episodes, Memory, Task, give, override
+from nics_drl_bridge.env.task import Episodes, Memory, Task, still, team_space
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend, RobotView, Start
@@ -44,7 +50,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     For one robot, `Box(-1, 1, (C,), float32)`: each command of the robot, scaled between its
     limits, for the Ackermann robot speed [m/s] and steering angle [rad]; or `Discrete` with
-    `task_options={"actions": "discrete"}`, see `env.actions.DRIVES`. For M robots, concatenated,
+    `task_options={"actions": "discrete"}`, see `env.task.DRIVES`. For M robots, concatenated,
     `Box(-1, 1, (M C,), float32)` or `MultiDiscrete`.
 
     ## Observation Space
@@ -141,9 +147,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._picture: Any = None
         if isinstance(backend, str):
             robots = self.robots if self.robots > 1 else None
-            asked = {"estimator": estimator, "robots": robots, "randomisation": randomisation}
-            options = {name: value for name, value in asked.items() if value is not None}
-            options = {**(backend_options or {}), **options}
+            own = {"estimator": estimator, "robots": robots, "randomisation": randomisation}
+            given = {name: value for name, value in own.items() if value is not None}
+            options = {**(backend_options or {}), **given}
             backend = make_backend(backend, self.model, self.world, **options)
         self._backend: Backend = completed(backend, self._row(self._rest))
 
@@ -171,8 +177,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         episodes = Episodes(np.array([episode]), starts[None], self.scene.goals[None])
         self._rehearse(episodes)
         memory = self.task.reset(episodes)
-        check_options(options, memory)
-        override(memory, options)
+        override(memory, options, "start")
         self._view = self._lifted(self._backend.reset(Start(episode, self._row(starts))))
         self.memory = memory
         self.ended = np.zeros(self.robots, np.bool_)

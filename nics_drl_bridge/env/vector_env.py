@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
@@ -12,35 +12,25 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env import vector_rows
-from nics_drl_bridge.env.actions import check_action, still, team_space
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
-from nics_drl_bridge.env.guard import check_options, check_reset
+from nics_drl_bridge.env.guard import check_action, check_reset, give, override
 from nics_drl_bridge.env.kernels import episode_seeds
 from nics_drl_bridge.env.registry import make_task
-from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, give, override
-from nics_drl_bridge.env.vector_rows import (
-    EVERY,
-    Rows,
-    VectorFacts,
-    chosen_worlds,
-    flat,
-    joined,
-    mode_of,
-    named_seeds,
-    over_robots,
-)
+from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, still, team_space, total
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import NS_PER_S, RobotView
-from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.lidar.shapes import BODY
-from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
+Facts = Mapping[str, Any]
+"""Name -> array whose first dimension is the world, or another such mapping."""
+Rows = slice | NDArray[np.intp] | Flags
+MODES = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
 
 
 class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
@@ -72,10 +62,10 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             ignores) or `SameStep` (at once; the last observation is in `info["final_obs"]`).
         copy: True if the caller may keep what `step` returns. False reuses the array of the
             observation in the next step.
-        renderer: `baked` or `exact` lidar.
-        threads: of the simulator; the numbers do not depend on it.
-        randomisation: quantities drawn in each episode, see `BridgeEnv`.
         render_mode: `rgb_array`, of every world, or None.
+        simulation: further arguments of the FastSimulator: `renderer` (`baked` by default, or
+            `exact`), `threads`, on which the numbers do not depend, and `randomisation`, the
+            quantities drawn in each episode, see `BridgeEnv`.
 
     Raises:
         ConfigError, ModelError: an unknown name or a wrong file.
@@ -97,16 +87,18 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         max_episode_steps: int = 300,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         copy: bool = True,
-        renderer: Renderer = "baked",
-        threads: int = 1,
-        randomisation: str | Randomisation | None = None,
+        *,
         render_mode: str | None = None,
+        **simulation: Any,
     ) -> None:
         self._pictures: list[Any] = []  # `close` needs it even if the rest raises
         check_render_mode(render_mode, self.metadata)
         self.num_envs, self.render_mode = num_envs, render_mode
         self._limit, self.copy = max_episode_steps, copy
-        self._mode = mode_of(autoreset_mode)
+        mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
+        if mode not in MODES:
+            raise ConfigError(f"autoreset_mode {mode!r}: must be one of {', '.join(MODES)}.")
+        self._mode = MODES[mode]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.model = open_model(model) if isinstance(model, str) else model
         self.world = load_world(world) if isinstance(world, str) else world
@@ -116,12 +108,11 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self.single_action_space = team_space(self.task.action_space, self.robots)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.simulator = FastSimulator(
-            self.model, self.world, num_envs, self.robots, renderer, threads, randomisation
-        )
+        simulation = {"renderer": "baked", **simulation}
+        self.simulator = FastSimulator(self.model, self.world, num_envs, self.robots, **simulation)
         self._each = (num_envs, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
-        self._facts = VectorFacts(self.simulator, round(self.model.control_period * NS_PER_S))
+        self._period_ns = round(self.model.control_period * NS_PER_S)
         self._allocate()
 
     def _allocate(self) -> None:
@@ -174,8 +165,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         rows = np.flatnonzero(chosen)
         self._begin(rows, self._out, options)
         infos: dict[str, Any] = {}
-        facts = self._known(rows) | self._facts.beginnings(self._starts, self._bodies, rows)
-        vector_rows.put_rows(infos, facts, rows, self.num_envs)
+        put_rows(infos, self._known(chosen) | self._beginnings(chosen), chosen)
         self.ready = True
         return flat(self._out.copy() if self.copy else self._out), infos
 
@@ -196,8 +186,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._bodies[worlds] = scenes.bodies
         self._starts[worlds] = self.simulator.data.pose[worlds]
         fresh = self.task.reset(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))
-        check_options(options, fresh, more=("reset_mask",))
-        override(fresh, options)
+        override(fresh, options, "start", "reset_mask")
         for name, rows in fresh.items():
             if name not in self.memory:
                 self.memory[name] = np.zeros((self.num_envs, *rows.shape[1:]), rows.dtype)
@@ -225,10 +214,10 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         )
         terminated = self.ended.all(axis=1) & ~begun
         truncated = (self.simulator.data.steps >= self._limit) & ~begun
-        reward = np.where(begun, 0.0, over_robots(self._reward))
+        reward = np.where(begun, 0.0, total(self._reward))
         over = terminated | truncated
         infos: dict[str, Any] = {}
-        facts = self._facts.of_step(outcome)
+        facts = self._facts_of_step(outcome)
         if self._mode is AutoresetMode.SAME_STEP:
             self._end_at_once(out, over, facts, infos)
         else:
@@ -268,12 +257,13 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self, out: Observation, over: Flags, facts: dict[str, Any], infos: dict[str, Any]
     ) -> None:
         """SAME_STEP: resets the worlds that ended; `infos` gets their last observation and info."""
-        rows = np.flatnonzero(over)
-        if len(rows):
-            infos.update(vector_rows.finals(flat(out), rows))
+        if over.any():
+            shown = np.full(self.num_envs, None, dtype=object)
+            for n in np.flatnonzero(over):  # only those that ended: each needs its own object
+                shown[n] = flat(out)[n].copy()
+            infos["final_obs"], infos["_final_obs"] = shown, over.copy()
             final: dict[str, Any] = {}
-            known = self._known(rows) | vector_rows.rows_of(facts, rows)
-            vector_rows.put_rows(final, known, rows, self.num_envs)
+            put_rows(final, self._known(over) | rows_of(facts, over), over)
             infos["final_info"], infos["_final_info"] = final, over.copy()
             self.simulator.run_parts(
                 lambda part: self._begin(part.start + np.flatnonzero(over[part]), out)
@@ -282,17 +272,47 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
         """Adds to `infos` the facts of every world, and the beginnings of those in `begun`."""
-        vector_rows.put_all(infos, self._known(), np.zeros_like(begun))
-        rows = np.flatnonzero(begun)
-        if len(rows) < self.num_envs:
-            vector_rows.put_all(infos, facts, begun)
-        if len(rows):
-            beginnings = self._facts.beginnings(self._starts, self._bodies, rows)
-            vector_rows.put_rows(infos, beginnings, rows, self.num_envs)
+        put_all(infos, self._known(slice(None)), np.ones_like(begun))
+        if not begun.all():
+            put_all(infos, facts, ~begun)
+        if begun.any():
+            put_rows(infos, self._beginnings(begun), begun)
 
-    def _known(self, rows: Rows = EVERY) -> dict[str, Any]:
-        shown = {name: self.memory[name] for name in self.task.shown}
-        return self._facts.known(shown, rows)
+    # Facts as new arrays (N, ...) of worlds with one robot, or (N, M, ...) of teams.
+
+    def _known(self, rows: Rows) -> dict[str, Any]:
+        """Facts of some worlds that are known at any time."""
+        shown = {name: self._row(self.memory[name][rows]).copy() for name in self.task.shown}
+        pose = self._row(self.simulator.data.odom[rows]).copy()
+        ages = np.zeros(len(pose))
+        return {**shown, "pose": pose, "scan_age_s": ages, "odom_age_s": ages.copy()}
+
+    def _beginnings(self, rows: Flags) -> dict[str, Any]:
+        """Facts of episodes that begin, with the values that the randomisation drew."""
+        drawn = {
+            name: self._row(values[rows]) if values.ndim > 1 else values[rows]
+            for name, values in self.simulator.drawn.items()
+        }
+        return {
+            "episode_seed": self.simulator.data.seeds[rows],
+            "start": self._row(self._starts[rows]),
+            "bodies": self._bodies[rows],
+            **({"randomisation": drawn} if drawn else {}),
+        }
+
+    def _facts_of_step(self, outcome: Outcome) -> dict[str, Any]:
+        """Facts of a step, for every world."""
+        data = self.simulator.data
+        return {
+            "stamp_ns": data.steps * self._period_ns,
+            "true_pose": self._row(data.pose).copy(),
+            "true_collision": self._row(data.collided).astype(np.bool_),
+            **{name: self._row(values).copy() for name, values in outcome.info.items()},
+            "reward_terms": {name: self._row(t).copy() for name, t in outcome.terms.items()},
+        }
+
+    def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
+        return rows[:, 0] if self.robots == 1 else rows
 
     def render(self) -> tuple[Any, ...] | None:
         """Draws every world; see Gymnasium."""
@@ -314,3 +334,108 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """Closes the pictures."""
         for picture in self._pictures:
             picture.close()
+
+
+def flat(observations: Observation) -> Observation:
+    """Concatenates the observations of each world's robots to (N, M O), without a copy."""
+    return observations.reshape(len(observations), -1)
+
+
+def joined(parts: Sequence[Outcome]) -> Outcome:
+    """Joins the outcomes of consecutive parts of the worlds."""
+    if len(parts) == 1:
+        return parts[0]
+
+    def join(one: Callable[[Outcome], dict[str, Any]]) -> dict[str, Any]:
+        return {name: np.concatenate([one(part)[name] for part in parts]) for name in one(parts[0])}
+
+    ended = np.concatenate([part.ended for part in parts])
+    return Outcome(join(lambda part: part.terms), ended, join(lambda part: part.info))
+
+
+def chosen_worlds(options: dict[str, Any] | None, count: int) -> Flags:
+    """Mask (N,) of the worlds to reset. Raises ConfigError for a wrong `reset_mask`."""
+    if not options or "reset_mask" not in options:
+        return np.ones(count, np.bool_)
+    chosen = np.asarray(options["reset_mask"])
+    if chosen.shape != (count,) or chosen.dtype != np.bool_ or not chosen.any():
+        raise ConfigError(
+            f"options['reset_mask'] of shape {chosen.shape}, {chosen.dtype}: must be ({count},) "
+            "bool with at least one True."
+        )
+    return chosen.copy()
+
+
+def named_seeds(
+    seed: int | Sequence[int | None] | None, chosen: Flags, unnamed: Flags, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], Flags]:
+    """Seeds (N,) that a reset gives to worlds, and a mask (N,) of those that begin anew with them.
+
+    The seed is that of the first world, or of each (None keeps its present one), or None for all.
+    For `chosen` worlds that are `unnamed`, as they never had a seed, one is drawn if none is given.
+
+    Raises:
+        ConfigError: wrong number of seeds, or a negative one.
+    """
+    count = len(chosen)
+    if isinstance(seed, Sequence | np.ndarray):
+        if len(seed) != count:
+            raise ConfigError(f"{len(seed)} seeds for {count} worlds; give one each.")
+        given = chosen & np.array([one is not None for one in seed])
+        seeds = np.array([0 if one is None else one for one in seed], np.int64)
+    else:
+        given = chosen & (seed is not None)
+        seeds = (seed or 0) + np.arange(count, dtype=np.int64)
+    new = chosen & unnamed & ~given
+    if new.any():
+        seeds = np.where(new, int(rng.integers(2**31)) + np.arange(count), seeds)
+    fresh = given | new
+    if (seeds[fresh] < 0).any():
+        raise ConfigError("a seed must not be negative.")
+    return seeds, fresh
+
+
+def put_all(infos: dict[str, Any], facts: Facts, mask: Flags) -> None:
+    """Adds facts of all worlds (N, ...), which it takes over; zero outside a mask, as Gymnasium.
+
+    Each has its mask, `_name`.
+    """
+    without = np.flatnonzero(~mask)
+
+    def cleared(values: NDArray[Any]) -> NDArray[Any]:
+        if len(without):
+            values[without] = 0
+        return values
+
+    _put(infos, facts, mask, cleared)
+
+
+def put_rows(infos: dict[str, Any], facts: Facts, mask: Flags) -> None:
+    """Adds facts (n, ...) of the worlds of a mask (N,); the rows of the others are zero."""
+
+    def spread(values: NDArray[Any]) -> NDArray[Any]:
+        rows = np.zeros((len(mask), *values.shape[1:]), values.dtype)
+        rows[mask] = values
+        return rows
+
+    _put(infos, facts, mask, spread)
+
+
+def _put(
+    infos: dict[str, Any], facts: Facts, mask: Flags, placed: Callable[[NDArray[Any]], NDArray[Any]]
+) -> None:
+    for name, values in facts.items():
+        if isinstance(values, Mapping):
+            infos[name] = {}
+            _put(infos[name], values, mask, placed)
+        else:
+            infos[name] = placed(values)
+        infos[f"_{name}"] = mask.copy()
+
+
+def rows_of(facts: Facts, mask: Flags) -> dict[str, Any]:
+    """The same facts of some worlds only."""
+    return {
+        name: rows_of(values, mask) if isinstance(values, Mapping) else values[mask]
+        for name, values in facts.items()
+    }

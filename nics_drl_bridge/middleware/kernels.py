@@ -45,7 +45,7 @@ class Motion(NamedTuple):
 
 
 class Log(NamedTuple):
-    """Commands (K, C) and the times at which they take effect [ns] (K,), of which `used` are used."""
+    """Commands (K, C) and when they take effect [ns] (K,); the first `used` rows count."""
 
     effective: NDArray[np.int64]
     commands: Array

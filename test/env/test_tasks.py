@@ -10,10 +10,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
 from robots import DIRECT, direct_model, field, lidar
 
-from nics_drl_bridge.env.actions import DRIVES, discrete_commands, still
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import ENVIRONMENTS, TASK, make_task
-from nics_drl_bridge.env.task import bearing, distance
+from nics_drl_bridge.env.task import DRIVES, bearing, discrete_commands, distance, still
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.spec import load_robot
