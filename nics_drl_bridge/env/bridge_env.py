@@ -38,13 +38,12 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     ## Description
 
-    A robot with a lidar stands in a walled field among obstacles and has a task: to reach a goal
-    (`NicsBridge/Navigation-v0`), to reach several goals as a team
-    (`NicsBridge/CooperativeReaching-v0`), to catch others or escape them
-    (`NicsBridge/PursuitEvasion-v0`), or a task of your own (`NicsBridge/Task-v0`). The robot is
-    either simulated in this process (`backend="sim"`) or whatever is behind the ROS 2 topics
-    `cmd_vel`, `scan` and `odom` (`backend="dds"`): a simulator node or the vehicle. Task, spaces
-    and numbers are the same.
+    A robot with a lidar stands in a walled field among obstacles and has a task, whose class
+    documents observation, reward and end: `Navigation` (`NicsBridge/Navigation-v0`),
+    `CooperativeReaching` and `PursuitEvasion` for teams, or your own (`NicsBridge/Task-v0`). The
+    robot is either simulated in this process (`backend="sim"`) or whatever is behind the ROS 2
+    topics `cmd_vel`, `scan` and `odom` (`backend="dds"`): a simulator node or the vehicle. Task,
+    spaces and numbers are the same.
 
     ## Action Space
 
@@ -55,24 +54,13 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     ## Observation Space
 
-    `Box((O,), float32)`, or `Box((M O,), float32)` for a team, robot by robot, which
-    `observation.reshape(M, O)` separates; the docstring of the task's class (`Navigation`,
-    `CooperativeReaching`, `PursuitEvasion`) lists the parts with their units. Those of the
-    navigation task, B beams:
-
-    | Num | Observation | Min | Max | Unit |
-    |---|---|---|---|---|
-    | 0 to B - 1 | range as a share of the maximum; 1 free, 0 too close or unknown | 0 | 1 | - |
-    | B | distance to the goal | 0 | 1000 | m |
-    | B + 1, B + 2 | cosine, sine of the bearing of the goal | -1 | 1 | - |
-    | B + 3, B + 4 | estimated velocity forward, left | -1000 | 1000 | m/s |
-    | B + 5 | estimated turn rate | -1000 | 1000 | rad/s |
+    The task's `Box((O,), float32)`, or `Box((M O,), float32)` for a team, robot by robot, which
+    `observation.reshape(M, O)` separates.
 
     ## Rewards
 
     The sum of the terms in `info["reward_terms"]`, and over the robots of a team, whose terms are
-    arrays (M,). Navigation: `progress`, 1 per metre of approach; `time`, -0.01 per step;
-    `success`, 10 at the goal; `collision`, -10 at a contact.
+    arrays (M,).
 
     ## Starting State
 
@@ -82,10 +70,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     ## Episode End
 
-    Terminated when the task has ended for every robot: navigation ends when the goal is nearer
-    than 0.3 m or something touches the footprint, both judged from the robot's own estimate and
-    scan. A robot of a team that ended earlier stands still. Truncated after 300 steps, unless
-    `gymnasium.make` is given another `max_episode_steps`.
+    Terminated when the task has ended for every robot; a robot of a team that ended earlier stands
+    still. Truncated after 300 steps, unless `gymnasium.make` is given another `max_episode_steps`.
 
     ## Arguments
 

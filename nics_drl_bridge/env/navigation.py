@@ -59,12 +59,6 @@ class Navigation(Task):
 
     The goal is nearer than 0.3 m, or something touches the footprint, both judged from the robot's
     own estimate and scan. A contact at the goal is no success.
-
-    Attributes:
-        goal_radius: distance at which the goal is reached [m].
-        success_reward, collision_reward: for such an end.
-        progress_reward: per metre of approach.
-        time_reward: per step.
     """
 
     keeps_last_scan: ClassVar[bool] = False

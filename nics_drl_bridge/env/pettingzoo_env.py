@@ -41,17 +41,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
 
     ## Arguments
 
-    Args:
-        model: a SimulatorModel, its folder, or the name of a shipped robot.
-        world: a World, its YAML file, or the name of a shipped one.
-        task: a name, `path/to/file.py:ClassName`, a class, or a Task.
-        task_options: further arguments of the task's class.
-        max_episode_steps: an episode is truncated after this many steps.
-        randomisation: quantities drawn in each episode, see `BridgeEnv`.
-        render_mode: `rgb_array`, `human` or None.
-
-    Raises:
-        ConfigError, ModelError: an unknown name or a wrong file.
+    Those of `BridgeEnv`, and `max_episode_steps`, after which an episode is truncated.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo's own declaration

@@ -41,8 +41,7 @@ class Episodes:
     """Episodes at their start, in n worlds with M robots.
 
     Attributes:
-        seeds: (n,) of each episode. All that a task draws must follow from them, see
-            `random_kernels.uniform`.
+        seeds: (n,); all that a task draws must follow from them, see `random_kernels.uniform`.
         starts: (n, M, 3) poses of the robots: x [m], y [m], heading [rad] in `map`.
         goals: (n, M, 2) free points that the world drew, one per robot [m].
     """
@@ -68,10 +67,7 @@ class Outcome:
 class Sight:
     """Meaning of the scan parts of an observation.
 
-    Attributes:
-        angles: (P,) direction of each part, counter-clockwise, in `base_link` [rad].
-        origin: (2,) origin of the rays, in `base_link` [m].
-        range_max: range that a share of 1 stands for [m].
+    Direction (P,) [rad] and origin (2,) [m] of the rays in `base_link`, range of a share of 1 [m].
     """
 
     angles: Array
@@ -215,7 +211,7 @@ class Task(ABC):
     def _look(self, ranges: NDArray[np.float32]) -> tuple[Observation, Flags]:
         ranges = np.ascontiguousarray(ranges, np.float32)
         rows = ranges.reshape(-1, ranges.shape[-1])
-        parts, count = self.scan_parts, len(rows)
+        parts, count = rows.shape[-1] if self.scan is None else self.scan.sectors, len(rows)
         shares, touched = np.empty((count, parts), np.float32), np.empty(count, np.bool_)
         kernels.looks(shares, touched, rows, self.scale)
         lead = ranges.shape[:-1]

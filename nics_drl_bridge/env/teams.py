@@ -89,15 +89,7 @@ class CooperativeReaching(Task):
     ## Episode End
 
     For a robot when it touches something; it then stands still as another obstacle. For all
-    when the last goal is reached.
-
-    Attributes:
-        robots: M.
-        goal_radius: distance at which a goal is reached [m].
-        reached_reward: of the team, for each goal.
-        collision_reward: of a robot, for a contact.
-        progress_reward: per metre of approach.
-        time_reward: per step.
+    when the last goal is reached: a robot is within `goal_radius` [m] of it.
     """
 
     keeps_last_scan: ClassVar[bool] = False
@@ -224,17 +216,9 @@ class PursuitEvasion(Task):
 
     ## Episode End
 
-    For an evader when a pursuer's centre is nearer than the capture distance; for any robot when
-    it touches something otherwise; it then stands still as another obstacle. For all when all
-    evaders, or all pursuers, are out. The pursuers succeed when every evader is caught.
-
-    Attributes:
-        pursuers, evaders: P and E.
-        capture_gap: free space between two footprints at which an evader is caught [m].
-        capture_reward: for each capture.
-        collision_reward: for a contact.
-        pursuit_reward: per metre.
-        time_reward: per step of a pursuer; the negative of it for an evader.
+    For an evader when the free space between it and a pursuer is below `capture_gap` [m]; for any
+    robot when it touches something otherwise; it then stands still as another obstacle. For all when
+    all evaders, or all pursuers, are out. The pursuers succeed when every evader is caught.
     """
 
     keeps_last_scan: ClassVar[bool] = False
@@ -285,17 +269,13 @@ class PursuitEvasion(Task):
         caught = ~self.pursues & (chased < reach) & ~memory["out"]
         memory["newly"][...] = caught
         memory["caught"] |= caught
-        memory["out"] |= caught | self._touches(after, memory)
+        memory["out"] |= caught | self._collided(after, memory)
 
     def _gaps(self, view: RobotView, memory: Memory) -> Array:
         """(..., M) [m] to the nearest robot of the other side that is not out; inf without one."""
         between = distances(view.pose, view.pose[..., :2])
         foe = (self.pursues[:, None] != self.pursues) & ~memory["out"][..., None, :]
         return np.asarray(np.where(foe, between, np.inf).min(axis=-1))
-
-    def _touches(self, view: RobotView, memory: Memory) -> Flags:
-        """True for a contact that is no capture, of a robot whose episode continues."""
-        return self.touches(view.ranges) & ~memory["newly"] & ~memory["out"]
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
         """The observation (..., M, O) of views (..., M)."""
@@ -330,6 +310,7 @@ class PursuitEvasion(Task):
         }
 
     def _collided(self, view: RobotView, memory: Memory) -> Flags:
+        """True for a contact that is no capture."""
         return np.asarray(self.touches(view.ranges) & ~memory["newly"])
 
     def end(self, view: RobotView, memory: Memory) -> Flags:

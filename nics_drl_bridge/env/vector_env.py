@@ -53,10 +53,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     Args:
         num_envs: N.
-        model: a SimulatorModel, its folder, or the name of a shipped robot.
-        world: a World, its YAML file, or the name of a shipped one.
-        task: a name, `path/to/file.py:ClassName`, a class, or a Task.
-        task_options: further arguments of the task's class.
+        model, world, task, task_options: see `BridgeEnv`.
         max_episode_steps: an episode is truncated after this many steps.
         autoreset_mode: `NextStep` (an ended world is reset in the next step, whose action it
             ignores) or `SameStep` (at once; the last observation is in `info["final_obs"]`).
