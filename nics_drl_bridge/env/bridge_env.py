@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import Any
 
 import gymnasium
@@ -295,10 +294,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if self._view is None or self.scene is None:
             raise gymnasium.error.ResetNeeded("call reset() before render().")
         if self._picture is None:
-            drawing = import_module("nics_drl_bridge.env.rendering")
-            self._picture = drawing.WorldPicture(
-                self.model, self.world, self.render_mode, RENDER_FPS
-            )
+            from nics_drl_bridge.env.rendering import WorldPicture  # loads matplotlib
+
+            self._picture = WorldPicture(self.model, self.world, self.render_mode, RENDER_FPS)
         facts = self._backend.facts()
         poses = np.reshape(facts.get("true_pose", self._view.pose), (self.robots, 3))
         bodies = facts.get("bodies", self.scene.bodies)

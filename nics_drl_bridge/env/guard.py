@@ -7,7 +7,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from functools import wraps
-from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import gymnasium
 import numpy as np
@@ -16,30 +16,18 @@ from numpy.typing import NDArray
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.errors import ConfigError, nearest
 
-
-class Halting(Protocol):
-    """Anything with a robot that can be stopped."""
-
-    def halt(self) -> None:
-        """Stops the robot with a zero command."""
-        ...
-
-
 P = ParamSpec("P")
-H = TypeVar("H", bound=Halting)
 T = TypeVar("T")
 
 
-def halts_on_error(
-    method: Callable[Concatenate[H, P], T],
-) -> Callable[Concatenate[H, P], T]:
-    """Makes a method halt its object's robot if any exception leaves it, including Ctrl-C.
+def halts_on_error(method: Callable[Concatenate[Any, P], T]) -> Callable[Concatenate[Any, P], T]:
+    """Makes a method `halt` its object's robot if any exception leaves it, including Ctrl-C.
 
     An error of `halt` itself is raised with the first one as its context.
     """
 
     @wraps(method)
-    def guarded(self: H, /, *args: P.args, **kwargs: P.kwargs) -> T:
+    def guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
         try:
             return method(self, *args, **kwargs)
         except BaseException:

@@ -38,7 +38,7 @@ class ScanScale(NamedTuple):
     plan: Any
 
 
-class Progress(NamedTuple):
+class GoalProgress(NamedTuple):
     """Outcome of a step of the navigation task.
 
     Attributes:
@@ -125,7 +125,7 @@ def bearing(pose, x, y):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def navigate(out, progress, before, pose, twist, ranges, goals, scale, radius):  # type: ignore[no-untyped-def]
-    """Writes observations (R, P + 6), see `navigation.Navigation`, and a `Progress`.
+    """Writes observations (R, P + 6), see `navigation.Navigation`, and a `GoalProgress`.
 
     Poses before and after the step (R, 3), twists (R, 3), scans (R, B), goals (R, 2) and their
     radius [m].

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
-from nics_drl_bridge.env.kernels import LIMIT, Progress
+from nics_drl_bridge.env.kernels import LIMIT, GoalProgress
 from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Outcome, Task, distance
 from nics_drl_bridge.interface import RobotView
 
@@ -87,10 +87,6 @@ class Navigation(Task):
         self._see(out, view.pose, view, memory)
         return out
 
-    def observe_into(self, out: Observation, view: RobotView, memory: Memory) -> None:
-        """Writes the observation into (..., B + 6), which is contiguous."""
-        self._see(out, view.pose, view, memory)
-
     def judge(self, view: RobotView, memory: Memory) -> NavigationVerdict:
         """Judges which robots are at their goals, and which touch something."""
         near = distance(view.pose, memory["goal"])
@@ -125,7 +121,7 @@ class Navigation(Task):
         lead = view.pose.shape[:-1]
         approach = np.empty(lead)
         reached, touched = np.empty(lead, np.bool_), np.empty(lead, np.bool_)
-        progress = Progress(approach.reshape(-1), reached.reshape(-1), touched.reshape(-1))
+        progress = GoalProgress(approach.reshape(-1), reached.reshape(-1), touched.reshape(-1))
         kernels.navigate(
             out.reshape(-1, out.shape[-1]), progress, before.reshape(-1, 3),
             view.pose.reshape(-1, 3), view.twist.reshape(-1, 3),

@@ -165,10 +165,6 @@ class Task(ABC):
         kernels.commands(out.reshape(rows.shape), rows, low, high)
         return out
 
-    def observe_into(self, out: Observation, view: RobotView, memory: Memory) -> None:
-        """Writes the observation into (..., O)."""
-        out[...] = self.observation(view, memory)
-
     def step_into(
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
     ) -> Outcome:
@@ -177,7 +173,7 @@ class Task(ABC):
         Override it if one pass over the scan gives several of these results.
         """
         self.update(before, after, memory)
-        self.observe_into(out, after, memory)
+        out[...] = self.observation(after, memory)
         terms = self.reward(before, after, memory)
         return Outcome(terms, self.end(after, memory), self.info(after, memory))
 

@@ -217,8 +217,8 @@ class PursuitEvasion(Task):
     ## Episode End
 
     For an evader when the free space between it and a pursuer is below `capture_gap` [m]; for any
-    robot when it touches something otherwise; it then stands still as another obstacle. For all when
-    all evaders, or all pursuers, are out. The pursuers succeed when every evader is caught.
+    robot when it touches something otherwise; it then stands still as another obstacle. For all
+    when all evaders, or all pursuers, are out. The pursuers succeed when every evader is caught.
     """
 
     keeps_last_scan: ClassVar[bool] = False

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from importlib import import_module
 from typing import Any
 
 import gymnasium
@@ -158,11 +157,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self.ready = False
         self._first[fresh], self._episode[fresh] = seeds[fresh], -1
         if not chosen.all():  # the others keep their observation
-            self.task.observe_into(self._out, self._view(slice(None)), self.memory)
-        rows = np.flatnonzero(chosen)
-        self._begin(rows, self._out, options)
-        infos: dict[str, Any] = {}
-        put_rows(infos, self._known(chosen) | self._beginnings(chosen), chosen)
+            self._out[...] = self.task.observation(self._view(slice(None)), self.memory)
+        self._begin(np.flatnonzero(chosen), self._out, options)
+        infos = spread(self._known(chosen) | self._beginnings(chosen), chosen)
         self.ready = True
         return flat(self._out.copy() if self.copy else self._out), infos
 
@@ -259,9 +256,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             for n in np.flatnonzero(over):  # only those that ended: each needs its own object
                 shown[n] = flat(out)[n].copy()
             infos["final_obs"], infos["_final_obs"] = shown, over.copy()
-            final: dict[str, Any] = {}
-            put_rows(final, self._known(over) | rows_of(facts, over), over)
-            infos["final_info"], infos["_final_info"] = final, over.copy()
+            final = self._known(over) | mapped(facts, lambda values: values[over])
+            infos["final_info"], infos["_final_info"] = spread(final, over), over.copy()
             self.simulator.run_parts(
                 lambda part: self._begin(part.start + np.flatnonzero(over[part]), out)
             )
@@ -269,11 +265,13 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
         """Adds to `infos` the facts of every world, and the beginnings of those in `begun`."""
-        put_all(infos, self._known(slice(None)), np.ones_like(begun))
+        infos |= masked(self._known(slice(None)), np.ones_like(begun))
+        if not begun.any():
+            infos |= masked(facts, ~begun)
+            return
+        infos |= spread(self._beginnings(begun), begun)
         if not begun.all():
-            put_all(infos, facts, ~begun)
-        if begun.any():
-            put_rows(infos, self._beginnings(begun), begun)
+            infos |= spread(mapped(facts, lambda values: values[~begun]), ~begun)
 
     # Facts as new arrays (N, ...) of worlds with one robot, or (N, M, ...) of teams.
 
@@ -316,11 +314,10 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         if self.render_mode is None:
             return None
         if not self._pictures:
-            drawing = import_module("nics_drl_bridge.env.rendering")
-            self._pictures = [
-                drawing.WorldPicture(self.model, self.world, self.render_mode, RENDER_FPS)
-                for _ in range(self.num_envs)
-            ]
+            from nics_drl_bridge.env.rendering import WorldPicture  # loads matplotlib
+
+            which = (self.model, self.world, self.render_mode, RENDER_FPS)
+            self._pictures = [WorldPicture(*which) for _ in range(self.num_envs)]
         drawn, data, bodies = [], self.simulator.data, self.simulator.obstacles
         for n, picture in enumerate(self._pictures):
             memory = {name: rows[n : n + 1] for name, rows in self.memory.items()}
@@ -343,11 +340,9 @@ def joined(parts: Sequence[Outcome]) -> Outcome:
     if len(parts) == 1:
         return parts[0]
 
-    def join(one: Callable[[Outcome], dict[str, Any]]) -> dict[str, Any]:
-        return {name: np.concatenate([one(part)[name] for part in parts]) for name in one(parts[0])}
-
-    ended = np.concatenate([part.ended for part in parts])
-    return Outcome(join(lambda part: part.terms), ended, join(lambda part: part.info))
+    terms = {name: np.concatenate([part.terms[name] for part in parts]) for name in parts[0].terms}
+    info = {name: np.concatenate([part.info[name] for part in parts]) for name in parts[0].info}
+    return Outcome(terms, np.concatenate([part.ended for part in parts]), info)
 
 
 def chosen_worlds(options: dict[str, Any] | None, count: int) -> Flags:
@@ -392,47 +387,29 @@ def named_seeds(
     return seeds, fresh
 
 
-def put_all(infos: dict[str, Any], facts: Facts, mask: Flags) -> None:
-    """Adds facts of all worlds (N, ...), which it takes over; zero outside a mask, as Gymnasium.
-
-    Each has its mask, `_name`.
-    """
-    without = np.flatnonzero(~mask)
-
-    def cleared(values: NDArray[Any]) -> NDArray[Any]:
-        if len(without):
-            values[without] = 0
-        return values
-
-    _put(infos, facts, mask, cleared)
+def mapped(facts: Facts, function: Callable[[NDArray[Any]], NDArray[Any]]) -> dict[str, Any]:
+    """Applies a function to every array of facts."""
+    return {
+        name: mapped(values, function) if isinstance(values, Mapping) else function(values)
+        for name, values in facts.items()
+    }
 
 
-def put_rows(infos: dict[str, Any], facts: Facts, mask: Flags) -> None:
-    """Adds facts (n, ...) of the worlds of a mask (N,); the rows of the others are zero."""
+def masked(facts: Facts, mask: Flags) -> dict[str, Any]:
+    """Pairs each fact (N, ...) with the mask (N,) of its worlds, `_name`, as Gymnasium does."""
+    paired: dict[str, Any] = {}
+    for name, values in facts.items():
+        paired[name] = masked(values, mask) if isinstance(values, Mapping) else values
+        paired[f"_{name}"] = mask.copy()
+    return paired
 
-    def spread(values: NDArray[Any]) -> NDArray[Any]:
+
+def spread(facts: Facts, mask: Flags) -> dict[str, Any]:
+    """Facts (n, ...) of the worlds of a mask (N,) as rows of all, zero for the others; `masked`."""
+
+    def placed(values: NDArray[Any]) -> NDArray[Any]:
         rows = np.zeros((len(mask), *values.shape[1:]), values.dtype)
         rows[mask] = values
         return rows
 
-    _put(infos, facts, mask, spread)
-
-
-def _put(
-    infos: dict[str, Any], facts: Facts, mask: Flags, placed: Callable[[NDArray[Any]], NDArray[Any]]
-) -> None:
-    for name, values in facts.items():
-        if isinstance(values, Mapping):
-            infos[name] = {}
-            _put(infos[name], values, mask, placed)
-        else:
-            infos[name] = placed(values)
-        infos[f"_{name}"] = mask.copy()
-
-
-def rows_of(facts: Facts, mask: Flags) -> dict[str, Any]:
-    """The same facts of some worlds only."""
-    return {
-        name: rows_of(values, mask) if isinstance(values, Mapping) else values[mask]
-        for name, values in facts.items()
-    }
+    return masked(mapped(facts, placed), mask)

@@ -33,19 +33,15 @@ class Anchor(NamedTuple):
 class Belief(NamedTuple):
     """Complete state of the filter at a time; its arrays are never modified in place.
 
-    Attributes:
-        time_ns: of the belief [ns].
-        mean: (3 + S,) x [m], y [m], heading [rad] in `map`, then the state of the RobotSpec.
-        covariance: (3 + S, 3 + S).
-        outliers: number of consecutive outliers of each kind.
-        anchor: the newest odometry; None before the first.
-        lost: True if the robot may have moved unobserved since the anchor.
+    The mean (3 + S,) is x [m], y [m], heading [rad] in `map`, then the state of the RobotSpec. The
+    consecutive `outliers` are counted by kind. The anchor is None before the first odometry; the
+    robot is `lost` if it may have moved unobserved since.
     """
 
     time_ns: int
     mean: Array
     covariance: Array
-    outliers: tuple[int, int, int]
+    outliers: tuple[int, ...]
     anchor: Anchor | None
     lost: bool
 
@@ -92,15 +88,13 @@ class Unseen:
         process: (3 + S, 3 + S) growth of the filter's covariance per second.
         noise: (3, 3) of the twist that odometry measures.
         news: (3 + S,) variance of the state after possible news, see `Acceptance`; 0 for the pose.
-
-    Attributes:
-        walk: (3,) variance that a pose by odometry gains in a second [m^2, m^2, rad^2].
     """
 
     def __init__(self, model: SimulatorModel, process: Array, noise: Array, news: Array) -> None:
         self._news = news
         self._fastest = greatest_twist(model)
-        # Odometry integrates its twists, so their noise is a random walk with a step each period.
+        # Variance (3,) that a pose by odometry gains in a second [m^2, m^2, rad^2]: it integrates
+        # its twists, so their noise is a random walk with a step each period.
         self.walk = np.diag(process)[:3] + np.diag(noise) * model.control_period
 
     def reach(self, seconds: float) -> tuple[float, float]:
@@ -121,11 +115,9 @@ class Unseen:
         return doubted
 
     def bridged(self, anchor: Anchor, odom: Array, seconds: float) -> tuple[Array, Array] | None:
-        """Bridges unobserved motion from an anchor to the pose (3,) in `odom` some time later [s].
+        """Returns the pose (3,) now, of which odometry has `odom`, and its covariance (3, 3).
 
-        Returns:
-            Pose (3,) and its covariance (3, 3); None if the motion is beyond reach: odometry was
-            restarted, or jumped.
+        None if the motion since the anchor is beyond reach: odometry was restarted, or jumped.
         """
         moved = geometry.between(anchor.odom, odom)
         far, turned = self.reach(seconds)

@@ -10,7 +10,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.belief import Anchor, Belief, Foreseen, Unseen, parted
-from nics_drl_bridge.middleware.kernels import CommandLog, Motion
+from nics_drl_bridge.middleware.kernels import CommandLog, MotionModel
 from nics_drl_bridge.middleware.measurement import (
     Acceptance,
     Judgement,
@@ -51,18 +51,15 @@ LONGEST_GAP_S = 10.0
 class Estimator:
     """Pose and state of one robot, predicted by the fitted model, corrected by measurements.
 
-    Time is in integer nanoseconds, so that the results of the same messages are bit-identical.
-    Measurements apply at the time of the estimate; `replay` inserts late ones at their time.
-
-    Args:
-        model: its kinematics predict, its drift is the Q and its sensors' noise the R of the
-            filter, its latency delays the commands.
+    The model's drift is the Q and its sensors' noise the R of the filter; its latency delays the
+    commands. Time is in integer nanoseconds, so that the results of the same messages are
+    bit-identical. Measurements apply at the time of the estimate; `Timeline` inserts late ones.
     """
 
     def __init__(self, model: SimulatorModel) -> None:
         dt, _, delay = model.timing
         steps = round(dt * NS_PER_S), round(LONGEST_GAP_S * NS_PER_S)
-        self._motion = Motion(term_arrays(model.kinematics), SERIES, *steps)
+        self._motion = MotionModel(term_arrays(model.kinematics), SERIES, *steps)
         self._delay_ns = round(dt * delay * NS_PER_S)
         size = len(model.robot.state)
         reach = np.array([v.max - v.min for v in model.robot.state])
@@ -231,13 +228,12 @@ class Estimator:
     def _bridge(self, odom: Array) -> None:
         """Moves the estimate by the odometry since the anchor, if that is within reach."""
         anchor, self._lost = self._anchor, False
-        if anchor is None:
-            return
-        seconds = (self.time_ns - anchor.time_ns) / NS_PER_S
-        bridged = self.unseen.bridged(anchor, odom, seconds)
-        if bridged is not None:
-            self._jump(*bridged)
-            self._foreseen = None
+        if anchor is not None:
+            seconds = (self.time_ns - anchor.time_ns) / NS_PER_S
+            bridged = self.unseen.bridged(anchor, odom, seconds)
+            if bridged is not None:
+                self._jump(*bridged)
+                self._foreseen = None
 
     def _correct(self, measurement: Measurement) -> Judgement:
         kind, value, noise, _ = measurement
@@ -252,10 +248,11 @@ class Estimator:
         if outcome is Acceptance.OUTLIER:
             self._count(kind, self._outliers[kind] + 1)
             return Judgement(distance, outcome)
+        here = self._foreseen_here if kind is Kind.TWIST and outcome is Acceptance.USED else None
         if kind is Kind.POSE and outcome is Acceptance.JUMP:
             self._jump(value, noise)
-        elif (update := self._update_foreseen(kind, outcome, noise)) is not None:
-            gain, self._filter.P = update
+        elif here is not None and here.update is not None and noise is self._noise[kind]:
+            gain, self._filter.P = here.update
             self._filter.x = self._filter.x + gain.dot(innovation)
         else:
             self._filter.update(
@@ -271,23 +268,18 @@ class Estimator:
         """Returns the expected measurement (n,) and its derivative (n, 3 + S)."""
         if kind is Kind.POSE:
             return self._filter.x[:3], self._observe_pose
-        if self._foreseen is not None and self._foreseen.mean is self._filter.x:
-            twist, derivative = self._foreseen.expected
+        if (here := self._foreseen_here) is not None:
+            twist, derivative = here.expected
         else:
-            twist, derivative = kernels.expect(
-                self._filter.x, self.time_ns, self._motion, self._log.arrays
-            )
+            log = self._log.arrays
+            twist, derivative = kernels.expect(self._filter.x, self.time_ns, self._motion, log)
         return (twist, derivative) if kind is Kind.TWIST else (twist[2:], derivative[2:])
 
-    def _update_foreseen(
-        self, kind: Kind, outcome: Acceptance, noise: Array
-    ) -> tuple[Array, Array] | None:
-        """Returns the update computed in advance, if it is for such a measurement and belief."""
+    @property
+    def _foreseen_here(self) -> Foreseen | None:
+        """The last prediction if it is the present belief."""
         foreseen = self._foreseen
-        if foreseen is None or foreseen.mean is not self._filter.x:
-            return None
-        as_tried = outcome is Acceptance.USED and noise is self._noise[Kind.TWIST]
-        return foreseen.update if kind is Kind.TWIST and as_tried else None
+        return foreseen if foreseen is not None and foreseen.mean is self._filter.x else None
 
     def _surprise(
         self, kind: Kind, innovation: Array, derivative: Array, noise: Array
@@ -303,8 +295,7 @@ class Estimator:
                 self._filter.P = doubtful
                 return Acceptance.NEWS
             if believed:
-                self._filter.P = doubtful
-                self._filter.P = parted(self._filter.P)
+                self._filter.P = parted(doubtful)
         return Acceptance.JUMP if believed else Acceptance.OUTLIER
 
     def _jump(self, pose: Array, noise: Array) -> None:
@@ -315,9 +306,7 @@ class Estimator:
         self._filter.x = mean
 
     def _count(self, kind: Kind, outliers: int) -> None:
-        counts = list(self._outliers)
-        counts[kind] = outliers
-        self._outliers = (counts[0], counts[1], counts[2])
+        self._outliers = tuple(outliers if k == kind else n for k, n in enumerate(self._outliers))
 
 
 def _widened(low: Array, high: Array) -> tuple[Array, Array]:

@@ -1,7 +1,7 @@
 """Compiled parts of the estimator: motion under the commands of the recent past, gates, health.
 
 Shared arguments: `mean` (3 + S,) and `transition` (3 + S, 3 + S), the Jacobian of its motion;
-`begin`, `end` and `now` are times [ns]; `motion` is `Motion`, `log` is `Log`.
+`begin`, `end` and `now` are times [ns]; `motion` is `MotionModel`, `log` is `Log`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ROOM = 128
 """Number of commands for which a log has room at first."""
 
 
-class Motion(NamedTuple):
+class MotionModel(NamedTuple):
     """Model of the motion.
 
     Attributes:

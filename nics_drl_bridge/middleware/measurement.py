@@ -30,14 +30,10 @@ class Kind(IntEnum):
 
 
 class Measurement(NamedTuple):
-    """One measurement.
+    """One measurement: body twist (3,), yaw rate (1,), or pose (3,) in `map`.
 
-    Attributes:
-        kind: the measured quantity.
-        value: (3,) body twist vx, vy [m/s], wz [rad/s]; (1,) yaw rate [rad/s]; or (3,) pose
-            x, y [m], heading [rad] in `map`.
-        noise: covariance of the value, (3, 3) or (1, 1); the model's if None.
-        odom: (3,) pose in `odom` that came with a twist; it bridges unobserved motion.
+    The noise is the covariance of the value, the model's if it is None. With a twist came the pose
+    (3,) in `odom`, which bridges unobserved motion.
     """
 
     kind: Kind
@@ -103,13 +99,9 @@ def pose_residual(measured: Array, expected: Array) -> Array:
 
 @dataclass(frozen=True)
 class TopicHealth:
-    """Health of one topic.
+    """Accepted data of one topic, their rate of arrival (0 before the second) and age by arrival.
 
-    Attributes:
-        received: number of accepted data.
-        rate_hz: rate of arrivals [1/s]; 0 before the second datum.
-        age_s: time since the latest arrival [s], on the clock of the receiver.
-        innovation: distance of the newest `Judgement`; NaN for topics that correct nothing.
+    The innovation is the distance of the newest `Judgement`; NaN for topics that correct nothing.
     """
 
     received: int
@@ -120,13 +112,10 @@ class TopicHealth:
 
 @dataclass(frozen=True)
 class Health:
-    """Health of all topics of a robot.
+    """Health of all topics of a robot that have data.
 
-    Attributes:
-        topics: topic -> its health; topics without data are missing.
-        rejected: reason -> number of data; a reason begins with the topic.
-        noticed: surprising data that were used nevertheless (`odom: news`) -> number of times.
-        replayed: number of late data that were inserted at their time.
+    Numbers of data `rejected`, by reasons that begin with the topic; `noticed`, which surprised but
+    were used (`odom: news`); and `replayed`, which were late and inserted at their time.
     """
 
     topics: dict[str, TopicHealth] = field(default_factory=dict)

@@ -55,14 +55,7 @@ class Datum(NamedTuple):
 
 @dataclass
 class TopicCache:
-    """Keeps the newest datum and the arrival times of each topic, and counts rejected data.
-
-    Attributes:
-        newest: topic -> datum.
-        rejected: reason -> number of data.
-        received: topic -> number of accepted data.
-        arrivals: topic -> arrival times of the latest data [ns].
-    """
+    """The newest datum, number and latest arrivals [ns] by topic; rejected data by reason."""
 
     newest: dict[str, Datum] = field(default_factory=dict)
     rejected: dict[str, int] = field(default_factory=dict)

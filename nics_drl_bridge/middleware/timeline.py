@@ -53,9 +53,9 @@ class _Entry:
     """A measurement, its verdict, and the state of the filter after it."""
 
     moment: Moment
-    measurement: Measurement | None
-    verdict: Judgement | None
     belief: Belief
+    measurement: Measurement | None = None
+    verdict: Judgement | None = None
 
 
 class Timeline:
@@ -79,8 +79,7 @@ class Timeline:
         self._distances: dict[Kind, float] = {}
         self.replayed = 0
         self._entries.clear()
-        start = _Entry((self._start_ns, -1), None, None, self._estimator.belief)
-        self._entries.append(start)
+        self._entries.append(_Entry((self._start_ns, -1), self._estimator.belief))
 
     @property
     def newest_ns(self) -> int:
@@ -106,7 +105,7 @@ class Timeline:
         place, reason = self._place(moment)
         if reason:
             return reason
-        self._entries.insert(place, _Entry(moment, measurement, None, self._entries[0].belief))
+        self._entries.insert(place, _Entry(moment, self._entries[0].belief, measurement))
         self._rerun(place)
         return ""
 
@@ -128,15 +127,12 @@ class Timeline:
 
     def outcomes(self) -> Mapping[tuple[Kind, Acceptance], int]:
         """Returns the number of measurements by kind and outcome."""
-        return self._past + Counter(
-            (kind, verdict.outcome) for kind, verdict in _verdicts(self._entries)
-        )
+        recent = Counter((kind, each.outcome) for kind, each in _verdicts(self._entries))
+        return self._past + recent
 
     def distances(self) -> Mapping[Kind, float]:
         """Returns the squared, normalised innovation of the newest measurement of each kind."""
-        return self._distances | {
-            kind: verdict.distance for kind, verdict in _verdicts(self._entries)
-        }
+        return self._distances | {kind: each.distance for kind, each in _verdicts(self._entries)}
 
     def _place(self, moment: Moment) -> tuple[int, str]:
         """Returns the place of a late measurement, or the reason if it cannot be used."""
@@ -154,7 +150,7 @@ class Timeline:
     def _run(self, moment: Moment, measurement: Measurement) -> _Entry:
         self._estimator.predict(moment[0])
         verdict = self._estimator.correct(measurement)
-        return _Entry(moment, measurement, verdict, self._estimator.belief)
+        return _Entry(moment, self._estimator.belief, measurement, verdict)
 
     def _rerun(self, place: int) -> None:
         """Re-runs the filter over all entries from a place on."""

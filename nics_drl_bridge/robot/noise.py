@@ -38,7 +38,7 @@ def assumed(std: float, unit: str) -> Level:
 class Noise(Schema):
     """Noise of a robot's odometry and pose sensor, and drift of its pose and its state by name.
 
-    The drift is the motion that the model does not explain; it grows with the square root of time.
+    The drift is motion that the model does not explain; it grows with the square root of time.
     The simulator draws the odometry noise, and the drift if it was measured: an assumed drift is
     a margin for the estimator, not a motion of the robot. The estimator takes its R from odometry
     and pose, its Q from the drift.

@@ -28,7 +28,7 @@ CMD_VEL_FIELDS: tuple[CmdVelField, ...] = ("linear.x", "linear.y", "angular.z")
 POSE_RATES = ("vx", "vy", "wz")
 POSE_UNITS = ("m/s", "m/s", "rad/s")
 TWIST_UNITS = dict(zip(CMD_VEL_FIELDS, POSE_UNITS, strict=True))
-UNITS = ("m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1")
+Unit = Literal["m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1"]
 """SI units of a state or a command; 1 for a ratio or a count."""
 MOST_CORNERS, MOST_VARIABLES = 512, 32
 """Greatest number of corners of a footprint, and of variables of a state or a command."""
@@ -44,11 +44,7 @@ def kind_names() -> list[str]:
 
 
 def find_kind(name: str) -> Any | None:
-    """Returns the `kinds.RobotKind` of a name; None if there is none.
-
-    Raises:
-        ConfigError: a library that it needs is missing.
-    """
+    """Returns a `kinds.RobotKind`; None if there is none of that name."""
     if name in extensions.known("kinds"):
         return extensions.load("kinds", name)
     return _own_kind(name)
@@ -65,16 +61,9 @@ class Variable(Schema):
     """A component of the state or of the command."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
-    unit: str
+    unit: Unit
     min: float = Field(ge=-FASTEST, le=FASTEST)
     max: float = Field(ge=-FASTEST, le=FASTEST)
-
-    @field_validator("unit")
-    @classmethod
-    def _si(cls, unit: str) -> str:
-        if unit not in UNITS:
-            raise ValueError(f"the unit must be one of {', '.join(UNITS)}")
-        return unit
 
     @model_validator(mode="after")
     def _ordered(self) -> Variable:

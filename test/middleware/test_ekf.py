@@ -14,7 +14,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.ekf import Estimator
-from nics_drl_bridge.middleware.kernels import Log, Motion
+from nics_drl_bridge.middleware.kernels import Log, MotionModel
 from nics_drl_bridge.middleware.measurement import Acceptance
 from nics_drl_bridge.robot.kernels import SERIES, rates, scratch, term_arrays
 from nics_drl_bridge.robot.noise import Level, Noise
@@ -65,7 +65,7 @@ def test_the_derivative_of_the_rates_is_the_numerical_one(robot):
 @pytest.mark.parametrize(("dt", "steps"), [(0.01, 1), (0.01, 10), (0.003, 1)])
 def test_the_transition_is_the_numerical_derivative_of_the_motion(robot, dt, steps):
     model, rng = builtin_model(robot), np.random.default_rng(1)
-    motion = Motion(term_arrays(model.kinematics), SERIES, 0, 0)
+    motion = MotionModel(term_arrays(model.kinematics), SERIES, 0, 0)
     for _ in range(10):
         mean, command = random_mean(model, rng), random_command(model, rng)
 
@@ -83,7 +83,7 @@ def test_the_transition_is_the_numerical_derivative_of_the_motion(robot, dt, ste
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_the_expected_twist_has_the_numerical_derivative(robot):
     model, rng = builtin_model(robot), np.random.default_rng(2)
-    motion = Motion(term_arrays(model.kinematics), SERIES, 0, 0)
+    motion = MotionModel(term_arrays(model.kinematics), SERIES, 0, 0)
     for _ in range(10):
         mean, command = random_mean(model, rng), random_command(model, rng)
         log = Log(np.zeros(1, np.int64), command[None], 1)
