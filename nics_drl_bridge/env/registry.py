@@ -105,22 +105,19 @@ def _class_of(name: str) -> type[Task]:
     module = _load(Path(path)) if path.endswith(".py") else _import(path)
     found = getattr(module, attribute, None)
     if not (isinstance(found, type) and issubclass(found, Task)):
-        tasks = [n for n, v in vars(module).items() if isinstance(v, type) and _own(v, module)]
+        classes = [each for each in vars(module).values() if isinstance(each, type)]
+        own = [each for each in classes if each.__module__ == module.__name__]
+        tasks = [each.__name__ for each in own if issubclass(each, Task)]
         raise ConfigError(f"task {name!r}: {path} has no such Task; {nearest(attribute, tasks)}")
     return found
-
-
-def _own(found: type, module: Any) -> bool:
-    return issubclass(found, Task) and found.__module__ == module.__name__
 
 
 def _import(name: str) -> Any:
     try:
         return import_module(name)
     except (ImportError, TypeError, ValueError) as error:
-        raise ConfigError(
-            f"task {name!r}: can't be imported ({error}); give path/to/file.py:ClassName."
-        ) from None
+        reason = f"can't be imported ({error}); give path/to/file.py:ClassName."
+        raise ConfigError(f"task {name!r}: {reason}") from None
 
 
 def _load(path: Path) -> Any:

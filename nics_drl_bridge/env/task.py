@@ -194,10 +194,7 @@ class Task(ABC):
         )
 
     def free_share(self, ranges: NDArray[np.float32]) -> Observation:
-        """Returns ranges (..., B) as shares (..., P): 1 no return, 0 too close or unknown.
-
-        Shares are relative to the maximum range of the lidar, or of the layout `scan`.
-        """
+        """Returns ranges (..., B) as shares of the maximum (..., P): 1 free, 0 close or unknown."""
         return self._look(ranges)[0]
 
     def touches(self, ranges: NDArray[np.float32]) -> Flags:
@@ -221,8 +218,7 @@ class Task(ABC):
     @cached_property
     def sight(self) -> Sight:
         """Meaning of the scan parts."""
-        if self.scan is not None:
-            layout = self.scan
+        if (layout := self.scan) is not None:
             return Sight(layout.angles, np.array(layout.viewpoint), layout.range_max)
         x, y, heading = self.lidar.mount
         return Sight(self.lidar.angles + heading, np.array([x, y]), self.lidar.range_max)

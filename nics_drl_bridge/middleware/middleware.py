@@ -110,9 +110,7 @@ class Middleware:
     """
 
     def __init__(self, model: SimulatorModel) -> None:
-        self._beams = model.lidar.beams
-        self._width = len(model.robot.command)
-        self._unknown = np.full(self._beams, np.nan, np.float32)
+        self._beams, self._width = model.lidar.beams, len(model.robot.command)
         self.estimator = Estimator(model)
         self._timeline = Timeline(self.estimator)
         self._trail = Trail(self.estimator.unseen.walk)
@@ -141,7 +139,7 @@ class Middleware:
 
     def expect_beams(self, beams: int) -> None:
         """Sets the number of beams of the scans to come; the newest scan is forgotten."""
-        self._beams, self._unknown = beams, np.full(beams, np.nan, np.float32)
+        self._beams = beams
         self.cache.newest.pop(SCAN, None)
 
     def command(
@@ -300,12 +298,10 @@ class Middleware:
 
     def view(self, now_ns: int) -> RobotView:
         """Returns the view of the robot at a time; NaN ranges before the first scan."""
-        pose, twist = self.estimator.at(now_ns)
         scan, newest_ns = self.cache.newest.get(SCAN), self.newest_ns
         return RobotView(
-            pose=pose,
-            twist=twist,
-            ranges=self._unknown.copy() if scan is None else scan.value,
+            *self.estimator.at(now_ns),
+            ranges=np.full(self._beams, np.nan, np.float32) if scan is None else scan.value,
             stamp_s=(now_ns if newest_ns is None else newest_ns) * S_PER_NS,
             scan_age_s=self.cache.age_s(SCAN, now_ns),
             odom_age_s=self.cache.age_s(ODOM, now_ns),

@@ -39,7 +39,7 @@ TYPES: Mapping[str, tuple[str, ...]] = {
     IMU: (topic_roles.IMU,),
 }
 ALWAYS = (SCAN, ODOM, CMD_VEL)
-"""Topics that are used if the bag has them; the others only on request."""
+"""Roles whose topics are used if the bag has them; the others only on request."""
 APART_S = 1.0
 """Greatest difference between stamps of one clock at the same time of receipt [s]."""
 COLUMNS = ("x", "y", "heading", "vx", "vy", "wz")
@@ -49,12 +49,8 @@ COLUMNS = ("x", "y", "heading", "vx", "vy", "wz")
 class EstimatedDrive:
     """Estimates of the middleware over a drive, after each odometry that was the newest.
 
-    Attributes:
-        stamp_ns: (T,) of the estimates [ns].
-        pose: (T, 3) x [m], y [m], heading [rad] in `map`.
-        twist: (T, 3) vx [m/s], vy [m/s], wz [rad/s] in `base_link`.
-        covariance: (T, 3, 3) of the pose.
-        rejected: reason -> number of data that were not used.
+    T stamps [ns], poses (T, 3) in `map` with their covariances (T, 3, 3), body twists (T, 3), and
+    the number of data that were not used, by reason.
     """
 
     stamp_ns: NDArray[np.int64]

@@ -56,12 +56,8 @@ def wheeled(
 ) -> Textbook:
     """Builds the kinematics of a robot whose twist is linear in its wheel speeds, its state.
 
-    Args:
-        spec: the robot.
-        inverse: (S, C) wheel speeds per command, in the order of `fields` of `cmd_vel`.
-        forward: (3, S) body twist per wheel speed.
-        fields: of the commands.
-        moves: the degrees of freedom that the wheels can move.
+    `inverse` (S, C) gives wheel speeds per command, in the order of `fields`; `forward` (3, S) the
+    body twist per wheel speed. The wheels can move the degrees of freedom `moves`.
     """
     if len(spec.state) != len(inverse):
         raise ConfigError(

@@ -23,11 +23,9 @@ class Textbook:
     Attributes:
         twist: gives the body twist (..., 3) for a state (..., S).
         target: gives the state (..., S) that a command (..., C) requests.
-        lag: (S,) time constants of first-order actuators [s]; unused for rate-limited ones.
-        rate: (S,) greatest rates of the state of rate-limited actuators [its unit/s]; inf for
-            first-order ones.
-        structure: possible products of state variables in each degree of freedom of the twist, up
-            to the second order.
+        lag: (S,) time constants of first-order actuators [s].
+        rate: (S,) greatest rates of rate-limited actuators [its unit/s]; inf for first-order ones.
+        structure: possible products of state variables in each degree of freedom of the twist.
     """
 
     twist: Callable[[Array], Array]
@@ -62,14 +60,9 @@ class Pivot:
 
 @dataclass(frozen=True)
 class Wheel:
-    """A wheel that stands on the ground.
+    """A wheel that stands on the ground, with its place x, y in `base_link` and its radius [m].
 
-    Attributes:
-        name: of its joint.
-        place: x, y of its centre in `base_link` [m].
-        radius: [m].
-        turns: True if its joint turns by the state variable of that name.
-        pivot: None for a wheel that is not steered.
+    Its name is that of its joint, which `turns` by the state variable of that name if there is one.
     """
 
     name: str
@@ -81,12 +74,9 @@ class Wheel:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Looks of a robot.
+    """Looks of a robot: its wheels, and a box (length, width) or a cylinder (radius) as body [m].
 
-    Attributes:
-        body: length and width of a box, or radius of a cylinder [m].
-        centre: x and height of the body's centre above `base_link` [m].
-        wheels: in the order in which they are drawn.
+    `centre` is x and height of the body's centre above `base_link` [m].
     """
 
     body: tuple[float, float] | float
@@ -108,27 +98,23 @@ def textbook(spec: RobotSpec) -> Textbook:
     Raises:
         ConfigError: the spec names none, lacks a parameter, or has other variables.
     """
-    return _made(spec, _kind_of(spec).kinematics)
+    return _made(spec, lambda kind: kind.kinematics(spec))
 
 
 def drawing(spec: RobotSpec) -> Drawing:
     """Returns the looks of a robot. Raises ConfigError as `textbook` does."""
-    return _made(spec, _kind_of(spec).drawing)
+    return _made(spec, lambda kind: kind.drawing(spec))
 
 
-def _kind_of(spec: RobotSpec) -> RobotKind:
+def _made(spec: RobotSpec, make: Callable[[RobotKind], T]) -> T:
     kind: RobotKind | None = find_kind(require_textbook(spec))
     if kind is None:
         raise ConfigError(
             f"robot {spec.name!r}: `textbook:` must be one of {', '.join(kind_names())}, not "
             f"{spec.textbook!r}."
         )
-    return kind
-
-
-def _made(spec: RobotSpec, make: Callable[[RobotSpec], T]) -> T:
     try:
-        return make(spec)
+        return make(kind)
     except KeyError as error:
         raise ConfigError(
             f"robot {spec.name!r}: the {spec.textbook} kinematics need the parameter {error}; add "

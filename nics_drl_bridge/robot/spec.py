@@ -75,8 +75,7 @@ class Variable(Schema):
 class StateVariable(Variable):
     """A component of the state.
 
-    It may name the command that it `follows` with a lag: if all do, a recording without measured
-    state can be used.
+    If all name the command that they follow with a lag, the recording may lack the state.
     """
 
     follows: str | None = None

@@ -17,10 +17,6 @@ from nics_drl_bridge.errors import ModelError
 Array = NDArray[np.float64]
 
 
-def _unknown() -> Array:
-    return np.zeros((0, 0))
-
-
 @dataclass(frozen=True)
 class TaylorModel:
     """`dQ/dt = A chi(X)` without the pruned terms (Eq. 1, 2).
@@ -32,8 +28,7 @@ class TaylorModel:
         coefficients: (D, K); zero where a degree of freedom does not keep a term.
         dt: the step for which the rates are valid [s]; the simulator's step.
         low, high: (V,) the box of X that the recording covered.
-        assumed: terms (dof, term) that the drive could not show, filled in from the
-            textbook's structure on request.
+        assumed: terms (dof, term) that the drive could not show, of the textbook's structure.
         std_errors: (D, K) of the coefficients; NaN for a kept one that was not estimated but
             assumed or fixed by definition. Empty, (0, 0), if none is known.
     """
@@ -47,7 +42,7 @@ class TaylorModel:
     low: Array
     high: Array
     assumed: tuple[tuple[str, str], ...] = ()
-    std_errors: Array = field(default_factory=_unknown)
+    std_errors: Array = field(default_factory=lambda: np.zeros((0, 0)))
     quality: Quality | None = None
 
     @property
@@ -94,7 +89,7 @@ class TaylorModel:
     def with_errors(self, errors: Mapping[str, Mapping[str, float]]) -> TaylorModel:
         """Returns the model with standard errors by dof and term; NaN for kept terms without."""
         if not errors:
-            return replace(self, std_errors=_unknown())
+            return replace(self, std_errors=np.zeros((0, 0)))
         names = self.term_names
         rows = [[errors.get(dof, {}).get(name, np.nan) for name in names] for dof in self.dofs]
         known = np.array(rows, dtype=np.float64).reshape(self.coefficients.shape)
@@ -158,7 +153,7 @@ def evaluate(x: ArrayLike, powers: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def term_name(row: NDArray[np.int64], names: tuple[str, ...]) -> str:
-    """Returns a term as text: `1`, `speed`, `speed*steering`, `speed^2`."""
+    """Returns a term as text: `1`, `speed*steering`, `speed^2`."""
     factors = [names[v] if row[v] == 1 else f"{names[v]}^{row[v]}" for v in np.flatnonzero(row)]
     return "*".join(factors) or "1"
 
@@ -230,11 +225,10 @@ class NamedTaylorModel(Schema):
     def model(self) -> TaylorModel:
         """Returns the model as arrays. Raises ModelError if the names do not fit each other."""
         variables, dofs = tuple(self.valid), tuple(self.terms)
+        every = dict.fromkeys(name for row in self.terms.values() for name in row)
         try:
             units = tuple(self.units[dof] for dof in dofs)
-            parsed = {
-                name: parse_term(name, variables) for row in self.terms.values() for name in row
-            }
+            parsed = {name: parse_term(name, variables) for name in every}
         except KeyError as error:
             raise ModelError(f"kinematics: {error} has no unit; generate the model anew.") from None
         except (OverflowError, ValueError) as error:

@@ -24,12 +24,7 @@ def urdf_of(
     `laser` is at its mount, at the height of `base_link`, since the package's world is flat.
     Moving joints have the names of the state variables in `joint_states`. A robot without
     textbook kinematics has no wheels here, since its spec does not contain their positions.
-
-    Args:
-        spec: of the robot.
-        mount: x [m], y [m], heading [rad] of the lidar in the base.
-        laser: its frame id.
-        base: frame id of the robot.
+    The lidar's frame is `laser`, its mount x [m], y [m], heading [rad] in the frame `base`.
     """
     robot = Element("robot", name=spec.name)
     for name, colour in COLOURS.items():
