@@ -185,9 +185,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         """
         if self._rehearsed:
             return
-        still = np.zeros((1, self.robots, 3))
         free = np.full((1, self.robots, self.model.lidar.beams), np.inf, np.float32)
-        view = RobotView(episodes.starts.copy(), still, free, 0.0, 0.0, 0.0)
+        view = RobotView(episodes.starts.copy(), 0.0 * episodes.starts, free, 0.0, 0.0, 0.0)
         memory = self.task.reset(episodes)
         self.task.step_into(np.empty(self._shape, np.float32), view, view, memory)
         self._rehearsed = True

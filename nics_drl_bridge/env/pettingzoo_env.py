@@ -20,8 +20,6 @@ from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world import World
 
 Observations = dict[str, NDArray[np.float32]]
-OF_CHECKER = "options"
-"""PettingZoo's checker resets with an option of this name, which has no meaning."""
 
 
 class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
@@ -70,10 +68,9 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         self.agents: list[str] = []
         of = self.env.task
         # One space for each agent: a space has its own random generator.
-        self.observation_spaces = {
-            name: deepcopy(of.observation_space) for name in self.possible_agents
-        }
-        self.action_spaces = {name: deepcopy(of.action_space) for name in self.possible_agents}
+        agents = self.possible_agents
+        self.observation_spaces = {name: deepcopy(of.observation_space) for name in agents}
+        self.action_spaces = {name: deepcopy(of.action_space) for name in agents}
 
     def observation_space(self, agent: str) -> gymnasium.Space[Any]:
         """Space of an agent, always the same object."""
@@ -88,8 +85,8 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, dict[str, Any]]]:
         """Begins an episode with all agents; see PettingZoo."""
-        if isinstance(options, dict):
-            options = {name: value for name, value in options.items() if name != OF_CHECKER}
+        if isinstance(options, dict):  # PettingZoo's checker resets with an option "options"
+            options = {name: value for name, value in options.items() if name != "options"}
         observation, info = self.env.reset(seed=seed, options=options)
         self.agents, self._steps = list(self.possible_agents), 0
         seen = dict(zip(self.agents, observation.reshape(len(self.agents), -1), strict=True))

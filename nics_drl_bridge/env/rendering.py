@@ -47,11 +47,7 @@ class WorldPicture:
         self._axes = self._figure.add_axes((0.0, 0.0, 1.0, 1.0))
 
     def draw(
-        self,
-        poses: Array,
-        ranges: NDArray[np.float32],
-        bodies: Array,
-        memory: dict[str, NDArray[Any]],
+        self, poses: Array, ranges: NDArray[Any], bodies: Array, memory: dict[str, NDArray[Any]]
     ) -> NDArray[np.uint8] | None:
         """Draws robots at poses (M, 3) with scans (M, B), bodies (K, 7), and the memory's `goal`.
 

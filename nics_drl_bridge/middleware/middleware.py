@@ -67,8 +67,7 @@ class TopicCache:
         held = self.newest.get(topic)
         if held is not None and stamp_ns <= held.stamp_ns:
             late = stamp_ns < held.stamp_ns
-            self.reject(f"{topic}: out of order" if late else f"{topic}: duplicate")
-            return False
+            return self.reject(f"{topic}: out of order" if late else f"{topic}: duplicate")
         self.take(topic, stamp_ns, arrival_ns, value)
         return True
 
@@ -80,9 +79,10 @@ class TopicCache:
         self.received[topic] = count + 1
         self.arrivals.setdefault(topic, deque(maxlen=RATE_OVER)).append(arrival_ns)
 
-    def reject(self, reason: str) -> None:
-        """Counts a rejected datum."""
+    def reject(self, reason: str) -> bool:
+        """Counts a rejected datum; False."""
         self.rejected[reason] = self.rejected.get(reason, 0) + 1
+        return False
 
     def age_s(self, topic: str, now_ns: int) -> float:
         """Age of the newest datum by its stamp [s]; inf if there is none."""
@@ -163,10 +163,7 @@ class Middleware:
             self._commanded = value
             reason = self._stamps.fault(stamp_ns, arrival_ns)
             reason = reason or self._timeline.command(stamp_ns, value)
-        if reason:
-            self.cache.reject(f"{CMD_VEL}: {reason}")
-            return False
-        return True
+        return not reason or self.cache.reject(f"{CMD_VEL}: {reason}")
 
     def foresee(self, stamp_ns: int) -> None:
         """Prepares for the next expected odometry, of a stamp [ns]."""
@@ -178,8 +175,7 @@ class Middleware:
         if ranges.shape != (self._beams,):
             fault = f"shape {ranges.shape}, not ({self._beams},)"
         if fault:
-            self.cache.reject(f"{SCAN}: {fault}")
-            return False
+            return self.cache.reject(f"{SCAN}: {fault}")
         if not self.cache.put(SCAN, stamp_ns, arrival_ns, ranges):
             return False
         self._stamps.accept(stamp_ns, arrival_ns)
@@ -193,11 +189,9 @@ class Middleware:
         """
         value = np.array(pose, dtype=np.float64), np.array(twist, dtype=np.float64)
         if not (np.isfinite(value[0]).all() and np.isfinite(value[1]).all()):
-            self.cache.reject(f"{ODOM}: {NOT_FINITE}")
-            return False
+            return self.cache.reject(f"{ODOM}: {NOT_FINITE}")
         if fault := self._stamps.fault(stamp_ns, None):
-            self.cache.reject(f"{ODOM}: {fault}")
-            return False
+            return self.cache.reject(f"{ODOM}: {fault}")
         odometry = ReportedPose(stamp_ns, arrival_ns, *value)
         if stamp_ns == self._start_ns and ODOM not in self.cache.newest:
             # At a reset the pose is known: the odometry of that time adds nothing.
@@ -205,16 +199,17 @@ class Middleware:
         elif self._trail.contradicts(odometry):
             self._follow_clock(odometry)
         else:
-            return self._measure_odometry(odometry, value)
+            return self._measure_odometry(odometry)
         self._stamps.accept(stamp_ns, arrival_ns)
         self.cache.take(ODOM, stamp_ns, arrival_ns, value)
         self._trail.use(odometry)
         return True
 
-    def _measure_odometry(self, odometry: ReportedPose, value: tuple[Array, Array]) -> bool:
+    def _measure_odometry(self, odometry: ReportedPose) -> bool:
         """Measures an odometry; True if accepted. Continues from it if the clock was set."""
-        measurement = Measurement(Kind.TWIST, odometry.twist, odom=odometry.pose)
-        reason = self._measure(odometry.stamp_ns, odometry.arrival_ns, measurement, value)
+        stamp_ns, arrival_ns, pose, twist = odometry
+        measurement = Measurement(Kind.TWIST, twist, odom=pose)
+        reason = self._measure(stamp_ns, arrival_ns, measurement, (pose, twist))
         if not reason:
             self._trail.use(odometry)
         elif reason in self._off_the_clock:
@@ -231,8 +226,7 @@ class Middleware:
 
         Its covariance (3, 3) is the model's pose noise if it is None or all zeros.
         """
-        value = np.array(pose, dtype=np.float64)
-        return self._optional(Kind.POSE, stamp_ns, arrival_ns, value, covariance)
+        return self._optional(Kind.POSE, stamp_ns, arrival_ns, pose, covariance)
 
     def imu(
         self, stamp_ns: int, arrival_ns: int, yaw_rate: float, variance: float | None = None
@@ -241,27 +235,20 @@ class Middleware:
 
         Its variance [rad^2/s^2] is that of a cheap gyro if it is None or zero.
         """
-        value = np.array([yaw_rate], dtype=np.float64)
         covariance = None if variance is None else [[variance]]
-        return self._optional(Kind.YAW_RATE, stamp_ns, arrival_ns, value, covariance)
+        return self._optional(Kind.YAW_RATE, stamp_ns, arrival_ns, [yaw_rate], covariance)
 
     def _optional(
-        self,
-        kind: Kind,
-        stamp_ns: int,
-        arrival_ns: int,
-        value: Array,
-        covariance: ArrayLike | None,
+        self, kind: Kind, stamp_ns: int, arrival_ns: int, given: ArrayLike, about: ArrayLike | None
     ) -> bool:
         """Takes a measurement that came with its own covariance; True if it was accepted."""
+        value = np.array(given, dtype=np.float64)
         if not np.isfinite(value).all():
-            self.cache.reject(f"{kind.topic}: {NOT_FINITE}")
-            return False
+            return self.cache.reject(f"{kind.topic}: {NOT_FINITE}")
         try:
-            noise = checked_covariance(covariance, len(value), LEAST_STD[kind])
+            noise = checked_covariance(about, len(value), LEAST_STD[kind])
         except ValueError as error:
-            self.cache.reject(f"{kind.topic}: {error}")
-            return False
+            return self.cache.reject(f"{kind.topic}: {error}")
         return not self._measure(stamp_ns, arrival_ns, Measurement(kind, value, noise), value)
 
     def _measure(self, stamp_ns: int, arrival_ns: int, measurement: Measurement, kept: Any) -> str:

@@ -194,8 +194,7 @@ class Playback:
         if self._any_lidar:
             values = self._followed(message).ordered(values)
             if len(values) != self.lidar.beams:
-                self.middleware.cache.reject(f"{SCAN}: another lidar")
-                return False
+                return self.middleware.cache.reject(f"{SCAN}: another lidar")
         ranges = from_device(np.ascontiguousarray(values), self.lidar)
         return self.middleware.scan(stamp(message), arrival_ns, ranges)
 
@@ -231,8 +230,7 @@ class Playback:
     def _imu(self, arrival_ns: int, message: Any) -> bool:
         covariance = message.angular_velocity_covariance
         if covariance[0] == -1.0:
-            self.middleware.cache.reject(f"{IMU}: no angular velocity")
-            return False
+            return self.middleware.cache.reject(f"{IMU}: no angular velocity")
         rate, variance = float(message.angular_velocity.z), float(covariance[8])
         return self.middleware.imu(stamp(message), arrival_ns, rate, variance)
 
