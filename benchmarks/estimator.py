@@ -28,7 +28,7 @@ from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.measurement import ODOM
 from nics_drl_bridge.middleware.middleware import Middleware
-from nics_drl_bridge.middleware.trail import ReportedPose
+from nics_drl_bridge.middleware.timeline import ReportedPose
 from nics_drl_bridge.robot.noise import Level, Noise
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World

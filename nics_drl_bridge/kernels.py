@@ -142,6 +142,8 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         name = re.sub(r"-\d+(\.py\d+\w*)$", rf"{kind}\1", self._impl.filename_base)
         stamp = digest_of(Path(function.__code__.co_filename))
         self._cache_file = IndexDataCacheFile(self._cache_path, name, stamp)
+        # It is compared before the types are unpickled, whose classes may have other names now.
+        self._cache_file._version += stamp
 
     @property
     def is_warm(self) -> bool:

@@ -97,6 +97,16 @@ def test_an_edit_of_what_a_kernel_is_made_of_compiles_it_anew_and_no_other(
     assert ask(package)[1] == [0, 0]
 
 
+def test_a_class_of_arguments_may_get_another_name(package):
+    named = "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    one: float\n"
+    call = LOW.replace("x + STEP", "x.one + STEP") + "\nlow(Pair(1.0))\n"
+    file = package / "low_kernels.py"
+    for name in ("Pair", "Couple"):
+        file.write_text((named + call).replace("Pair", name))
+        code = "import nics_drl_bridge.low_kernels"
+        subprocess.run([sys.executable, "-c", code], cwd=package.parent, check=True)
+
+
 def test_a_kernel_that_moves_within_its_file_leaves_nothing_behind(package):
     ask(package)
     before = len(list(package.rglob("*.nbi")))

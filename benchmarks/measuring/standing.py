@@ -8,8 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env.actions import discrete_commands, still
-from nics_drl_bridge.env.task import Task
+from nics_drl_bridge.env.task import Task, discrete_commands, still
 
 
 class Standing:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env.actions import check_action, check_command, still, team_space
-from nics_drl_bridge.env.guard import check_options, check_reset, halts_on_error
+from nics_drl_bridge.env.guard import (
+    check_action,
+    check_command,
+    check_reset,
+    give,
+    halts_on_error,
+    override,
+)
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.sim_backend import completed, make_backend
-from nics_drl_bridge.env.task import Episodes, Memory, Task, give, override
+from nics_drl_bridge.env.task import Episodes, Memory, Task, still, team_space
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend, RobotView, Start
@@ -32,41 +37,29 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     ## Description
 
-    A robot with a lidar stands in a walled field among obstacles and has a task: to reach a goal
-    (`NicsBridge/Navigation-v0`), to reach several goals as a team
-    (`NicsBridge/CooperativeReaching-v0`), to catch others or escape them
-    (`NicsBridge/PursuitEvasion-v0`), or a task of your own (`NicsBridge/Task-v0`). The robot is
-    either simulated in this process (`backend="sim"`) or whatever is behind the ROS 2 topics
-    `cmd_vel`, `scan` and `odom` (`backend="dds"`): a simulator node or the vehicle. Task, spaces
-    and numbers are the same.
+    A robot with a lidar stands in a walled field among obstacles and has a task, whose class
+    documents observation, reward and end: `Navigation` (`NicsBridge/Navigation-v0`),
+    `CooperativeReaching` and `PursuitEvasion` for teams, or your own (`NicsBridge/Task-v0`). The
+    robot is either simulated in this process (`backend="sim"`) or whatever is behind the ROS 2
+    topics `cmd_vel`, `scan` and `odom` (`backend="dds"`): a simulator node or the vehicle. Task,
+    spaces and numbers are the same.
 
     ## Action Space
 
     For one robot, `Box(-1, 1, (C,), float32)`: each command of the robot, scaled between its
     limits, for the Ackermann robot speed [m/s] and steering angle [rad]; or `Discrete` with
-    `task_options={"actions": "discrete"}`, see `env.actions.DRIVES`. For M robots, concatenated,
+    `task_options={"actions": "discrete"}`, see `env.task.DRIVES`. For M robots, concatenated,
     `Box(-1, 1, (M C,), float32)` or `MultiDiscrete`.
 
     ## Observation Space
 
-    `Box((O,), float32)`, or `Box((M O,), float32)` for a team, robot by robot, which
-    `observation.reshape(M, O)` separates; the docstring of the task's class (`Navigation`,
-    `CooperativeReaching`, `PursuitEvasion`) lists the parts with their units. Those of the
-    navigation task, B beams:
-
-    | Num | Observation | Min | Max | Unit |
-    |---|---|---|---|---|
-    | 0 to B - 1 | range as a share of the maximum; 1 free, 0 too close or unknown | 0 | 1 | - |
-    | B | distance to the goal | 0 | 1000 | m |
-    | B + 1, B + 2 | cosine, sine of the bearing of the goal | -1 | 1 | - |
-    | B + 3, B + 4 | estimated velocity forward, left | -1000 | 1000 | m/s |
-    | B + 5 | estimated turn rate | -1000 | 1000 | rad/s |
+    The task's `Box((O,), float32)`, or `Box((M O,), float32)` for a team, robot by robot, which
+    `observation.reshape(M, O)` separates.
 
     ## Rewards
 
     The sum of the terms in `info["reward_terms"]`, and over the robots of a team, whose terms are
-    arrays (M,). Navigation: `progress`, 1 per metre of approach; `time`, -0.01 per step;
-    `success`, 10 at the goal; `collision`, -10 at a contact.
+    arrays (M,).
 
     ## Starting State
 
@@ -76,10 +69,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     ## Episode End
 
-    Terminated when the task has ended for every robot: navigation ends when the goal is nearer
-    than 0.3 m or something touches the footprint, both judged from the robot's own estimate and
-    scan. A robot of a team that ended earlier stands still. Truncated after 300 steps, unless
-    `gymnasium.make` is given another `max_episode_steps`.
+    Terminated when the task has ended for every robot; a robot of a team that ended earlier stands
+    still. Truncated after 300 steps, unless `gymnasium.make` is given another `max_episode_steps`.
 
     ## Arguments
 
@@ -141,9 +132,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._picture: Any = None
         if isinstance(backend, str):
             robots = self.robots if self.robots > 1 else None
-            asked = {"estimator": estimator, "robots": robots, "randomisation": randomisation}
-            options = {name: value for name, value in asked.items() if value is not None}
-            options = {**(backend_options or {}), **options}
+            own = {"estimator": estimator, "robots": robots, "randomisation": randomisation}
+            given = {name: value for name, value in own.items() if value is not None}
+            options = {**(backend_options or {}), **given}
             backend = make_backend(backend, self.model, self.world, **options)
         self._backend: Backend = completed(backend, self._row(self._rest))
 
@@ -171,8 +162,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         episodes = Episodes(np.array([episode]), starts[None], self.scene.goals[None])
         self._rehearse(episodes)
         memory = self.task.reset(episodes)
-        check_options(options, memory)
-        override(memory, options)
+        override(memory, options, "start")
         self._view = self._lifted(self._backend.reset(Start(episode, self._row(starts))))
         self.memory = memory
         self.ended = np.zeros(self.robots, np.bool_)
@@ -195,9 +185,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         """
         if self._rehearsed:
             return
-        still = np.zeros((1, self.robots, 3))
         free = np.full((1, self.robots, self.model.lidar.beams), np.inf, np.float32)
-        view = RobotView(episodes.starts.copy(), still, free, 0.0, 0.0, 0.0)
+        view = RobotView(episodes.starts.copy(), 0.0 * episodes.starts, free, 0.0, 0.0, 0.0)
         memory = self.task.reset(episodes)
         self.task.step_into(np.empty(self._shape, np.float32), view, view, memory)
         self._rehearsed = True
@@ -304,10 +293,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if self._view is None or self.scene is None:
             raise gymnasium.error.ResetNeeded("call reset() before render().")
         if self._picture is None:
-            drawing = import_module("nics_drl_bridge.env.rendering")
-            self._picture = drawing.WorldPicture(
-                self.model, self.world, self.render_mode, RENDER_FPS
-            )
+            from nics_drl_bridge.env.rendering import WorldPicture  # loads matplotlib
+
+            self._picture = WorldPicture(self.model, self.world, self.render_mode, RENDER_FPS)
         facts = self._backend.facts()
         poses = np.reshape(facts.get("true_pose", self._view.pose), (self.robots, 3))
         bodies = facts.get("bodies", self.scene.bodies)

@@ -1,45 +1,33 @@
-"""Guard around an env's methods: any exception that leaves one stops the robot.
-
-Checks of the seeds and options of a reset, before anything begins.
-"""
+"""Guard around an env's methods: any exception stops the robot; checks of what a caller gives."""
 
 from __future__ import annotations
 
 import contextlib
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import wraps
-from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
+import gymnasium
 import numpy as np
+from numpy.typing import NDArray
 
+from nics_drl_bridge.env import kernels
 from nics_drl_bridge.errors import ConfigError, nearest
 
-
-class Halting(Protocol):
-    """Anything with a robot that can be stopped."""
-
-    def halt(self) -> None:
-        """Stops the robot with a zero command."""
-        ...
-
-
 P = ParamSpec("P")
-H = TypeVar("H", bound=Halting)
 T = TypeVar("T")
 
 
-def halts_on_error(
-    method: Callable[Concatenate[H, P], T],
-) -> Callable[Concatenate[H, P], T]:
-    """Makes a method halt its object's robot if any exception leaves it, including Ctrl-C.
+def halts_on_error(method: Callable[Concatenate[Any, P], T]) -> Callable[Concatenate[Any, P], T]:
+    """Makes a method `halt` its object's robot if any exception leaves it, including Ctrl-C.
 
     An error of `halt` itself is raised with the first one as its context.
     """
 
     @wraps(method)
-    def guarded(self: H, /, *args: P.args, **kwargs: P.kwargs) -> T:
+    def guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
         try:
             return method(self, *args, **kwargs)
         except BaseException:
@@ -68,19 +56,12 @@ def uninterrupted() -> Iterator[None]:
 
 SEEDS = 2**63
 """Exclusive upper bound of seeds: signed 64-bit integers over ROS 2 and in the kernels."""
-START = "start"
-"""The option that every task takes in addition to the names of its memory."""
 
 
 def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
-    """Checks what can be checked without the task.
+    """Checks the seed of the first world, from which the others count up, or one for each.
 
     Gymnasium itself refuses negative seeds.
-
-    Args:
-        seed: of the first world, from which the others count up, or one for each.
-        options: as given to `reset`.
-        worlds: number of worlds.
 
     Raises:
         ConfigError: a seed is not an integer or too large, or the options are not a dict.
@@ -90,7 +71,8 @@ def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
         if not (one is None or isinstance(one, int | np.integer)):
             raise ConfigError(f"seed of type {type(one).__name__}: must be an integer, or None.")
         if one is not None and one > last:
-            raise ConfigError(f"seed {_shown(int(one))}: must be at most 2**63 - {SEEDS - last}.")
+            shown = int(one) if one < SEEDS**2 else f"of {int(one).bit_length()} bits"
+            raise ConfigError(f"seed {shown}: must be at most 2**63 - {SEEDS - last}.")
     if options is not None and not isinstance(options, Mapping):
         raise ConfigError(
             f"reset options of type {type(options).__name__}: must be a dict, as {{'start': "
@@ -98,22 +80,76 @@ def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
         )
 
 
-def _shown(seed: int) -> str:
-    """A seed as text; of an overlong one its number of bits."""
-    return str(seed) if seed < SEEDS**2 else f"of {seed.bit_length()} bits"
-
-
-def check_options(
-    options: Mapping[str, Any] | None, memory: Iterable[str], more: tuple[str, ...] = ()
+def override(
+    memory: dict[str, NDArray[Any]], options: Mapping[str, Any] | None, *of_env: str
 ) -> None:
-    """Raises ConfigError for an unknown reset option.
+    """Writes values of `reset(options=...)` into all rows of the memory arrays that they name.
 
-    Args:
-        options: as given to `reset`.
-        memory: names of the task's memory.
-        more: further names that the env takes.
+    Raises:
+        ConfigError: a name that neither the memory nor the env has, or a wrong value.
     """
-    valid = {START, *memory, *more}
-    for name in options or ():
-        if name not in valid:
+    for name, value in (options or {}).items():
+        if name in memory:
+            give(memory[name], name, value)
+        elif name not in of_env:
+            valid = {*memory, *of_env}
             raise ConfigError(f"unknown reset option {name!r}; {nearest(str(name), valid)}")
+
+
+def give(rows: NDArray[Any], name: str, value: Any) -> None:
+    """Writes the value of an option of `reset(options=...)` into rows (n, ...).
+
+    Raises:
+        ConfigError: the value has a wrong shape, or contains NaN or inf.
+    """
+    try:
+        given = np.asarray(value)
+    except ValueError:  # a ragged list
+        given = np.asarray(None)
+    fits = given.shape in [rows.shape[k:] for k in range(max(2, rows.ndim))]
+    if not fits or given.dtype.kind not in "fiub":
+        raise ConfigError(
+            f"reset option {name!r}, {value!r}: must be numbers of shape {rows.shape[1:]}, or of "
+            "its last dimensions."
+        )
+    rows[...] = given
+    if not np.isfinite(rows).all():
+        raise ConfigError(f"reset option {name!r}, {value!r}: must be finite.")
+
+
+def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray[Any]:
+    """Returns an action as an array of its space's shape.
+
+    Raises:
+        gymnasium.error.InvalidAction: not numeric, of another shape, NaN, inf, or no action of
+            that number.
+    """
+    try:
+        given = np.asarray(action)
+    except ValueError as error:  # a ragged list
+        raise gymnasium.error.InvalidAction(f"{name}: {error}") from None
+    if given.dtype.kind not in "fiub":
+        raise gymnasium.error.InvalidAction(f"{name} of {given.dtype}: must be real numbers.")
+    if given.shape != space.shape:
+        raise gymnasium.error.InvalidAction(
+            f"{name} of shape {given.shape}: must be of shape {space.shape}."
+        )
+    if isinstance(space, gymnasium.spaces.Box) and space.dtype == np.float32:
+        if given.dtype.char not in "fd":
+            given = given.astype(np.float64)  # the kernels are compiled for these two
+        if not kernels.finite(given.reshape(1, -1)):
+            raise gymnasium.error.InvalidAction(f"{name} {given!r}: holds NaN or inf.")
+    elif not space.contains(given):
+        raise gymnasium.error.InvalidAction(f"{name} {given!r}: is not in {space}.")
+    return given
+
+
+def check_command(command: Any, like: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns a command as an array. Raises ConfigError unless finite, of the shape of `like`."""
+    made = np.asarray(command, np.float64)
+    if made.shape != like.shape or not kernels.finite(made.reshape(1, -1)):
+        raise ConfigError(
+            f"the task's command {made}: must be finite, of shape {like.shape}; look at its "
+            "`command`."
+        )
+    return made

@@ -1,16 +1,18 @@
 """Compiled inner loops of the tasks: actions, observations, and the navigation task.
 
 The batched loops call a scalar function per robot, so that results are bit-identical for one robot
-and for thousands. Shapes: R robots of any worlds, B beams, C commands, O parts of an observation,
-the first P of them a scan. Bearings are computed here because numpy's vectorised functions round
-the remainder of a batch differently from its body.
+and for thousands. Shapes: R robots of any worlds, B beams, C commands, P parts of a scan in an
+observation. Bearings are computed here because numpy's vectorised functions round the remainder of
+a batch differently from its body.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.sector_kernels import resample
@@ -18,6 +20,36 @@ from nics_drl_bridge.random_kernels import episode_seed
 
 LIMIT = 1000.0
 """Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation."""
+
+
+class ScanScale(NamedTuple):
+    """Conversion of a scan to parts of an observation, and to contacts.
+
+    Attributes:
+        per_metre: 1 / the range that a share of 1 stands for [1/m], float32.
+        leaves: (B,) float32 range at which each beam leaves the footprint [m].
+        sectors: number of sectors that are observed; 0 if the beams themselves are.
+        plan: mapping of beams to sectors, see `sectors.SectorPlan.arguments`.
+    """
+
+    per_metre: np.float32
+    leaves: NDArray[np.float32]
+    sectors: int
+    plan: Any
+
+
+class GoalProgress(NamedTuple):
+    """Outcome of a step of the navigation task.
+
+    Attributes:
+        approach: (R,) decrease of the distance to the goal [m].
+        reached: (R,) True at the goal.
+        touched: (R,) True if the scan shows a contact with the footprint.
+    """
+
+    approach: NDArray[np.float64]
+    reached: NDArray[np.bool_]
+    touched: NDArray[np.bool_]
 
 
 @kernel(allocates=True)
@@ -47,44 +79,36 @@ def finite(values):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def look(shares, ranges, per_metre, leaves):  # type: ignore[no-untyped-def]
-    """Writes a scan as shares of the maximum range; returns True if something is too close.
+def look(shares, ranges, scale):  # type: ignore[no-untyped-def]
+    """Writes a scan (B,) as shares (P,) of a `ScanScale`; returns True if something is too close.
 
-    Args:
-        shares: (B,) float32, result: 1 no return, 0 too close or unknown.
-        ranges: (B,) float32 [m], REP-117.
-        per_metre: 1 / maximum range [1/m], float32.
-        leaves: (B,) float32 range at which each beam leaves the footprint [m].
+    A share of 1 is no return, 0 too close or unknown. Contact is judged from the beams.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     hits = np.int32(0)
-    for b in range(shares.shape[0]):
-        # A comparison with NaN (unknown) is False; -inf (too close) is below every range.
-        share = ranges[b] * per_metre
+    if scale.sectors == 0:
+        for b in range(shares.shape[0]):
+            # A comparison with NaN (unknown) is False; -inf (too close) is below every range.
+            share = ranges[b] * scale.per_metre
+            share = share if share > zero else zero
+            shares[b] = share if share < one else one
+            hits |= np.int32(ranges[b] < scale.leaves[b])
+        return hits != 0
+    resample(shares, ranges, scale.plan)
+    for s in range(shares.shape[0]):
+        share = shares[s] * scale.per_metre
         share = share if share > zero else zero
-        shares[b] = share if share < one else one
-        hits |= np.int32(ranges[b] < leaves[b])
+        shares[s] = share if share < one else one
+    for b in range(ranges.shape[0]):
+        hits |= np.int32(ranges[b] < scale.leaves[b])
     return hits != 0
 
 
 @kernel(allocates=True)
-def look_by_sector(shares, ranges, sensor):  # type: ignore[no-untyped-def]
-    """Writes the nearest returns of sectors (S,) as shares; returns True if something is too close.
-
-    Contact is judged from the beams (B,) themselves. `sensor` contains per_metre and leaves of
-    `look`, and the mapping of beams to sectors, see `sectors.SectorPlan.arguments`.
-    """
-    per_metre, leaves, plan = sensor
-    zero, one = np.float32(0.0), np.float32(1.0)
-    resample(shares, ranges, plan)
-    for s in range(shares.shape[0]):
-        share = shares[s] * per_metre
-        share = share if share > zero else zero
-        shares[s] = share if share < one else one
-    hits = np.int32(0)
-    for b in range(ranges.shape[0]):
-        hits |= np.int32(ranges[b] < leaves[b])
-    return hits != 0
+def looks(shares, touched, ranges, scale):  # type: ignore[no-untyped-def]
+    """Applies `look` to the scans (R, B) of R robots; touched (R,) is its result."""
+    for i in range(ranges.shape[0]):
+        touched[i] = look(shares[i], ranges[i], scale)
 
 
 @kernel(allocates=True)
@@ -100,48 +124,19 @@ def bearing(pose, x, y):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def bearings(out, poses, points):  # type: ignore[no-untyped-def]
-    """Writes `bearing` (R, 3) of points (R, 2) from poses (R, 3)."""
-    for i in range(out.shape[0]):
-        distance, out[i, 1], out[i, 2] = bearing(poses[i], points[i, 0], points[i, 1])
-        out[i, 0] = min(distance, LIMIT)
+def navigate(out, progress, before, pose, twist, ranges, goals, scale, radius):  # type: ignore[no-untyped-def]
+    """Writes observations (R, P + 6), see `navigation.Navigation`, and a `GoalProgress`.
 
-
-@kernel(allocates=True)
-def looks(shares, touched, ranges, sensor):  # type: ignore[no-untyped-def]
-    """Writes scans of R robots with `look` or `look_by_sector`; touched (R,) is their result."""
-    for i in range(ranges.shape[0]):
-        if sensor[2][0].shape[0] == 0:
-            touched[i] = look(shares[i], ranges[i], sensor[0], sensor[1])
-        else:
-            touched[i] = look_by_sector(shares[i], ranges[i], sensor)
-
-
-@kernel(allocates=True)
-def navigate(out, approach, reached, touched, before, pose, twist, ranges, goals, sensor, radius):  # type: ignore[no-untyped-def]
-    """Writes observations and outcomes of the navigation task.
-
-    Args:
-        out: (R, P + 6) float32, result, see `navigation.Navigation`; P parts of a scan.
-        approach: (R,) decrease of the distance to the goal [m], result.
-        reached, touched: (R,) bool, True at the goal, or in contact; results.
-        before: (R, 3) poses before the step.
-        pose, twist: (R, 3).
-        ranges: (R, B) float32.
-        goals: (R, 2) [m].
-        sensor: see `look_by_sector`; with a plan without sectors, the beams are used directly.
-        radius: of a goal [m].
+    Poses before and after the step (R, 3), twists (R, 3), scans (R, B), goals (R, 2) and their
+    radius [m].
     """
     parts = out.shape[1] - 6
     for i in range(out.shape[0]):
-        if sensor[2][0].shape[0] == 0:
-            touched[i] = look(out[i, :parts], ranges[i], sensor[0], sensor[1])
-        else:
-            touched[i] = look_by_sector(out[i, :parts], ranges[i], sensor)
+        progress.touched[i] = look(out[i, :parts], ranges[i], scale)
         distance, c, s = bearing(pose[i], goals[i, 0], goals[i, 1])
         dx, dy = goals[i, 0] - before[i, 0], goals[i, 1] - before[i, 1]
-        approach[i] = math.sqrt(dx * dx + dy * dy) - distance
-        reached[i] = distance < radius
+        progress.approach[i] = math.sqrt(dx * dx + dy * dy) - distance
+        progress.reached[i] = distance < radius
         out[i, parts] = min(distance, LIMIT)
         out[i, parts + 1], out[i, parts + 2] = c, s
         for k in range(3):
@@ -149,29 +144,21 @@ def navigate(out, approach, reached, touched, before, pose, twist, ranges, goals
 
 
 @kernel(allocates=True)
+def bearings(out, poses, points):  # type: ignore[no-untyped-def]
+    """Writes `bearing` (R, M, Q, 3) of each point (R, Q, 2) from each pose (R, M, 3)."""
+    for r in range(out.shape[0]):
+        for m in range(out.shape[1]):
+            for q in range(out.shape[2]):
+                x, y = points[r, q, 0], points[r, q, 1]
+                distance, out[r, m, q, 1], out[r, m, q, 2] = bearing(poses[r, m], x, y)
+                out[r, m, q, 0] = min(distance, LIMIT)
+
+
+@kernel(allocates=True)
 def distances(out, poses, points):  # type: ignore[no-untyped-def]
-    """Writes distances (R,) [m] from poses (R, 3) to points (R, 2)."""
-    for i in range(out.shape[0]):
-        dx, dy = points[i, 0] - poses[i, 0], points[i, 1] - poses[i, 1]
-        out[i] = math.sqrt(dx * dx + dy * dy)
-
-
-@kernel(allocates=True)
-def pair_bearings(out, poses, points):  # type: ignore[no-untyped-def]
-    """Writes `bearing` (R, M, P, 3) of each point (R, P, 2) from each pose (R, M, 3)."""
+    """Writes distances (R, M, Q) [m] from each pose (R, M, 3) to each point (R, Q, 2)."""
     for r in range(out.shape[0]):
         for m in range(out.shape[1]):
-            for p in range(out.shape[2]):
-                x, y = points[r, p, 0], points[r, p, 1]
-                distance, out[r, m, p, 1], out[r, m, p, 2] = bearing(poses[r, m], x, y)
-                out[r, m, p, 0] = min(distance, LIMIT)
-
-
-@kernel(allocates=True)
-def pair_distances(out, poses, points):  # type: ignore[no-untyped-def]
-    """Writes distances (R, M, P) [m] from poses (R, M, 3) to points (R, P, 2)."""
-    for r in range(out.shape[0]):
-        for m in range(out.shape[1]):
-            for p in range(out.shape[2]):
-                dx, dy = points[r, p, 0] - poses[r, m, 0], points[r, p, 1] - poses[r, m, 1]
-                out[r, m, p] = math.sqrt(dx * dx + dy * dy)
+            for q in range(out.shape[2]):
+                dx, dy = points[r, q, 0] - poses[r, m, 0], points[r, q, 1] - poses[r, m, 1]
+                out[r, m, q] = math.sqrt(dx * dx + dy * dy)

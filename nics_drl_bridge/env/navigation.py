@@ -4,30 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
-from nics_drl_bridge.env.kernels import LIMIT
+from nics_drl_bridge.env.kernels import LIMIT, GoalProgress
 from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Outcome, Task, distance
 from nics_drl_bridge.interface import RobotView
 
 Array = NDArray[np.float64]
-GOAL_PARTS = 3
-TWIST_PARTS = 3
 
 
-@dataclass(frozen=True)
-class NavigationVerdict:
-    """Outcome of a step for the robots. Each is (...,) bool.
-
-    Attributes:
-        reached: the robot is at the goal.
-        touched: the scan shows a contact with the footprint.
-    """
+class NavigationVerdict(NamedTuple):
+    """Robots (...,) at their goals, and those whose scan shows a contact with the footprint."""
 
     reached: Flags
     touched: Flags
@@ -52,7 +44,7 @@ class Navigation(Task):
     ## Action Space
 
     `Box(-1, 1, (C,), float32)`: each command between its limits; or `Discrete(7)`, the paper's
-    drives (`actions.DRIVES`; 9 for a robot that moves sideways).
+    drives (`task.DRIVES`; 9 for a robot that moves sideways).
 
     ## Rewards
 
@@ -67,12 +59,6 @@ class Navigation(Task):
 
     The goal is nearer than 0.3 m, or something touches the footprint, both judged from the robot's
     own estimate and scan. A contact at the goal is no success.
-
-    Attributes:
-        goal_radius: distance at which the goal is reached [m].
-        success_reward, collision_reward: for such an end.
-        progress_reward: per metre of approach.
-        time_reward: per step.
     """
 
     keeps_last_scan: ClassVar[bool] = False
@@ -97,14 +83,9 @@ class Navigation(Task):
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
         """The observation (..., B + 6) of a view, for goals (..., 2) in `map`."""
-        width = self.scan_parts + GOAL_PARTS + TWIST_PARTS
-        out = np.empty((*view.pose.shape[:-1], width), np.float32)
+        out = np.empty((*view.pose.shape[:-1], self.scan_parts + 6), np.float32)
         self._see(out, view.pose, view, memory)
         return out
-
-    def observe_into(self, out: Observation, view: RobotView, memory: Memory) -> None:
-        """Writes the observation into (..., B + 6), which is contiguous."""
-        self._see(out, view.pose, view, memory)
 
     def judge(self, view: RobotView, memory: Memory) -> NavigationVerdict:
         """Judges which robots are at their goals, and which touch something."""
@@ -140,21 +121,19 @@ class Navigation(Task):
         lead = view.pose.shape[:-1]
         approach = np.empty(lead)
         reached, touched = np.empty(lead, np.bool_), np.empty(lead, np.bool_)
+        progress = GoalProgress(approach.reshape(-1), reached.reshape(-1), touched.reshape(-1))
         kernels.navigate(
-            out.reshape(-1, out.shape[-1]),
-            approach.reshape(-1), reached.reshape(-1), touched.reshape(-1), before.reshape(-1, 3),
+            out.reshape(-1, out.shape[-1]), progress, before.reshape(-1, 3),
             view.pose.reshape(-1, 3), view.twist.reshape(-1, 3),
             view.ranges.reshape(-1, view.ranges.shape[-1]), memory["goal"].reshape(-1, 2),
-            self.sensor, self.goal_radius,
+            self.scale, self.goal_radius,
         )  # fmt: skip
         return approach, NavigationVerdict(reached, touched)
 
     def _terms(self, approach: Array, verdict: NavigationVerdict) -> dict[str, Array]:
-        time = np.empty_like(approach)
-        time.fill(self.time_reward)
         return {
             "progress": self.progress_reward * approach,
-            "time": time,
+            "time": np.full_like(approach, self.time_reward),
             "success": np.multiply(self.success_reward, verdict.reached & ~verdict.touched),
             "collision": np.multiply(self.collision_reward, verdict.touched),
         }

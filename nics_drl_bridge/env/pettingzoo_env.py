@@ -20,8 +20,6 @@ from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world import World
 
 Observations = dict[str, NDArray[np.float32]]
-OF_CHECKER = "options"
-"""PettingZoo's checker resets with an option of this name, which has no meaning."""
 
 
 class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
@@ -41,17 +39,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
 
     ## Arguments
 
-    Args:
-        model: a SimulatorModel, its folder, or the name of a shipped robot.
-        world: a World, its YAML file, or the name of a shipped one.
-        task: a name, `path/to/file.py:ClassName`, a class, or a Task.
-        task_options: further arguments of the task's class.
-        max_episode_steps: an episode is truncated after this many steps.
-        randomisation: quantities drawn in each episode, see `BridgeEnv`.
-        render_mode: `rgb_array`, `human` or None.
-
-    Raises:
-        ConfigError, ModelError: an unknown name or a wrong file.
+    Those of `BridgeEnv`, and `max_episode_steps`, after which an episode is truncated.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo's own declaration
@@ -80,10 +68,9 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         self.agents: list[str] = []
         of = self.env.task
         # One space for each agent: a space has its own random generator.
-        self.observation_spaces = {
-            name: deepcopy(of.observation_space) for name in self.possible_agents
-        }
-        self.action_spaces = {name: deepcopy(of.action_space) for name in self.possible_agents}
+        agents = self.possible_agents
+        self.observation_spaces = {name: deepcopy(of.observation_space) for name in agents}
+        self.action_spaces = {name: deepcopy(of.action_space) for name in agents}
 
     def observation_space(self, agent: str) -> gymnasium.Space[Any]:
         """Space of an agent, always the same object."""
@@ -98,12 +85,12 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, dict[str, Any]]]:
         """Begins an episode with all agents; see PettingZoo."""
-        if isinstance(options, dict):
-            options = {name: value for name, value in options.items() if name != OF_CHECKER}
+        if isinstance(options, dict):  # PettingZoo's checker resets with an option "options"
+            options = {name: value for name, value in options.items() if name != "options"}
         observation, info = self.env.reset(seed=seed, options=options)
         self.agents, self._steps = list(self.possible_agents), 0
         seen = dict(zip(self.agents, observation.reshape(len(self.agents), -1), strict=True))
-        return seen, {name: self._told(info, m) for m, name in enumerate(self.agents)}
+        return seen, {name: self._of(info, m) for m, name in enumerate(self.agents)}
 
     @halts_on_error
     def step(
@@ -111,51 +98,44 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
     ) -> tuple[
         Observations, dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
     ]:
-        """Advances one control period with the actions of the remaining agents; see PettingZoo.
+        """Advances one control period; see PettingZoo.
 
         Raises:
             ConfigError: a remaining agent has no action.
         """
-        missing = sorted(set(self.agents) - set(actions))
-        if missing:
+        if missing := sorted(set(self.agents) - set(actions)):
             raise ConfigError(f"no action for {', '.join(missing)}; each agent that is left acts.")
         space = self.env.task.action_space
         rest: Any = np.zeros(space.shape or (), space.dtype)
         # The env stops the robots that left, whatever their action.
         joint = [actions[n] if n in self.agents else rest for n in self.possible_agents]
-        told_all = joint[0] if self.env.robots == 1 else np.array(joint, space.dtype).ravel()
-        observation, terms, info = self.env.advance(told_all)
+        action = joint[0] if self.env.robots == 1 else np.array(joint, space.dtype).ravel()
+        observation, terms, info = self.env.advance(action)
         if self.render_mode == "human":
             self.env.render()
         self._steps += 1
         late = self._steps >= self._limit
         index = {name: self.possible_agents.index(name) for name in self.agents}
-        told = {name: self._told(info, m) for name, m in index.items()}
-        rewards = {}
+        infos, rewards = {}, {}
         for name, m in index.items():
-            told[name]["reward_terms"] = {key: float(term[m]) for key, term in terms.items()}
-            rewards[name] = sum(told[name]["reward_terms"].values())
+            paid = {key: float(term[m]) for key, term in terms.items()}
+            infos[name] = {**self._of(info, m), "reward_terms": paid}
+            rewards[name] = sum(paid.values())
         ended = {name: bool(self.env.ended[m]) for name, m in index.items()}
         cut = dict.fromkeys(self.agents, late)
         seen = {name: observation[m] for name, m in index.items()}
         self.agents = [] if late else [name for name in self.agents if not ended[name]]
-        return seen, rewards, ended, cut, told
+        return seen, rewards, ended, cut, infos
 
     def halt(self) -> None:
         """Stops every robot until the next reset. Any exception has done so already."""
         self.env.halt()
 
-    def _told(self, info: dict[str, Any], m: int) -> dict[str, Any]:
-        """The part of the env's `info` that concerns robot m."""
-        return {
-            name: value if name in ("goal", "bodies") else self._of(value, m)
-            for name, value in info.items()
-        }
-
     def _of(self, value: Any, m: int) -> Any:
-        """Robot m's row of a fact per robot; a fact of the world unchanged."""
+        """Robot m's row of a fact, or of each in a dict; a fact of the world unchanged."""
         if isinstance(value, dict):
-            return {name: self._of(one, m) for name, one in value.items()}
+            of_world = ("goal", "bodies")
+            return {n: one if n in of_world else self._of(one, m) for n, one in value.items()}
         each = self.env.robots > 1 and isinstance(value, np.ndarray)
         return value[m] if each else value
 

@@ -1,7 +1,4 @@
-"""Tasks by name, and user-defined ones by the path of their file.
-
-Makes the environments known to `gymnasium.make` and `gymnasium.make_vec`.
-"""
+"""Tasks by name or by the path of a user's file; the environments, for `gymnasium.make`."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ from nics_drl_bridge.lidar.sectors import layout_of
 TASKS = {
     "navigation": "nics_drl_bridge.env.navigation:Navigation",
     "cooperative_reaching": "nics_drl_bridge.env.teams:CooperativeReaching",
-    "pursuit_evasion": "nics_drl_bridge.env.pursuit_evasion:PursuitEvasion",
+    "pursuit_evasion": "nics_drl_bridge.env.teams:PursuitEvasion",
 }
 """Module and class of each shipped task."""
 
@@ -35,12 +32,9 @@ def make_task(
 ) -> Task:
     """Makes a task for the robot of a model.
 
-    Args:
-        task: the name of a shipped one (`navigation`), `path/to/file.py:ClassName`, a class, or a
-            Task.
-        model: gives the robot and the lidar.
-        options: further arguments of the class; `scan` may also be a number of sectors, the name
-            of a layout or its fields, see `canonical.layout_of`.
+    The task is the name of a shipped one (`navigation`), `path/to/file.py:ClassName`, a class, or a
+    Task. Options are further arguments of the class; `scan` may also be a number of sectors, the
+    name of a layout or its fields, see `sectors.layout_of`.
 
     Raises:
         ConfigError: no such task, an unknown argument, or a Task for another robot.
@@ -69,29 +63,23 @@ def _check_options(found: type[Task], options: dict[str, Any]) -> None:
             raise ConfigError(f"task {found.__name__}: unknown task option {name!r}; {hint}")
         annotation = known[name].annotation if name in known else None
         kind = str(getattr(annotation, "__name__", annotation))
-        if kind in KINDS and not KINDS[kind][0](value):
+        if kind in KINDS and not _fits(value, kind):
             raise ConfigError(f"task option {name}={value!r}: must be {KINDS[kind][1]}.")
 
 
-def _is_flag(value: object) -> bool:
-    return isinstance(value, bool | np.bool_)
-
-
-def _is_whole(value: object) -> bool:
-    return isinstance(value, int | np.integer) and not _is_flag(value)
-
-
-def _is_finite(value: object) -> bool:
-    number = _is_whole(value) or isinstance(value, float | np.floating)
-    return number and bool(np.isfinite(value))  # type: ignore[call-overload]
-
-
-KINDS = {
-    "bool": (_is_flag, "True or False"),
-    "int": (_is_whole, "a whole number"),
-    "float": (_is_finite, "a finite number"),
+KINDS: dict[str, tuple[tuple[type, ...], str]] = {
+    "bool": ((bool, np.bool_), "True or False"),
+    "int": ((int, np.integer), "a whole number"),
+    "float": ((int, np.integer, float, np.floating), "a finite number"),
 }
-"""Annotation of an option -> its check, and its name in errors."""
+"""Annotation of an option -> its types, and their name in errors."""
+
+
+def _fits(value: Any, kind: str) -> bool:
+    if isinstance(value, bool | np.bool_):
+        return kind == "bool"
+    finite = kind != "float" or not isinstance(value, float | np.floating) or np.isfinite(value)
+    return isinstance(value, KINDS[kind][0]) and bool(finite)
 
 
 def _checked(task: Task, model: SimulatorModel, options: dict[str, Any] | None) -> Task:
@@ -117,22 +105,19 @@ def _class_of(name: str) -> type[Task]:
     module = _load(Path(path)) if path.endswith(".py") else _import(path)
     found = getattr(module, attribute, None)
     if not (isinstance(found, type) and issubclass(found, Task)):
-        tasks = [n for n, v in vars(module).items() if isinstance(v, type) and _own(v, module)]
+        classes = [each for each in vars(module).values() if isinstance(each, type)]
+        own = [each for each in classes if each.__module__ == module.__name__]
+        tasks = [each.__name__ for each in own if issubclass(each, Task)]
         raise ConfigError(f"task {name!r}: {path} has no such Task; {nearest(attribute, tasks)}")
     return found
-
-
-def _own(found: type, module: Any) -> bool:
-    return issubclass(found, Task) and found.__module__ == module.__name__
 
 
 def _import(name: str) -> Any:
     try:
         return import_module(name)
     except (ImportError, TypeError, ValueError) as error:
-        raise ConfigError(
-            f"task {name!r}: can't be imported ({error}); give path/to/file.py:ClassName."
-        ) from None
+        reason = f"can't be imported ({error}); give path/to/file.py:ClassName."
+        raise ConfigError(f"task {name!r}: {reason}") from None
 
 
 def _load(path: Path) -> Any:
@@ -202,29 +187,16 @@ register_envs()
 
 
 def make(task: str = "navigation", **arguments: Any) -> gymnasium.Env[Any, Any]:
-    """An env of a task, with Gymnasium's own wrappers around it.
-
-    Args:
-        task: a name, or `path/to/file.py:ClassName`.
-        arguments: of `BridgeEnv`, as `model`, `world` and `backend`.
+    """An env of a task, with Gymnasium's own wrappers and the arguments of `BridgeEnv`.
 
     Raises:
         ConfigError, ModelError: an unknown name or a wrong file.
     """
-    made: gymnasium.Env[Any, Any] = gymnasium.make(TASK, task=task, **arguments)
-    return made
+    return gymnasium.make(TASK, task=task, **arguments)
 
 
 def make_vec(num_envs: int, task: str = "navigation", **arguments: Any) -> Any:
-    """A task in many worlds at once, for training.
-
-    Args:
-        num_envs: N.
-        task: a name, or `path/to/file.py:ClassName`.
-        arguments: of `BridgeVectorEnv`, as `model`, `world` and `threads`.
-
-    Returns:
-        A `BridgeVectorEnv`.
+    """A `BridgeVectorEnv`: a task in many worlds at once, for training.
 
     Raises:
         ConfigError, ModelError: an unknown name or a wrong file.

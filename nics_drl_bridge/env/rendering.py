@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import HEADING, RADIUS, SHAPE
 from nics_drl_bridge.sim.world import World
 
@@ -27,55 +28,37 @@ ROBOTS = ("#1f6fb2", "#2f855a", "#7a4fa3", "#b7791f", "#0f766e", "#9d174d")
 class WorldPicture:
     """Picture of walls, obstacles, goals, robots and their scans, redrawn at every step.
 
-    Args:
-        model: gives the footprint and the lidar.
-        world: gives the walls.
-        mode: `rgb_array` or `human`, which shows a window if there is a display.
-        fps: maximum number of pictures per second of `human`.
+    The mode is `rgb_array`, or `human`, which shows a window if there is a display.
     """
 
     def __init__(self, model: SimulatorModel, world: World, mode: str, fps: int) -> None:
         self._model, self._world = model, world
         self._human, self._pause_s = mode == "human", 1.0 / fps
-        x1, y1, x2, y2 = world.extent
-        width, depth = x2 - x1, y2 - y1
-        edge = (MARGIN * width, MARGIN * depth)
-        self._shown_x, self._shown_y = (x1 - edge[0], x2 + edge[0]), (y1 - edge[1], y2 + edge[1])
-        scale = SIZE_IN / max(width, depth)
-        size = (scale * width, scale * depth)
+        low, high = np.array(world.extent).reshape(2, 2)
+        width, depth = (SIZE_IN * (high - low) / (high - low).max()).tolist()
+        self._low, self._high = low - MARGIN * (high - low), high + MARGIN * (high - low)
         if self._human:
             import matplotlib.pyplot as plt  # looks for a display, which `rgb_array` does not need
 
-            self._figure = plt.figure(figsize=size, dpi=DPI)
+            self._figure = plt.figure(figsize=(width, depth), dpi=DPI)
         else:
-            self._figure = Figure(figsize=size, dpi=DPI)
+            self._figure = Figure(figsize=(width, depth), dpi=DPI)
             FigureCanvasAgg(self._figure)
         self._axes = self._figure.add_axes((0.0, 0.0, 1.0, 1.0))
 
     def draw(
-        self,
-        poses: Array,
-        ranges: NDArray[np.float32],
-        bodies: Array,
-        memory: dict[str, NDArray[Any]],
+        self, poses: Array, ranges: NDArray[Any], bodies: Array, memory: dict[str, NDArray[Any]]
     ) -> NDArray[np.uint8] | None:
-        """Draws a world.
+        """Draws robots at poses (M, 3) with scans (M, B), bodies (K, 7), and the memory's `goal`.
 
-        Args:
-            poses: (M, 3) of the robots.
-            ranges: (M, B) scans of the robots [m].
-            bodies: (K, 7) see `sim.scenes.Scene`.
-            memory: of the task, with a leading 1; `goal` (1, M, 2) is drawn.
-
-        Returns:
-            (H, W, 3) pixels; None for `human`.
+        Returns pixels (H, W, 3); None for `human`.
         """
         axes = self._axes
         axes.clear()
         axes.set_axis_off()
         axes.set_aspect("equal")
-        axes.set_xlim(*self._shown_x)
-        axes.set_ylim(*self._shown_y)
+        axes.set_xlim(self._low[0], self._high[0])
+        axes.set_ylim(self._low[1], self._high[1])
         draw_world(axes, self._world, bodies)
         for goal in np.reshape(memory.get("goal", np.zeros((0, 2))), (-1, 2)):
             axes.plot(*goal, marker="*", color=GOAL, markersize=16, markeredgecolor=WALL)
@@ -123,15 +106,9 @@ class WorldPicture:
 
 
 def draw_world(axes: Axes, world: World, bodies: NDArray[np.float64]) -> None:
-    """Draws map, walls and obstacles.
-
-    Args:
-        axes: to draw into; x and y in `map` [m].
-        world: map, walls and shapes.
-        bodies: (K, 7) see `sim.scenes.Scene`.
-    """
+    """Draws map, walls and obstacles (K, 7), see `sim.scenes.Scene`; x and y in `map` [m]."""
     if world.grid is not None:
-        _draw_map(axes, world)
+        _draw_map(axes, world.grid)
     for x1, y1, x2, y2 in world.all_walls():
         axes.plot([x1, x2], [y1, y2], color=WALL, linewidth=2)
     for body in bodies:
@@ -139,11 +116,8 @@ def draw_world(axes: Axes, world: World, bodies: NDArray[np.float64]) -> None:
             axes.add_patch(_patch(world, body))
 
 
-def _draw_map(axes: Axes, world: World) -> None:
+def _draw_map(axes: Axes, grid: GridMap) -> None:
     """Draws occupied cells dark and unknown ones grey."""
-    grid = world.grid
-    if grid is None:
-        return
     rows, columns = grid.cells.shape
     i, j = np.indices((rows + 1, columns + 1)) - 0.5
     corners = grid.cell_to_world(np.stack([i, j], axis=-1))

@@ -1,7 +1,4 @@
-"""SimBackend: the fast simulator in this process, with or without the robot's middleware.
-
-Backends of an env: those known by name, and user-defined ones.
-"""
+"""Backends of an env: the fast simulator in this process, those by name, and user-defined ones."""
 
 from __future__ import annotations
 
@@ -15,14 +12,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge import extensions
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import (
-    NS_PER_S,
-    Backend,
-    BackendFacts,
-    RobotView,
-    Start,
-    stacked,
-)
+from nics_drl_bridge.interface import NS_PER_S, Backend, BackendFacts, RobotView, Start, stacked
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -39,13 +29,8 @@ class SimBackend:
     Without it, the pose is that of the wheel odometry: bit-identical to a world of the vector env,
     and several times faster.
 
-    Args:
-        model: the robot.
-        world: the field.
-        renderer: `baked` or `exact` lidar.
-        estimator: True puts a middleware for each robot between simulator and env.
-        robots: M; views and commands have a leading (M,) if M > 1.
-        simulation: further arguments of the FastSimulator.
+    Views and commands have a leading (M,) if M > 1 `robots`; `simulation` are further arguments of
+    the FastSimulator.
     """
 
     def __init__(
@@ -92,10 +77,8 @@ class SimBackend:
         known: BackendFacts = {
             **self._truth(), "bodies": simulator.obstacles[0], "scenes": simulator.scenes,
         }  # fmt: skip
-        if simulator.drawn:
-            known["randomisation"] = {
-                name: self._of_episode(draws) for name, draws in simulator.drawn.items()
-            }
+        if drawn := simulator.drawn:
+            known["randomisation"] = {name: self._of_episode(each) for name, each in drawn.items()}
         return known
 
     def _truth(self) -> BackendFacts:
@@ -134,24 +117,17 @@ class SimBackend:
         """Does nothing: there is nothing to free."""
 
 
-NEEDED = ("reset", "step", "close")
-
-
 class CompletedBackend:
     """Wraps a user-defined backend that lacks `halt` or `facts`.
 
-    Instead of `halt` it gets a step with the command nearest to zero; its facts are those of its
-    last step.
-
-    Args:
-        backend: with `reset`, `step` and `close`.
-        still: (C,), or (M, C) for a team, the command nearest to zero.
+    Instead of `halt` it gets a step with the command nearest to zero, `still` (C,), or (M, C) for a
+    team; its facts are those of its last step.
     """
 
     def __init__(self, backend: Any, still: NDArray[np.float64]) -> None:
         self._backend, self._still = backend, still
-        self._halt, self._facts = method_of(backend, "halt"), method_of(backend, "facts")
-        self._told, self._known = False, BackendFacts()
+        self._halt, self._facts = _method(backend, "halt"), _method(backend, "facts")
+        self._moved, self._known = False, BackendFacts()
 
     def reset(self, start: Start) -> RobotView:
         """Calls the backend's."""
@@ -161,46 +137,41 @@ class CompletedBackend:
 
     def step(self, command: NDArray[np.float64]) -> tuple[RobotView, dict[str, Any]]:
         """Calls the backend's."""
-        self._told = True
-        told: tuple[RobotView, dict[str, Any]] = self._backend.step(command)
-        if "true_pose" in told[1]:
-            self._known = {"true_pose": told[1]["true_pose"]}
-        return told
+        self._moved = True
+        view, facts = self._backend.step(command)
+        if "true_pose" in facts:
+            self._known = {"true_pose": facts["true_pose"]}
+        return view, facts
 
     def halt(self) -> None:
         """Calls the backend's, or steps at a standstill if there was a step since the last halt."""
         if self._halt is not None:
             self._halt()
-        elif self._told:
+        elif self._moved:
             self._backend.step(self._still.copy())
-            self._told = False
+            self._moved = False
 
     def facts(self) -> BackendFacts:
-        """Calls the backend's, or returns the true pose of the last step if that told it."""
+        """Calls the backend's, or returns the true pose of the last step if that had it."""
         known: BackendFacts = self._known if self._facts is None else self._facts()
         return known
 
     def close(self) -> None:
         """Closes the backend, which sends a zero command itself."""
         self._backend.close()
-        self._told = False
+        self._moved = False
 
 
-def method_of(backend: Any, name: str) -> Callable[..., Any] | None:
-    """Returns a method of a user-defined backend; None if it has none of that name."""
+def _method(backend: Any, name: str) -> Callable[..., Any] | None:
     method = getattr(backend, name, None)
     return method if callable(method) else None
 
 
 def completed(backend: Any, still: NDArray[np.float64]) -> Backend:
-    """Returns a backend as one with all methods; see `CompletedBackend`.
-
-    Raises:
-        ConfigError: it is not a backend.
-    """
+    """Returns a backend with all methods. Raises ConfigError if it is none."""
     if isinstance(backend, Backend):
         return backend
-    missing = [name for name in NEEDED if method_of(backend, name) is None]
+    missing = [name for name in ("reset", "step", "close") if _method(backend, name) is None]
     if missing:
         raise ConfigError(
             f"backend of type {type(backend).__name__}: has no {', no '.join(missing)}; see "

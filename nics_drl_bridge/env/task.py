@@ -1,23 +1,18 @@
-"""Task: the job of a robot, written once for one robot over ROS 2 and thousands in arrays.
-
-Ranges below which a lidar return means contact with the robot.
-"""
+"""Task: the job of a robot, written once for one robot over ROS 2 and thousands in arrays."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.env import kernels
-from nics_drl_bridge.env.actions import Actions, action_space, discrete_commands, scaled
-from nics_drl_bridge.env.kernels import LIMIT
+from nics_drl_bridge.env.kernels import LIMIT, ScanScale
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, SectorPlan, plan_of
@@ -27,8 +22,18 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
+Actions = Literal["continuous", "discrete"]
 Memory = dict[str, NDArray[Any]]
 """Memory of a task during an episode: name -> array with leading (n, M), or (n,) per world."""
+
+DRIVES = ((0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 0, -1), (-1, 0, 0), (-1, 0, 1), (-1, 0, -1))
+"""The seven drives of the paper's cars: stop; ahead, ahead to the left, to the right; and back.
+
+They are those of the authors' code (efc-robot/MultiVehicleEnv), as signs of `cmd_vel`: linear.x,
+linear.y, angular.z. A robot that can't reverse stays in place, and turns if it can on the spot.
+"""
+SIDEWAYS = ((0, 1, 0), (0, -1, 0))
+"""Two more for a robot that moves sideways."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +41,7 @@ class Episodes:
     """Episodes at their start, in n worlds with M robots.
 
     Attributes:
-        seeds: (n,) of each episode. All that a task draws must follow from them, see
-            `random_kernels.uniform`.
+        seeds: (n,); all that a task draws must follow from them, see `random_kernels.uniform`.
         starts: (n, M, 3) poses of the robots: x [m], y [m], heading [rad] in `map`.
         goals: (n, M, 2) free points that the world drew, one per robot [m].
     """
@@ -49,12 +53,9 @@ class Episodes:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a step. All arrays have the leading dimensions of the view.
+    """Outcome of a step: terms of the reward, robots whose episode has ended, facts for `info`.
 
-    Attributes:
-        terms: name -> term of the reward; their sum is the reward.
-        ended: True where the episode has ended for a robot.
-        info: further facts by name, for `info`.
+    All arrays have the leading dimensions of the view; the reward is the sum of its terms.
     """
 
     terms: dict[str, Array]
@@ -66,10 +67,7 @@ class Outcome:
 class Sight:
     """Meaning of the scan parts of an observation.
 
-    Attributes:
-        angles: (P,) direction of each part, counter-clockwise, in `base_link` [rad].
-        origin: (2,) origin of the rays, in `base_link` [m].
-        range_max: range that a share of 1 stands for [m].
+    Direction (P,) [rad] and origin (2,) [m] of the rays in `base_link`, range of a share of 1 [m].
     """
 
     angles: Array
@@ -90,7 +88,7 @@ class Task(ABC):
     Attributes:
         robot: gives commands, their limits, and the footprint.
         lidar: gives the scan.
-        actions: `continuous` (Box) or `discrete` (the paper's drives, see `actions.DRIVES`).
+        actions: `continuous` (Box) or `discrete` (the paper's drives, see `DRIVES`).
         contact_margin: a return this close to the footprint counts as a contact [m].
         scan: sectors that observations contain instead of the lidar's beams, so that they mean the
             same for any lidar; None keeps the beams. Contact is always judged from the beams.
@@ -126,8 +124,10 @@ class Task(ABC):
 
     @cached_property
     def action_space(self) -> gymnasium.Space[Any]:
-        """Action space of one robot."""
-        return action_space(self.robot, self.actions)
+        """Action space of one robot: Box [-1, 1] of its commands, or Discrete."""
+        if self.actions == "discrete":
+            return gymnasium.spaces.Discrete(len(self._commands))
+        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.robot.command),), np.float32)
 
     @abstractmethod
     def reset(self, episodes: Episodes) -> Memory:
@@ -153,14 +153,17 @@ class Task(ABC):
         """Updates the memory after a step, in place, before anything is computed from it."""
 
     def command(self, action: ArrayLike) -> Array:
-        """Returns the command (..., C) of an action: (..., C) continuous, or (...) discrete."""
+        """Returns the command (..., C) of an action: (..., C) continuous, or (...) discrete.
+
+        Continuous actions are cut to [-1, 1] and scaled between the limits of the commands.
+        """
         if self.actions == "discrete":
             return np.asarray(self._commands[np.asarray(action)])
-        return scaled(action, self.robot)
-
-    def observe_into(self, out: Observation, view: RobotView, memory: Memory) -> None:
-        """Writes the observation into (..., O)."""
-        out[...] = self.observation(view, memory)
+        given = np.ascontiguousarray(action)
+        out, rows = np.empty(given.shape), given.reshape(-1, given.shape[-1])
+        low, high = self.robot.command_low, self.robot.command_high
+        kernels.commands(out.reshape(rows.shape), rows, low, high)
+        return out
 
     def step_into(
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
@@ -170,7 +173,7 @@ class Task(ABC):
         Override it if one pass over the scan gives several of these results.
         """
         self.update(before, after, memory)
-        self.observe_into(out, after, memory)
+        out[...] = self.observation(after, memory)
         terms = self.reward(before, after, memory)
         return Outcome(terms, self.end(after, memory), self.info(after, memory))
 
@@ -191,10 +194,7 @@ class Task(ABC):
         )
 
     def free_share(self, ranges: NDArray[np.float32]) -> Observation:
-        """Returns ranges (..., B) as shares (..., P): 1 no return, 0 too close or unknown.
-
-        Shares are relative to the maximum range of the lidar, or of the layout `scan`.
-        """
+        """Returns ranges (..., B) as shares of the maximum (..., P): 1 free, 0 close or unknown."""
         return self._look(ranges)[0]
 
     def touches(self, ranges: NDArray[np.float32]) -> Flags:
@@ -204,9 +204,9 @@ class Task(ABC):
     def _look(self, ranges: NDArray[np.float32]) -> tuple[Observation, Flags]:
         ranges = np.ascontiguousarray(ranges, np.float32)
         rows = ranges.reshape(-1, ranges.shape[-1])
-        parts = rows.shape[-1] if self.scan is None else self.scan.sectors
-        shares, touched = np.empty((len(rows), parts), np.float32), np.empty(len(rows), np.bool_)
-        kernels.looks(shares, touched, rows, self.sensor)
+        parts, count = rows.shape[-1] if self.scan is None else self.scan.sectors, len(rows)
+        shares, touched = np.empty((count, parts), np.float32), np.empty(count, np.bool_)
+        kernels.looks(shares, touched, rows, self.scale)
         lead = ranges.shape[:-1]
         return shares.reshape(*lead, parts), touched.reshape(lead)
 
@@ -218,8 +218,7 @@ class Task(ABC):
     @cached_property
     def sight(self) -> Sight:
         """Meaning of the scan parts."""
-        if self.scan is not None:
-            layout = self.scan
+        if (layout := self.scan) is not None:
             return Sight(layout.angles, np.array(layout.viewpoint), layout.range_max)
         x, y, heading = self.lidar.mount
         return Sight(self.lidar.angles + heading, np.array([x, y]), self.lidar.range_max)
@@ -230,19 +229,48 @@ class Task(ABC):
         return NO_PLAN if self.scan is None else plan_of(self.lidar, self.scan)
 
     @cached_property
-    def sensor(self) -> tuple[Any, ...]:
-        """Arguments of the kernels: `per_metre`, `contact_ranges`, and the plan's arrays."""
-        return self.per_metre, self.contact_ranges, self.plan.arguments
+    def scale(self) -> ScanScale:
+        """Conversion of a scan, for the kernels."""
+        leaves = contact_ranges(self.robot, self.lidar, self.contact_margin)
+        sectors = 0 if self.scan is None else self.scan.sectors
+        per_metre = np.float32(1.0 / self.sight.range_max)
+        return ScanScale(per_metre, leaves, sectors, self.plan.arguments)
 
-    @cached_property
-    def per_metre(self) -> np.float32:
-        """1 / the range that a share of 1 stands for [1/m]."""
-        return np.float32(1.0 / self.sight.range_max)
 
-    @cached_property
-    def contact_ranges(self) -> NDArray[np.float32]:
-        """(B,) range at which each beam leaves the footprint and its margin [m]."""
-        return contact_ranges(self.robot, self.lidar, self.contact_margin)
+def discrete_commands(robot: RobotSpec) -> Array:
+    """(A, C) commands of the discrete actions: `DRIVES` at the commands' limits.
+
+    A robot whose commands do not name fields of `cmd_vel` gets a stop, and each command alone at
+    its maximum and its minimum.
+    """
+    if any(command.cmd_vel is None for command in robot.command):
+        each = np.eye(len(robot.command), dtype=np.int64)
+        signs = np.concatenate([0 * each[:1], each, -each])
+    else:
+        drives = (*DRIVES, *SIDEWAYS) if robot.moves_sideways else DRIVES
+        signs = robot.from_cmd_vel(np.array(drives))
+    limits = np.where(signs > 0, robot.command_high, robot.command_low)
+    commands: Array = np.where(signs == 0, still(robot), limits)
+    return commands
+
+
+def still(robot: RobotSpec) -> Array:
+    """(C,) the command nearest to zero, which stops a robot."""
+    nearest_zero: Array = np.clip(0.0, robot.command_low, robot.command_high)
+    return nearest_zero
+
+
+def team_space(space: gymnasium.Space[Any], robots: int) -> gymnasium.Space[Any]:
+    """Joint space of M robots, concatenated to a vector as algorithms expect it.
+
+    Box (L,) becomes Box (M L,), Discrete becomes MultiDiscrete (M,); one robot's is unchanged.
+    """
+    if robots == 1:
+        return space
+    several = gymnasium.vector.utils.batch_space(space, robots)
+    if not isinstance(several, gymnasium.spaces.Box):
+        return several
+    return gymnasium.spaces.Box(several.low.ravel(), several.high.ravel(), dtype=np.float32)
 
 
 def bearing(pose: ArrayLike, points: ArrayLike) -> Array:
@@ -252,16 +280,16 @@ def bearing(pose: ArrayLike, points: ArrayLike) -> Array:
     distances are cut at `kernels.LIMIT`.
     """
     poses, places, shape = _rows(pose, points)
-    out = np.empty((len(poses), 3))
-    kernels.bearings(out, poses, places)
+    out = np.empty((len(poses), 1, 1, 3))
+    kernels.bearings(out, poses[:, None], places[:, None])
     return out.reshape(*shape, 3)
 
 
 def distance(pose: ArrayLike, points: ArrayLike) -> Array:
     """Returns distances (...) [m] from poses (..., 2 or 3) to points (..., 2), broadcast."""
     poses, places, shape = _rows(pose, points)
-    out = np.empty(len(poses))
-    kernels.distances(out, poses, places)
+    out = np.empty((len(poses), 1, 1))
+    kernels.distances(out, poses[:, None], places[:, None])
     return out.reshape(shape)
 
 
@@ -284,44 +312,18 @@ def limited(twist: Array) -> Array:
     return np.minimum(np.maximum(twist, -LIMIT), LIMIT)
 
 
-def override(memory: Memory, options: Mapping[str, Any] | None) -> None:
-    """Writes values of `reset(options=...)` into all rows of the memory arrays that they name."""
-    for name, rows in memory.items():
-        if options and name in options:
-            give(rows, name, options[name])
-
-
-def give(rows: NDArray[Any], name: str, value: Any) -> None:
-    """Writes the value of an option of `reset(options=...)` into rows (n, ...).
-
-    Raises:
-        ConfigError: the value has a wrong shape, or contains NaN or inf.
-    """
-    try:
-        given = np.asarray(value)
-    except ValueError:  # a ragged list
-        given = np.asarray(None)
-    fits = given.shape in [rows.shape[k:] for k in range(max(2, rows.ndim))]
-    if not fits or given.dtype.kind not in "fiub":
-        raise ConfigError(
-            f"reset option {name!r}, {value!r}: must be numbers of shape {rows.shape[1:]}, or of "
-            "its last dimensions."
-        )
-    rows[...] = given
-    if not np.isfinite(rows).all():
-        raise ConfigError(f"reset option {name!r}, {value!r}: must be finite.")
+def total(values: Array) -> Array:
+    """Sums over the last axis to (...), in order: bit-identical for every batch size."""
+    summed = values[..., 0].copy()
+    for k in range(1, values.shape[-1]):
+        summed += values[..., k]
+    return np.asarray(summed)
 
 
 def contact_ranges(robot: RobotSpec, lidar: LidarSpec, margin: float) -> NDArray[np.float32]:
-    """Range at which each beam leaves the footprint and a margin around it.
+    """Ranges (B,) at which each beam leaves the footprint, round or a polygon, and a margin [m].
 
-    Args:
-        robot: gives the footprint, round or a polygon.
-        lidar: gives the mount and the beams.
-        margin: [m].
-
-    Returns:
-        (B,) [m]; -inf where a beam does not cross the footprint.
+    -inf where a beam does not cross the footprint.
     """
     x, y, heading = lidar.mount
     angles = lidar.angles + heading

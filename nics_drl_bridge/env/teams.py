@@ -1,7 +1,4 @@
-"""Helpers for tasks of several robots: bearings and distances of all pairs, (..., M, P).
-
-Cooperative reaching: a team has to reach several goals, each with any of its robots.
-"""
+"""Tasks of several robots: reach goals together, and pursuit and evasion."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.env.kernels import LIMIT
-from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Task, limited
+from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Task, limited, total
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import RobotView
 
@@ -26,7 +23,7 @@ def seen(pose: Array, points: Array) -> Array:
     """Bearings (..., M, P, 3) of points (..., P, 2) from each robot (..., M, 3); see `bearing`."""
     robots, places, shape = _batched(pose, points)
     out = np.empty((len(robots), robots.shape[1], places.shape[1], 3))
-    kernels.pair_bearings(out, robots, places)
+    kernels.bearings(out, robots, places)
     return out.reshape(*shape, 3)
 
 
@@ -34,7 +31,7 @@ def distances(pose: Array, points: Array) -> Array:
     """Distances (..., M, P) [m] from each robot (..., M, 3) to each point (..., P, 2)."""
     robots, places, shape = _batched(pose, points)
     out = np.empty((len(robots), robots.shape[1], places.shape[1]))
-    kernels.pair_distances(out, robots, places)
+    kernels.distances(out, robots, places)
     return out.reshape(shape)
 
 
@@ -56,22 +53,14 @@ def others(of_all: Array) -> Array:
     return np.asarray(kept.reshape(*lead, count, count - 1, width))
 
 
-def total(values: Array) -> Array:
-    """Sums over the last axis to (...), in order: bit-identical for every batch size."""
-    summed = values[..., 0].copy()
-    for k in range(1, values.shape[-1]):
-        summed += values[..., k]
-    return np.asarray(summed)
-
-
 @dataclass(frozen=True)
 class CooperativeReaching(Task):
     """M robots have to reach M goals; a goal counts for all as soon as one robot was there.
 
     ## Observation Space
 
-    Of one robot, `Box((B + 4 M + 3 (M - 1) + 3,), float32)`, B beams or
-    sectors. The robots share their positions.
+    Of one robot, `Box((B + 4 M + 3 (M - 1) + 3,), float32)`, B beams or sectors. The robots share
+    their positions.
 
     | Num | Observation | Min | Max | Unit |
     |---|---|---|---|---|
@@ -100,15 +89,7 @@ class CooperativeReaching(Task):
     ## Episode End
 
     For a robot when it touches something; it then stands still as another obstacle. For all
-    when the last goal is reached.
-
-    Attributes:
-        robots: M.
-        goal_radius: distance at which a goal is reached [m].
-        reached_reward: of the team, for each goal.
-        collision_reward: of a robot, for a contact.
-        progress_reward: per metre of approach.
-        time_reward: per step.
+    when the last goal is reached: a robot is within `goal_radius` [m] of it.
     """
 
     keeps_last_scan: ClassVar[bool] = False
@@ -192,4 +173,157 @@ class CooperativeReaching(Task):
             "is_success": done.copy(),
             "collision": self.touches(view.ranges),
             "reached": memory["reached"].copy(),
+        }
+
+
+@dataclass(frozen=True)
+class PursuitEvasion(Task):
+    """P pursuers have to get close to E evaders, who have to keep away; all robots are alike.
+
+    The first P of the M = P + E robots pursue.
+
+    ## Observation Space
+
+    Of one robot, `Box((B + 5 (M - 1) + 1 + 3,), float32)`, B beams or sectors. Every robot knows
+    the positions of all others.
+
+    | Num | Observation | Min | Max | Unit |
+    |---|---|---|---|---|
+    | 0 to B - 1 | range as a share of the maximum; 1 free, 0 too close or unknown | 0 | 1 | - |
+    | 5 for each other robot, in order | distance | 0 | 1000 | m |
+    | | cosine, sine of the bearing | -1 | 1 | - |
+    | | 1 if it is on the same side | 0 | 1 | - |
+    | | 1 if it is out: caught, or touched something | 0 | 1 | - |
+    | then 1 | 1 if the robot itself pursues | 0 | 1 | - |
+    | the last 3 | estimated velocity forward, left; turn rate | -1000 | 1000 | m/s, rad/s |
+
+    ## Action Space
+
+    Of one robot as in navigation: `Box(-1, 1, (C,), float32)`, or `Discrete`.
+
+    ## Rewards
+
+    `pursuit`: for a pursuer, 1 per metre of approach to the nearest evader that is not out; for an
+    evader, 1 per metre gained on the nearest pursuer. `capture`: 10 for every pursuer for each
+    evader that is caught, -10 for that evader. `time`: -0.01 per step for a pursuer, 0.01 for an
+    evader. `collision`: -10 for a robot that touches something otherwise. To train one side, use
+    that side's rewards, from `info["reward_terms"]` or from the PettingZoo env; the reward of the
+    Gymnasium env is the sum over all robots.
+
+    ## Starting State
+
+    Obstacles and starts are drawn by the world. Memory: `out` (M,), `caught` (M,), `newly` (M,).
+
+    ## Episode End
+
+    For an evader when the free space between it and a pursuer is below `capture_gap` [m]; for any
+    robot when it touches something otherwise; it then stands still as another obstacle. For all
+    when all evaders, or all pursuers, are out. The pursuers succeed when every evader is caught.
+    """
+
+    keeps_last_scan: ClassVar[bool] = False
+
+    pursuers: int = 2
+    evaders: int = 1
+    capture_gap: float = 0.15
+    capture_reward: float = 10.0
+    collision_reward: float = -10.0
+    pursuit_reward: float = 1.0
+    time_reward: float = -0.01
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if min(self.pursuers, self.evaders) < 1:
+            raise ConfigError(
+                f"task options pursuers={self.pursuers}, evaders={self.evaders}: at least 1 each."
+            )
+
+    @property
+    def robots(self) -> int:
+        """M = P + E."""
+        return self.pursuers + self.evaders
+
+    @cached_property
+    def pursues(self) -> Flags:
+        """(M,) True for pursuers."""
+        return np.arange(self.robots) < self.pursuers
+
+    @cached_property
+    def observation_space(self) -> gymnasium.spaces.Box:
+        """Box of one robot's observation."""
+        other = self.robots - 1
+        return self.box(
+            [*[0.0, -1.0, -1.0, 0.0, 0.0] * other, 0.0, *[-LIMIT] * 3],
+            [*[LIMIT, 1.0, 1.0, 1.0, 1.0] * other, 1.0, *[LIMIT] * 3],
+        )
+
+    def reset(self, episodes: Episodes) -> Memory:
+        """Returns a memory with no robot out; `newly` marks those caught in the last step."""
+        none = np.zeros(episodes.starts.shape[:-1], np.bool_)
+        return {"out": none, "caught": none.copy(), "newly": none.copy()}
+
+    def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:
+        """Marks the robots that are caught or out."""
+        chased = self._gaps(after, memory)
+        reach = 2.0 * self.robot.footprint_radius + self.capture_gap
+        caught = ~self.pursues & (chased < reach) & ~memory["out"]
+        memory["newly"][...] = caught
+        memory["caught"] |= caught
+        memory["out"] |= caught | self._collided(after, memory)
+
+    def _gaps(self, view: RobotView, memory: Memory) -> Array:
+        """(..., M) [m] to the nearest robot of the other side that is not out; inf without one."""
+        between = distances(view.pose, view.pose[..., :2])
+        foe = (self.pursues[:, None] != self.pursues) & ~memory["out"][..., None, :]
+        return np.asarray(np.where(foe, between, np.inf).min(axis=-1))
+
+    def observation(self, view: RobotView, memory: Memory) -> Observation:
+        """The observation (..., M, O) of views (..., M)."""
+        lead = view.pose.shape[:-1]
+        mates = np.broadcast_to(self.pursues[:, None] == self.pursues, (*lead, self.robots))
+        out = np.broadcast_to(memory["out"][..., None, :], (*lead, self.robots))
+        places = seen(view.pose, view.pose[..., :2])
+        known = np.concatenate([places, mates[..., None], out[..., None]], axis=-1)
+        parts: list[NDArray[Any]] = [
+            self.free_share(view.ranges),
+            others(known).reshape(*lead, -1),
+            np.broadcast_to(self.pursues[:, None], (*lead, 1)),
+            limited(view.twist),
+        ]
+        return np.concatenate(parts, axis=-1, dtype=np.float32, casting="same_kind")
+
+    def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
+        """The terms (..., M)."""
+        # Evaders caught in this step still count for this step.
+        known = {**memory, "out": memory["out"] & ~memory["newly"]}
+        gap = [self._gaps(view, known) for view in (before, after)]
+        free = np.isfinite(gap[0]) & np.isfinite(gap[1])
+        nearer = np.where(free, np.where(free, gap[0], 0.0) - np.where(free, gap[1], 0.0), 0.0)
+        side = np.where(self.pursues, 1.0, -1.0)
+        captures = memory["newly"].sum(axis=-1)[..., None]
+        newly = np.where(self.pursues, captures, -1.0 * memory["newly"])
+        return {
+            "pursuit": self.pursuit_reward * side * nearer,
+            "capture": self.capture_reward * newly,
+            "time": np.broadcast_to(self.time_reward * side, nearer.shape).copy(),
+            "collision": np.multiply(self.collision_reward, self._collided(after, memory)),
+        }
+
+    def _collided(self, view: RobotView, memory: Memory) -> Flags:
+        """True for a contact that is no capture."""
+        return np.asarray(self.touches(view.ranges) & ~memory["newly"])
+
+    def end(self, view: RobotView, memory: Memory) -> Flags:
+        """Returns the robots that are out; all of them when one side has none left."""
+        out = memory["out"]
+        over = out[..., self.pursues].all(axis=-1) | out[..., ~self.pursues].all(axis=-1)
+        return np.asarray(out | np.asarray(over)[..., None])
+
+    def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
+        """Success of each robot's side, contacts, and captures (..., M)."""
+        won = np.asarray(memory["caught"][..., ~self.pursues].all(axis=-1))[..., None]
+        return {
+            "is_success": np.asarray(won == self.pursues),
+            "collision": self._collided(view, memory),
+            "caught": memory["caught"].copy(),
         }

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from importlib import import_module
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -12,35 +11,25 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env import vector_rows
-from nics_drl_bridge.env.actions import check_action, still, team_space
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
-from nics_drl_bridge.env.guard import check_options, check_reset
+from nics_drl_bridge.env.guard import check_action, check_reset, give, override
 from nics_drl_bridge.env.kernels import episode_seeds
 from nics_drl_bridge.env.registry import make_task
-from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, give, override
-from nics_drl_bridge.env.vector_rows import (
-    EVERY,
-    Rows,
-    VectorFacts,
-    chosen_worlds,
-    flat,
-    joined,
-    mode_of,
-    named_seeds,
-    over_robots,
-)
+from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, still, team_space, total
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import NS_PER_S, RobotView
-from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.lidar.shapes import BODY
-from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
+Facts = Mapping[str, Any]
+"""Name -> array whose first dimension is the world, or another such mapping."""
+Rows = slice | NDArray[np.intp] | Flags
+MODES = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
 
 
 class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
@@ -63,19 +52,16 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     Args:
         num_envs: N.
-        model: a SimulatorModel, its folder, or the name of a shipped robot.
-        world: a World, its YAML file, or the name of a shipped one.
-        task: a name, `path/to/file.py:ClassName`, a class, or a Task.
-        task_options: further arguments of the task's class.
+        model, world, task, task_options: see `BridgeEnv`.
         max_episode_steps: an episode is truncated after this many steps.
         autoreset_mode: `NextStep` (an ended world is reset in the next step, whose action it
             ignores) or `SameStep` (at once; the last observation is in `info["final_obs"]`).
         copy: True if the caller may keep what `step` returns. False reuses the array of the
             observation in the next step.
-        renderer: `baked` or `exact` lidar.
-        threads: of the simulator; the numbers do not depend on it.
-        randomisation: quantities drawn in each episode, see `BridgeEnv`.
         render_mode: `rgb_array`, of every world, or None.
+        simulation: further arguments of the FastSimulator: `renderer` (`baked` by default, or
+            `exact`), `threads`, on which the numbers do not depend, and `randomisation`, the
+            quantities drawn in each episode, see `BridgeEnv`.
 
     Raises:
         ConfigError, ModelError: an unknown name or a wrong file.
@@ -97,16 +83,18 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         max_episode_steps: int = 300,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         copy: bool = True,
-        renderer: Renderer = "baked",
-        threads: int = 1,
-        randomisation: str | Randomisation | None = None,
+        *,
         render_mode: str | None = None,
+        **simulation: Any,
     ) -> None:
         self._pictures: list[Any] = []  # `close` needs it even if the rest raises
         check_render_mode(render_mode, self.metadata)
         self.num_envs, self.render_mode = num_envs, render_mode
         self._limit, self.copy = max_episode_steps, copy
-        self._mode = mode_of(autoreset_mode)
+        mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
+        if mode not in MODES:
+            raise ConfigError(f"autoreset_mode {mode!r}: must be one of {', '.join(MODES)}.")
+        self._mode = MODES[mode]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.model = open_model(model) if isinstance(model, str) else model
         self.world = load_world(world) if isinstance(world, str) else world
@@ -116,12 +104,11 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self.single_action_space = team_space(self.task.action_space, self.robots)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.simulator = FastSimulator(
-            self.model, self.world, num_envs, self.robots, renderer, threads, randomisation
-        )
+        simulation = {"renderer": "baked", **simulation}
+        self.simulator = FastSimulator(self.model, self.world, num_envs, self.robots, **simulation)
         self._each = (num_envs, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
-        self._facts = VectorFacts(self.simulator, round(self.model.control_period * NS_PER_S))
+        self._period_ns = round(self.model.control_period * NS_PER_S)
         self._allocate()
 
     def _allocate(self) -> None:
@@ -170,12 +157,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self.ready = False
         self._first[fresh], self._episode[fresh] = seeds[fresh], -1
         if not chosen.all():  # the others keep their observation
-            self.task.observe_into(self._out, self._view(slice(None)), self.memory)
-        rows = np.flatnonzero(chosen)
-        self._begin(rows, self._out, options)
-        infos: dict[str, Any] = {}
-        facts = self._known(rows) | self._facts.beginnings(self._starts, self._bodies, rows)
-        vector_rows.put_rows(infos, facts, rows, self.num_envs)
+            self._out[...] = self.task.observation(self._view(slice(None)), self.memory)
+        self._begin(np.flatnonzero(chosen), self._out, options)
+        infos = spread(self._known(chosen) | self._beginnings(chosen), chosen)
         self.ready = True
         return flat(self._out.copy() if self.copy else self._out), infos
 
@@ -196,8 +180,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._bodies[worlds] = scenes.bodies
         self._starts[worlds] = self.simulator.data.pose[worlds]
         fresh = self.task.reset(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))
-        check_options(options, fresh, more=("reset_mask",))
-        override(fresh, options)
+        override(fresh, options, "start", "reset_mask")
         for name, rows in fresh.items():
             if name not in self.memory:
                 self.memory[name] = np.zeros((self.num_envs, *rows.shape[1:]), rows.dtype)
@@ -225,10 +208,10 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         )
         terminated = self.ended.all(axis=1) & ~begun
         truncated = (self.simulator.data.steps >= self._limit) & ~begun
-        reward = np.where(begun, 0.0, over_robots(self._reward))
+        reward = np.where(begun, 0.0, total(self._reward))
         over = terminated | truncated
         infos: dict[str, Any] = {}
-        facts = self._facts.of_step(outcome)
+        facts = self._facts_of_step(outcome)
         if self._mode is AutoresetMode.SAME_STEP:
             self._end_at_once(out, over, facts, infos)
         else:
@@ -268,13 +251,13 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self, out: Observation, over: Flags, facts: dict[str, Any], infos: dict[str, Any]
     ) -> None:
         """SAME_STEP: resets the worlds that ended; `infos` gets their last observation and info."""
-        rows = np.flatnonzero(over)
-        if len(rows):
-            infos.update(vector_rows.finals(flat(out), rows))
-            final: dict[str, Any] = {}
-            known = self._known(rows) | vector_rows.rows_of(facts, rows)
-            vector_rows.put_rows(final, known, rows, self.num_envs)
-            infos["final_info"], infos["_final_info"] = final, over.copy()
+        if over.any():
+            shown = np.full(self.num_envs, None, dtype=object)
+            for n in np.flatnonzero(over):  # only those that ended: each needs its own object
+                shown[n] = flat(out)[n].copy()
+            infos["final_obs"], infos["_final_obs"] = shown, over.copy()
+            final = self._known(over) | mapped(facts, lambda values: values[over])
+            infos["final_info"], infos["_final_info"] = spread(final, over), over.copy()
             self.simulator.run_parts(
                 lambda part: self._begin(part.start + np.flatnonzero(over[part]), out)
             )
@@ -282,28 +265,59 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
         """Adds to `infos` the facts of every world, and the beginnings of those in `begun`."""
-        vector_rows.put_all(infos, self._known(), np.zeros_like(begun))
-        rows = np.flatnonzero(begun)
-        if len(rows) < self.num_envs:
-            vector_rows.put_all(infos, facts, begun)
-        if len(rows):
-            beginnings = self._facts.beginnings(self._starts, self._bodies, rows)
-            vector_rows.put_rows(infos, beginnings, rows, self.num_envs)
+        infos |= masked(self._known(slice(None)), np.ones_like(begun))
+        if not begun.any():
+            infos |= masked(facts, ~begun)
+            return
+        infos |= spread(self._beginnings(begun), begun)
+        if not begun.all():
+            infos |= spread(mapped(facts, lambda values: values[~begun]), ~begun)
 
-    def _known(self, rows: Rows = EVERY) -> dict[str, Any]:
-        shown = {name: self.memory[name] for name in self.task.shown}
-        return self._facts.known(shown, rows)
+    # Facts as new arrays (N, ...) of worlds with one robot, or (N, M, ...) of teams.
+
+    def _known(self, rows: Rows) -> dict[str, Any]:
+        """Facts of some worlds that are known at any time."""
+        shown = {name: self._row(self.memory[name][rows]).copy() for name in self.task.shown}
+        pose = self._row(self.simulator.data.odom[rows]).copy()
+        ages = np.zeros(len(pose))
+        return {**shown, "pose": pose, "scan_age_s": ages, "odom_age_s": ages.copy()}
+
+    def _beginnings(self, rows: Flags) -> dict[str, Any]:
+        """Facts of episodes that begin, with the values that the randomisation drew."""
+        drawn = {
+            name: self._row(values[rows]) if values.ndim > 1 else values[rows]
+            for name, values in self.simulator.drawn.items()
+        }
+        return {
+            "episode_seed": self.simulator.data.seeds[rows],
+            "start": self._row(self._starts[rows]),
+            "bodies": self._bodies[rows],
+            **({"randomisation": drawn} if drawn else {}),
+        }
+
+    def _facts_of_step(self, outcome: Outcome) -> dict[str, Any]:
+        """Facts of a step, for every world."""
+        data = self.simulator.data
+        return {
+            "stamp_ns": data.steps * self._period_ns,
+            "true_pose": self._row(data.pose).copy(),
+            "true_collision": self._row(data.collided).astype(np.bool_),
+            **{name: self._row(values).copy() for name, values in outcome.info.items()},
+            "reward_terms": {name: self._row(t).copy() for name, t in outcome.terms.items()},
+        }
+
+    def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
+        return rows[:, 0] if self.robots == 1 else rows
 
     def render(self) -> tuple[Any, ...] | None:
         """Draws every world; see Gymnasium."""
         if self.render_mode is None:
             return None
         if not self._pictures:
-            drawing = import_module("nics_drl_bridge.env.rendering")
-            self._pictures = [
-                drawing.WorldPicture(self.model, self.world, self.render_mode, RENDER_FPS)
-                for _ in range(self.num_envs)
-            ]
+            from nics_drl_bridge.env.rendering import WorldPicture  # loads matplotlib
+
+            which = (self.model, self.world, self.render_mode, RENDER_FPS)
+            self._pictures = [WorldPicture(*which) for _ in range(self.num_envs)]
         drawn, data, bodies = [], self.simulator.data, self.simulator.obstacles
         for n, picture in enumerate(self._pictures):
             memory = {name: rows[n : n + 1] for name, rows in self.memory.items()}
@@ -314,3 +328,88 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """Closes the pictures."""
         for picture in self._pictures:
             picture.close()
+
+
+def flat(observations: Observation) -> Observation:
+    """Concatenates the observations of each world's robots to (N, M O), without a copy."""
+    return observations.reshape(len(observations), -1)
+
+
+def joined(parts: Sequence[Outcome]) -> Outcome:
+    """Joins the outcomes of consecutive parts of the worlds."""
+    if len(parts) == 1:
+        return parts[0]
+
+    terms = {name: np.concatenate([part.terms[name] for part in parts]) for name in parts[0].terms}
+    info = {name: np.concatenate([part.info[name] for part in parts]) for name in parts[0].info}
+    return Outcome(terms, np.concatenate([part.ended for part in parts]), info)
+
+
+def chosen_worlds(options: dict[str, Any] | None, count: int) -> Flags:
+    """Mask (N,) of the worlds to reset. Raises ConfigError for a wrong `reset_mask`."""
+    if not options or "reset_mask" not in options:
+        return np.ones(count, np.bool_)
+    chosen = np.asarray(options["reset_mask"])
+    if chosen.shape != (count,) or chosen.dtype != np.bool_ or not chosen.any():
+        raise ConfigError(
+            f"options['reset_mask'] of shape {chosen.shape}, {chosen.dtype}: must be ({count},) "
+            "bool with at least one True."
+        )
+    return chosen.copy()
+
+
+def named_seeds(
+    seed: int | Sequence[int | None] | None, chosen: Flags, unnamed: Flags, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], Flags]:
+    """Seeds (N,) that a reset gives to worlds, and a mask (N,) of those that begin anew with them.
+
+    The seed is that of the first world, or of each (None keeps its present one), or None for all.
+    For `chosen` worlds that are `unnamed`, as they never had a seed, one is drawn if none is given.
+
+    Raises:
+        ConfigError: wrong number of seeds, or a negative one.
+    """
+    count = len(chosen)
+    if isinstance(seed, Sequence | np.ndarray):
+        if len(seed) != count:
+            raise ConfigError(f"{len(seed)} seeds for {count} worlds; give one each.")
+        given = chosen & np.array([one is not None for one in seed])
+        seeds = np.array([0 if one is None else one for one in seed], np.int64)
+    else:
+        given = chosen & (seed is not None)
+        seeds = (seed or 0) + np.arange(count, dtype=np.int64)
+    new = chosen & unnamed & ~given
+    if new.any():
+        seeds = np.where(new, int(rng.integers(2**31)) + np.arange(count), seeds)
+    fresh = given | new
+    if (seeds[fresh] < 0).any():
+        raise ConfigError("a seed must not be negative.")
+    return seeds, fresh
+
+
+def mapped(facts: Facts, function: Callable[[NDArray[Any]], NDArray[Any]]) -> dict[str, Any]:
+    """Applies a function to every array of facts."""
+    return {
+        name: mapped(values, function) if isinstance(values, Mapping) else function(values)
+        for name, values in facts.items()
+    }
+
+
+def masked(facts: Facts, mask: Flags) -> dict[str, Any]:
+    """Pairs each fact (N, ...) with the mask (N,) of its worlds, `_name`, as Gymnasium does."""
+    paired: dict[str, Any] = {}
+    for name, values in facts.items():
+        paired[name] = masked(values, mask) if isinstance(values, Mapping) else values
+        paired[f"_{name}"] = mask.copy()
+    return paired
+
+
+def spread(facts: Facts, mask: Flags) -> dict[str, Any]:
+    """Facts (n, ...) of the worlds of a mask (N,) as rows of all, zero for the others; `masked`."""
+
+    def placed(values: NDArray[Any]) -> NDArray[Any]:
+        rows = np.zeros((len(mask), *values.shape[1:]), values.dtype)
+        rows[mask] = values
+        return rows
+
+    return masked(mapped(facts, placed), mask)

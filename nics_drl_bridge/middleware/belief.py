@@ -1,7 +1,4 @@
-"""State of the filter at a time, and its prediction.
-
-Bounds on the motion of a robot while none of its data could be used.
-"""
+"""State of the filter at a time, and bounds on motion that none of a robot's data showed."""
 
 from __future__ import annotations
 
@@ -16,16 +13,16 @@ from nics_drl_bridge.generator import SimulatorModel
 
 Array = NDArray[np.float64]
 
+JITTER_S = 0.2
+"""Uncertainty of the unobserved time: transmission takes longer now and then [s]."""
+MARGIN = 1.2
+"""Factor by which odometry, through noise or slip, may exceed the greatest speed."""
+LEVELS, MOST_CORNERS = 3, 4096
+"""Values tried per variable for the greatest speed, and greatest number of combinations."""
+
 
 class Anchor(NamedTuple):
-    """The newest odometry, and the state of the filter after it.
-
-    Attributes:
-        time_ns: of the odometry [ns].
-        odom: (3,) its pose in `odom`.
-        mean: (3 + S,) see `Belief`.
-        covariance: (3 + S, 3 + S).
-    """
+    """The newest odometry: time [ns], pose in `odom` (3,), mean and covariance after it."""
 
     time_ns: int
     odom: Array
@@ -36,19 +33,15 @@ class Anchor(NamedTuple):
 class Belief(NamedTuple):
     """Complete state of the filter at a time; its arrays are never modified in place.
 
-    Attributes:
-        time_ns: of the belief [ns].
-        mean: (3 + S,) x [m], y [m], heading [rad] in `map`, then the state of the RobotSpec.
-        covariance: (3 + S, 3 + S).
-        outliers: number of consecutive outliers of each kind.
-        anchor: the newest odometry; None before the first.
-        lost: True if the robot may have moved unobserved since the anchor.
+    The mean (3 + S,) is x [m], y [m], heading [rad] in `map`, then the state of the RobotSpec. The
+    consecutive `outliers` are counted by kind. The anchor is None before the first odometry; the
+    robot is `lost` if it may have moved unobserved since.
     """
 
     time_ns: int
     mean: Array
     covariance: Array
-    outliers: tuple[int, int, int]
+    outliers: tuple[int, ...]
     anchor: Anchor | None
     lost: bool
 
@@ -74,24 +67,15 @@ def parted(covariance: Array) -> Array:
     return copied
 
 
-JITTER_S = 0.2
-"""Uncertainty of the unobserved time: transmission takes longer now and then [s]."""
-MARGIN = 1.2
-"""Factor by which odometry, through noise or slip, may exceed the greatest speed."""
-LEVELS, MOST_CORNERS = 3, 4096
-"""Values tried per variable for the greatest speed, and greatest number of combinations."""
-
-
 def greatest_twist(model: SimulatorModel) -> tuple[float, float]:
     """Greatest speed [m/s] and turn rate [rad/s] of a model within the ranges of its RobotSpec."""
     ranges = [(v.min, v.max) for v in (*model.robot.state, *model.robot.command)]
     levels = LEVELS if LEVELS ** len(ranges) <= MOST_CORNERS else 2
-    values = [np.linspace(low, high, levels) for low, high in ranges]
     if levels ** len(ranges) > MOST_CORNERS:
         low, high = np.array(ranges).T
         tried = np.random.default_rng(0).uniform(low, high, (MOST_CORNERS, len(ranges)))
     else:
-        tried = np.array(list(product(*values)))
+        tried = np.array(list(product(*(np.linspace(*each, levels) for each in ranges))))
     twist = model.kinematics.rates(tried)[:, :3]
     return float(np.hypot(twist[:, 0], twist[:, 1]).max()), float(np.abs(twist[:, 2]).max())
 
@@ -103,16 +87,14 @@ class Unseen:
         model: of the robot.
         process: (3 + S, 3 + S) growth of the filter's covariance per second.
         noise: (3, 3) of the twist that odometry measures.
-        news: (3 + S,) variance of the state after possible news, see `Outcome`; 0 for the pose.
-
-    Attributes:
-        walk: (3,) variance that a pose by odometry gains in a second [m^2, m^2, rad^2].
+        news: (3 + S,) variance of the state after possible news, see `Acceptance`; 0 for the pose.
     """
 
     def __init__(self, model: SimulatorModel, process: Array, noise: Array, news: Array) -> None:
         self._news = news
         self._fastest = greatest_twist(model)
-        # Odometry integrates its twists, so their noise is a random walk with a step each period.
+        # Variance (3,) that a pose by odometry gains in a second [m^2, m^2, rad^2]: it integrates
+        # its twists, so their noise is a random walk with a step each period.
         self.walk = np.diag(process)[:3] + np.diag(noise) * model.control_period
 
     def reach(self, seconds: float) -> tuple[float, float]:
@@ -133,16 +115,9 @@ class Unseen:
         return doubted
 
     def bridged(self, anchor: Anchor, odom: Array, seconds: float) -> tuple[Array, Array] | None:
-        """Bridges unobserved motion by odometry.
+        """Returns the pose (3,) now, of which odometry has `odom`, and its covariance (3, 3).
 
-        Args:
-            anchor: the odometry and estimate before.
-            odom: (3,) pose in `odom` now.
-            seconds: between the two [s].
-
-        Returns:
-            Pose (3,) and its covariance (3, 3); None if the motion is beyond reach: odometry was
-            restarted, or jumped.
+        None if the motion since the anchor is beyond reach: odometry was restarted, or jumped.
         """
         moved = geometry.between(anchor.odom, odom)
         far, turned = self.reach(seconds)

@@ -1,14 +1,22 @@
-"""Compiled parts of the estimator: motion with its Jacobian, gates, numerical health."""
+"""Compiled parts of the estimator: motion under the commands of the recent past, gates, health.
+
+Shared arguments: `mean` (3 + S,) and `transition` (3 + S, 3 + S), the Jacobian of its motion;
+`begin`, `end` and `now` are times [ns]; `motion` is `MotionModel`, `log` is `Log`.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.robot.kernels import advance, rates, wrap
+from nics_drl_bridge.robot.kernels import Terms, advance, rates, wrap
+
+Array = NDArray[np.float64]
 
 RUNAWAY = 1e9
 """Bound on poses and states [m, rad, its unit] and on their derivatives; beyond, the model has
@@ -17,6 +25,86 @@ LEAST_PIVOT = 1e-12
 """Lower bound on a variable's variance given those before it, as a share of its own variance."""
 LEAST_VARIANCE = 1e-18
 """Absolute lower bound on that variance."""
+ROOM = 128
+"""Number of commands for which a log has room at first."""
+
+
+class MotionModel(NamedTuple):
+    """Model of the motion.
+
+    Attributes:
+        terms, series: see `robot.kernels`.
+        step_ns: the model's step [ns].
+        longest_ns: longest gap that is predicted [ns].
+    """
+
+    terms: Terms
+    series: Array
+    step_ns: int
+    longest_ns: int
+
+
+class Log(NamedTuple):
+    """Commands (K, C) and when they take effect [ns] (K,); the first `used` rows count."""
+
+    effective: NDArray[np.int64]
+    commands: Array
+    used: int
+
+
+class CommandLog:
+    """Commands (C,) in the order in which they take effect; before the first, zero."""
+
+    def __init__(self, width: int) -> None:
+        self._effective = np.empty(ROOM, dtype=np.int64)
+        self._commands = np.zeros((ROOM, width))
+        self.clear()
+
+    @property
+    def arrays(self) -> Log:
+        """The commands, for the kernels."""
+        return Log(self._effective, self._commands, self._count)
+
+    def clear(self) -> None:
+        """Forgets all commands."""
+        self.keep(0.0)
+
+    def keep(self, command: ArrayLike) -> None:
+        """Forgets all commands but this one (C,), which counts as always in effect."""
+        self._effective[0], self._commands[0] = np.iinfo(np.int64).min, command
+        self._count = 1
+
+    def add(self, effective_ns: int, command: ArrayLike, needed_ns: int) -> bool:
+        """Adds a command (C,) that takes effect at a time [ns].
+
+        Commands superseded before `needed_ns` may be forgotten. Returns False if there already is
+        a command of exactly that time, which is kept.
+        """
+        if self._count == len(self._effective):
+            self._make_room(needed_ns)
+        place = end = self._count
+        while self._effective[place - 1] >= effective_ns:
+            place -= 1
+        if place < end and self._effective[place] == effective_ns:
+            return False
+        if place < end:
+            self._effective[place + 1 : end + 1] = self._effective[place:end].copy()
+            self._commands[place + 1 : end + 1] = self._commands[place:end].copy()
+        self._effective[place], self._commands[place] = effective_ns, command
+        self._count += 1
+        return True
+
+    def _make_room(self, needed_ns: int) -> None:
+        """Drops commands that are no longer needed; doubles the capacity if that is not enough."""
+        used, size = self._effective[: self._count], len(self._effective)
+        first = max(int(np.searchsorted(used, needed_ns, side="right")) - 1, 0)
+        kept = slice(first, self._count)
+        self._count -= first
+        size *= 2 if self._count > size // 2 else 1
+        self._effective = np.resize(self._effective[kept], size)
+        self._commands = np.resize(self._commands[kept], (size, self._commands.shape[1]))
+        # The first command kept counts as in effect at all earlier times.
+        self._effective[0] = np.iinfo(np.int64).min
 
 
 @kernel(allocates=True)
@@ -35,11 +123,10 @@ def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def predict(mean, transition, command, dt, steps, terms, series):  # type: ignore[no-untyped-def]
-    """Moves the mean (3 + S) by `steps` steps of `dt` under one command (C,), in place.
+def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-untyped-def]
+    """Moves the mean by `steps` steps of `dt` [s] under one command (C,), in place.
 
-    Args:
-        transition: (3 + S, 3 + S) multiplied in place by the Jacobian of the motion.
+    The transition is multiplied in place by the Jacobian of the motion.
     """
     size, width = mean.shape[0] - 3, command.shape[0]
     x, dq = np.ones(size + width + 1), np.zeros(3 + size)
@@ -47,8 +134,8 @@ def predict(mean, transition, command, dt, steps, terms, series):  # type: ignor
     x[size : size + width] = command
     for _ in range(steps):
         x[:size] = mean[3:]
-        rates(dq, x, terms)
-        rates_jacobian(jacobian, x, terms)
+        rates(dq, x, motion.terms)
+        rates_jacobian(jacobian, x, motion.terms)
         # The arc is short, so the derivative at its middle heading is good to second order.
         middle = mean[2] + dq[2] * dt / 2.0
         c, s = math.cos(middle), math.sin(middle)
@@ -63,31 +150,18 @@ def predict(mean, transition, command, dt, steps, terms, series):  # type: ignor
             for d in range(size):
                 step[3 + d, 3 + i] = (1.0 if d == i else 0.0) + dt * jacobian[3 + d, i]
         transition[:] = step @ transition
-        advance(mean[:3], dq, dt, series)
+        advance(mean[:3], dq, dt, motion.series)
         for i in range(size):
             mean[3 + i] += dt * dq[3 + i]
 
 
 @kernel(allocates=True)
-def twist_of(mean, command, terms):  # type: ignore[no-untyped-def]
-    """Body twist (3,) and its derivative (3, 3 + S) for a mean (3 + S) and a command (C,)."""
-    size, width = mean.shape[0] - 3, command.shape[0]
-    x, dq = np.ones(size + width + 1), np.zeros(3 + size)
-    jacobian, derivative = np.zeros((3 + size, size + width)), np.zeros((3, 3 + size))
-    x[:size], x[size : size + width] = mean[3:], command
-    rates(dq, x, terms)
-    rates_jacobian(jacobian, x, terms)
-    derivative[:, 3:] = jacobian[:3, :size]
-    return dq[:3].copy(), derivative
-
-
-@kernel(allocates=True)
-def in_effect(effective, count, time):  # type: ignore[no-untyped-def]
+def in_effect(log, time):  # type: ignore[no-untyped-def]
     """Index of the command in effect just before a time: the last that took effect earlier."""
-    low, high = 0, count
+    low, high = 0, log.used
     while low < high:
         middle = (low + high) // 2
-        if effective[middle] < time:
+        if log.effective[middle] < time:
             low = middle + 1
         else:
             high = middle
@@ -95,33 +169,26 @@ def in_effect(effective, count, time):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def carry(mean, transition, begin, end, timing, log, terms, series):  # type: ignore[no-untyped-def]
-    """Moves a mean (3 + S) from one time to another, command by command, in place.
+def carry(mean, transition, begin, end, motion, log):  # type: ignore[no-untyped-def]
+    """Moves a mean from one time to another, command by command, in place, see `predict`.
 
     Over a gap that is too long, the pose is kept and the state set to zero. The same is done if
     the model diverges, which none does within its range.
-
-    Args:
-        mean, transition, terms, series: see `predict`.
-        begin, end: times [ns].
-        timing: the model's step, and the longest gap that is predicted [ns].
-        log: times at which the commands take effect [ns] (K,), the commands (K, C), their number.
     """
-    step, longest = timing
-    effective, commands, count = log
-    if end - begin > longest:
+    step, commands = motion.step_ns, log.commands
+    if end - begin > motion.longest_ns:
         mean[3:] = 0.0
         return
     before = mean[:3].copy()
-    now, k = begin, in_effect(effective, count, begin + 1)
+    now, k = begin, in_effect(log, begin + 1)
     while now < end:
         until = end
-        if k + 1 < count and effective[k + 1] < end:
-            until = effective[k + 1]
+        if k + 1 < log.used and log.effective[k + 1] < end:
+            until = log.effective[k + 1]
         steps, rest = (until - now) // step, (until - now) % step
-        predict(mean, transition, commands[k], step / NS_PER_S, steps, terms, series)
+        predict(mean, transition, commands[k], step / NS_PER_S, steps, motion)
         if rest > 0:
-            predict(mean, transition, commands[k], rest / NS_PER_S, 1, terms, series)
+            predict(mean, transition, commands[k], rest / NS_PER_S, 1, motion)
         now, k = until, k + 1
     if not (np.all(np.abs(mean) < RUNAWAY) and np.all(np.abs(transition) < RUNAWAY)):
         mean[:3], mean[3:] = before, 0.0
@@ -129,30 +196,35 @@ def carry(mean, transition, begin, end, timing, log, terms, series):  # type: ig
 
 
 @kernel(allocates=True)
-def forecast(mean, covariance, process, begin, end, timing, log, terms, series):  # type: ignore[no-untyped-def]
+def forecast(mean, covariance, process, begin, end, motion, log):  # type: ignore[no-untyped-def]
     """Predicts mean and covariance at a later time; `process` (3 + S, 3 + S) is per second."""
     moved, transition = mean.copy(), np.eye(mean.shape[0])
-    carry(moved, transition, begin, end, timing, log, terms, series)
+    carry(moved, transition, begin, end, motion, log)
     spread = transition @ covariance @ transition.T + process * ((end - begin) / NS_PER_S)
     return moved, (spread + spread.T) * 0.5
 
 
 @kernel(allocates=True)
-def look_ahead(mean, begin, end, timing, log, terms, series):  # type: ignore[no-untyped-def]
-    """Predicts mean (3 + S) and body twist (3,) at a time; the present ones if that is earlier."""
-    moved = mean.copy()
-    if end > begin:
-        carry(moved, np.eye(mean.shape[0]), begin, end, timing, log, terms, series)
-    effective, commands, count = log
-    command = commands[in_effect(effective, count, max(begin, end))]
-    return moved, twist_of(moved, command, terms)[0]
+def expect(mean, now, motion, log):  # type: ignore[no-untyped-def]
+    """Expected body twist (3,) at the time of the mean, and its derivative (3, 3 + S)."""
+    command = log.commands[in_effect(log, now)]
+    size, width = mean.shape[0] - 3, command.shape[0]
+    x, dq = np.ones(size + width + 1), np.zeros(3 + size)
+    jacobian, derivative = np.zeros((3 + size, size + width)), np.zeros((3, 3 + size))
+    x[:size], x[size : size + width] = mean[3:], command
+    rates(dq, x, motion.terms)
+    rates_jacobian(jacobian, x, motion.terms)
+    derivative[:, 3:] = jacobian[:3, :size]
+    return dq[:3].copy(), derivative
 
 
 @kernel(allocates=True)
-def expect(mean, now, log, terms):  # type: ignore[no-untyped-def]
-    """Expected body twist (3,) at the time of the mean, and its derivative (3, 3 + S)."""
-    effective, commands, count = log
-    return twist_of(mean, commands[in_effect(effective, count, now)], terms)
+def look_ahead(mean, begin, end, motion, log):  # type: ignore[no-untyped-def]
+    """Predicts mean and body twist (3,) at a time; the present ones if that is earlier."""
+    moved = mean.copy()
+    if end > begin:
+        carry(moved, np.eye(mean.shape[0]), begin, end, motion, log)
+    return moved, expect(moved, max(begin, end), motion, log)[0]
 
 
 @kernel(allocates=True)

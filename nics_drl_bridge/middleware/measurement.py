@@ -1,7 +1,4 @@
-"""Measurements of a robot's sensors, and the estimator's verdicts on them.
-
-Health of a robot's topics, as reported by the diagnostics.
-"""
+"""Measurements of a robot's sensors, the estimator's verdicts on them, and health of the topics."""
 
 from __future__ import annotations
 
@@ -33,14 +30,10 @@ class Kind(IntEnum):
 
 
 class Measurement(NamedTuple):
-    """One measurement.
+    """One measurement: body twist (3,), yaw rate (1,), or pose (3,) in `map`.
 
-    Attributes:
-        kind: the measured quantity.
-        value: (3,) body twist vx, vy [m/s], wz [rad/s]; (1,) yaw rate [rad/s]; or (3,) pose
-            x, y [m], heading [rad] in `map`.
-        noise: covariance of the value, (3, 3) or (1, 1); the model's if None.
-        odom: (3,) pose in `odom` that came with a twist; it bridges unobserved motion.
+    The noise is the covariance of the value, the model's if it is None. With a twist came the pose
+    (3,) in `odom`, which bridges unobserved motion.
     """
 
     kind: Kind
@@ -63,12 +56,9 @@ class Acceptance(IntEnum):
 
 
 class Judgement(NamedTuple):
-    """The estimator's verdict on a measurement.
+    """The estimator's verdict on a measurement, with its squared, normalised innovation.
 
-    Attributes:
-        distance: squared, normalised innovation; close to the number of components of the value
-            if the filter is consistent.
-        outcome: whether and how it was used.
+    That distance is close to the number of components of the value if the filter is consistent.
     """
 
     distance: float
@@ -76,15 +66,10 @@ class Judgement(NamedTuple):
 
 
 def checked_covariance(covariance: ArrayLike | None, size: int, least_std: float) -> Array | None:
-    """Returns a covariance (size, size) that the filter can use.
+    """Returns a covariance (size, size) that the filter can use; None if it is unknown.
 
-    Args:
-        covariance: as given by the sensor. All zeros means unknown, as in ROS messages.
-        size: number of measured components.
-        least_std: lower bound on the standard deviation in any direction.
-
-    Returns:
-        The covariance, or None if it is unknown.
+    All zeros means unknown, as in ROS messages. The standard deviation in any direction is raised
+    to `least_std`.
 
     Raises:
         ValueError: it is not a covariance.
@@ -114,14 +99,9 @@ def pose_residual(measured: Array, expected: Array) -> Array:
 
 @dataclass(frozen=True)
 class TopicHealth:
-    """Health of one topic.
+    """Accepted data of one topic, their rate of arrival (0 before the second) and age by arrival.
 
-    Attributes:
-        received: number of accepted data.
-        rate_hz: rate of arrivals [1/s]; 0 before the second datum.
-        age_s: time since the latest arrival [s], on the clock of the receiver.
-        innovation: squared, normalised innovation of the newest measurement, close to its number
-            of components if the filter is consistent; NaN for topics that correct nothing.
+    The innovation is the distance of the newest `Judgement`; NaN for topics that correct nothing.
     """
 
     received: int
@@ -132,13 +112,10 @@ class TopicHealth:
 
 @dataclass(frozen=True)
 class Health:
-    """Health of all topics of a robot.
+    """Health of all topics of a robot that have data.
 
-    Attributes:
-        topics: topic -> its health; topics without data are missing.
-        rejected: reason -> number of data; a reason begins with the topic.
-        noticed: surprising data that were used nevertheless (`odom: news`) -> number of times.
-        replayed: number of late data that were inserted at their time.
+    Numbers of data `rejected`, by reasons that begin with the topic; `noticed`, which surprised but
+    were used (`odom: news`); and `replayed`, which were late and inserted at their time.
     """
 
     topics: dict[str, TopicHealth] = field(default_factory=dict)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, RobotView
-from nics_drl_bridge.middleware.cache import Stamps, TopicCache
+from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, RobotView
 from nics_drl_bridge.middleware.ekf import LEAST_POSE_STD, LEAST_TWIST_STD, START_STD, Estimator
 from nics_drl_bridge.middleware.measurement import (
     CMD_VEL,
@@ -23,12 +24,80 @@ from nics_drl_bridge.middleware.measurement import (
     TopicHealth,
     checked_covariance,
 )
-from nics_drl_bridge.middleware.timeline import BEFORE_START, TOO_OLD, Timeline
-from nics_drl_bridge.middleware.trail import ReportedPose, Trail
+from nics_drl_bridge.middleware.timeline import (
+    BEFORE_START,
+    TOO_OLD,
+    ReportedPose,
+    Stamps,
+    Timeline,
+    Trail,
+)
 
 Array = NDArray[np.float64]
 
 NOT_FINITE = "NaN or inf"
+LEAST_STD = {Kind.YAW_RATE: LEAST_TWIST_STD, Kind.POSE: LEAST_POSE_STD}
+RATE_OVER = 32
+"""Number of arrivals over which rates are computed."""
+
+
+class Datum(NamedTuple):
+    """A message as it arrived, with the number of earlier data of its topic.
+
+    The stamp is that of its header, the arrival is on the clock of the receiver.
+    """
+
+    stamp_ns: int
+    arrival_ns: int
+    sequence: int
+    value: Any
+
+
+@dataclass
+class TopicCache:
+    """The newest datum, number and latest arrivals [ns] by topic; rejected data by reason."""
+
+    newest: dict[str, Datum] = field(default_factory=dict)
+    rejected: dict[str, int] = field(default_factory=dict)
+    received: dict[str, int] = field(default_factory=dict)
+    arrivals: dict[str, deque[int]] = field(default_factory=dict)
+
+    def put(self, topic: str, stamp_ns: int, arrival_ns: int, value: Any) -> bool:
+        """Stores a datum unless it is older than the cached one, or a duplicate; True if stored."""
+        held = self.newest.get(topic)
+        if held is not None and stamp_ns <= held.stamp_ns:
+            late = stamp_ns < held.stamp_ns
+            return self.reject(f"{topic}: out of order" if late else f"{topic}: duplicate")
+        self.take(topic, stamp_ns, arrival_ns, value)
+        return True
+
+    def take(self, topic: str, stamp_ns: int, arrival_ns: int, value: Any) -> None:
+        """Counts a datum, and stores it if it is the newest: late data may be useful, too."""
+        held, count = self.newest.get(topic), self.received.get(topic, 0)
+        if held is None or stamp_ns > held.stamp_ns:
+            self.newest[topic] = Datum(stamp_ns, arrival_ns, count, value)
+        self.received[topic] = count + 1
+        self.arrivals.setdefault(topic, deque(maxlen=RATE_OVER)).append(arrival_ns)
+
+    def reject(self, reason: str) -> bool:
+        """Counts a rejected datum; False."""
+        self.rejected[reason] = self.rejected.get(reason, 0) + 1
+        return False
+
+    def age_s(self, topic: str, now_ns: int) -> float:
+        """Age of the newest datum by its stamp [s]; inf if there is none."""
+        held = self.newest.get(topic)
+        return math.inf if held is None else (now_ns - held.stamp_ns) * S_PER_NS
+
+    def rate_hz(self, topic: str, arrival_ns: int) -> float:
+        """Rate of arrivals by the receiver's clock [Hz]; it falls while a datum is overdue."""
+        arrivals = self.arrivals.get(topic, deque())
+        intervals = len(arrivals) - 1
+        if intervals < 1:
+            return 0.0
+        overdue_ns = (arrival_ns - arrivals[0]) * intervals / (intervals + 1)
+        span_ns = max(arrivals[-1] - arrivals[0], overdue_ns)
+        return intervals / (span_ns * S_PER_NS) if span_ns > 0 else 0.0
 
 
 class Middleware:
@@ -38,15 +107,10 @@ class Middleware:
     same data give the same view. Times are stamps in nanoseconds; arrivals are on the clock of
     the receiver, which need not be that of the stamps. Data that cannot be used are counted by
     reason, see `health`, and change nothing else.
-
-    Args:
-        model: of the robot.
     """
 
     def __init__(self, model: SimulatorModel) -> None:
-        self._beams = model.lidar.beams
-        self._width = len(model.robot.command)
-        self._unknown = np.full(self._beams, np.nan, np.float32)
+        self._beams, self._width = model.lidar.beams, len(model.robot.command)
         self.estimator = Estimator(model)
         self._timeline = Timeline(self.estimator)
         self._trail = Trail(self.estimator.unseen.walk)
@@ -57,10 +121,8 @@ class Middleware:
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
         """Forgets everything; the robot is at rest at a pose (3,) in `map`.
 
-        Args:
-            time_ns: of the reset [ns]; data that are not newer correct nothing.
-            pose: x [m], y [m], heading [rad].
-            std: standard deviation of the pose [m, rad]: one number, or (3,).
+        Data that are not newer than `time_ns` correct nothing. The standard deviation of the pose
+        [m, rad] is one number, or (3,).
         """
         self.cache = TopicCache()
         self._clock_jumps = 0
@@ -77,7 +139,7 @@ class Middleware:
 
     def expect_beams(self, beams: int) -> None:
         """Sets the number of beams of the scans to come; the newest scan is forgotten."""
-        self._beams, self._unknown = beams, np.full(beams, np.nan, np.float32)
+        self._beams = beams
         self.cache.newest.pop(SCAN, None)
 
     def command(
@@ -85,17 +147,13 @@ class Middleware:
     ) -> bool:
         """Takes a command (C,) that was sent to the robot; True if it was used.
 
-        Args:
-            stamp_ns: when it was sent [ns]; if None, at the stamp of the newest datum, and
-                after every earlier command without a stamp.
-            command: in the units and the order of the RobotSpec.
-            arrival_ns: when it arrived [ns]; None for own commands, whose stamps need no check.
+        Without a stamp it counts as sent at that of the newest datum, and after every earlier
+        command without a stamp. Own commands have no arrival: their stamps need no check.
         """
         if stamp_ns is None:
             stamp_ns = max(self.newest_ns or self._start_ns, self._unstamped_ns + 1)
             self._unstamped_ns = stamp_ns
         value = np.array(command, dtype=np.float64)
-        reason = ""
         if value.shape != (self._width,):
             reason = f"shape {value.shape}, not ({self._width},)"
         elif not np.isfinite(value).all():
@@ -103,12 +161,9 @@ class Middleware:
         else:
             # The robot follows it whatever its stamp: the clock may have been set meanwhile.
             self._commanded = value
-        reason = reason or self._stamps.fault(stamp_ns, arrival_ns)
-        reason = reason or self._timeline.command(stamp_ns, value)
-        if reason:
-            self.cache.reject(f"{CMD_VEL}: {reason}")
-            return False
-        return True
+            reason = self._stamps.fault(stamp_ns, arrival_ns)
+            reason = reason or self._timeline.command(stamp_ns, value)
+        return not reason or self.cache.reject(f"{CMD_VEL}: {reason}")
 
     def foresee(self, stamp_ns: int) -> None:
         """Prepares for the next expected odometry, of a stamp [ns]."""
@@ -120,8 +175,7 @@ class Middleware:
         if ranges.shape != (self._beams,):
             fault = f"shape {ranges.shape}, not ({self._beams},)"
         if fault:
-            self.cache.reject(f"{SCAN}: {fault}")
-            return False
+            return self.cache.reject(f"{SCAN}: {fault}")
         if not self.cache.put(SCAN, stamp_ns, arrival_ns, ranges):
             return False
         self._stamps.accept(stamp_ns, arrival_ns)
@@ -135,89 +189,66 @@ class Middleware:
         """
         value = np.array(pose, dtype=np.float64), np.array(twist, dtype=np.float64)
         if not (np.isfinite(value[0]).all() and np.isfinite(value[1]).all()):
-            self.cache.reject(f"{ODOM}: {NOT_FINITE}")
-            return False
+            return self.cache.reject(f"{ODOM}: {NOT_FINITE}")
         if fault := self._stamps.fault(stamp_ns, None):
-            self.cache.reject(f"{ODOM}: {fault}")
-            return False
-        told = ReportedPose(stamp_ns, arrival_ns, *value)
+            return self.cache.reject(f"{ODOM}: {fault}")
+        odometry = ReportedPose(stamp_ns, arrival_ns, *value)
         if stamp_ns == self._start_ns and ODOM not in self.cache.newest:
             # At a reset the pose is known: the odometry of that time adds nothing.
             self._timeline.anchor(value[0])
-        elif self._trail.contradicts(told):
-            self._follow_clock(told)
+        elif self._trail.contradicts(odometry):
+            self._follow_clock(odometry)
         else:
-            return self._measure_odometry(told, value)
+            return self._measure_odometry(odometry)
         self._stamps.accept(stamp_ns, arrival_ns)
         self.cache.take(ODOM, stamp_ns, arrival_ns, value)
-        self._trail.use(told)
+        self._trail.use(odometry)
         return True
 
-    def _measure_odometry(self, told: ReportedPose, value: tuple[Array, Array]) -> bool:
+    def _measure_odometry(self, odometry: ReportedPose) -> bool:
         """Measures an odometry; True if accepted. Continues from it if the clock was set."""
-        measurement = Measurement(Kind.TWIST, told.twist, odom=told.pose)
-        reason = self._measure(told.stamp_ns, told.arrival_ns, measurement, value)
+        stamp_ns, arrival_ns, pose, twist = odometry
+        measurement = Measurement(Kind.TWIST, twist, odom=pose)
+        reason = self._measure(stamp_ns, arrival_ns, measurement, (pose, twist))
         if not reason:
-            self._trail.use(told)
+            self._trail.use(odometry)
         elif reason in self._off_the_clock:
             if self._stamps.refuse():
-                self._follow_clock(told)
+                self._follow_clock(odometry)
             else:
-                self._trail.refuse(told)
+                self._trail.refuse(odometry)
         return not reason
 
     def pose(
-        self,
-        stamp_ns: int,
-        arrival_ns: int,
-        pose: ArrayLike,
-        covariance: ArrayLike | None = None,
+        self, stamp_ns: int, arrival_ns: int, pose: ArrayLike, covariance: ArrayLike | None = None
     ) -> bool:
-        """Takes a measured pose, such as from motion capture or AMCL; True if it was accepted.
+        """Takes a pose (3,) in `map`, as of motion capture or AMCL; True if it was accepted.
 
-        Args:
-            stamp_ns: when it was measured [ns].
-            arrival_ns: when it arrived [ns].
-            pose: (3,) x [m], y [m], heading [rad] in `map`.
-            covariance: (3, 3) of the pose; the model's pose noise if None or all zeros.
+        Its covariance (3, 3) is the model's pose noise if it is None or all zeros.
         """
-        value = np.array(pose, dtype=np.float64)
-        return self._optional(Kind.POSE, stamp_ns, arrival_ns, value, covariance, LEAST_POSE_STD)
+        return self._optional(Kind.POSE, stamp_ns, arrival_ns, pose, covariance)
 
     def imu(
         self, stamp_ns: int, arrival_ns: int, yaw_rate: float, variance: float | None = None
     ) -> bool:
-        """Takes a yaw rate [rad/s] of a gyro; True if it was accepted.
+        """Takes a gyro's yaw rate, counter-clockwise [rad/s]; True if it was accepted.
 
-        Args:
-            stamp_ns: when it was measured [ns].
-            arrival_ns: when it arrived [ns].
-            yaw_rate: about the upward axis, counter-clockwise [rad/s].
-            variance: of the yaw rate [rad^2/s^2]; that of a cheap gyro if None or zero.
+        Its variance [rad^2/s^2] is that of a cheap gyro if it is None or zero.
         """
-        value = np.array([yaw_rate], dtype=np.float64)
         covariance = None if variance is None else [[variance]]
-        least = LEAST_TWIST_STD
-        return self._optional(Kind.YAW_RATE, stamp_ns, arrival_ns, value, covariance, least)
+        return self._optional(Kind.YAW_RATE, stamp_ns, arrival_ns, [yaw_rate], covariance)
 
     def _optional(
-        self,
-        kind: Kind,
-        stamp_ns: int,
-        arrival_ns: int,
-        value: NDArray[np.float64],
-        covariance: ArrayLike | None,
-        least_std: float,
+        self, kind: Kind, stamp_ns: int, arrival_ns: int, given: ArrayLike, about: ArrayLike | None
     ) -> bool:
         """Takes a measurement that came with its own covariance; True if it was accepted."""
+        value = np.array(given, dtype=np.float64)
         if not np.isfinite(value).all():
-            self.cache.reject(f"{kind.topic}: {NOT_FINITE}")
-            return False
+            return self.cache.reject(f"{kind.topic}: {NOT_FINITE}")
         try:
-            noise = checked_covariance(covariance, len(value), least_std)
+            noise = checked_covariance(about, len(value), LEAST_STD[kind])
         except ValueError as error:
-            self.cache.reject(f"{kind.topic}: {error}")
-            return False
+            return self.cache.reject(f"{kind.topic}: {error}")
         return not self._measure(stamp_ns, arrival_ns, Measurement(kind, value, noise), value)
 
     def _measure(self, stamp_ns: int, arrival_ns: int, measurement: Measurement, kept: Any) -> str:
@@ -232,18 +263,18 @@ class Middleware:
             self.cache.take(topic, stamp_ns, arrival_ns, kept)
         return reason
 
-    def _follow_clock(self, told: ReportedPose) -> None:
+    def _follow_clock(self, odometry: ReportedPose) -> None:
         """Continues from an odometry to whose stamp the clock was set.
 
         Starts at the estimate after the last used odometry and adds the motion that odometry
         shows since; if odometry is not continuous, the robot may be anywhere within reach.
         """
-        seconds, continuous = self._trail.seconds(told), self._trail.continuous(told)
-        self.estimator.lose(told.stamp_ns, seconds, continuous, self._commanded)
-        self.estimator.correct(Measurement(Kind.TWIST, told.twist, odom=told.pose))
-        self._begin(told.stamp_ns)
+        seconds, continuous = self._trail.seconds(odometry), self._trail.continuous(odometry)
+        self.estimator.lose(odometry.stamp_ns, seconds, continuous, self._commanded)
+        self.estimator.correct(Measurement(Kind.TWIST, odometry.twist, odom=odometry.pose))
+        self._begin(odometry.stamp_ns)
         self._trail.reset()
-        self._trail.use(told)
+        self._trail.use(odometry)
         self.cache.newest.clear()
         self._clock_jumps += 1
 
@@ -254,13 +285,11 @@ class Middleware:
 
     def view(self, now_ns: int) -> RobotView:
         """Returns the view of the robot at a time; NaN ranges before the first scan."""
-        pose, twist = self.estimator.at(now_ns)
         scan, newest_ns = self.cache.newest.get(SCAN), self.newest_ns
         return RobotView(
-            pose=pose,
-            twist=twist,
-            ranges=self._unknown.copy() if scan is None else scan.value,
-            stamp_s=(now_ns if newest_ns is None else newest_ns) * 1e-9,
+            *self.estimator.at(now_ns),
+            ranges=np.full(self._beams, np.nan, np.float32) if scan is None else scan.value,
+            stamp_s=(now_ns if newest_ns is None else newest_ns) * S_PER_NS,
             scan_age_s=self.cache.age_s(SCAN, now_ns),
             odom_age_s=self.cache.age_s(ODOM, now_ns),
         )
@@ -273,23 +302,19 @@ class Middleware:
             topic: TopicHealth(
                 received,
                 cache.rate_hz(topic, arrival_ns),
-                (arrival_ns - cache.arrivals[topic][-1]) * 1e-9,
+                (arrival_ns - cache.arrivals[topic][-1]) * S_PER_NS,
                 distances.get(topic, math.nan),
             )
             for topic, received in cache.received.items()
         }
-        surprises = {
-            (kind, outcome): f"{kind.topic}: {outcome.name.lower()}" for kind, outcome in outcomes
-        }
-        rejected = {surprises[k]: n for k, n in outcomes.items() if k[1] is Acceptance.OUTLIER}
-        noticed = {
-            surprises[k]: n
-            for k, n in outcomes.items()
-            if k[1] in (Acceptance.NEWS, Acceptance.JUMP)
-        }
+        rejected, noticed = dict(cache.rejected), dict[str, int]()
+        for (kind, outcome), count in outcomes.items():
+            if outcome is not Acceptance.USED:
+                counts = rejected if outcome is Acceptance.OUTLIER else noticed
+                counts[f"{kind.topic}: {outcome.name.lower()}"] = count
         if self._clock_jumps:
             noticed["clock: jump"] = self._clock_jumps
-        return Health(topics, cache.rejected | rejected, noticed, self._timeline.replayed)
+        return Health(topics, rejected, noticed, self._timeline.replayed)
 
 
 def rehearse(model: SimulatorModel) -> RobotView:

@@ -21,7 +21,7 @@ from nics_drl_bridge.files import sha256, write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import Reader, reader_beside
 from nics_drl_bridge.lidar.spec import ScanHeader, from_device
-from nics_drl_bridge.middleware.ekf import ANYWHERE
+from nics_drl_bridge.middleware.ekf import ANYWHERE, START_STD
 from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.recording import topic_roles
@@ -39,7 +39,7 @@ TYPES: Mapping[str, tuple[str, ...]] = {
     IMU: (topic_roles.IMU,),
 }
 ALWAYS = (SCAN, ODOM, CMD_VEL)
-"""Topics that are used if the bag has them; the others only on request."""
+"""Roles whose topics are used if the bag has them; the others only on request."""
 APART_S = 1.0
 """Greatest difference between stamps of one clock at the same time of receipt [s]."""
 COLUMNS = ("x", "y", "heading", "vx", "vy", "wz")
@@ -49,12 +49,8 @@ COLUMNS = ("x", "y", "heading", "vx", "vy", "wz")
 class EstimatedDrive:
     """Estimates of the middleware over a drive, after each odometry that was the newest.
 
-    Attributes:
-        stamp_ns: (T,) of the estimates [ns].
-        pose: (T, 3) x [m], y [m], heading [rad] in `map`.
-        twist: (T, 3) vx [m/s], vy [m/s], wz [rad/s] in `base_link`.
-        covariance: (T, 3, 3) of the pose.
-        rejected: reason -> number of data that were not used.
+    T stamps [ns], poses (T, 3) in `map` with their covariances (T, 3, 3), body twists (T, 3), and
+    the number of data that were not used, by reason.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -73,13 +69,8 @@ class EstimatedDrive:
 def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str]) -> EstimatedDrive:
     """Runs a bag through the middleware, in process.
 
-    Args:
-        path: of the bag.
-        model: of the robot.
-        topics: role (`scan`, `odom`, `cmd_vel`, `pose`, `imu`) -> topic; see `chosen`.
-
-    Returns:
-        The estimate, identical in every run and on every machine with the same versions.
+    The estimate is identical in every run and on every machine with the same versions. `topics` are
+    by role, see `chosen`.
 
     Raises:
         RecordingError: the bag is damaged, a topic is missing or of a wrong type, or its data
@@ -87,9 +78,12 @@ def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str])
     """
     messages = played(path, topics)
     playback, rows = Playback(model, POSE in messages), []
+    middleware = playback.middleware
     for role, message in in_order(messages):
         if playback.take(role, message) and role == ODOM:
-            rows.append(_row(playback.middleware, stamp(message.content)))
+            stamp_ns = max(stamp(message.content), middleware.estimator.time_ns)
+            view, covariance = middleware.view(stamp_ns), middleware.estimator.covariance
+            rows.append((stamp_ns, view.pose, view.twist, covariance[:3, :3]))
     if not rows:
         raise RecordingError(
             "no odometry of the bag could be used; look at it with `nics bag info`."
@@ -97,27 +91,12 @@ def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str])
     stamps, poses, twists, covariances = zip(*rows, strict=True)
     return EstimatedDrive(
         np.array(stamps, dtype=np.int64), np.array(poses), np.array(twists),
-        np.array(covariances), dict(playback.middleware.cache.rejected),
+        np.array(covariances), dict(middleware.cache.rejected),
     )  # fmt: skip
 
 
-def _row(middleware: Middleware, stamp_ns: int) -> tuple[int, Array, Array, Array]:
-    estimator = middleware.estimator
-    stamp_ns = max(stamp_ns, estimator.time_ns)
-    view = middleware.view(stamp_ns)
-    return stamp_ns, view.pose, view.twist, estimator.covariance[:3, :3]
-
-
 def played(path: str | Path, topics: Mapping[str, str]) -> dict[str, list[Message]]:
-    """Returns the messages of each role that is played.
-
-    Args:
-        path: of the bag.
-        topics: role -> topic, see `chosen`.
-
-    Raises:
-        RecordingError: see `estimate`.
-    """
+    """Returns the messages of each role that is played. Raises as `estimate` does."""
     with opened(path) as bag:
         roles = chosen(bag, topics)
         messages = {role: bag.messages(topic) for role, topic in roles.items()}
@@ -128,10 +107,8 @@ def played(path: str | Path, topics: Mapping[str, str]) -> dict[str, list[Messag
 def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
     """Returns the topic of each role that is played.
 
-    Args:
-        bag: the recording.
-        topics: role -> topic as given by the user; `scan`, `odom` and `cmd_vel` are by default the
-            topics of these names, `pose` and `imu` are left out.
+    Those of `scan`, `odom` and `cmd_vel` are by default the topics of these names; `pose` and `imu`
+    are left out unless `topics` names them.
 
     Raises:
         RecordingError: a topic does not exist or is of a wrong type, or there is no `odom`.
@@ -191,15 +168,8 @@ def _check_clocks(
 class Playback:
     """Feeds the middleware as the nodes do.
 
-    Args:
-        model: of the robot.
-        posed: whether a pose sensor gives the start of the robot.
-        any_lidar: whether scans of a lidar other than the model's are accepted, as by
-            `policy_node`; the first scan then fixes the lidar.
-
-    Attributes:
-        middleware: the middleware that is fed.
-        lidar: the lidar of its scans.
+    With `posed`, a pose sensor gives the start of the robot. With `any_lidar`, the first scan fixes
+    the `lidar`, as in `policy_node`; otherwise it is the model's.
     """
 
     def __init__(self, model: SimulatorModel, posed: bool, any_lidar: bool = False) -> None:
@@ -224,8 +194,7 @@ class Playback:
         if self._any_lidar:
             values = self._followed(message).ordered(values)
             if len(values) != self.lidar.beams:
-                self.middleware.cache.reject(f"{SCAN}: another lidar")
-                return False
+                return self.middleware.cache.reject(f"{SCAN}: another lidar")
         ranges = from_device(np.ascontiguousarray(values), self.lidar)
         return self.middleware.scan(stamp(message), arrival_ns, ranges)
 
@@ -241,10 +210,7 @@ class Playback:
     def _odometry(self, arrival_ns: int, message: Any) -> bool:
         stamp_ns, pose = stamp(message), np.array(pose_row(message))
         if not self._started and np.isfinite(pose).all():
-            if self._posed:
-                self.middleware.reset(stamp_ns, pose, ANYWHERE)
-            else:
-                self.middleware.reset(stamp_ns, pose)
+            self.middleware.reset(stamp_ns, pose, ANYWHERE if self._posed else START_STD)
             self._started = True
         return self.middleware.odometry(stamp_ns, arrival_ns, pose, np.array(twist_row(message)))
 
@@ -264,21 +230,15 @@ class Playback:
     def _imu(self, arrival_ns: int, message: Any) -> bool:
         covariance = message.angular_velocity_covariance
         if covariance[0] == -1.0:
-            self.middleware.cache.reject(f"{IMU}: no angular velocity")
-            return False
+            return self.middleware.cache.reject(f"{IMU}: no angular velocity")
         rate, variance = float(message.angular_velocity.z), float(covariance[8])
         return self.middleware.imu(stamp(message), arrival_ns, rate, variance)
 
 
 def in_order(messages: Mapping[str, list[Message]]) -> Iterator[tuple[str, Message]]:
     """Yields all messages with their roles, in the order of receipt."""
-    every = [
-        (message.receive_ns, place, k, role, message)
-        for place, (role, some) in enumerate(sorted(messages.items()))
-        for k, message in enumerate(some)
-    ]
-    for _, _, _, role, message in sorted(every, key=lambda each: each[:3]):
-        yield role, message
+    every = [(role, message) for role in sorted(messages) for message in messages[role]]
+    yield from sorted(every, key=lambda each: each[1].receive_ns)  # which keeps equals in order
 
 
 def write_estimate(made: EstimatedDrive, path: str | Path) -> None:

@@ -1,23 +1,48 @@
-"""Replay of late data: the last second of the filter is kept and re-run with them in order."""
+"""Order of a robot's data in time: replay of late ones, and time stamps that can't be right."""
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
+from operator import index
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.middleware.belief import Belief
+from nics_drl_bridge import geometry
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.middleware.belief import JITTER_S, Belief
 from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, Measurement
 
-HISTORY_NS = 1_000_000_000
+Array = NDArray[np.float64]
+
+HISTORY_NS = NS_PER_S
 """Length of the past that may still change [ns]."""
 BEFORE_START = "not after the reset"
-TOO_OLD = f"older than {HISTORY_NS * 1e-9:g} s"
+TOO_OLD = f"older than {HISTORY_NS / NS_PER_S:g} s"
 DUPLICATE = "duplicate"
+NO_STAMP = "stamp is no number"
+FUTURE_NS = NS_PER_S
+"""Tolerance by which a stamp may be ahead of its due time [ns], at least two control periods."""
+CLOCK_JUMP = 10
+"""Number of consecutive odometries rejected for their stamps that shows that the robot's clock was
+set, or its simulation restarted."""
+NEAR_NS = HISTORY_NS + 2 * NS_PER_S
+"""Stamps farther back than this [ns] are all rejected, which `Stamps` detects."""
+CONTRADICTED_NS = 200_000_000
+"""A smaller error of a stamp [ns] cannot be distinguished from a longer transmission."""
+IN_STEP = 5
+"""Number of consecutive odometries that arrived in step with their stamps, before arrivals count as
+a measure of time."""
+SIGMA, LEAST = 6.0, 0.01
+"""Greatest difference between odometry's pose and twist, in standard deviations, and the one that
+is always allowed [m, rad]."""
+STILL = 0.02
+"""Slower motion [m/s, rad/s] gives no information about time."""
 
 Moment = tuple[int, int]
 """Stamp [ns] and kind: the order of measurements, whatever the order of their arrival."""
@@ -28,9 +53,9 @@ class _Entry:
     """A measurement, its verdict, and the state of the filter after it."""
 
     moment: Moment
-    measurement: Measurement | None
-    verdict: Judgement | None
     belief: Belief
+    measurement: Measurement | None = None
+    verdict: Judgement | None = None
 
 
 class Timeline:
@@ -39,10 +64,7 @@ class Timeline:
     A late one is inserted at its time, and the filter is re-run from before it. The arithmetic is
     the same as if it had arrived in time, so the result is bit-identical, unless something is
     later than `HISTORY_NS`. Going back to a snapshot of the filter is the idea of
-    robot_localization's `smooth_lagged_data`.
-
-    Args:
-        estimator: to feed; it must not be fed otherwise.
+    robot_localization's `smooth_lagged_data`. The estimator must not be fed otherwise.
     """
 
     def __init__(self, estimator: Estimator) -> None:
@@ -57,8 +79,7 @@ class Timeline:
         self._distances: dict[Kind, float] = {}
         self.replayed = 0
         self._entries.clear()
-        belief = self._estimator.belief
-        self._entries.append(_Entry((self._start_ns, -1), None, None, belief))
+        self._entries.append(_Entry((self._start_ns, -1), self._estimator.belief))
 
     @property
     def newest_ns(self) -> int:
@@ -84,7 +105,7 @@ class Timeline:
         place, reason = self._place(moment)
         if reason:
             return reason
-        self._entries.insert(place, _Entry(moment, measurement, None, self._entries[0].belief))
+        self._entries.insert(place, _Entry(moment, self._entries[0].belief, measurement))
         self._rerun(place)
         return ""
 
@@ -106,20 +127,12 @@ class Timeline:
 
     def outcomes(self) -> Mapping[tuple[Kind, Acceptance], int]:
         """Returns the number of measurements by kind and outcome."""
-        recent = Counter(
-            (entry.measurement.kind, entry.verdict.outcome)
-            for entry in self._entries
-            if entry.measurement is not None and entry.verdict is not None
-        )
+        recent = Counter((kind, each.outcome) for kind, each in _verdicts(self._entries))
         return self._past + recent
 
     def distances(self) -> Mapping[Kind, float]:
         """Returns the squared, normalised innovation of the newest measurement of each kind."""
-        return self._distances | {
-            entry.measurement.kind: entry.verdict.distance
-            for entry in self._entries
-            if entry.measurement is not None and entry.verdict is not None
-        }
+        return self._distances | {kind: each.distance for kind, each in _verdicts(self._entries)}
 
     def _place(self, moment: Moment) -> tuple[int, str]:
         """Returns the place of a late measurement, or the reason if it cannot be used."""
@@ -137,22 +150,186 @@ class Timeline:
     def _run(self, moment: Moment, measurement: Measurement) -> _Entry:
         self._estimator.predict(moment[0])
         verdict = self._estimator.correct(measurement)
-        return _Entry(moment, measurement, verdict, self._estimator.belief)
+        return _Entry(moment, self._estimator.belief, measurement, verdict)
 
     def _rerun(self, place: int) -> None:
         """Re-runs the filter over all entries from a place on."""
         self._estimator.belief = self._entries[place - 1].belief
-        for index in range(place, len(self._entries)):
-            entry = self._entries[index]
+        for k in range(place, len(self._entries)):
+            entry = self._entries[k]
             if entry.measurement is not None:
-                self._entries[index] = self._run(entry.moment, entry.measurement)
+                self._entries[k] = self._run(entry.moment, entry.measurement)
         self.replayed += 1
 
     def _forget(self) -> None:
         """Drops entries that can no longer change, except the last one before the history."""
         needed_ns = self.newest_ns - HISTORY_NS
         while self._entries[1].moment[0] < needed_ns:
-            entry = self._entries.popleft()
-            if entry.measurement is not None and entry.verdict is not None:
-                self._past[entry.measurement.kind, entry.verdict.outcome] += 1
-                self._distances[entry.measurement.kind] = entry.verdict.distance
+            for kind, verdict in _verdicts([self._entries.popleft()]):
+                self._past[kind, verdict.outcome] += 1
+                self._distances[kind] = verdict.distance
+
+
+def _verdicts(entries: Iterable[_Entry]) -> Iterator[tuple[Kind, Judgement]]:
+    for entry in entries:
+        if entry.measurement is not None and entry.verdict is not None:
+            yield entry.measurement.kind, entry.verdict
+
+
+class Stamps:
+    """Compares the progress of time stamps with that of the receiver's clock.
+
+    Only differences count: the clock of a robot may be off by any amount, and a simulation may run
+    slower, or faster if no two data are farther apart than the tolerance. The first datum after a
+    reset gives the offset of the two clocks. The control period [ns] widens the tolerance.
+    """
+
+    def __init__(self, period_ns: int = 0) -> None:
+        self._tolerance_ns = max(FUTURE_NS, 2 * period_ns)
+        self.from_the_future = f"more than {self._tolerance_ns * 1e-9:g} s in the future"
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the offset of the clocks."""
+        self._stamp_ns: int | None = None
+        self._arrival_ns = 0
+        self._refused = 0
+
+    def fault(self, stamp_ns: int, arrival_ns: int | None) -> str:
+        """Returns the fault of a stamp, or an empty string; without an arrival only its type."""
+        try:
+            index(stamp_ns)
+        except TypeError:
+            return NO_STAMP
+        if arrival_ns is None or self._stamp_ns is None:
+            return ""
+        latest_ns = self._stamp_ns + self._tolerance_ns
+        if stamp_ns <= latest_ns or stamp_ns <= latest_ns + (arrival_ns - self._arrival_ns):
+            return ""
+        return self.from_the_future
+
+    def accept(self, stamp_ns: int, arrival_ns: int) -> None:
+        """Records a datum that is used."""
+        self._refused = 0
+        if self._stamp_ns is None or stamp_ns > self._stamp_ns:
+            self._stamp_ns, self._arrival_ns = stamp_ns, arrival_ns
+
+    def refuse(self) -> bool:
+        """Records an odometry rejected for its stamp; True if the clock has jumped."""
+        self._refused += 1
+        return self._refused >= CLOCK_JUMP
+
+
+class ReportedPose(NamedTuple):
+    """An odometry as received: stamp and arrival [ns], pose in `odom` (3,), body twist (3,)."""
+
+    stamp_ns: int
+    arrival_ns: int
+    pose: Array
+    twist: Array
+
+
+class Trail:
+    """Follows the odometries since the last one that was used.
+
+    If the robot moves, the path between two odometries and their twists give the time between them.
+    If the arrivals agree with that time and the stamp does not, the odometry is neither late nor
+    did it follow a loss of data: the clock was set. `walk` (3,) is the variance per second by which
+    pose and twist of odometry differ [m^2/s, rad^2/s].
+    """
+
+    def __init__(self, walk: Array) -> None:
+        self._walk = walk
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets all odometries."""
+        self._recent: deque[ReportedPose] = deque(maxlen=IN_STEP + 1)
+        self._refused: deque[ReportedPose] = deque(maxlen=CLOCK_JUMP)
+
+    def use(self, odometry: ReportedPose) -> None:
+        """Records an odometry that is used."""
+        self._refused.clear()
+        if not self._recent or odometry.stamp_ns > self._recent[-1].stamp_ns:
+            self._recent.append(odometry)
+
+    def refuse(self, odometry: ReportedPose) -> None:
+        """Records an odometry that is rejected for its stamp."""
+        self._refused.append(odometry)
+
+    def contradicts(self, odometry: ReportedPose) -> bool:
+        """True if an odometry's path and arrival both show that the clock was set by a little.
+
+        Such stamps look like late data, or like data after a gap.
+        """
+        if len(self._recent) <= IN_STEP:
+            return False
+        last = self._recent[-1]
+        passed, waited = odometry.stamp_ns - last.stamp_ns, odometry.arrival_ns - last.arrival_ns
+        if abs(passed - waited) < CONTRADICTED_NS or not -NEAR_NS <= passed - waited <= FUTURE_NS:
+            return False
+        if not all(self._in_step(*pair) for pair in pairwise(self._recent)):
+            return False
+        seconds, stamped, arrived = (
+            _seconds(last, odometry, 0.0),
+            passed / NS_PER_S,
+            waited / NS_PER_S,
+        )
+        clear = CONTRADICTED_NS / NS_PER_S
+        return (
+            seconds > 0.0
+            and abs(seconds - arrived) <= max(0.5 * arrived, 0.5 * clear)
+            and abs(seconds - stamped) >= clear
+            and self._fits(last, odometry, seconds)
+            and not self._fits(last, odometry, stamped)
+        )
+
+    def _in_step(self, before: ReportedPose, after: ReportedPose) -> bool:
+        """True if both the arrivals and the path agree with the time between two stamps."""
+        passed, waited = after.stamp_ns - before.stamp_ns, after.arrival_ns - before.arrival_ns
+        return 2 * abs(waited - passed) <= passed and self._fits(before, after, passed / NS_PER_S)
+
+    def seconds(self, now: ReportedPose) -> float:
+        """Time since the last used odometry, by its arrival and by the stamps since [s]."""
+        if not self._recent:
+            return 0.0
+        last = self._recent[-1]
+        waited = max(now.arrival_ns - last.arrival_ns, 0)
+        stamped = now.stamp_ns - (*self._refused, now)[0].stamp_ns
+        # The last used one may have been a second late; the arrivals then show too little time.
+        return max(waited, min(stamped, waited + HISTORY_NS)) / NS_PER_S
+
+    def continuous(self, now: ReportedPose) -> bool:
+        """True if the poses since the last used odometry form one path and follow the motion."""
+        if not self._recent:
+            return False
+        path = [self._recent[-1], *self._refused, now]
+        unmoved = all(np.array_equal(each.pose, path[0].pose) for each in path)
+        if unmoved and any((np.abs(each.twist) > STILL).any() for each in path):
+            return False
+        times = [(b.stamp_ns - a.stamp_ns) / NS_PER_S for a, b in pairwise(path[1:])]
+        first = max(self.seconds(now) - sum(times), 0.0)
+        spans = [(max(first - JITTER_S, 0.0), first + JITTER_S)]
+        spans += [(0.5 * each, 1.5 * each) for each in times]
+        return all(
+            self._fits(a, b, float(np.clip(_seconds(a, b, high), low, high)))
+            for (a, b), (low, high) in zip(pairwise(path), spans, strict=True)
+        )
+
+    def _fits(self, before: ReportedPose, after: ReportedPose, seconds: float) -> bool:
+        """True if the twists lead from one pose to the other in a time [s]."""
+        mean, change = (before.twist + after.twist) / 2.0, np.abs(after.twist - before.twist)
+        moved = geometry.between(before.pose, after.pose)
+        off = np.abs(geometry.between(geometry.exp(mean * seconds), moved))
+        span = abs(seconds)
+        allowed = LEAST + SIGMA * np.sqrt(self._walk * span) + change * span / 2.0
+        return bool((off <= allowed).all())
+
+
+def _seconds(before: ReportedPose, after: ReportedPose, standing: float) -> float:
+    """Time [s] in which the mean twist leads between two poses; `standing` if it is at rest."""
+    mean = (before.twist + after.twist) / 2.0
+    if not (np.abs(mean) > STILL).any():
+        return standing
+    path = geometry.log(geometry.between(before.pose, after.pose))
+    return float(path @ mean / (mean @ mean))

@@ -13,8 +13,7 @@ import onnx
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.env.actions import discrete_commands
-from nics_drl_bridge.env.task import Task
+from nics_drl_bridge.env.task import Task, discrete_commands
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel

@@ -29,11 +29,8 @@ def kinematics(spec: RobotSpec) -> Textbook:
 
 def track_and_radius(parameters: dict[str, float]) -> tuple[float, float]:
     """Returns `track` and `wheel_radius` [m]; by default shares of the wheelbase."""
-    wheelbase = parameters["wheelbase"]
-    return (
-        parameters.get("track", 0.8 * wheelbase),
-        parameters.get("wheel_radius", 0.18 * wheelbase),
-    )
+    base = parameters["wheelbase"]
+    return parameters.get("track", 0.8 * base), parameters.get("wheel_radius", 0.18 * base)
 
 
 def drawing(spec: RobotSpec) -> Drawing:
@@ -41,11 +38,8 @@ def drawing(spec: RobotSpec) -> Drawing:
     wheelbase, angle = spec.parameters["wheelbase"], steering_angle(spec)
     track, radius = track_and_radius(spec.parameters)
     wheels = []
-    for side, y, joint in (
-        ("left", 0.5 * track, angle.name),
-        ("right", -0.5 * track, f"{angle.name}_right"),
-    ):
-        pivot = Pivot(f"{side}_knuckle", joint, angle)
+    for side, y, suffix in (("left", 0.5 * track, ""), ("right", -0.5 * track, "_right")):
+        pivot = Pivot(f"{side}_knuckle", angle.name + suffix, angle)
         wheels.append(Wheel(f"rear_{side}_wheel", (0.0, y), radius))
         wheels.append(Wheel(f"front_{side}_wheel", (wheelbase, y), radius, pivot=pivot))
     return Drawing((1.3 * wheelbase, 0.7 * track), (0.45 * wheelbase, radius), tuple(wheels))

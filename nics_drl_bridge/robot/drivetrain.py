@@ -20,21 +20,17 @@ from nics_drl_bridge.robot.kinds import Textbook
 from nics_drl_bridge.robot.spec import POSE_RATES, CmdVelField, RobotSpec, StateVariable
 
 Array = NDArray[np.float64]
-STEERED: tuple[CmdVelField, ...] = ("linear.x", "angular.z")
 
 
 def steered(spec: RobotSpec, twist: Callable[[Array, Array], Array]) -> Textbook:
     """Builds the kinematics of a robot that is driven by a speed and a steering angle.
 
     Its state and its commands are both of these, in any order; its turn rate is, up to the second
-    order, a multiple of their product, and its speed one of the speed.
-
-    Args:
-        spec: the robot.
-        twist: gives the body twist (..., 3) for speeds [m/s] and steering angles [rad] (...).
+    order, a multiple of their product, and its speed one of the speed. `twist` gives the body twist
+    (..., 3) for speeds [m/s] and steering angles [rad] (...).
     """
-    v, phi = _states(spec, ("m/s", "rad"))
-    command, order = _commands(spec, STEERED), np.argsort([v, phi])
+    v, phi = _states(spec)
+    command, order = _commands(spec, ("linear.x", "angular.z")), np.argsort([v, phi])
     names = [spec.state[i].name for i in (v, phi)]
     lag, rate = _actuators(spec.parameters, ("speed", "steering"))
     return Textbook(
@@ -48,7 +44,7 @@ def steered(spec: RobotSpec, twist: Callable[[Array, Array], Array]) -> Textbook
 
 def steering_angle(spec: RobotSpec) -> StateVariable:
     """Returns the state variable of the steering angle of a robot that is `steered`."""
-    return spec.state[_states(spec, ("m/s", "rad"))[1]]
+    return spec.state[_states(spec)[1]]
 
 
 def wheeled(
@@ -58,14 +54,10 @@ def wheeled(
     fields: tuple[CmdVelField, ...],
     moves: tuple[str, ...],
 ) -> Textbook:
-    """Builds the kinematics of a robot whose twist is linear in its wheel speeds.
+    """Builds the kinematics of a robot whose twist is linear in its wheel speeds, its state.
 
-    Args:
-        spec: the robot; its state is the wheel speeds.
-        inverse: (S, C) wheel speeds per command, in the order of `fields`.
-        forward: (3, S) body twist per wheel speed.
-        fields: of `cmd_vel`.
-        moves: the degrees of freedom that the wheels can move.
+    `inverse` (S, C) gives wheel speeds per command, in the order of `fields`; `forward` (3, S) the
+    body twist per wheel speed. The wheels can move the degrees of freedom `moves`.
     """
     if len(spec.state) != len(inverse):
         raise ConfigError(
@@ -89,24 +81,24 @@ def _commands(spec: RobotSpec, fields: tuple[CmdVelField, ...]) -> list[int]:
     have = [c.cmd_vel for c in spec.command]
     if not any(have):
         return list(range(len(have)))
-    missing = [field for field in fields if field not in have]
-    if missing:
-        raise ConfigError(
-            f"robot {spec.name!r}: the {spec.textbook} kinematics need a command with "
-            f"`cmd_vel: {missing[0]}`; add it."
-        )
+    for field in fields:
+        if field not in have:
+            raise ConfigError(
+                f"robot {spec.name!r}: the {spec.textbook} kinematics need a command with "
+                f"`cmd_vel: {field}`; add it."
+            )
     return [have.index(field) for field in fields]
 
 
-def _states(spec: RobotSpec, units: tuple[str, ...]) -> list[int]:
-    """Returns the indices of the state variables with the given units."""
+def _states(spec: RobotSpec) -> tuple[int, int]:
+    """Returns the indices of speed and steering angle in the state."""
     have = [v.unit for v in spec.state]
-    if sorted(have) != sorted(units):
+    if sorted(have) != ["m/s", "rad"]:
         raise ConfigError(
-            f"robot {spec.name!r}: the {spec.textbook} kinematics need a state in "
-            f"{' and '.join(units)}, not in {', '.join(have) or 'nothing'}; correct `state:`."
+            f"robot {spec.name!r}: the {spec.textbook} kinematics need a state in m/s and rad, not "
+            f"in {', '.join(have) or 'nothing'}; correct `state:`."
         )
-    return [have.index(unit) for unit in units]
+    return have.index("m/s"), have.index("rad")
 
 
 def _actuators(p: dict[str, float], parts: tuple[str, ...]) -> tuple[Array, Array]:

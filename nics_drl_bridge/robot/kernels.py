@@ -2,11 +2,10 @@
 
 Only the kept terms cost time. A step of one robot consists of scalar functions, `rates` then
 `move`; `run` does the same for a batch of robots, term by term, so that vector instructions
-process several robots at a time. Both give bit-identical results for every batch size: one robot
-is a batch of one.
+process several robots at a time. Both give bit-identical results for every batch size.
 
-Shared arguments: `terms` are `Terms`; `x` contains state, command and a last
-entry of 1; `dq` are the rates; `series` is `SERIES` in the type of the other arrays.
+Shared arguments: `terms` are `Terms`; `x` contains state, command and a last entry of 1; `dq` are
+the rates; `series` is `SERIES` in the type of the other arrays.
 """
 
 from __future__ import annotations
@@ -50,11 +49,7 @@ class Terms(NamedTuple):
 
 
 def term_arrays(model: TaylorModel) -> Terms:
-    """Returns the kept terms of a model.
-
-    Raises:
-        ModelError: a term is of a higher order than the kernels support.
-    """
+    """Returns the kept terms of a model. Raises ModelError if the order of one is too high."""
     one = len(model.variables)
     order = max(1, int(model.powers.sum(axis=1).max(initial=1)))
     if order > GREATEST_ORDER:
@@ -93,18 +88,14 @@ def rates(dq, x, terms):  # type: ignore[no-untyped-def]
 def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
     """Returns position and direction after the exact arc of a constant body twist.
 
-    Args:
-        x, y: position [m].
-        c, s: cosine and sine of the heading.
-        vx, vy: body velocity [m/s].
-        turn: turn rate x duration [rad].
-        dt: duration [s].
-        series: see the module.
+    Position x, y [m] and the heading's cosine c and sine s; body velocity vx, vy [m/s]; turn rate
+    x duration `turn` [rad], duration dt [s].
     """
     if abs(turn) > WIDE_TURN:
         one = series[3] + series[3]
         sine, versine = math.sin(turn), one - math.cos(turn)
-        return _along(x, y, c, s, vx, vy, sine / turn, versine / turn, sine, versine, dt)
+        ahead, aside = _chord(vx, vy, sine / turn, versine / turn, dt)
+        return _end(x, y, c, s, ahead, aside, sine, versine)
     return _move_little(x, y, c, s, vx, vy, turn, dt, series)
 
 
@@ -115,13 +106,19 @@ def _move_little(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyp
     a = series[0] - t2 * (series[1] - t2 * series[2])
     a = (series[3] + series[3]) - t2 * a
     b = turn * (series[3] - t2 * (series[4] - t2 * series[5]))
-    return _along(x, y, c, s, vx, vy, a, b, turn * a, turn * b, dt)
+    ahead, aside = _chord(vx, vy, a, b, dt)
+    return _end(x, y, c, s, ahead, aside, turn * a, turn * b)
 
 
 @kernel
-def _along(x, y, c, s, vx, vy, a, b, sine, versine, dt):  # type: ignore[no-untyped-def]
-    """Returns the end of an arc from a = sin(t) / t, b = (1 - cos(t)) / t, t a and t b."""
-    ahead, aside = (a * vx - b * vy) * dt, (b * vx + a * vy) * dt
+def _chord(vx, vy, a, b, dt):  # type: ignore[no-untyped-def]
+    """Returns the chord of an arc in the body's frame; a = sin(t) / t, b = (1 - cos(t)) / t."""
+    return (a * vx - b * vy) * dt, (b * vx + a * vy) * dt
+
+
+@kernel
+def _end(x, y, c, s, ahead, aside, sine, versine):  # type: ignore[no-untyped-def]
+    """Returns position and direction at the end of a chord, after a turn of that sine."""
     x, y = x + (c * ahead - s * aside), y + (s * ahead + c * aside)
     return x, y, c - (c * versine + s * sine), s - (s * versine - c * sine)
 
@@ -155,16 +152,14 @@ def _own(value, lane):  # type: ignore[no-untyped-def]
 
 @kernel
 def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
-    """Moves a batch of robots by the same number of steps, each under a constant command.
+    """Moves a batch of robots by the same number of steps of dt [s], under constant commands.
 
     Args:
         pose: (6, n) x, y [m], cosine and sine of the heading, heading [rad], and an upper bound
             of the path length [m], updated in place; the heading is not wrapped.
         x: (S + C + 1, n); the state is updated in place.
         dq: (3 + S, n) scratch memory; contains the rates of the last step afterwards.
-        terms, series: see the module; coefficients may be (T, n), one per robot.
-        dt: length of a step [s].
-        steps: number of steps.
+        terms: coefficients may be (T, n), one per robot.
     """
     for _ in range(steps):
         _rates_of_all(dq, x, terms)
@@ -239,14 +234,10 @@ def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-untyped-def]
-    """Rolls out robots open-loop under their commands, one robot after the other.
+    """Rolls out robots open-loop under commands (W, T, C), one per step of dt [s].
 
-    Args:
-        poses: (W, T + 1, 3), the first given, the others written; headings are not wrapped.
-        states: (W, T + 1, S), likewise.
-        commands: (W, T, C), one row per step.
-        terms, series: see the module.
-        dt: length of a step [s].
+    The first of poses (W, T + 1, 3) and states (W, T + 1, S) is given, the others are written;
+    headings are not wrapped.
     """
     size, width = states.shape[2], commands.shape[2]
     x, dq = np.ones(size + width + 1), np.zeros(3 + size)

@@ -1,4 +1,4 @@
-"""Kinds of robots: textbook kinematics and a drawing for each, found by name, see `registry`."""
+"""Kinds of robots: textbook kinematics and a drawing for each; `spec` finds them by name."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.robot.registry import find_kind, kind_names
-from nics_drl_bridge.robot.spec import RobotSpec, StateVariable
+from nics_drl_bridge.robot.spec import RobotSpec, StateVariable, find_kind, kind_names
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -24,11 +23,9 @@ class Textbook:
     Attributes:
         twist: gives the body twist (..., 3) for a state (..., S).
         target: gives the state (..., S) that a command (..., C) requests.
-        lag: (S,) time constants of first-order actuators [s]; unused for rate-limited ones.
-        rate: (S,) greatest rates of the state of rate-limited actuators [its unit/s]; inf for
-            first-order ones.
-        structure: possible products of state variables in each degree of freedom of the twist, up
-            to the second order.
+        lag: (S,) time constants of first-order actuators [s].
+        rate: (S,) greatest rates of rate-limited actuators [its unit/s]; inf for first-order ones.
+        structure: possible products of state variables in each degree of freedom of the twist.
     """
 
     twist: Callable[[Array], Array]
@@ -51,12 +48,9 @@ class Textbook:
 
 @dataclass(frozen=True)
 class Pivot:
-    """A vertical axis about which a wheel is steered.
+    """Vertical axis about which a wheel is steered: its link and joint, and the steering angle.
 
-    Attributes:
-        link: name of the link that carries the wheel.
-        joint: name of its joint; another one than the variable's follows the variable's joint.
-        angle: state variable of the steering angle [rad].
+    A joint of another name than the variable's follows the variable's joint.
     """
 
     link: str
@@ -66,14 +60,9 @@ class Pivot:
 
 @dataclass(frozen=True)
 class Wheel:
-    """A wheel of a drawing; it stands on the ground.
+    """A wheel that stands on the ground, with its place x, y in `base_link` and its radius [m].
 
-    Attributes:
-        name: of its joint.
-        place: x, y of its centre in `base_link` [m].
-        radius: [m].
-        turns: True if its joint turns, as the state variable of that name tells.
-        pivot: by which it is steered; None for a wheel that is not.
+    Its name is that of its joint, which `turns` by the state variable of that name if there is one.
     """
 
     name: str
@@ -85,12 +74,9 @@ class Wheel:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Looks of a robot.
+    """Looks of a robot: its wheels, and a box (length, width) or a cylinder (radius) as body [m].
 
-    Attributes:
-        body: length and width of a box, or radius of a cylinder [m].
-        centre: x and height of the body's centre above `base_link` [m].
-        wheels: in the order in which they are drawn.
+    `centre` is x and height of the body's centre above `base_link` [m].
     """
 
     body: tuple[float, float] | float
@@ -100,12 +86,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class RobotKind:
-    """A kind of robot. Both functions raise KeyError for a parameter that the spec lacks.
-
-    Attributes:
-        kinematics: gives the textbook kinematics of a robot.
-        drawing: gives the looks of a robot.
-    """
+    """A kind of robot. Both functions raise KeyError for a parameter that the spec lacks."""
 
     kinematics: Callable[[RobotSpec], Textbook]
     drawing: Callable[[RobotSpec], Drawing]
@@ -117,27 +98,23 @@ def textbook(spec: RobotSpec) -> Textbook:
     Raises:
         ConfigError: the spec names none, lacks a parameter, or has other variables.
     """
-    return _made(spec, _kind_of(spec).kinematics)
+    return _made(spec, lambda kind: kind.kinematics(spec))
 
 
 def drawing(spec: RobotSpec) -> Drawing:
     """Returns the looks of a robot. Raises ConfigError as `textbook` does."""
-    return _made(spec, _kind_of(spec).drawing)
+    return _made(spec, lambda kind: kind.drawing(spec))
 
 
-def _kind_of(spec: RobotSpec) -> RobotKind:
+def _made(spec: RobotSpec, make: Callable[[RobotKind], T]) -> T:
     kind: RobotKind | None = find_kind(require_textbook(spec))
     if kind is None:
         raise ConfigError(
             f"robot {spec.name!r}: `textbook:` must be one of {', '.join(kind_names())}, not "
             f"{spec.textbook!r}."
         )
-    return kind
-
-
-def _made(spec: RobotSpec, make: Callable[[RobotSpec], T]) -> T:
     try:
-        return make(spec)
+        return make(kind)
     except KeyError as error:
         raise ConfigError(
             f"robot {spec.name!r}: the {spec.textbook} kinematics need the parameter {error}; add "

@@ -1,7 +1,4 @@
-"""Noise of a robot, drawn by the simulator and expected by the estimator.
-
-Latency of a robot's scan and odometry, from measurement to receipt.
-"""
+"""Noise of a robot, drawn by the simulator and expected by the estimator, and its latency."""
 
 from __future__ import annotations
 
@@ -15,24 +12,16 @@ from nics_drl_bridge.config import Schema
 from nics_drl_bridge.robot.spec import RobotSpec
 
 MEASURED: Literal["measured"] = "measured"
-ASSUMED: Literal["assumed"] = "assumed"
 ASSUMED_STATE_DRIFT = 0.1
 """Assumed drift of an unmeasured state within a second, as a share of its range."""
 
 
 class Level(Schema):
-    """One standard deviation.
-
-    Attributes:
-        std: its value.
-        unit: of the value.
-        source: `measured` in the recording, or `assumed` if the recording did not show it.
-        uncertainty: standard uncertainty of the value; None if it is assumed.
-    """
+    """One standard deviation: measured in the recording, with its uncertainty, or assumed."""
 
     std: float = Field(ge=0.0)
     unit: str
-    source: Literal["measured", "assumed"] = ASSUMED
+    source: Literal["measured", "assumed"] = "assumed"
     uncertainty: float | None = Field(default=None, ge=0.0)
 
     @property
@@ -47,21 +36,12 @@ def assumed(std: float, unit: str) -> Level:
 
 
 class Noise(Schema):
-    """Noise of a robot's sensors and motion.
+    """Noise of a robot's odometry and pose sensor, and drift of its pose and its state by name.
 
+    The drift is motion that the model does not explain; it grows with the square root of time.
     The simulator draws the odometry noise, and the drift if it was measured: an assumed drift is
     a margin for the estimator, not a motion of the robot. The estimator takes its R from odometry
     and pose, its Q from the drift.
-
-    Attributes:
-        odom_linear: of each component of the measured velocity [m/s].
-        odom_angular: of the measured yaw rate [rad/s].
-        pose_position: of x and y of the pose sensor [m].
-        pose_heading: of its heading [rad].
-        position_drift: part of x and y that the model does not explain, growing with the square
-            root of time [m/sqrt(s)].
-        heading_drift: the same for the heading [rad/sqrt(s)].
-        state_drift: the same for each state variable, by name [its unit/sqrt(s)].
     """
 
     odom_linear: Level = assumed(0.01, "m/s")
@@ -92,18 +72,18 @@ class Noise(Schema):
 
     def drift(self, spec: RobotSpec) -> NDArray[np.float64]:
         """Returns the drift (3 + S,) of pose and state that the estimator expects in a second."""
-        states = [self._state(v.name, v.max - v.min, v.unit) for v in spec.state]
-        levels = (self.position_drift, self.position_drift, self.heading_drift, *states)
-        return np.array([level.std for level in levels])
+        return np.array([level.std for level in self._drift(spec)])
 
     def simulated_drift(self, spec: RobotSpec) -> NDArray[np.float64]:
         """Returns the drift (3 + S,) that the simulator draws: measured levels, else zero."""
-        states = [self._state(v.name, v.max - v.min, v.unit) for v in spec.state]
-        levels = (self.position_drift, self.position_drift, self.heading_drift, *states)
-        return np.array([level.std if level.measured else 0.0 for level in levels])
+        return np.array([level.std if level.measured else 0.0 for level in self._drift(spec)])
 
-    def _state(self, name: str, reach: float, unit: str) -> Level:
-        return self.state_drift.get(name, assumed(ASSUMED_STATE_DRIFT * reach, f"{unit}/sqrt(s)"))
+    def _drift(self, spec: RobotSpec) -> list[Level]:
+        levels = [self.position_drift, self.position_drift, self.heading_drift]
+        for v in spec.state:
+            unknown = assumed(ASSUMED_STATE_DRIFT * (v.max - v.min), f"{v.unit}/sqrt(s)")
+            levels.append(self.state_drift.get(v.name, unknown))
+        return levels
 
     def sentences(self) -> list[str]:
         """Returns one human-readable line per level."""
@@ -119,24 +99,14 @@ class Noise(Schema):
 
 
 class Delay(Schema):
-    """A uniform distribution of delays.
-
-    Attributes:
-        least: smallest delay [s].
-        jitter: greatest minus smallest delay [s].
-    """
+    """A uniform distribution of delays: the `least`, and how much longer the greatest is [s]."""
 
     least: float = Field(ge=0.0)
     jitter: float = Field(ge=0.0)
 
 
 class Latency(Schema):
-    """Delays from measurement to receipt; None if unknown.
-
-    Attributes:
-        scan: of scans, from the last beam.
-        odom: of odometry, from its stamp.
-    """
+    """Delays to receipt, of a scan from its last beam, of odometry from its stamp, if known."""
 
     scan: Delay | None = None
     odom: Delay | None = None

@@ -1,51 +1,69 @@
-"""RobotSpec: the single definition of a robot's state and command: order, units and limits."""
+"""RobotSpec: the single definition of a robot's state and command: order, units and limits.
+
+A module of this folder that defines `KIND`, a `kinds.RobotKind`, adds a kind of the module's name,
+which a robot's YAML file selects by `textbook:`. Other packages add kinds by entry points of the
+group `nics_drl_bridge.kinds`.
+"""
 
 from __future__ import annotations
 
 import math
 from functools import cached_property
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator, model_validator
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.robot.registry import find_kind, kind_names
 
 CmdVelField = Literal["linear.x", "linear.y", "angular.z"]
 CMD_VEL_FIELDS: tuple[CmdVelField, ...] = ("linear.x", "linear.y", "angular.z")
-TWIST_UNITS = dict(zip(CMD_VEL_FIELDS, ("m/s", "m/s", "rad/s"), strict=True))
-UNITS = ("m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1")
-"""SI units of a state or a command; 1 for a ratio or a count."""
-LARGEST = 1e3
-"""Maximum radius of a robot [m]."""
-MOST_CORNERS = 512
-"""Maximum number of corners of a footprint."""
-MOST_VARIABLES = 32
-"""Maximum number of variables of a state, and of a command."""
-FASTEST = 1e6
-"""Maximum absolute value of a variable, in its unit."""
 POSE_RATES = ("vx", "vy", "wz")
 POSE_UNITS = ("m/s", "m/s", "rad/s")
+TWIST_UNITS = dict(zip(CMD_VEL_FIELDS, POSE_UNITS, strict=True))
+Unit = Literal["m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1"]
+"""SI units of a state or a command; 1 for a ratio or a count."""
+MOST_CORNERS, MOST_VARIABLES = 512, 32
+"""Greatest number of corners of a footprint, and of variables of a state or a command."""
+FASTEST = 1e6
+"""Greatest absolute value of a variable, in its unit."""
+
+
+def kind_names() -> list[str]:
+    """Names of all kinds of robots."""
+    modules = (module.name for module in iter_modules([str(Path(__file__).parent)]))
+    own = (name for name in modules if _own_kind(name) is not None)
+    return sorted({*own, *extensions.known("kinds")})
+
+
+def find_kind(name: str) -> Any | None:
+    """Returns a `kinds.RobotKind`; None if there is none of that name."""
+    if name in extensions.known("kinds"):
+        return extensions.load("kinds", name)
+    return _own_kind(name)
+
+
+def _own_kind(name: str) -> Any | None:
+    place = f"{__package__}.{name}"
+    if not name.isidentifier() or find_spec(place) is None:
+        return None
+    return getattr(import_module(place), "KIND", None)
 
 
 class Variable(Schema):
     """A component of the state or of the command."""
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
-    unit: str
+    unit: Unit
     min: float = Field(ge=-FASTEST, le=FASTEST)
     max: float = Field(ge=-FASTEST, le=FASTEST)
-
-    @field_validator("unit")
-    @classmethod
-    def _si(cls, unit: str) -> str:
-        if unit not in UNITS:
-            raise ValueError(f"the unit must be one of {', '.join(UNITS)}")
-        return unit
 
     @model_validator(mode="after")
     def _ordered(self) -> Variable:
@@ -57,20 +75,14 @@ class Variable(Schema):
 class StateVariable(Variable):
     """A component of the state.
 
-    Attributes:
-        follows: the command that it follows with a lag. A recording without measured state can
-            still be used if every state variable names one.
+    If all name the command that they follow with a lag, the recording may lack the state.
     """
 
     follows: str | None = None
 
 
 class CommandVariable(Variable):
-    """A component of the command.
-
-    Attributes:
-        cmd_vel: its field of `cmd_vel`; None for a robot that is not driven through ROS 2.
-    """
+    """A component of the command, with its field of `cmd_vel` if that drives the robot."""
 
     cmd_vel: CmdVelField | None = None
 
@@ -85,11 +97,6 @@ class CommandVariable(Variable):
         return self.turns and self.unit == "rad"
 
     @property
-    def is_sideways(self) -> bool:
-        """True for a speed to the left."""
-        return self.cmd_vel == "linear.y"
-
-    @property
     def is_twist(self) -> bool:
         """True for a component of the body twist."""
         return self.cmd_vel is not None and TWIST_UNITS[self.cmd_vel] == self.unit
@@ -99,15 +106,12 @@ class RobotSpec(Schema):
     """Definition of a robot.
 
     Attributes:
-        name: user-visible name.
-        description: one sentence.
-        textbook: its kind, see `robot.kinds`: the textbook kinematics for its synthetic recordings,
-            whose structure may also be assumed for motion that a drive did not show.
+        textbook: its kind: the textbook kinematics for its synthetic recordings, whose structure
+            may also be assumed for motion that a drive did not show.
         parameters: of the textbook kinematics [m, s], see the module of that kind.
-        footprint_radius: radius of the circular footprint around `base_link` [m]; optional with a
-            `footprint`, which it then circumscribes.
-        footprint: corners of a polygonal footprint instead, in `base_link` [m], in either
-            direction; edges may not cross.
+        footprint_radius: of a circle around `base_link` [m]; optional with a `footprint`, which it
+            then circumscribes.
+        footprint: corners of a polygon instead, in `base_link` [m], in either direction.
         state: S components, in the order of every state vector.
         command: C components, in the order of every command vector.
     """
@@ -116,7 +120,7 @@ class RobotSpec(Schema):
     description: str = ""
     textbook: str | None = None
     parameters: dict[str, float] = Field(default_factory=dict)
-    footprint_radius: float = Field(ge=1e-3, le=LARGEST)
+    footprint_radius: float = Field(ge=1e-3, le=1e3)
     footprint: tuple[tuple[float, float], ...] | None = Field(
         default=None, min_length=3, max_length=MOST_CORNERS
     )
@@ -133,28 +137,23 @@ class RobotSpec(Schema):
     @model_validator(mode="before")
     @classmethod
     def _circumscribed(cls, data: Any) -> Any:
-        if (
-            not isinstance(data, dict)
-            or data.get("footprint") is None
-            or "footprint_radius" in data
-        ):
+        outline = data.get("footprint") if isinstance(data, dict) else None
+        if outline is None or "footprint_radius" in data:
             return data
         try:
-            if len(data["footprint"]) > MOST_CORNERS:
-                return data
-            corners = np.array(data["footprint"], dtype=np.float64)
-            return data | {"footprint_radius": float(np.hypot(*corners.T).max())}
+            if len(outline) <= MOST_CORNERS:
+                data = data | {"footprint_radius": _reach(outline)}
         except (OverflowError, TypeError, ValueError):
-            return data  # the field's own check reports the error
+            pass  # the field's own check reports the error
+        return data
 
     @model_validator(mode="after")
     def _outlined(self) -> RobotSpec:
         if self.footprint is None:
             return self
-        corners = np.array(self.footprint)
-        if _edges_cross(corners):
+        if _edges_cross(np.array(self.footprint)):
             raise ValueError("edges of footprint cross or touch; list its corners in order")
-        radius = float(np.hypot(*corners.T).max())
+        radius = _reach(self.footprint)
         if not math.isclose(radius, self.footprint_radius, rel_tol=1e-6):
             raise ValueError(
                 f"footprint reaches {radius:.6g} m from base_link, footprint_radius is "
@@ -206,15 +205,11 @@ class RobotSpec(Schema):
     @property
     def moves_sideways(self) -> bool:
         """True if a sideways speed is commanded."""
-        return any(command.is_sideways for command in self.command)
+        return any(command.cmd_vel == "linear.y" for command in self.command)
 
     @property
     def wheelbase(self) -> float:
-        """Distance between the axles of a robot that steers [m].
-
-        Raises:
-            ConfigError: it is not known.
-        """
+        """Distance between the axles of a robot that steers [m]. Raises ConfigError if unknown."""
         wheelbase = self.parameters.get("wheelbase", 0.0)
         if not wheelbase > 0.0:
             raise ConfigError(
@@ -252,6 +247,11 @@ class RobotSpec(Schema):
     def from_cmd_vel(self, twist: ArrayLike) -> NDArray[np.float64]:
         """Converts `cmd_vel` (..., 3) to a command (..., C); unused fields are dropped."""
         return np.asarray(twist, dtype=np.float64)[..., self._cmd_vel_index]
+
+
+def _reach(outline: ArrayLike) -> float:
+    """Radius of the circle around the origin that circumscribes an outline (V, 2)."""
+    return float(np.hypot(*np.array(outline, dtype=np.float64).T).max())
 
 
 def _edges_cross(corners: NDArray[np.float64]) -> bool:

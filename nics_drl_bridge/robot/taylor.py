@@ -1,9 +1,4 @@
-"""TaylorModel: the rates of pose and state as a short polynomial of state and command.
-
-Features of the Taylor model: the products of the variables up to an order (Eq. 1).
-
-Quality: goodness of fit of a model, on its training part and on unseen data.
-"""
+"""TaylorModel: rates of pose and state as a short polynomial of state and command (Eq. 1)."""
 
 from __future__ import annotations
 
@@ -22,10 +17,6 @@ from nics_drl_bridge.errors import ModelError
 Array = NDArray[np.float64]
 
 
-def _unknown() -> Array:
-    return np.zeros((0, 0))
-
-
 @dataclass(frozen=True)
 class TaylorModel:
     """`dQ/dt = A chi(X)` without the pruned terms (Eq. 1, 2).
@@ -33,16 +24,13 @@ class TaylorModel:
     Attributes:
         variables: V names of X = [state, command].
         dofs: D = 3 + S names of dQ/dt: vx, vy, wz of the body twist, then the state's rates.
-        dof_units: D units.
         powers: (K, V) exponents of the terms that any degree of freedom keeps.
         coefficients: (D, K); zero where a degree of freedom does not keep a term.
         dt: the step for which the rates are valid [s]; the simulator's step.
         low, high: (V,) the box of X that the recording covered.
-        assumed: terms (dof, term) that the drive could not show, filled in from the
-            textbook's structure on request.
-        std_errors: (D, K) standard errors of the coefficients; NaN for a kept one that was not
-            estimated but assumed or fixed by definition. Empty, (0, 0), if none is known.
-        quality: its goodness of fit; None if unknown.
+        assumed: terms (dof, term) that the drive could not show, of the textbook's structure.
+        std_errors: (D, K) of the coefficients; NaN for a kept one that was not estimated but
+            assumed or fixed by definition. Empty, (0, 0), if none is known.
     """
 
     variables: tuple[str, ...]
@@ -54,7 +42,7 @@ class TaylorModel:
     low: Array
     high: Array
     assumed: tuple[tuple[str, str], ...] = ()
-    std_errors: Array = field(default_factory=_unknown)
+    std_errors: Array = field(default_factory=lambda: np.zeros((0, 0)))
     quality: Quality | None = None
 
     @property
@@ -72,15 +60,9 @@ class TaylorModel:
         return evaluate(x, self.powers) @ self.coefficients.T
 
     def step(self, pose: ArrayLike, state: ArrayLike, command: ArrayLike) -> tuple[Array, Array]:
-        """Computes one step of `dt`; a readable reference for the simulator's kernel.
+        """Returns pose (..., 3) and state (..., S) after a step of `dt` under a command (..., C).
 
-        Args:
-            pose: (..., 3).
-            state: (..., S).
-            command: (..., C).
-
-        Returns:
-            Pose (..., 3), moved along the exact arc of the body twist, and state (..., S).
+        The pose moves along the exact arc of the body twist: a reference for the kernels.
         """
         state = np.asarray(state, dtype=np.float64)
         x = np.concatenate([state, np.asarray(command, dtype=np.float64)], axis=-1)
@@ -107,7 +89,7 @@ class TaylorModel:
     def with_errors(self, errors: Mapping[str, Mapping[str, float]]) -> TaylorModel:
         """Returns the model with standard errors by dof and term; NaN for kept terms without."""
         if not errors:
-            return replace(self, std_errors=_unknown())
+            return replace(self, std_errors=np.zeros((0, 0)))
         names = self.term_names
         rows = [[errors.get(dof, {}).get(name, np.nan) for name in names] for dof in self.dofs]
         known = np.array(rows, dtype=np.float64).reshape(self.coefficients.shape)
@@ -119,10 +101,7 @@ class TaylorModel:
         for d, dof in enumerate(self.dofs):
             text = ""
             for k in np.flatnonzero(self.coefficients[d]):
-                value, name = (
-                    self.coefficients[d, k],
-                    term_name(self.powers[k], self.variables),
-                )
+                value, name = self.coefficients[d, k], term_name(self.powers[k], self.variables)
                 sign = ("-" if value < 0 else "") if not text else (" - " if value < 0 else " + ")
                 mark = " (assumed)" if (dof, name) in self.assumed else ""
                 text += f"{sign}{abs(value):.5g}" + ("" if name == "1" else f"*{name}") + mark
@@ -150,22 +129,16 @@ class TaylorModel:
 
 
 def exponents(variables: int, order: int) -> NDArray[np.int64]:
-    """Returns the distinct products of up to `order` variables.
+    """Returns the exponents (K, V) of the distinct products of up to `order` of V variables.
 
-    `chi = vec([1, X] (x) [1, X])` of Eq. 1 contains every mixed product twice; here each occurs
-    once.
-
-    Args:
-        variables: V, the size of X.
-        order: of the Taylor expansion; the paper's is 2.
-
-    Returns:
-        (K, V) exponent of each variable in each term: the constant first, then by order.
+    The constant comes first, then by order. `chi = vec([1, X] (x) [1, X])` of Eq. 1, of order 2,
+    contains every mixed product twice; here each occurs once.
     """
-    rows = []
-    for degree in range(order + 1):
-        for chosen in combinations_with_replacement(range(variables), degree):
-            rows.append(np.bincount(np.array(chosen, dtype=np.int64), minlength=variables))
+    rows = [
+        np.bincount(np.array(chosen, dtype=np.int64), minlength=variables)
+        for degree in range(order + 1)
+        for chosen in combinations_with_replacement(range(variables), degree)
+    ]
     return np.array(rows, dtype=np.int64).reshape(len(rows), variables)
 
 
@@ -180,7 +153,7 @@ def evaluate(x: ArrayLike, powers: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def term_name(row: NDArray[np.int64], names: tuple[str, ...]) -> str:
-    """Returns a term as text: `1`, `speed`, `speed*steering`, `speed^2`."""
+    """Returns a term as text: `1`, `speed*steering`, `speed^2`."""
     factors = [names[v] if row[v] == 1 else f"{names[v]}^{row[v]}" for v in np.flatnonzero(row)]
     return "*".join(factors) or "1"
 
@@ -214,13 +187,10 @@ class Quality:
         samples: number of rows that the fit used.
         outliers: share of the rows that were dropped as outliers.
         condition: condition number of the standardised kept features.
-        rmse: of the rates on the training part, in the unit of the rate.
-        r2: share of the variance of the rates that is explained there.
+        rmse, r2: of the rates on the training part.
         held_out_rmse, held_out_r2: the same on data that the fit never saw; empty if none.
-        open_loop_horizon_s: length of the open-loop predictions on that data [s]; 0 if none.
-        open_loop_position_error_m: mean position error at their ends [m].
-        open_loop_heading_error_rad: mean heading error [rad].
-        open_loop_path_m: mean length of the measured path [m].
+        open_loop_horizon_s: length of the open-loop predictions on that data; 0 if none. The mean
+            errors at their ends follow, and the mean length of the measured path.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")  # a figure of merit may be inf
@@ -239,16 +209,9 @@ class Quality:
 
 
 class NamedTaylorModel(Schema):
-    """A TaylorModel by the names of its terms, as `model.yaml` holds it.
+    """A TaylorModel by names, as `model.yaml` holds it: `terms` by dof and `term_name`.
 
-    Attributes:
-        dt: the step for which the rates are valid [s].
-        units: of the rates, by degree of freedom.
-        terms: dof -> term -> coefficient; see `term_name`.
-        valid: least and greatest value of each variable in the recording.
-        assumed: terms (dof, term) that the drive could not show.
-        standard_errors: dof -> term -> standard error, as far as known.
-        quality: goodness of fit; None if unknown.
+    `units` are those of the rates by dof, `valid` is the range of each variable in the recording.
     """
 
     dt: float = Field(gt=0.0)
@@ -262,11 +225,10 @@ class NamedTaylorModel(Schema):
     def model(self) -> TaylorModel:
         """Returns the model as arrays. Raises ModelError if the names do not fit each other."""
         variables, dofs = tuple(self.valid), tuple(self.terms)
+        every = dict.fromkeys(name for row in self.terms.values() for name in row)
         try:
             units = tuple(self.units[dof] for dof in dofs)
-            parsed = {
-                name: parse_term(name, variables) for row in self.terms.values() for name in row
-            }
+            parsed = {name: parse_term(name, variables) for name in every}
         except KeyError as error:
             raise ModelError(f"kinematics: {error} has no unit; generate the model anew.") from None
         except (OverflowError, ValueError) as error:

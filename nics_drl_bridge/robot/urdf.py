@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from xml.etree import ElementTree
 
-from nics_drl_bridge.robot.kinds import Drawing, Pivot, Wheel, drawing
+from nics_drl_bridge.robot.kinds import Wheel, drawing
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Element = ElementTree.Element
@@ -13,7 +13,6 @@ Place = tuple[float, float, float]
 
 COLOURS = {"body": "0.2 0.4 0.7 1", "wheel": "0.1 0.1 0.1 1", "laser": "0.7 0.1 0.1 1"}
 BODY_HEIGHT = 0.04
-LASER_RADIUS, LASER_HEIGHT = 0.02, 0.03
 
 
 def urdf_of(
@@ -25,63 +24,48 @@ def urdf_of(
     `laser` is at its mount, at the height of `base_link`, since the package's world is flat.
     Moving joints have the names of the state variables in `joint_states`. A robot without
     textbook kinematics has no wheels here, since its spec does not contain their positions.
-
-    Args:
-        spec: of the robot.
-        mount: x [m], y [m], heading [rad] of the lidar in the base.
-        laser: frame id of the lidar.
-        base: frame id of the robot.
+    The lidar's frame is `laser`, its mount x [m], y [m], heading [rad] in the frame `base`.
     """
     robot = Element("robot", name=spec.name)
     for name, colour in COLOURS.items():
-        ElementTree.SubElement(_add(robot, "material", name=name), "color", rgba=colour)
+        _add(_add(robot, "material", name=name), "color", rgba=colour)
     link = _add(robot, "link", name=base)
-    collision = _add(link, "collision")
-    _cylinder(collision, spec.footprint_radius, BODY_HEIGHT, (0.0, 0.0, BODY_HEIGHT))
+    disc = (spec.footprint_radius, BODY_HEIGHT)
+    _geometry(_add(link, "collision"), disc, (0.0, 0.0, BODY_HEIGHT))
     if spec.textbook is None:
-        _visual_cylinder(link, "body", spec.footprint_radius, BODY_HEIGHT, BODY_HEIGHT)
+        _visual(link, "body", disc, (0.0, 0.0, BODY_HEIGHT))
     else:
-        _draw(robot, link, drawing(spec))
-    _visual_cylinder(_add(robot, "link", name=laser), "laser", LASER_RADIUS, LASER_HEIGHT, 0.07)
+        looks = drawing(spec)
+        body = looks.body if isinstance(looks.body, tuple) else (looks.body,)
+        _visual(link, "body", (*body, BODY_HEIGHT), (looks.centre[0], 0.0, looks.centre[1]))
+        for wheel in looks.wheels:
+            _wheel(robot, base, wheel)
+    _visual(_add(robot, "link", name=laser), "laser", (0.02, 0.03), (0.0, 0.0, 0.07))
     _joint(robot, "laser_mount", "fixed", (base, laser), (*mount[:2], 0.0), yaw=mount[2])
     ElementTree.indent(robot)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(robot, encoding="unicode")}\n'
 
 
-def _draw(robot: Element, link: Element, looks: Drawing) -> None:
-    x, height = looks.centre
-    if isinstance(looks.body, tuple):
-        _visual_box(link, looks.body, (x, height))
-    else:
-        _visual_cylinder(link, "body", looks.body, BODY_HEIGHT, height)
-    for wheel in looks.wheels:
-        _wheel(robot, link.attrib["name"], wheel)
-
-
-def _wheel(robot: Element, base: str, wheel: Wheel) -> None:
+def _wheel(robot: Element, parent: str, wheel: Wheel) -> None:
     """Adds a wheel; one that turns turns forwards about y, a steered one's pivot about z."""
-    parent, place = base, (*wheel.place, wheel.radius)
+    place: Place = (*wheel.place, wheel.radius)
     if wheel.pivot is not None:
-        _pivot(robot, base, wheel.pivot, place)
-        parent, place = wheel.pivot.link, (0.0, 0.0, 0.0)
+        pivot, angle = wheel.pivot, wheel.pivot.angle
+        _add(robot, "link", name=pivot.link)
+        joint = _joint(robot, pivot.joint, "revolute", (parent, pivot.link), place)
+        _add(joint, "axis", xyz="0 0 1")
+        limits = {"lower": f"{angle.min:g}", "upper": f"{angle.max:g}"}
+        _add(joint, "limit", **limits, effort="1", velocity="10")
+        if pivot.joint != angle.name:
+            _add(joint, "mimic", joint=angle.name)
+        parent, place = pivot.link, (0.0, 0.0, 0.0)
     name, kind = wheel.name, "continuous" if wheel.turns else "fixed"
     joint = _joint(robot, name, kind, (parent, f"{name}_link"), place)
     if wheel.turns:
         _add(joint, "axis", xyz="0 1 0")
-    visual = _add(_add(robot, "link", name=f"{name}_link"), "visual")
-    _cylinder(visual, wheel.radius, 0.4 * wheel.radius, (0.0, 0.0, 0.0), roll=0.5 * math.pi)
-    _add(visual, "material", name="wheel")
-
-
-def _pivot(robot: Element, base: str, pivot: Pivot, place: Place) -> None:
-    angle = pivot.angle
-    _add(robot, "link", name=pivot.link)
-    joint = _joint(robot, pivot.joint, "revolute", (base, pivot.link), place)
-    _add(joint, "axis", xyz="0 0 1")
-    limits = {"lower": f"{angle.min:g}", "upper": f"{angle.max:g}"}
-    _add(joint, "limit", **limits, effort="1", velocity="10")
-    if pivot.joint != angle.name:
-        _add(joint, "mimic", joint=angle.name)
+    size = (wheel.radius, 0.4 * wheel.radius)
+    link = _add(robot, "link", name=f"{name}_link")
+    _visual(link, "wheel", size, (0.0, 0.0, 0.0), roll=0.5 * math.pi)
 
 
 def _add(parent: Element, tag: str, **attributes: str) -> Element:
@@ -102,23 +86,19 @@ def _joint(
     return joint
 
 
-def _cylinder(parent: Element, radius: float, length: float, at: Place, roll: float = 0.0) -> None:
-    _add(parent, "origin", xyz=_numbers(*at), rpy=_numbers(roll, 0.0, 0.0))
-    shape = _add(parent, "geometry")
-    _add(shape, "cylinder", radius=f"{radius:.6g}", length=f"{length:.6g}")
-
-
-def _visual_cylinder(
-    link: Element, material: str, radius: float, height: float, centre: float
+def _visual(
+    link: Element, material: str, size: tuple[float, ...], at: Place, roll: float = 0.0
 ) -> None:
     visual = _add(link, "visual")
-    _cylinder(visual, radius, height, (0.0, 0.0, centre))
+    _geometry(visual, size, at, roll)
     _add(visual, "material", name=material)
 
 
-def _visual_box(link: Element, size: tuple[float, float], centre: tuple[float, float]) -> None:
-    """Adds a body of the given length and width, at the given x and height."""
-    visual = _add(link, "visual")
-    _add(visual, "origin", xyz=_numbers(centre[0], 0.0, centre[1]), rpy="0 0 0")
-    _add(_add(visual, "geometry"), "box", size=_numbers(*size, BODY_HEIGHT))
-    _add(visual, "material", name="body")
+def _geometry(parent: Element, size: tuple[float, ...], at: Place, roll: float = 0.0) -> None:
+    """Adds a box of length, width and height, or a cylinder of radius and length."""
+    _add(parent, "origin", xyz=_numbers(*at), rpy=_numbers(roll, 0.0, 0.0))
+    shape = _add(parent, "geometry")
+    if len(size) == 3:
+        _add(shape, "box", size=_numbers(*size))
+    else:
+        _add(shape, "cylinder", radius=_numbers(size[0]), length=_numbers(size[1]))

@@ -26,7 +26,7 @@ from nics_drl_bridge.policy.evaluation import drive
 MODEL, FIELD = direct_model(), field()
 AHEAD = np.array([1.0, 0.5, -0.5], np.float32)
 ERRORS = (ValueError, ConfigError, MemoryError, RecursionError, KeyboardInterrupt, SystemExit)
-OF_TASK = ("reset", "command", "step_into", "update", "observe_into", "observation", "reward",
+OF_TASK = ("reset", "command", "step_into", "update", "observation", "reward",
            "end", "info")  # fmt: skip
 
 

@@ -6,9 +6,8 @@ import pytest
 from robots import DIRECT, FOOTPRINT, direct_model, field, lidar
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.pursuit_evasion import PursuitEvasion
 from nics_drl_bridge.env.task import Episodes, bearing, distance
-from nics_drl_bridge.env.teams import CooperativeReaching, distances, others, seen
+from nics_drl_bridge.env.teams import CooperativeReaching, PursuitEvasion, distances, others, seen
 from nics_drl_bridge.interface import RobotView
 
 B = 72

@@ -104,17 +104,21 @@ def test_it_steps_as_gymnasiums_own_vector_env_of_single_envs(task, mode):
     assert ended >= 9
 
 
+@pytest.mark.parametrize(
+    ("steps", "counts"),
+    [(300, (1, 17)), pytest.param(2000, (1, 4, 16, 64), marks=pytest.mark.campaign)],
+)
 @pytest.mark.parametrize("task", TASKS, ids=IDS)
-def test_a_world_does_not_depend_on_how_many_others_there_are(task):
+def test_a_world_does_not_depend_on_how_many_others_there_are(task, steps, counts):
     def course(count):
         env = vector(count, **task)
         seen = [env.reset(seed=10)[0][:1]]
-        for action in actions_of(vector(1, **task), 2000):
+        for action in actions_of(vector(1, **task), steps):
             step = env.step(np.repeat(action, count, axis=0))
             seen += [part[:1].copy() for part in step[:4]]
         return digest(seen)
 
-    assert len({course(count) for count in (1, 4, 16, 64)}) == 1
+    assert len({course(count) for count in counts}) == 1
 
 
 def digest(arrays):
@@ -131,15 +135,16 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 env = BridgeVectorEnv(4, model="differential", threads=int(sys.argv[1]))
 env.action_space.seed(0)
 found = hashlib.sha256(env.reset(seed=1)[0].tobytes())
-for _ in range(2000):
+for _ in range(500):
     for part in env.step(env.action_space.sample())[:4]:
         found.update(part.tobytes())
 print(found.hexdigest())
 """
 
 
-@pytest.mark.timeout(300)  # a cold start compiles
-def test_2000_steps_give_the_same_digest_in_fresh_processes_with_any_number_of_threads():
+@pytest.mark.process
+@pytest.mark.slow
+def test_steps_give_the_same_digest_in_fresh_processes_with_any_number_of_threads():
     found = []
     for threads in THREADS:
         command = [sys.executable, "-c", COURSE, str(threads)]

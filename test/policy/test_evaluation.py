@@ -14,7 +14,6 @@ from scipy import stats
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.env.vector_rows import VectorFacts
 from nics_drl_bridge.policy.evaluation import (
     ELSEWHERE,
     Episode,
@@ -187,13 +186,13 @@ def test_arrived_is_who_truly_is_there(monkeypatch):
     policy = make_policy("straight", env.task)
     honest = drive_worlds(env, policy.act, range(8))
     assert honest.success.any()
-    of_step = VectorFacts.of_step
+    of_step = BridgeVectorEnv._facts_of_step
 
     def aside(self, outcome):
         facts = of_step(self, outcome)
         return facts | {"true_pose": facts["true_pose"] + [0.5, 0.0, 0.0]}
 
-    monkeypatch.setattr(VectorFacts, "of_step", aside)
+    monkeypatch.setattr(BridgeVectorEnv, "_facts_of_step", aside)
     lied = drive_worlds(env, policy.act, range(8))
     assert lied.success.sum() < honest.success.sum()
     assert lied.collision.tolist() == honest.collision.tolist()

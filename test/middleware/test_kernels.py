@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.middleware import kernels
-from nics_drl_bridge.middleware.command_log import ROOM, CommandLog
+from nics_drl_bridge.middleware.kernels import ROOM, CommandLog
 
 
 def in_effect(log, time):
-    effective, commands, count = log.arrays
-    return commands[kernels.in_effect(effective, count, time)].tolist()
+    return log.arrays.commands[kernels.in_effect(log.arrays, time)].tolist()
 
 
 def test_before_the_first_command_there_is_none():
@@ -49,7 +48,7 @@ def test_what_is_no_longer_needed_is_forgotten_and_all_else_kept():
         log.add(k, [float(k)], k - 50)
         for back in (0, 1, 49):
             assert in_effect(log, k - back + 1) == [float(max(k - back, 0))]
-    assert len(log.arrays[0]) == ROOM
+    assert len(log.arrays.effective) == ROOM
 
 
 def test_it_grows_with_what_is_needed():

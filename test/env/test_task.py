@@ -9,13 +9,21 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
 from robots import DIRECT, direct_model, field, lidar
+from shapely.geometry import LineString, Polygon
 
-from nics_drl_bridge.env.actions import DRIVES, discrete_commands, still
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import ENVIRONMENTS, TASK, make_task
-from nics_drl_bridge.env.task import bearing, distance
+from nics_drl_bridge.env.task import (
+    DRIVES,
+    bearing,
+    contact_ranges,
+    discrete_commands,
+    distance,
+    still,
+)
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.robot.spec import load_robot
 
 OWN = Path(__file__).resolve().parents[2] / "examples" / "own_task.py"
@@ -192,3 +200,47 @@ def test_a_policy_of_sectors_sees_the_same_from_lidars_of_other_layout():
         ranges = (1.5 + np.cos(spec.angles)).astype(np.float32)
         views.append(task.free_share(ranges))
     assert views[0] == pytest.approx(views[1], abs=0.01)
+
+
+TRUCK = ((0.5, 0.2), (0.5, -0.2), (-0.3, -0.2), (-0.3, 0.2))
+ARROW = ((0.6, 0.0), (-0.3, -0.3), (0.0, 0.0), (-0.3, 0.3))
+MARGIN = 0.02
+
+
+def robot(footprint):
+    about = {**load_robot("differential").model_dump(), "footprint": footprint}
+    about.pop("footprint_radius")
+    return type(load_robot("differential")).model_validate(about)
+
+
+def lidar(mount):
+    spec = load_lidar("paper")
+    return type(spec).model_validate({**spec.model_dump(), "mount": mount})
+
+
+@pytest.mark.parametrize("footprint", [TRUCK, ARROW], ids=["truck", "arrow"])
+@pytest.mark.parametrize("mount", [(0.2, 0.0, 0.0), (0.1, 0.02, 1.3)])
+def test_a_return_within_the_corners_of_a_footprint_is_a_touch(footprint, mount):
+    spec = lidar(mount)
+    found = contact_ranges(robot(footprint), spec, MARGIN)
+    outline = Polygon(footprint).boundary
+    for angle, leaves in zip(spec.angles[::7] + mount[2], found[::7], strict=True):
+        far = (mount[0] + 3.0 * np.cos(angle), mount[1] + 3.0 * np.sin(angle))
+        crossed = LineString([mount[:2], far]).intersection(outline)
+        points = [crossed] if crossed.geom_type == "Point" else list(crossed.geoms)
+        last = max(np.hypot(p.x - mount[0], p.y - mount[1]) for p in points)
+        assert leaves == pytest.approx(last + MARGIN, abs=1e-5)
+
+
+def test_beams_that_do_not_cross_a_footprint_touch_nothing():
+    spec = lidar((1.0, 0.0, 0.0))
+    found = contact_ranges(robot(TRUCK), spec, MARGIN)
+    ahead = np.abs(spec.angles) < 1.0
+    assert (found[ahead] == -np.inf).all()
+    assert (found[~ahead] > 0.0).any()
+
+
+def test_a_round_footprint_is_left_at_its_radius_from_the_middle():
+    spec = load_robot("differential")
+    found = contact_ranges(spec, lidar((0.0, 0.0, 0.5)), MARGIN)
+    assert found == pytest.approx(spec.footprint_radius + MARGIN, abs=1e-6)

@@ -14,9 +14,12 @@ from nics_drl_bridge.middleware.measurement import Acceptance, Kind, Measurement
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.middleware.timeline import (
     BEFORE_START,
+    CLOCK_JUMP,
     DUPLICATE,
+    FUTURE_NS,
     HISTORY_NS,
     TOO_OLD,
+    Stamps,
     Timeline,
 )
 
@@ -89,8 +92,7 @@ def numbers(middleware):
     return belief.time_ns, np.concatenate([belief.mean, belief.covariance.ravel(), pose, twist])
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("robot", "seed"), [(robot, k) for k, robot in enumerate(ROBOTS)])
 def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order(robot, seed):
     model, rng = builtin_model(robot), np.random.default_rng(seed)
     drive = messages(model, rng)
@@ -109,7 +111,7 @@ def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order(robo
     assert other.replayed > 100
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(5))
 def test_any_order_of_one_seconds_data_gives_the_same_estimate(seed):
     model, rng = builtin_model("ackermann"), np.random.default_rng(100 + seed)
     drive = messages(model, rng, seconds=0.9)
@@ -230,3 +232,53 @@ def test_a_late_command_after_a_silence_finds_the_commands_before_it():
     found = middleware.estimator.at(3 * SECOND)[0]
     assert found[:2] == pytest.approx(expected[:2], abs=1e-9)
     assert found[2] == pytest.approx(0.005, abs=1e-6)
+
+
+def heard(stamp=100 * SECOND, arrival=7 * SECOND, **options):
+    stamps = Stamps(**options)
+    assert stamps.fault(stamp, arrival) == ""
+    stamps.accept(stamp, arrival)
+    return stamps
+
+
+@pytest.mark.parametrize("offset", [-(10**18), 0, 10**18])
+def test_the_first_stamp_shows_how_the_clocks_lie(offset):
+    stamps = heard(100 * SECOND + offset)
+    assert stamps.fault(101 * SECOND + offset, 8 * SECOND) == ""
+    assert "in the future" in stamps.fault(109 * SECOND + offset, 8 * SECOND)
+
+
+@pytest.mark.parametrize("elapsed", [0, 1, SECOND, 60 * SECOND])
+def test_a_stamp_may_be_ahead_of_what_is_due_by_the_tolerance(elapsed):
+    stamps, due = heard(), 100 * SECOND + elapsed + FUTURE_NS
+    assert stamps.fault(due, 7 * SECOND + elapsed) == ""
+    assert stamps.fault(due + 1, 7 * SECOND + elapsed) == "more than 1 s in the future"
+
+
+def test_a_receivers_clock_that_is_set_back_makes_nothing_come_from_the_future():
+    assert heard().fault(100 * SECOND + FUTURE_NS, 0) == ""
+
+
+def test_a_simulation_with_long_periods_may_outrun_the_receivers_clock():
+    stamps = heard(period_ns=3 * SECOND)
+    assert stamps.fault(103 * SECOND, 7 * SECOND) == ""
+    assert stamps.fault(107 * SECOND, 7 * SECOND) == "more than 6 s in the future"
+
+
+def test_old_stamps_do_not_change_what_is_due():
+    stamps = heard()
+    stamps.accept(50 * SECOND, 9 * SECOND)
+    assert stamps.fault(102 * SECOND, 7 * SECOND) != ""
+
+
+def test_a_row_of_refusals_means_that_the_clock_was_set():
+    stamps = heard()
+    assert [stamps.refuse() for _ in range(CLOCK_JUMP)] == [False] * (CLOCK_JUMP - 1) + [True]
+
+
+def test_one_datum_that_is_used_ends_the_row():
+    stamps = heard()
+    for _ in range(CLOCK_JUMP - 1):
+        assert not stamps.refuse()
+    stamps.accept(101 * SECOND, 8 * SECOND)
+    assert not stamps.refuse()
