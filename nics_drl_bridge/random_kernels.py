@@ -54,3 +54,11 @@ def episode_seed(seed, number):  # type: ignore[no-untyped-def]
     if number == 0:
         return np.int64(seed)
     return np.int64(uniform(seed, EPISODE_STREAM, number) * 9007199254740992.0)
+
+
+@kernel
+def uniforms(out, seeds, stream, counters):  # type: ignore[no-untyped-def]
+    """Fills out (n, Q) with the draws of each seed (n,) at each counter (Q,)."""
+    for n in range(out.shape[0]):
+        for q in range(out.shape[1]):
+            out[n, q] = uniform(seeds[n], stream, counters[q])

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot.kernels import SERIES, scratch, term_arrays
-from nics_drl_bridge.sim.contact_kernels import SEVERAL
+from nics_drl_bridge.sim.contact_kernels import FRAME, SEVERAL
 from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT
+from nics_drl_bridge.sim.obstacles import Motion, plan_arrays
 from nics_drl_bridge.sim.sensing_kernels import PAST
 from nics_drl_bridge.sim.separation_kernels import MARK
 from nics_drl_bridge.sim.state import (
+    NO_FIELD,
     Cells,
     Dynamics,
     Lanes,
@@ -25,7 +28,6 @@ from nics_drl_bridge.sim.state import (
     MapField,
     Movers,
     Nearby,
-    OutlineArrays,
     Part,
     Scans,
     Scratch,
@@ -33,8 +35,8 @@ from nics_drl_bridge.sim.state import (
     State,
     Surroundings,
 )
+from nics_drl_bridge.sim.world import World
 
-Array = NDArray[np.float64]
 SLICES = 16
 """Number of groups of beams in which a skewed scan is rendered."""
 LANES = 256
@@ -50,21 +52,13 @@ testing all of them takes less time than a separate scan for each robot."""
 
 @dataclass(frozen=True)
 class Sizes:
-    """Dimensions of a simulation.
+    """Dimensions of a simulation."""
 
-    Attributes:
-        worlds: N.
-        robots: M in each.
-        obstacles: K in each.
-        longest_delay: greatest latency of commands [substeps].
-        longest_age: greatest age of an observation [substeps].
-    """
-
-    worlds: int
-    robots: int
-    obstacles: int
-    longest_delay: int
-    longest_age: int
+    worlds: int  # N
+    robots: int  # M in each
+    obstacles: int  # K in each
+    longest_delay: int  # greatest latency of commands [substeps]
+    longest_age: int  # greatest age of an observation [substeps]
 
     @property
     def crowded(self) -> bool:
@@ -114,20 +108,34 @@ def split(worlds: int, threads: int) -> tuple[slice, ...]:
     return tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(edges))
 
 
+def map_field(grid: GridMap | None) -> MapField:
+    """Returns a static map as the kernels take it."""
+    if grid is None:
+        return NO_FIELD
+    return MapField(np.ascontiguousarray(grid.distance_field), *grid.arrays[1].tolist())
+
+
+def surroundings(
+    world: World, motions: Sequence[Motion | None], scanner: Scanner, sizes: Sizes
+) -> Surroundings:
+    """Returns all that stands in every world, with obstacles that move by `motions` (K,)."""
+    low_x, low_y, high_x, high_y = world.extent
+    half = np.array([max(-low_x, high_x), max(-low_y, high_y)])
+    moves = any(motion is not None for motion in motions)
+    outlines = OutlineArrays(*scanner.table.outlines.arguments)
+    return Surroundings(
+        world.all_walls(), map_field(scanner.grid), outlines, sizes.crowded, sizes.scattered,
+        Movers(moves, *plan_arrays(motions), half),
+    )  # fmt: skip
+
+
 def part_of(
-    state: State,
-    model: SimulatorModel,
-    scanner: Scanner,
-    walls: Array,
-    movers: Movers,
-    sizes: Sizes,
+    state: State, scene: Surroundings, model: SimulatorModel, scanner: Scanner, sizes: Sizes,
     part: slice,
-) -> Part:
+) -> Part:  # fmt: skip
     """Returns the arguments of the kernels for one part of the worlds, with scratch of its own."""
     lidar, grid = model.lidar, scanner.grid
     dt, substeps, _ = model.timing
-    outlines = OutlineArrays(*scanner.table.outlines.arguments)
-    scene = Surroundings(walls, _grid(grid), outlines, sizes.crowded, sizes.scattered, movers)
     view = LidarView(
         scanner.arguments,
         NO_MAP if grid is None else grid.arrays,
@@ -138,12 +146,6 @@ def part_of(
     )
     motion = Dynamics(term_arrays(model.kinematics), SERIES, float(dt), int(substeps))
     return Part(state, scene, view, motion, _scratch(model, scanner, sizes, part.stop - part.start))
-
-
-def _grid(grid: GridMap | None) -> MapField:
-    if grid is None:
-        return MapField(np.zeros((0, 0), np.float32), np.zeros(5))
-    return MapField(np.ascontiguousarray(grid.distance_field), grid.arrays[1])
 
 
 def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int) -> Scratch:
@@ -174,12 +176,12 @@ def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int)
         ),
         cells=Cells(
             begin=np.zeros(side * side + 2, np.int64), order=np.zeros(bodies, np.int64),
-            cell_of=np.zeros(bodies, np.int64), frame=np.zeros(5),
+            cell_of=np.zeros(bodies, np.int64), frame=np.zeros(FRAME),
             found=np.zeros(bodies, np.int64),
         ),
         scans=Scans(
             before=np.zeros((lanes, 3)), waiting=np.zeros(worlds, np.int64),
-            seen=np.zeros((bodies + 1) * BODY), spot=np.zeros((1, 1, 3)),
+            seen=np.zeros((bodies + 1, BODY)), spot=np.zeros((1, 1, 3)),
             slices=np.zeros((SLICES, 3)), part=np.zeros((1, 1, model.lidar.beams), np.float32),
             drive=np.zeros(3), none=np.zeros(1, np.int64), lookup=scanner.room(bodies),
         ),

@@ -14,34 +14,22 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Simulator
-from nics_drl_bridge.sim.robot_kernels import propagate_in_place
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Sensed:
-    """Measurements and true state of one robot at a time.
+    """Measurements and true state of one robot at a time."""
 
-    Attributes:
-        odom: (3,) pose by odometry.
-        covariance: (3, 3) of `odom`.
-        twist: (3,) measured body twist.
-        state: (S,) true state.
-        ranges: (B,) scan.
-        pose: (3,) true pose in `map`.
-        before: (3,) true pose one step earlier.
-        period: length of a step [s].
-    """
-
-    odom: Array
-    covariance: Array
-    twist: Array
-    state: Array
-    ranges: NDArray[np.float32]
-    pose: Array
-    before: Array
-    period: float
+    odom: Array  # (3,) pose by odometry
+    covariance: Array  # (3, 3) of `odom`
+    twist: Array  # (3,) measured body twist
+    state: Array  # (S,) true state
+    ranges: NDArray[np.float32]  # (B,) scan
+    pose: Array  # (3,) true pose in `map`
+    before: Array  # (3,) true pose one step earlier
+    period: float  # length of a step [s]
 
     @property
     def true_twist(self) -> Array:
@@ -50,15 +38,12 @@ class Sensed:
 
 
 class DeviceWorld:
-    """Keeps the last command of each robot and the covariance of its odometry.
+    """Keeps the command of each of M robots for the next step and the covariance of its odometry.
 
     Args:
         simulator: moves the robots.
         model: of the robots, with the step of the simulator.
         robots: M.
-
-    Attributes:
-        commands: (M, C) commands for the next step.
     """
 
     def __init__(self, simulator: Simulator, model: SimulatorModel, robots: int) -> None:
@@ -108,15 +93,10 @@ class DeviceWorld:
         """Returns the present values of one robot; the next step may overwrite them."""
         data = self._simulator.data
         return Sensed(
-            data.odom[0, robot],
-            self._covariance[robot],
-            data.twist[0, robot],
-            data.state[0, robot],
-            data.ranges[0, robot],
-            data.pose[0, robot],
-            self._before[robot],
+            data.odom[0, robot], self._covariance[robot], data.twist[0, robot],
+            data.state[0, robot], data.ranges[0, robot], data.pose[0, robot], self._before[robot],
             self._period,
-        )
+        )  # fmt: skip
 
 
 LEAST_VARIANCE = 1e-9
@@ -135,18 +115,14 @@ def step_covariance(std: tuple[float, float], period: float) -> Array:
 
 
 def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Array) -> Array:
-    """Propagates the covariances (M, 3, 3) of poses by odometry by one period.
+    """Propagates the covariances (M, 3, 3) of poses by odometry (M, 3) from before to after.
 
     A heading error rotates the motion that follows: P' = F P F^T + Q, with F the derivative of
-    the new pose with respect to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4).
-
-    Args:
-        covariance: (M, 3, 3) before the period.
-        before: (M, 3) poses by odometry before it.
-        after: (M, 3) poses by odometry after it.
-        added: (3, 3) of one period, see `step_covariance`.
+    the new pose with respect to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4) and
+    Q (3, 3) `added` by a period, see `step_covariance`.
     """
-    after_that = np.array(covariance, np.float64)
-    poses = (np.ascontiguousarray(pose, np.float64) for pose in (before, after))
-    propagate_in_place(after_that, *poses, added)
-    return after_that
+    p, (x, y, _) = np.array(covariance, np.float64), np.subtract(before, after).T
+    turned = np.stack([y, -x], axis=1)  # F differs from the identity only in its last column
+    p[:, :2] += turned[:, :, None] * p[:, 2:]
+    p[:, :, :2] += turned[:, None] * p[:, :, 2:]
+    return p + added

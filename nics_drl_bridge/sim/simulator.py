@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -12,24 +14,18 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.lidar.bake import with_shapes
+from nics_drl_bridge.lidar.exact_kernels import SHAPE
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
-from nics_drl_bridge.lidar.shapes import SHAPE, place
-from nics_drl_bridge.sim import step_kernels
-from nics_drl_bridge.sim.allocation import SLICES, Sizes, allocate, part_of, split
-from nics_drl_bridge.sim.obstacles import distance_arrays, plan_arrays
+from nics_drl_bridge.lidar.shapes import place
+from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.taylor import TaylorModel
+from nics_drl_bridge.sim import contact_kernels, step_kernels
+from nics_drl_bridge.sim.allocation import Sizes, allocate, part_of, split, surroundings
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
-from nics_drl_bridge.sim.state import Movers, State
-from nics_drl_bridge.sim.validity import (
-    CommandBox,
-    OutsideValidityWarning,
-    require_sane_speed,
-    warn,
-)
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.threads import Crew
-
-__all__ = ["SLICES", "FastSimulator", "OutsideValidityWarning", "State"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -39,6 +35,79 @@ MOST_ROBOTS = 1_000
 MOST_NUMBERS = 2**30
 """Greatest number of values in all worlds, some GB: beams of robots, states of obstacles."""
 PER_BODY = 64
+TOLERANCE = 0.05
+"""Tolerance beyond the range of commands that was recorded, as a share of their limits."""
+EVERY = 16
+"""Commands are checked in the first step after a reset and then at this interval [steps]."""
+
+
+class OutsideValidityWarning(UserWarning):
+    """Commands lie outside the range that the model's recording covered."""
+
+
+def warn(message: str) -> None:
+    """Issues an OutsideValidityWarning to the caller that steps the simulator."""
+    warnings.warn(message, OutsideValidityWarning, stacklevel=4)
+
+
+class CommandBox:
+    """The range of commands that a model was fitted to, save those whose effect was assumed.
+
+    `tell` is called with the message of a warning.
+    """
+
+    def __init__(
+        self, model: TaylorModel, robot: RobotSpec, tell: Callable[[str], None] = warn
+    ) -> None:
+        first, margin = len(robot.state), TOLERANCE * (robot.command_high - robot.command_low)
+        self._tell, self._names = tell, robot.variable_names[first:]
+        self._range = model.low[first:], model.high[first:]
+        self._low: Array = self._range[0] - margin
+        self._high: Array = self._range[1] + margin
+        for _, term in model.assumed:
+            assumed = taylor.parse_term(term, model.variables)[first:] > 0
+            self._low[assumed], self._high[assumed] = -np.inf, np.inf
+        self.begin()
+
+    def begin(self) -> None:
+        """Begins an episode: the next step is checked, and one warning may be issued."""
+        self._steps, self._armed = 0, True
+
+    def check(self, commands: Array) -> None:
+        """Warns once per episode if commands (..., C) are outside the range."""
+        steps, self._steps = self._steps, self._steps + 1
+        if not self._armed or steps % EVERY:
+            return
+        flat = commands.reshape(-1, commands.shape[-1])
+        least, most = flat.min(axis=0), flat.max(axis=0)
+        outside = (least < self._low) | (most > self._high)
+        if outside.any():
+            self._armed = False
+            i = int(np.argmax(outside))
+            value = least[i] if least[i] < self._low[i] else most[i]
+            self._tell(
+                f"{self._names[i]} is {value:.4g}, but the model was fitted to "
+                f"{self._range[0][i]:.4g} to {self._range[1][i]:.4g} only: its motion there is "
+                "extrapolated; record a drive that covers it."
+            )
+
+
+def _check_speed(model: TaylorModel, robot: RobotSpec, world: World) -> None:
+    """Raises ConfigError if a robot could cross a whole world in one step of its kinematics."""
+    first = len(robot.state)
+    most = np.maximum(np.abs(model.low), np.abs(model.high))
+    limits = np.maximum(np.abs(robot.command_low), np.abs(robot.command_high))
+    most[first:] = np.maximum(most[first:], limits)
+    products = np.prod(most**model.powers, axis=1)
+    step = float((np.abs(model.coefficients[:2]) @ products).max() * model.dt)
+    x1, y1, x2, y2 = world.extent
+    least = min(x2 - x1, y2 - y1)
+    if not step < least:
+        raise ConfigError(
+            f"the robot {robot.name!r} could drive {step:.3g} m in a step of {model.dt:g} s, "
+            f"across a world of {least:.3g} m; lower the limits of its commands, or generate its "
+            "model with a shorter step."
+        )
 
 
 def _check_memory(model: SimulatorModel, world: World, worlds: int, robots: int) -> None:
@@ -101,7 +170,7 @@ class FastSimulator:
         _check_memory(model, world, worlds, robots)
         if isinstance(randomisation, str):
             randomisation = load_randomisation(randomisation)
-        require_sane_speed(model.kinematics, model.robot, world.extent)
+        _check_speed(model.kinematics, model.robot, world)
         self.model, self.world = model, world
         self.randomisation = randomisation
         self._draws = None if randomisation is None else Sampler(randomisation, model, robots)
@@ -137,12 +206,8 @@ class FastSimulator:
     @cached_property
     def packed(self) -> dict[int, Any]:
         """Packed arguments of the kernels, by the first world of each part."""
-        walls, motions = self.world.all_walls(), self.sampler.motions
-        moves = any(motion is not None for motion in motions)
-        low_x, low_y, high_x, high_y = self.world.extent
-        half = np.array([max(-low_x, high_x), max(-low_y, high_y)])
-        movers = Movers(moves, plan_arrays(motions), half, distance_arrays(self.world.grid))
-        of = (self.data, self.model, self._scanner, walls, movers, self._sizes)
+        scene = surroundings(self.world, self.sampler.motions, self._scanner, self._sizes)
+        of = (self.data, scene, self.model, self._scanner, self._sizes)
         return {part.start: step_kernels.pack(part_of(*of, part)) for part in self.parts}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -273,3 +338,67 @@ class FastSimulator:
                 f"commands are {commands.shape}; they must be {(worlds, robots, width)}: worlds, "
                 "robots, and a robot's commands."
             )
+
+
+@dataclass(frozen=True)
+class Driven:
+    """Motion of the robots in one control period."""
+
+    pose: Array  # (M, 3) true pose of `base_link` in `map` at the end
+    twist: Array  # (M, 3) true body twist at the end [m/s, m/s, rad/s]
+    state: Array  # (M, S) at the end
+    wheels: Array  # (M, 3) pose at the end by wheel odometry, without noise
+    counted: Array  # (M, 3) body twist at the end by wheel odometry
+    touched: NDArray[np.bool_]  # (M,) true for robots that touched anything
+
+
+class DrivenSimulator:
+    """One world of the fast simulator whose robots are moved from outside, by other physics.
+
+    Scenes, motion of the obstacles, noise, faults and scans are those of the FastSimulator for the
+    same seed. Odometry is the wheel odometry with the model's noise.
+
+    Attributes:
+        fast: holds all data; do not call its `step`.
+        wheels: (M, 3) pose by wheel odometry, beginning at the start pose.
+    """
+
+    def __init__(
+        self, model: SimulatorModel, world: World, robots: int = 1, renderer: Renderer = "auto"
+    ) -> None:
+        self.fast = FastSimulator(model, world, robots=robots, renderer=renderer)
+        self._start = self.fast.obstacles[0, :, :3].copy()
+        self.wheels: Array = np.zeros((robots, 3))
+
+    def reset(self, seeds: ArrayLike, starts: ArrayLike | None = None) -> Scenes:
+        """Begins an episode, see `FastSimulator.reset`."""
+        scenes = self.fast.reset(seeds, starts=starts)
+        self.wheels = self.fast.data.pose[0].copy()
+        return scenes
+
+    def begin_period(self) -> None:
+        """Sets the obstacles' velocities for the period that begins."""
+        data = self.fast.data
+        self._start = data.bodies[0, :, :3].copy()
+        step_kernels.begin_period(self.fast.packed[0])
+
+    def move_obstacles(self, time: float) -> Array:
+        """Moves the obstacles to their poses `time` [s] after the beginning of the period.
+
+        Returns:
+            (K, 7) see `lidar.shapes.BODY`.
+        """
+        data = self.fast.data
+        contact_kernels.move_obstacles(data.bodies, self._start, data.velocity, 0, time)
+        return data.bodies[0, : data.velocity.shape[1]]
+
+    def end_period(self, driven: Driven) -> None:
+        """Takes over the motion of the robots and measures what they sense."""
+        data = self.fast.data
+        data.pose[0], data.state[0] = driven.pose, driven.state
+        data.collided[0] |= driven.touched.astype(np.uint8)
+        step_kernels.end_period(
+            self.fast.packed[0], driven.twist[None], self.wheels[None], driven.wheels[None],
+            driven.counted[None],
+        )  # fmt: skip
+        self.wheels = driven.wheels.copy()

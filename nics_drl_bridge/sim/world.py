@@ -16,8 +16,8 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.lidar.maps import GridMap, load_map
 from nics_drl_bridge.lidar.shapes import LARGEST, MOST_SHAPES, Coordinate, Heading, Shape
+from nics_drl_bridge.sim.collision_kernels import wall_distance
 from nics_drl_bridge.sim.obstacles import Motion, Patrol
-from nics_drl_bridge.sim.space_kernels import wall_distance
 
 Array = NDArray[np.float64]
 MOST_OBSTACLES = 10_000

@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 from shapely import affinity, geometry
 
+from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Polygon, Rectangle, Segment, place
 from nics_drl_bridge.sim import collision_kernels as kernels
+from nics_drl_bridge.sim.allocation import map_field
+from nics_drl_bridge.sim.state import NO_FIELD
 
 L = Polygon(points=((0, 0), (1, 0), (1, 0.3), (0.3, 0.3), (0.3, 1), (0, 1)))
 FORK = Polygon(
@@ -25,6 +28,7 @@ SHAPES = (
     Segment(ends=((-0.4, 0.1), (0.5, 0.0))),
 )
 OUTLINES = Outlines.of(SHAPES)
+ARRAYS = OutlineArrays(*OUTLINES.arguments)
 SPARE = np.zeros((16, 2))
 
 
@@ -47,7 +51,7 @@ def body(index, pose):
 
 
 def gap(one, other, limit=np.inf):
-    return kernels.body_gap(one, other, OUTLINES.corners, OUTLINES.corner, limit, SPARE)
+    return kernels.body_gap(one, other, ARRAYS, limit, SPARE)
 
 
 @pytest.mark.parametrize("one", range(len(SHAPES)))
@@ -107,9 +111,7 @@ def test_the_clearance_to_a_straight_wall_is_that_of_shapely(index):
         pose, wall = rng.uniform(-0.8, 0.8, 3) * [1.0, 1.0, 4.0], rng.uniform(-1.0, 1.0, 4)
         line = geometry.LineString([wall[:2], wall[2:]])
         expected = solid(SHAPES[index], pose).distance(line) - radius(SHAPES[index])
-        found = kernels.wall_gap(
-            body(index, pose), wall, OUTLINES.corners, OUTLINES.corner, np.inf, SPARE
-        )
+        found = kernels.wall_gap(body(index, pose), wall, ARRAYS, np.inf, SPARE)
         if expected > 0.0 or isinstance(SHAPES[index], Segment):
             assert found == pytest.approx(expected, abs=1e-9)
         else:
@@ -127,15 +129,15 @@ def test_the_clearance_to_a_map_is_that_of_shapely(index):
         corners = np.array([(x, y), (x + 0.3, y), (x + 0.3, y + 0.3), (x, y + 0.3)])
         c, s = np.cos(0.4), np.sin(0.4)
         squares.append(geometry.Polygon(corners @ [[c, s], [-s, c]] + (-1.0, -2.0)))
-    known = (grid.distance_field, grid.arrays[1])
+    known = map_field(grid)
     overlaps = 0
     for _ in range(400):
         pose = rng.uniform(-3.0, 4.0, 3)
         shape = solid(SHAPES[index], pose)
         expected = min(shape.distance(square) for square in squares) - radius(SHAPES[index])
         there = body(index, pose)
-        found = kernels.map_gap(there, known, OUTLINES.corners, OUTLINES.corner, np.inf, SPARE)
-        at_once = kernels.map_gap(there, known, OUTLINES.corners, OUTLINES.corner, 0.0, SPARE)
+        found = kernels.map_gap(there, known, ARRAYS, np.inf, SPARE)
+        at_once = kernels.map_gap(there, known, ARRAYS, 0.0, SPARE)
         assert kernels.map_bound(there, known) <= max(expected, 0.0) + 1e-6
         if expected > 0.0:
             assert found == pytest.approx(expected, abs=1e-6)
@@ -148,7 +150,6 @@ def test_the_clearance_to_a_map_is_that_of_shapely(index):
 
 
 def test_where_there_is_no_map_nothing_is_near():
-    nothing = (np.zeros((0, 0), np.float32), np.zeros(5))
     there = body(0, [0.0, 0.0, 0.0])
-    assert kernels.map_bound(there, nothing) == np.inf
-    assert kernels.map_gap(there, nothing, OUTLINES.corners, OUTLINES.corner, 1.0, SPARE) == 1.0
+    assert kernels.map_bound(there, NO_FIELD) == np.inf
+    assert kernels.map_gap(there, NO_FIELD, ARRAYS, 1.0, SPARE) == 1.0

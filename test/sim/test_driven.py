@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from robots import direct_model, lidar
 
-from nics_drl_bridge.sim.driven import Driven, DrivenSimulator
-from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.simulator import Driven, DrivenSimulator, FastSimulator
 from nics_drl_bridge.sim.world import load_world
 
 PARTS = 4

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from moving import PERIOD, scattered, sides, watch
+from moving import PERIOD, scattered, sides, state_of, surroundings_of, watch
 from pydantic import TypeAdapter
 from shapely import LineString, MultiLineString, box, unary_union
 
@@ -14,15 +14,8 @@ from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.sim import obstacle_kernels as kernels
 from nics_drl_bridge.sim import separation_kernels as at
-from nics_drl_bridge.sim.obstacles import (
-    NO_DISTANCES,
-    Motion,
-    Patrol,
-    Pedestrian,
-    Wander,
-    distance_arrays,
-    plan_arrays,
-)
+from nics_drl_bridge.sim.allocation import map_field
+from nics_drl_bridge.sim.obstacles import Motion, Patrol, Pedestrian, Wander, plan_arrays
 from nics_drl_bridge.sim.separation_kernels import MARK
 
 WANDER, WALKER = Wander(speed=(0.3, 0.8)), Pedestrian()
@@ -193,13 +186,11 @@ def walk_on(marks, places, radii, half, seed, steps=120):
     poses = np.concatenate([places, np.zeros((2, 1))], axis=1)[None]
     bodies = place(poses, np.asarray(radii)[None], np.zeros((1, 2)))
     marks, velocity, track = marks[None].copy(), np.zeros((1, 1, 3)), []
-    walls, half, plans = sides(half), np.asarray(half), plan_arrays([WALKER])
-    goal = marks[0, 0, at.GOAL_X].copy()
+    scene = surroundings_of([WALKER], half, sides(half))
+    state, goal = state_of(bodies, marks, velocity, [seed]), marks[0, 0, at.GOAL_X].copy()
     for t in range(steps):
-        kernels.steer(
-            velocity, marks, 0, bodies, 1, np.zeros((1, 2)), plans, walls, half, seed, t + 1,
-            PERIOD, NO_DISTANCES,
-        )  # fmt: skip
+        state.steps[0] = t + 1
+        kernels.steer(0, state, scene, PERIOD, np.zeros((1, 2)))
         if marks[0, 0, at.GOAL_X] != goal:
             break
         bodies[0, 0, :2] += velocity[0, 0, :2] * PERIOD
@@ -222,15 +213,14 @@ def in_batch(seeds, motions=tuple(MIXED), steps=200):
     poses = np.tile(np.concatenate([places, np.zeros((count + 1, 1))], 1), (worlds, 1, 1))
     bodies = place(poses, radii, np.zeros_like(radii))
     marks, velocity = np.full((worlds, count, MARK), 7.0), np.full((worlds, count, 3), 9.0)
-    plans, still = plan_arrays(motions), np.zeros((1, 2))
-    for n, seed in enumerate(seeds):
-        kernels.begin(marks, n, bodies, plans, half, seed)
+    scene, still = surroundings_of(motions, half, sides(half)), np.zeros((1, 2))
+    state = state_of(bodies, marks, velocity, seeds)
+    for n in range(worlds):
+        kernels.begin(n, state, scene.movers.plans)
     for t in range(steps):
-        for n, seed in enumerate(seeds):
-            kernels.steer(
-                velocity, marks, n, bodies, count, still, plans, sides(half), half, seed, t,
-                PERIOD, NO_DISTANCES,
-            )  # fmt: skip
+        state.steps[:] = t
+        for n in range(worlds):
+            kernels.steer(n, state, scene, PERIOD, still)
         bodies[:, :count, :3] += velocity * PERIOD
     return bodies
 
@@ -262,7 +252,7 @@ def test_what_moves_keeps_clear_of_a_static_map(motion, heading):
         ):
             places.append(spot)
     seen = watch([motion] * count, np.array(places), [radius] * count,
-                 distances=distance_arrays(grid))  # fmt: skip
+                 grid=map_field(grid))  # fmt: skip
     d = seen.places - (x, y)
     local = np.stack([c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0]], axis=-1)
     for k in range(count):

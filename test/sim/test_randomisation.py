@@ -14,8 +14,12 @@ from nics_drl_bridge.lidar import fault_kernels
 from nics_drl_bridge.lidar.faults import SKEW, LidarFaults
 from nics_drl_bridge.robot.kernels import term_arrays
 from nics_drl_bridge.robot.noise import MEASURED, Level, Noise
-from nics_drl_bridge.sim.randomisation import Randomisation, Sampler, load_randomisation
-from nics_drl_bridge.sim.randomisation_ranges import LidarRanges
+from nics_drl_bridge.sim.randomisation import (
+    LidarRanges,
+    Randomisation,
+    Sampler,
+    load_randomisation,
+)
 
 SEEDS = np.arange(4000)
 ROBOTS = ("ackermann", "differential", "mecanum")

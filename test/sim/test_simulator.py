@@ -9,7 +9,9 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.lidar.faults import scan_skewed, slice_poses
 from nics_drl_bridge.lidar.scanner import Scanner
-from nics_drl_bridge.sim.simulator import SLICES, FastSimulator, State
+from nics_drl_bridge.sim.allocation import SLICES
+from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.state import State
 from nics_drl_bridge.sim.world import load_world
 
 ORIGIN = np.zeros((1, 1, 3))

@@ -8,7 +8,7 @@ import pytest
 
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel
-from nics_drl_bridge.sim.validity import EVERY, CommandBox, OutsideValidityWarning
+from nics_drl_bridge.sim.simulator import EVERY, CommandBox, OutsideValidityWarning
 
 
 @pytest.fixture
