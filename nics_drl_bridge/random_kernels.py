@@ -57,8 +57,15 @@ def episode_seed(seed, number):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def uniforms(out, seeds, stream, counters):  # type: ignore[no-untyped-def]
-    """Fills out (n, Q) with the draws of each seed (n,) at each counter (Q,)."""
+def uniform_between(out, low, high, seeds, stream, first, stride):  # type: ignore[no-untyped-def]
+    """Fills out (n, M, Q) with draws between low (Q,) and high (Q,), or these where both are equal.
+
+    That of seed n (n,), row m and column q has the counter first + m stride + q.
+    """
     for n in range(out.shape[0]):
-        for q in range(out.shape[1]):
-            out[n, q] = uniform(seeds[n], stream, counters[q])
+        for m in range(out.shape[1]):
+            for q in range(out.shape[2]):
+                out[n, m, q] = low[q]
+                if high[q] != low[q]:
+                    share = uniform(seeds[n], stream, first + m * stride + q)
+                    out[n, m, q] = low[q] + share * (high[q] - low[q])

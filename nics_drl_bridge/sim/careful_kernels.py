@@ -16,20 +16,7 @@ from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN
 from nics_drl_bridge.robot.kernels import Terms, delayed, move, rates, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import impact_kernels as impact
-from nics_drl_bridge.sim.impact_kernels import (
-    AFTER,
-    DEPTH,
-    NOTHING,
-    OTHERS,
-    OWN,
-    STOP,
-    TIME,
-    TURN,
-    VX,
-    VY,
-    WITH,
-    Moving,
-)
+from nics_drl_bridge.sim.impact_kernels import AFTER, DEPTH, STOP, TIME, TURN, VX, VY, Moving
 from nics_drl_bridge.sim.sensing_kernels import drift_of
 from nics_drl_bridge.sim.state import Array, Dynamics, Nearby, Single, State, Surroundings
 
@@ -132,10 +119,10 @@ def _settle(
         for p in range(1, robots):
             if events[p, TIME] < events[m, TIME]:
                 m = p
-        time, k = events[m, TIME], int(events[m, WITH])
+        time, k = events[m, TIME], int(events[m, impact.WITH])
         if time >= until:
             return
-        own, others = -events[m, OWN], -events[m, OTHERS]
+        own, others = -events[m, impact.OWN], -events[m, impact.OTHERS]
         touched[m] = 1
         if k >= first:
             touched[k - first] = 1
@@ -232,9 +219,9 @@ def _check_overlap(
     """Records how deep robot m overlaps anything as the period begins; marks it if it does."""
     events, body = single.events, moving.world[moving.first + m]
     depth, whom = contacts.contact(
-        body, m, moving.world, scene, nearby, single.spare, 2.0 * NOTHING
+        body, m, moving.world, scene, nearby, single.spare, 2.0 * impact.NOTHING
     )
-    events[m, DEPTH] = min(depth, -np.finfo(np.float64).tiny) if depth <= NOTHING else 0.0
+    events[m, DEPTH] = min(depth, -np.finfo(np.float64).tiny) if depth <= impact.NOTHING else 0.0
     if depth < 0.0:
         touched[m] = 1
         if whom >= moving.first:
@@ -294,8 +281,8 @@ def drift_carefully(
             flight[STOP] = 0.0
             if events[m, TIME] < 1.0:
                 stop, collided[n, m] = events[m, TIME], 1
-                if events[m, WITH] >= first:
-                    collided[n, int(events[m, WITH]) - first] = 1
+                if events[m, impact.WITH] >= first:
+                    collided[n, int(events[m, impact.WITH]) - first] = 1
         x, y, _, _ = move(
             pose[n, m, 0], pose[n, m, 1], math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2]),
             ahead, aside, turn * stop, stop, motion.series,

@@ -17,13 +17,7 @@ import numpy as np
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
 from nics_drl_bridge.robot.kernels import wrap
-from nics_drl_bridge.sim.collision_kernels import (
-    body_gap,
-    map_bound,
-    map_gap,
-    segment_distance2,
-    wall_gap,
-)
+from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, Cells, Nearby, State, Surroundings
 
 FREE, BODIES, WALLS, MAP = 0, 1, 2, 4
@@ -82,12 +76,15 @@ def find_near(
     near[m, 0] = count
     meets = BODIES if count > 0 else FREE
     for w in range(walls.shape[0]):
-        d2 = segment_distance2(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3])
+        d2 = collision.segment_distance2(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3])
         if d2 <= own * own:
             meets |= WALLS
             break
     grid = scene.grid
-    if grid.distances.size > 0 and map_bound(bodies[n, me], grid) <= own - bodies[n, me, RADIUS]:
+    if (
+        grid.distances.size > 0
+        and collision.map_bound(bodies[n, me], grid) <= own - bodies[n, me, RADIUS]
+    ):
         meets |= MAP
     return meets
 
@@ -117,16 +114,16 @@ def contact(
             k = near[m, 1 + i] if listed else i
             if k == me or world[k, RADIUS] <= 0.0:
                 continue
-            gap = body_gap(body, world[k], outlines, limit, spare)
+            gap = collision.body_gap(body, world[k], outlines, limit, spare)
             if gap < least:
                 least, whom = gap, k
     if nearby.meets[m] & WALLS:
         for w in range(scene.walls.shape[0]):
-            gap = wall_gap(body, scene.walls[w], outlines, limit, spare)
+            gap = collision.wall_gap(body, scene.walls[w], outlines, limit, spare)
             if gap < least:
                 least, whom = gap, -1
     if nearby.meets[m] & MAP:
-        gap = map_gap(body, scene.grid, outlines, limit, spare)
+        gap = collision.map_gap(body, scene.grid, outlines, limit, spare)
         if gap < least:
             least, whom = gap, -1
     return least, whom

@@ -1,7 +1,4 @@
-"""DeviceWorld: one world of a simulator as seen by the devices in it, whatever moves them.
-
-With the covariance of a pose by odometry after a drive, given the noise of the measured twist.
-"""
+"""One world of a simulator: as its devices see it, and with robots that other physics moves."""
 
 from __future__ import annotations
 
@@ -14,6 +11,11 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Simulator
+from nics_drl_bridge.lidar.scanner import Renderer
+from nics_drl_bridge.sim import contact_kernels, step_kernels
+from nics_drl_bridge.sim.scenes import Scenes
+from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
 
@@ -126,3 +128,67 @@ def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Arr
     p[:, :2] += turned[:, :, None] * p[:, 2:]
     p[:, :, :2] += turned[:, None] * p[:, :, 2:]
     return p + added
+
+
+@dataclass(frozen=True)
+class Driven:
+    """Motion of the robots in one control period."""
+
+    pose: Array  # (M, 3) true pose of `base_link` in `map` at the end
+    twist: Array  # (M, 3) true body twist at the end [m/s, m/s, rad/s]
+    state: Array  # (M, S) at the end
+    wheels: Array  # (M, 3) pose at the end by wheel odometry, without noise
+    counted: Array  # (M, 3) body twist at the end by wheel odometry
+    touched: NDArray[np.bool_]  # (M,) true for robots that touched anything
+
+
+class DrivenSimulator:
+    """One world of the fast simulator whose robots are moved from outside, by other physics.
+
+    Scenes, motion of the obstacles, noise, faults and scans are those of the FastSimulator for the
+    same seed. Odometry is the wheel odometry with the model's noise.
+
+    Attributes:
+        fast: holds all data; do not call its `step`.
+        wheels: (M, 3) pose by wheel odometry, beginning at the start pose.
+    """
+
+    def __init__(
+        self, model: SimulatorModel, world: World, robots: int = 1, renderer: Renderer = "auto"
+    ) -> None:
+        self.fast = FastSimulator(model, world, robots=robots, renderer=renderer)
+        self._start = self.fast.obstacles[0, :, :3].copy()
+        self.wheels: Array = np.zeros((robots, 3))
+
+    def reset(self, seeds: ArrayLike, starts: ArrayLike | None = None) -> Scenes:
+        """Begins an episode, see `FastSimulator.reset`."""
+        scenes = self.fast.reset(seeds, starts=starts)
+        self.wheels = self.fast.data.pose[0].copy()
+        return scenes
+
+    def begin_period(self) -> None:
+        """Sets the obstacles' velocities for the period that begins."""
+        data = self.fast.data
+        self._start = data.bodies[0, :, :3].copy()
+        step_kernels.begin_period(self.fast.packed[0])
+
+    def move_obstacles(self, time: float) -> Array:
+        """Moves the obstacles to their poses `time` [s] after the beginning of the period.
+
+        Returns:
+            (K, 7) see `lidar.shapes.BODY`.
+        """
+        data = self.fast.data
+        contact_kernels.move_obstacles(data.bodies, self._start, data.velocity, 0, time)
+        return data.bodies[0, : data.velocity.shape[1]]
+
+    def end_period(self, driven: Driven) -> None:
+        """Takes over the motion of the robots and measures what they sense."""
+        data = self.fast.data
+        data.pose[0], data.state[0] = driven.pose, driven.state
+        data.collided[0] |= driven.touched.astype(np.uint8)
+        step_kernels.end_period(
+            self.fast.packed[0], driven.twist[None], self.wheels[None], driven.wheels[None],
+            driven.counted[None],
+        )  # fmt: skip
+        self.wheels = driven.wheels.copy()

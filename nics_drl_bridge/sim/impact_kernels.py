@@ -23,14 +23,7 @@ import numpy as np
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SIN, OutlineArrays, X, Y
 from nics_drl_bridge.robot.kernels import move
-from nics_drl_bridge.sim.collision_kernels import (
-    Outline,
-    cells_near,
-    in_grid,
-    map_bound,
-    outline_of,
-    segment_distance2,
-)
+from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, MapField
 
 VX, VY, TURN, STOP, FLIGHT = range(5)
@@ -261,7 +254,7 @@ def touch(
 
 
 @kernel
-def _edge_of(v: int, outline: Outline) -> Edge:
+def _edge_of(v: int, outline: collision.Outline) -> Edge:
     """Returns edge v of an outline, or the origin of a circle's, which has none."""
     corners, begin, end = outline.corners, outline.begin, outline.end
     if begin == end:
@@ -271,7 +264,7 @@ def _edge_of(v: int, outline: Outline) -> Edge:
 
 
 @kernel
-def _edges(outline: Outline) -> int:
+def _edges(outline: collision.Outline) -> int:
     """Number of edges of an outline: one of a segment, and a circle counts as a single point."""
     return outline.end - outline.begin if outline.end - outline.begin > 2 else 1
 
@@ -294,9 +287,9 @@ def _touch_edge(
     far = world[a, RADIUS] + round_b + speed * (event[TIME] - begin)
     if speed == 0.0 and (begin >= flights[a, STOP] or flights[a, TURN] == 0.0):
         return
-    if segment_distance2(x, y, there.ax, there.ay, there.bx, there.by) > far * far:
+    if collision.segment_distance2(x, y, there.ax, there.ay, there.bx, there.by) > far * far:
         return
-    outline = outline_of(world[a], moving.outlines)
+    outline = collision.outline_of(world[a], moving.outlines)
     round_a = world[a, RADIUS] if outline.begin == outline.end else 0.0
     for v in range(_edges(outline)):
         edge = _edge_of(v, outline)
@@ -315,7 +308,7 @@ def touch_body(event: Array, a: int, b: int, begin: float, moving: Moving) -> No
     far = world[a, RADIUS] + world[b, RADIUS] + speed * (event[TIME] - begin)
     if (x - ox) * (x - ox) + (y - oy) * (y - oy) > far * far:
         return
-    outline = outline_of(world[b], moving.outlines)
+    outline = collision.outline_of(world[b], moving.outlines)
     round_b = world[b, RADIUS] if outline.begin == outline.end else 0.0
     for v in range(_edges(outline)):
         _touch_edge(event, a, b, _edge_of(v, outline), round_b, begin, moving)
@@ -351,12 +344,12 @@ def touch_map(event: Array, a: int, grid: MapField, begin: float, moving: Moving
     if distances.size == 0:
         return
     speed = speed_at(a, begin, moving.flights)
-    if map_bound(world[a], grid) > speed * event[TIME]:
+    if collision.map_bound(world[a], grid) > speed * event[TIME]:
         return
     px, py, _, _ = pose_at(a, begin, moving)
-    x, y = in_grid(px, py, grid)
+    x, y = collision.in_grid(px, py, grid)
     far = world[a, RADIUS] + speed * (event[TIME] - begin) + SLACK
-    low_i, end_i, low_j, end_j = cells_near(x, y, far, grid)
+    low_i, end_i, low_j, end_j = collision.cells_near(x, y, far, grid)
     for i in range(low_i, end_i):
         for j in range(low_j, end_j):
             if distances[i, j] > 0.0:

@@ -43,6 +43,21 @@ TRIES = 8
 """Directions that it tries in one period."""
 MOST_CORNERS = 32
 """Greatest number of waypoints that a patrol passes in a period."""
+NEAREST = 1e-3
+"""Least distance for which a force is computed [m]: at 0 it has no direction."""
+FAR = 8.0
+"""Forces beyond this many ranges are neglected."""
+STRONGEST = 5.0
+"""Greatest acceleration [m/s^2]: people reach no more, and the model's is unbounded."""
+ARRIVED = 0.3
+"""A goal is reached within this distance [m]."""
+ROOM = 0.2
+"""Free space around a walker at a new goal [m]."""
+LEAST_WALK = 1.0
+"""Least distance of a new goal [m], if such a goal is found."""
+PATIENCE = 5.0
+"""A walker gives up a goal after twice the time of the straight path plus this time [s]."""
+CANDIDATES = 16
 
 
 @kernel
@@ -154,38 +169,14 @@ def _follow(mark, body, row, waypoints, period, keep):  # type: ignore[no-untype
             x, y = x + (goal[0] - x) * reach / away, y + (goal[1] - y) * reach / away
             break
         x, y, left, rest = goal[0], goal[1], left - away / mark[at.SPEED], row[at.PAUSE]
-        index, way = _after(index, way, row)
+        if row[at.LOOP] != 0.0:
+            index = (index + 1) % int(row[at.COUNT])
+        else:
+            way = way if 0 <= index + way < int(row[at.COUNT]) else -way
+            index += int(way)
     if keep:
         mark[at.INDEX], mark[at.WAY], mark[at.REST] = index, way, rest
     return x - body[X], y - body[Y]
-
-
-@kernel
-def _after(index, way, row):  # type: ignore[no-untyped-def]
-    """Returns the next waypoint and the direction along the list: 1, or -1 for backwards."""
-    count = int(row[at.COUNT])
-    if row[at.LOOP] != 0.0:
-        return (index + 1) % count, 1.0
-    if not 0 <= index + way < count:
-        way = -way
-    return index + int(way), way
-
-
-NEAREST = 1e-3
-"""Least distance for which a force is computed [m]: at 0 it has no direction."""
-FAR = 8.0
-"""Forces beyond this many ranges are neglected."""
-STRONGEST = 5.0
-"""Greatest acceleration [m/s^2]: people reach no more, and the model's is unbounded."""
-ARRIVED = 0.3
-"""A goal is reached within this distance [m]."""
-ROOM = 0.2
-"""Free space around a walker at a new goal [m]."""
-LEAST_WALK = 1.0
-"""Least distance of a new goal [m], if such a goal is found."""
-PATIENCE = 5.0
-"""A walker gives up a goal after twice the time of the straight path plus this time [s]."""
-CANDIDATES = 16
 
 
 @kernel
@@ -214,13 +205,6 @@ def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-un
 
 
 @kernel
-def _sight(ex, ey, fx, fy, row):  # type: ignore[no-untyped-def]
-    """Weight (8) of a force on a walker that looks along e: 1, or less from behind."""
-    seen = -(ex * fx + ey * fy) >= row[at.VIEW] * math.sqrt(fx * fx + fy * fy)
-    return 1.0 if seen else row[at.BEHIND]
-
-
-@kernel
 def _from_bodies(k, ex, ey, marks, traffic):  # type: ignore[no-untyped-def]
     """Sums the forces of all other bodies on walker k: walkers, obstacles, robots."""
     bodies, first, row, ax, ay = traffic.bodies, traffic.first, traffic.plans[k], 0.0, 0.0
@@ -243,7 +227,9 @@ def _from_bodies(k, ex, ey, marks, traffic):  # type: ignore[no-untyped-def]
         fx, fy = repulsion(
             rx * share, ry * share, vx, vy, row[at.FORESIGHT], row[at.REPULSION], row[at.RANGE]
         )
-        weight = _sight(ex, ey, fx, fy, row)
+        # Less (8) from outside the angle of sight of a walker that looks along e.
+        seen = -(ex * fx + ey * fy) >= row[at.VIEW] * math.sqrt(fx * fx + fy * fy)
+        weight = 1.0 if seen else row[at.BEHIND]
         ax, ay = ax + weight * fx, ay + weight * fy
     return ax, ay
 

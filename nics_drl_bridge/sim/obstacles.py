@@ -31,14 +31,12 @@ def _fast(speed: tuple[float, float]) -> tuple[float, float]:
 
 
 Speed = Annotated[tuple[float, float], AfterValidator(_fast)]
+Strength = Annotated[float, Field(ge=0.0, le=STRONGEST)]
+Distance = Annotated[float, Field(ge=1e-3, le=STRONGEST)]
 
 
 class Wander(Schema):
-    """Moves straight ahead and turns to a free direction when something is near.
-
-    Attributes:
-        speed: least and greatest; one is drawn per episode [m/s].
-    """
+    """Moves straight ahead, by a speed drawn per episode, and turns when something is near."""
 
     kind: Literal["wander"] = "wander"
     speed: Speed
@@ -80,13 +78,10 @@ class Pedestrian(Schema):
     standard deviation of 0.26 m/s.
 
     Attributes:
-        speed: least and greatest desired speed; one is drawn per episode, and the walker is
-            never faster than the greatest [m/s].
+        speed: least and greatest desired speed, and the walker's greatest; drawn per episode [m/s].
         relaxation: tau, the time constant of approaching the desired velocity [s].
-        repulsion: V0 of walkers, obstacles and robots [m^2/s^2].
-        range: sigma, the range of `repulsion` [m].
-        wall_repulsion: U0 of walls [m^2/s^2].
-        wall_range: R, the range of `wall_repulsion` [m].
+        repulsion, range: V0 [m^2/s^2] and sigma [m], of walkers, obstacles and robots.
+        wall_repulsion, wall_range: U0 [m^2/s^2] and R [m], of walls.
         foresight: delta t, the time by which the others' motion is extrapolated [s].
         view: 2 phi, the angle of sight [rad].
         behind: c, the weight of forces from outside the angle of sight.
@@ -96,14 +91,14 @@ class Pedestrian(Schema):
     kind: Literal["pedestrian"] = "pedestrian"
     speed: Speed = (1.08, 1.6)
     relaxation: float = Field(default=0.5, ge=0.1, le=10.0)
-    repulsion: float = Field(default=2.1, ge=0.0, le=STRONGEST)
-    range: float = Field(default=0.3, ge=1e-3, le=STRONGEST)
-    wall_repulsion: float = Field(default=10.0, ge=0.0, le=STRONGEST)
-    wall_range: float = Field(default=0.2, ge=1e-3, le=STRONGEST)
-    foresight: float = Field(default=1.0, ge=0.0, le=STRONGEST)
+    repulsion: Strength = 2.1
+    range: Distance = 0.3
+    wall_repulsion: Strength = 10.0
+    wall_range: Distance = 0.2
+    foresight: Strength = 1.0
     view: float = Field(default=math.radians(200.0), ge=0.0, le=2.0 * math.pi)
     behind: float = Field(default=0.5, ge=0.0, le=1.0)
-    fluctuation: float = Field(default=0.1, ge=0.0, le=STRONGEST)
+    fluctuation: Strength = 0.1
 
 
 Motion = Annotated[Wander | Patrol | Pedestrian, Field(discriminator="kind")]
@@ -126,9 +121,9 @@ def plan_arrays(motions: Sequence[Wander | Patrol | Pedestrian | None]) -> tuple
             row[at.FIRST], row[at.COUNT] = len(waypoints), len(motion.waypoints)
             waypoints = np.concatenate([waypoints, motion.waypoints])
         else:
-            row[at.KIND], row[at.VIEW] = at.PEDESTRIAN, math.cos(motion.view / 2.0)
             row[at.RELAXATION], row[at.FLUCTUATION] = motion.relaxation, motion.fluctuation
             row[at.REPULSION], row[at.RANGE] = motion.repulsion, motion.range
             row[at.WALL_REPULSION], row[at.WALL_RANGE] = motion.wall_repulsion, motion.wall_range
             row[at.FORESIGHT], row[at.BEHIND] = motion.foresight, motion.behind
+            row[at.KIND], row[at.VIEW] = at.PEDESTRIAN, math.cos(motion.view / 2.0)
     return rows, waypoints

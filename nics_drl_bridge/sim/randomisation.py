@@ -20,7 +20,7 @@ from nics_drl_bridge.config import Schema, find_config, load_yaml, validate
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import fault_kernels
-from nics_drl_bridge.lidar.faults import SKEW, TOO_CLOSE, LidarFaults, Skew, TooClose
+from nics_drl_bridge.lidar.faults import SKEW, TOO_CLOSE, Skew, TooClose
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.kernels import term_arrays
@@ -32,13 +32,14 @@ __all__ = ["Draws", "Label", "LidarRanges", "Randomisation", "Sampler", "load_ra
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Bounds = tuple[Array, Array]
-MOST_PERIODS = 50.0
-"""Greatest latency that may be drawn [control periods]; the simulator stores as many."""
 MOST_OBSTACLES = 10_000
-GREATEST_FACTOR = 1e3
-GREATEST_LEVEL = 1e6
 NOISE_NAMES = ("odom_linear", "odom_angular", "position_drift", None, "heading_drift")
 """Columns of the noise, before those of the state; the drift of y equals that of x."""
+SCALED = {
+    "noise": (slice(0, 2), ("odom_linear", "odom_angular")),
+    "drift": (slice(2, None), ("position_drift", "heading_drift")),
+}
+"""Columns that a factor scales, and the levels that may be given instead."""
 CORNERS = 256
 """Number of mixtures of least and greatest factors that are checked for stability."""
 FAULT_COLUMNS = (
@@ -55,6 +56,7 @@ KINEMATICS_GROUP, LATENCY_GROUP, ODOMETRY_GROUP, LIDAR_GROUP, CHOICES_GROUP, SCE
 GROUPS = 8
 PLACES = 1 << 20
 """More than a group has columns; the counters of two groups never collide."""
+UNIT = (np.zeros(1), np.ones(1))
 
 
 def _ordered(span: tuple[float, float]) -> tuple[float, float]:
@@ -63,31 +65,12 @@ def _ordered(span: tuple[float, float]) -> tuple[float, float]:
     return span
 
 
-def _not_negative(span: tuple[float, float]) -> tuple[float, float]:
-    if not 0.0 <= span[0] <= span[1] <= GREATEST_LEVEL:
-        raise ValueError(f"a range must not begin below 0 or end above {GREATEST_LEVEL:g}")
-    return span
-
-
-def _positive(span: tuple[float, float]) -> tuple[float, float]:
-    if not 1.0 / GREATEST_FACTOR <= span[0] <= span[1] <= GREATEST_FACTOR:
-        raise ValueError(
-            f"a range of factors must begin above 0, at {1.0 / GREATEST_FACTOR:g} or more, and end "
-            f"at {GREATEST_FACTOR:g} or less"
-        )
-    return span
-
-
-def _soon(span: tuple[float, float]) -> tuple[float, float]:
-    if span[1] > MOST_PERIODS:
-        raise ValueError(f"a latency must be at most {MOST_PERIODS:g} control periods")
-    return span
-
-
-Span = Annotated[tuple[float, float], AfterValidator(_ordered)]
-Level = Annotated[Span, AfterValidator(_not_negative)]
-Factor = Annotated[Span, AfterValidator(_positive)]
-Latency = Annotated[Level, AfterValidator(_soon)]
+NotNegative = Annotated[float, Field(ge=0.0, le=1e6)]
+Positive = Annotated[float, Field(ge=1e-3, le=1e3)]
+Periods = Annotated[float, Field(ge=0.0, le=50.0)]  # the simulator stores as many
+Level = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_ordered)]
+Factor = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
+Latency = Annotated[tuple[Periods, Periods], AfterValidator(_ordered)]
 AS_IT_IS: Factor = (1.0, 1.0)
 
 
@@ -112,10 +95,8 @@ class OdometryRanges(Schema):
         noise: factor on the noise of the measured twist.
         drift: factor on the part of the motion that the model does not explain; only a drift that
             was found in the recording can be scaled.
-        odom_linear: noise of the velocity [m/s], instead of the model's.
-        odom_angular: noise of the yaw rate [rad/s].
-        position_drift: of x and y [m/sqrt(s)].
-        heading_drift: [rad/sqrt(s)].
+        odom_linear, odom_angular: noise of velocity [m/s] and yaw rate [rad/s].
+        position_drift, heading_drift: of x and y [m/sqrt(s)], and [rad/sqrt(s)].
     """
 
     noise: Factor | None = None
@@ -127,9 +108,7 @@ class OdometryRanges(Schema):
 
     @model_validator(mode="after")
     def _once(self) -> OdometryRanges:
-        pairs = {"noise": ("odom_linear", "odom_angular")}
-        pairs["drift"] = ("position_drift", "heading_drift")
-        for factor, levels in pairs.items():
+        for factor, (_, levels) in SCALED.items():
             for level in levels:
                 if getattr(self, factor) is not None and getattr(self, level) is not None:
                     raise ValueError(f"give either the factor {factor} or the level {level}")
@@ -160,15 +139,6 @@ class LidarRanges(Schema):
             raise ValueError("the greatest dropout and dropout_far must add up to at most 1")
         return self
 
-    def numbers(self, end: int) -> dict[str, float]:
-        """Returns the least (end 0) or greatest (end 1) of each number in `LidarFaults`."""
-        spans = {name: getattr(self, name) for name in LidarFaults.model_fields}
-        return {
-            name: span[end]
-            for name, span in spans.items()
-            if span is not None and name not in CHOICES
-        }
-
 
 class ObstacleRanges(Schema):
     """Number and size of the obstacles of a scene.
@@ -189,25 +159,13 @@ class ObstacleRanges(Schema):
             raise ValueError(f"count must be [least, greatest] from 0 to {MOST_OBSTACLES}")
         return self
 
-    @property
-    def sizes(self) -> tuple[float, ...]:
-        """The factors that may be drawn, ascending."""
-        low, high = self.size
-        rungs = self.rungs if high > low else 1
-        return tuple(float(factor) for factor in np.linspace(low, high, rungs))
-
 
 class Randomisation(Schema):
     """Ranges that are drawn from in every episode; all else stays as in model and world.
 
     Attributes:
-        name: the name users refer to it by.
-        kinematics: see `KinematicRanges`.
         action_latency: in addition to the model's [control periods].
         observation_latency: age of scan and odometry [control periods].
-        odometry: see `OdometryRanges`.
-        lidar: see `LidarRanges`.
-        obstacles: see `ObstacleRanges`.
     """
 
     name: str
@@ -221,7 +179,9 @@ class Randomisation(Schema):
     @property
     def sizes(self) -> tuple[float, ...]:
         """The factors on the obstacles' size that may be drawn, ascending."""
-        return self.obstacles.sizes
+        low, high = self.obstacles.size
+        rungs = self.obstacles.rungs if high > low else 1
+        return tuple(np.linspace(low, high, rungs).tolist())
 
 
 def load_randomisation(name: str | Path) -> Randomisation:
@@ -277,7 +237,6 @@ class Sampler:
     Attributes:
         longest_delay: greatest latency of a command that may occur [substeps].
         longest_age: greatest age of an observation that may occur [substeps].
-        skews: True if a lidar may measure its beams one after the other.
     """
 
     def __init__(
@@ -299,43 +258,26 @@ class Sampler:
         self._scene = np.array([least, 0.0]), np.array([most + 1.0, len(randomisation.sizes)])
         self._sizes = np.array(randomisation.sizes)
         self.longest_delay, self.longest_age = (int(most) for most in self._timing[1])
-        own = self._faults[0][fault_kernels.SKEW]
-        turns = self._choices.get(fault_kernels.SKEW, own)
-        self.skews = bool(np.any(turns != fault_kernels.AT_ONCE))
         self._labels = tuple(self._name(model))
 
     def draw(self, seeds: ArrayLike) -> Draws:
         """Draws the numbers of the episodes of some seeds (n,)."""
-        chosen = checked_seeds(seeds)
-        timing = np.floor(self._between(self._timing, chosen, LATENCY_GROUP)).astype(np.int64)
-        scene = np.floor(self._between(self._scene, chosen, SCENE_GROUP)[:, 0]).astype(np.int64)
-        noise = self._between(self._noise, chosen, ODOMETRY_GROUP)
-        faults = self._between(self._faults, chosen, LIDAR_GROUP)
+        chosen, robots = checked_seeds(seeds), self._robots
+        timing = np.floor(_between(self._timing, chosen, robots, LATENCY_GROUP)).astype(np.int64)
+        scene = np.floor(_between(self._scene, chosen, 1, SCENE_GROUP)[:, 0]).astype(np.int64)
+        noise = _between(self._noise, chosen, robots, ODOMETRY_GROUP)
+        faults = _between(self._faults, chosen, robots, LIDAR_GROUP)
         noise[..., 3] = noise[..., 2]
         for column, values in self._choices.items():
-            shares = self._shares(chosen, CHOICES_GROUP, [column])[..., 0]
-            faults[..., column] = values[(shares * len(values)).astype(np.int64)]
+            drawn = _between(UNIT, chosen, robots, CHOICES_GROUP, column)[..., 0]
+            faults[..., column] = values[(drawn * len(values)).astype(np.int64)]
         counts = self.randomisation.obstacles.count is not None
         return Draws(
-            self._between(self._coefficient, chosen, KINEMATICS_GROUP),
+            _between(self._coefficient, chosen, robots, KINEMATICS_GROUP),
             timing[..., 0].copy(), timing[..., 1].copy(), noise, faults,
             scene[:, 0] if counts else None, scene[:, 1] if len(self._sizes) > 1 else None,
             self._sizes, self._labels,
         )  # fmt: skip
-
-    def _between(self, bounds: Bounds, seeds: Integers, group: int) -> Array:
-        """Draws (n, M, Q) numbers between the bounds (Q,); exactly these where they are equal."""
-        low, high = bounds
-        shares = self._shares(seeds, group, np.arange(len(low)))
-        return np.where(high == low, low, low + shares * (high - low))
-
-    def _shares(self, seeds: Integers, group: int, columns: ArrayLike) -> Array:
-        """Draws (n, M, Q) numbers in [0, 1) for some columns (Q,) of a group."""
-        robots = np.arange(self._robots)[:, None]
-        counters = (robots * GROUPS + group) * PLACES + np.asarray(columns, np.int64)
-        shares = np.empty((len(seeds), counters.size))
-        random.uniforms(shares, seeds, random.RANDOMISATION_STREAM, counters.ravel())
-        return shares.reshape(len(seeds), *counters.shape)
 
     def _name(self, model: SimulatorModel) -> Iterator[Label]:
         kinematics = model.kinematics
@@ -358,6 +300,14 @@ class Sampler:
             yield Label("obstacles.count", "count")
         if len(self._sizes) > 1:
             yield Label("obstacles.size", "size")
+
+
+def _between(bounds: Bounds, seeds: Integers, robots: int, group: int, column: int = 0) -> Array:
+    """Draws (n, M, Q) numbers between bounds (Q,), for the columns of a group from one on."""
+    drawn = np.empty((len(seeds), robots, len(bounds[0])))
+    first, stride, stream = group * PLACES + column, GROUPS * PLACES, random.RANDOMISATION_STREAM
+    random.uniform_between(drawn, *bounds, seeds, stream, first, stride)
+    return drawn
 
 
 def _varies(ends: Bounds, column: int) -> bool:
@@ -442,18 +392,15 @@ def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
     """Bounds (2 + 3 + S,) of the noise."""
     odometry = ranges.odometry
     base = np.array([*model.noise.odometry, *model.noise.simulated_drift(model.robot)])
-    factors: tuple[tuple[str, Factor | None, slice, str], ...] = (
-        ("noise", odometry.noise, slice(0, 2), "'odom_linear' and 'odom_angular'"),
-        ("drift", odometry.drift, slice(2, None), "'position_drift' and 'heading_drift'"),
-    )
     low, high = base.copy(), base.copy()
-    for key, factor, part, instead in factors:
+    for key, (part, (one, other)) in SCALED.items():
+        factor = getattr(odometry, key)
         if factor is None:
             continue
         if not base[part].any():
             raise ConfigError(
                 f"{where}: key 'odometry.{key}': the model of {model.robot.name!r} has no "
-                f"measured {key} to scale; give {instead} instead."
+                f"measured {key} to scale; give {one!r} and {other!r} instead."
             )
         low[part], high[part] = base[part] * factor[0], base[part] * factor[1]
     for column, name in enumerate(NOISE_NAMES):
@@ -467,9 +414,10 @@ def _faults(ranges: Randomisation, lidar: LidarSpec, where: str) -> Bounds:
     """Bounds (P,) of the lidar's noise and faults."""
     bounds = []
     for end in range(2):
-        std = lidar.noise_std if ranges.lidar.noise_std is None else ranges.lidar.noise_std[end]
-        numbers = ranges.lidar.numbers(end)
-        faults = lidar.faults.model_dump() | numbers
-        spec = lidar.model_dump() | {"noise_std": std, "faults": faults}
+        spans = {name: span for name, span in ranges.lidar if span is not None}
+        numbers = {name: span[end] for name, span in spans.items() if name not in CHOICES}
+        std = numbers.pop("noise_std", lidar.noise_std)
+        spec = lidar.model_dump() | {"noise_std": std}
+        spec["faults"] |= numbers
         bounds.append(validate(spec, LidarSpec, f"{where} of the lidar {lidar.name!r}"))
     return bounds[0].fault_parameters, bounds[1].fault_parameters

@@ -29,15 +29,7 @@ from nics_drl_bridge.lidar.exact_kernels import (
     X,
     Y,
 )
-from nics_drl_bridge.sim.collision_kernels import (
-    FLOAT32,
-    body_gap,
-    in_grid,
-    is_round,
-    map_gap,
-    wall_distance,
-    wall_gap,
-)
+from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, Integers, MapField
 
 TRIES = 2000
@@ -67,7 +59,7 @@ class FreeSpace(NamedTuple):
 
 
 class ScenePlan(NamedTuple):
-    """What scenes of a world are drawn from: K obstacles in G groups, H shapes in S sizes."""
+    """Basis of the scenes of a world: K obstacles in G groups, of H shapes in S sizes."""
 
     space: FreeSpace
     outlines: OutlineArrays  # of all shapes, the last of which is a disc
@@ -106,7 +98,7 @@ def wall_distances(cells, walls):  # type: ignore[no-untyped-def]
     for i in range(distances.shape[0]):
         for j in range(distances.shape[1]):
             x, y = place_in(i + 0.5, j + 0.5, cells)
-            distances[i, j] = min(distances[i, j], wall_distance(x, y, walls))
+            distances[i, j] = min(distances[i, j], collision.wall_distance(x, y, walls))
 
 
 @kernel
@@ -119,7 +111,7 @@ def place_in(row, column, cells):  # type: ignore[no-untyped-def]
 @kernel
 def cell_of(x, y, cells):  # type: ignore[no-untyped-def]
     """Returns row and column of a point, and its distance from the centre of that cell [m]."""
-    u, v = in_grid(x, y, cells)
+    u, v = collision.in_grid(x, y, cells)
     u, v = u / cells.cell, v / cells.cell
     i, j = math.floor(v), math.floor(u)
     return i, j, cells.cell * math.sqrt((u - j - 0.5) ** 2 + (v - i - 0.5) ** 2)
@@ -144,7 +136,7 @@ def _within(x, y, space):  # type: ignore[no-untyped-def]
     if not inside:
         return False, 0.0, 0.0
     middle = distances[i, j]
-    return True, middle * (1.0 - FLOAT32) - off, middle * (1.0 + FLOAT32) + off
+    return True, middle * (1.0 - collision.FLOAT32) - off, middle * (1.0 + collision.FLOAT32) + off
 
 
 @kernel
@@ -154,7 +146,7 @@ def _clear_of_walls(body, room, plan, spare):  # type: ignore[no-untyped-def]
     inside, low, high = _within(body[X], body[Y], space)
     if inside and low >= body[RADIUS] + room:
         return True
-    if is_round(body, outlines):
+    if collision.is_round(body, outlines):
         if not inside or high < body[RADIUS] + room:
             return False
     else:  # its origin may lie outside its outline
@@ -164,9 +156,9 @@ def _clear_of_walls(body, room, plan, spare):  # type: ignore[no-untyped-def]
         if not _within(x, y, space)[0]:
             return False
     for w in range(space.walls.shape[0]):
-        if wall_gap(body, space.walls[w], outlines, room, spare) < room:
+        if collision.wall_gap(body, space.walls[w], outlines, room, spare) < room:
             return False
-    return map_gap(body, space.grid, outlines, room, spare) >= room
+    return collision.map_gap(body, space.grid, outlines, room, spare) >= room
 
 
 @kernel
@@ -175,9 +167,9 @@ def _clear_of(body, other, room, outlines, spare):  # type: ignore[no-untyped-de
     dx, dy, far = body[X] - other[X], body[Y] - other[Y], body[RADIUS] + other[RADIUS] + room
     if dx * dx + dy * dy >= far * far:
         return True
-    if is_round(body, outlines) and is_round(other, outlines):
+    if collision.is_round(body, outlines) and collision.is_round(other, outlines):
         return False
-    return body_gap(body, other, outlines, room, spare) >= room
+    return collision.body_gap(body, other, outlines, room, spare) >= room
 
 
 @kernel

@@ -15,16 +15,7 @@ from nics_drl_bridge.lidar import fault_kernels, scan_kernels
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
 from nics_drl_bridge.robot.kernels import move, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
-from nics_drl_bridge.sim.state import (
-    Array,
-    Cells,
-    Dynamics,
-    LidarView,
-    Scans,
-    Scratch,
-    State,
-    Surroundings,
-)
+from nics_drl_bridge.sim.state import Array, Dynamics, LidarView, Scratch, State, Surroundings
 
 POSE, TWIST, ODOM, MEASURED, PAST = 0, 3, 6, 9, 12
 """Columns of `past`."""
@@ -177,9 +168,10 @@ def scan_or_wait(
 
 @kernel
 def scan_together(
-    waiting: int, state: State, scene: Surroundings, view: LidarView, scans: Scans
+    waiting: int, state: State, scene: Surroundings, view: LidarView, scratch: Scratch
 ) -> None:
-    """Scans the first `waiting` worlds of the list in `scans`, as they stand."""
+    """Scans the first `waiting` worlds of the list in the scratch memory, as they stand."""
+    scans = scratch.scans
     chosen, first = scans.waiting[:waiting], state.velocity.shape[1]
     scan_kernels.scan_worlds(
         state.ranges, state.pose, chosen, state.bodies, first, scene.walls, view.sensor,
@@ -204,9 +196,9 @@ def distort(low: int, high: int, state: State, view: LidarView) -> None:
 
 
 @kernel
-def _place_lidar(n: int, m: int, lag: int, state: State, scans: Scans, substeps: int) -> None:
+def _place_lidar(n: int, m: int, lag: int, state: State, scratch: Scratch, substeps: int) -> None:
     """Writes pose and twist of a robot, `lag` substeps ago, to `spot` and `drive`."""
-    spot, drive, steps = scans.spot[0, 0], scans.drive, state.steps[n]
+    spot, drive, steps = scratch.scans.spot[0, 0], scratch.scans.drive, state.steps[n]
     row = state.past[n, m, steps % state.past.shape[2]]
     for i in range(3):
         spot[i] = state.pose[n, m, i]
@@ -225,11 +217,11 @@ def _scan_alone(
     scans, beams = scratch.scans, state.ranges.shape[2]
     spot, drive, skew = scans.spot, scans.drive, state.faults[n, m, fault_kernels.SKEW]
     lag = lag_of(state.age[n, m], state.steps[n], state.past.shape[2], motion.substeps)
-    _place_lidar(n, m, lag, state, scans, motion.substeps)
+    _place_lidar(n, m, lag, state, scratch, motion.substeps)
     reach = view.limits[1] + math.hypot(view.mount[0], view.mount[1])
     if skew != 0.0:
         reach += math.hypot(drive[0], drive[1]) * view.sweep_time
-    count = _gather(n, m, lag, reach, state, scene, motion, scans, scratch.cells)
+    count = _gather(n, m, lag, reach, state, scene, motion, scratch)
     seen = scans.seen[:count].reshape((1, count, 7))
     begin = (n * state.ranges.shape[1] + m) * beams
     scan = state.ranges.reshape(-1)[begin : begin + beams].reshape((1, 1, beams))
@@ -254,10 +246,11 @@ def _scan_alone(
 @kernel
 def _gather(
     n: int, m: int, lag: int, reach: float, state: State, scene: Surroundings, motion: Dynamics,
-    scans: Scans, cells: Cells,
+    scratch: Scratch,
 ) -> int:  # fmt: skip
     """Copies the bodies around `spot`, as they were `lag` substeps ago; returns their number."""
-    spot, bodies, velocity = scans.spot[0, 0], state.bodies, state.velocity
+    scans, cells, bodies, velocity = scratch.scans, scratch.cells, state.bodies, state.velocity
+    spot = scans.spot[0, 0]
     first, several = velocity.shape[1], bodies.shape[1]
     in_cells = scene.scattered and lag == 0  # the cells are of this period
     if in_cells:

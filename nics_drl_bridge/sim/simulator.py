@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -20,7 +19,7 @@ from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
-from nics_drl_bridge.sim import contact_kernels, step_kernels
+from nics_drl_bridge.sim import step_kernels
 from nics_drl_bridge.sim.allocation import Sizes, allocate, part_of, split, surroundings
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
@@ -47,7 +46,7 @@ class OutsideValidityWarning(UserWarning):
 
 def warn(message: str) -> None:
     """Issues an OutsideValidityWarning to the caller that steps the simulator."""
-    warnings.warn(message, OutsideValidityWarning, stacklevel=4)
+    warnings.warn(message, OutsideValidityWarning, stacklevel=5)
 
 
 class CommandBox:
@@ -227,9 +226,6 @@ class FastSimulator:
             worlds: (n,) indices of the worlds to reset, all by default.
             starts: (n, M, 3) poses to begin at instead of the scene's.
 
-        Returns:
-            The scene of each episode.
-
         Raises:
             ConfigError: the seeds or starts do not fit, or the world has no room for a scene.
         """
@@ -273,10 +269,8 @@ class FastSimulator:
     def _place(self, chosen: Indices, seeds: Indices, scenes: Scenes, starts: Array) -> None:
         data = self.data
         data.pose[chosen], data.odom[chosen] = starts, starts
-        for zeroed in (
-            data.state, data.history, data.twist, data.collided, data.steps, data.velocity,
-        ):  # fmt: skip
-            zeroed[chosen] = 0
+        for name in ("state", "history", "twist", "collided", "steps", "velocity"):
+            getattr(data, name)[chosen] = 0
         data.seeds[chosen] = seeds
         bodies = scenes.bodies.copy()
         bodies[..., SHAPE] = self._in_table[bodies[..., SHAPE].astype(np.int64)]
@@ -292,113 +286,42 @@ class FastSimulator:
         data.faults[chosen] = draws.faults
         for name, values in draws.named().items():
             if name not in self.drawn:
-                shape = (len(data.steps), *values.shape[1:])
-                self.drawn[name] = np.zeros(shape, values.dtype)
+                self.drawn[name] = np.zeros((len(data.steps), *values.shape[1:]), values.dtype)
             self.drawn[name][chosen] = values
 
     def step(self, commands: ArrayLike) -> None:
         """Moves every world by one control period; the results are in `data`.
 
-        Args:
-            commands: (N, M, C) in the units and the order of the RobotSpec.
+        The commands are (N, M, C), in the units and the order of the RobotSpec.
         """
-        commands = np.ascontiguousarray(commands, dtype=np.float64)
-        self._check_shape(commands, len(self.data.steps))
-        self._boxes[0].check(commands)
-        if len(self.parts) == 1:
-            step_kernels.step_worlds(self.packed[0], commands, 0)
-        else:
-            self.run_parts(
-                lambda part: step_kernels.step_worlds(
-                    self.packed[part.start], commands[part], part.start
-                )
+        checked = self._checked(slice(0, len(self.data.steps)), commands)
+        self.run_parts(
+            lambda part: step_kernels.step_worlds(
+                self.packed[part.start], checked[part], part.start
             )
+        )
 
     def run_parts(self, function: Callable[[slice], R]) -> list[R]:
         """Runs a function for each of `parts`, one thread per part; returns the results."""
         return self._crew.run(function, self.parts)
 
     def step_part(self, part: slice, commands: ArrayLike) -> None:
-        """Moves the worlds of one part by one control period, in the calling thread.
+        """Moves the worlds of one of `parts` by one control period, in the calling thread.
 
-        Args:
-            part: one of `parts`; different parts may be stepped in parallel.
-            commands: (n, M, C) of the worlds of the part.
+        The commands (n, M, C) are of these worlds; different parts may be stepped in parallel.
         """
-        commands = np.ascontiguousarray(commands, dtype=np.float64)
-        self._check_shape(commands, part.stop - part.start)
-        self._boxes[part.start].check(commands)
-        step_kernels.step_worlds(self.packed[part.start], commands, part.start)
+        checked = self._checked(part, commands)
+        step_kernels.step_worlds(self.packed[part.start], checked, part.start)
 
-    def _check_shape(self, commands: Array, worlds: int) -> None:
-        """Raises ConfigError if the kernels would read beyond the commands."""
+    def _checked(self, part: slice, commands: ArrayLike) -> Array:
+        """Returns commands as the kernels read them. Raises ConfigError for another shape."""
+        checked = np.ascontiguousarray(commands, dtype=np.float64)
         robots, _, width = self.data.history.shape[1:]
-        if commands.shape != (worlds, robots, width):
+        expected = (part.stop - part.start, robots, width)
+        if checked.shape != expected:
             raise ConfigError(
-                f"commands are {commands.shape}; they must be {(worlds, robots, width)}: worlds, "
-                "robots, and a robot's commands."
+                f"commands are {checked.shape}; they must be {expected}: worlds, robots, and a "
+                "robot's commands."
             )
-
-
-@dataclass(frozen=True)
-class Driven:
-    """Motion of the robots in one control period."""
-
-    pose: Array  # (M, 3) true pose of `base_link` in `map` at the end
-    twist: Array  # (M, 3) true body twist at the end [m/s, m/s, rad/s]
-    state: Array  # (M, S) at the end
-    wheels: Array  # (M, 3) pose at the end by wheel odometry, without noise
-    counted: Array  # (M, 3) body twist at the end by wheel odometry
-    touched: NDArray[np.bool_]  # (M,) true for robots that touched anything
-
-
-class DrivenSimulator:
-    """One world of the fast simulator whose robots are moved from outside, by other physics.
-
-    Scenes, motion of the obstacles, noise, faults and scans are those of the FastSimulator for the
-    same seed. Odometry is the wheel odometry with the model's noise.
-
-    Attributes:
-        fast: holds all data; do not call its `step`.
-        wheels: (M, 3) pose by wheel odometry, beginning at the start pose.
-    """
-
-    def __init__(
-        self, model: SimulatorModel, world: World, robots: int = 1, renderer: Renderer = "auto"
-    ) -> None:
-        self.fast = FastSimulator(model, world, robots=robots, renderer=renderer)
-        self._start = self.fast.obstacles[0, :, :3].copy()
-        self.wheels: Array = np.zeros((robots, 3))
-
-    def reset(self, seeds: ArrayLike, starts: ArrayLike | None = None) -> Scenes:
-        """Begins an episode, see `FastSimulator.reset`."""
-        scenes = self.fast.reset(seeds, starts=starts)
-        self.wheels = self.fast.data.pose[0].copy()
-        return scenes
-
-    def begin_period(self) -> None:
-        """Sets the obstacles' velocities for the period that begins."""
-        data = self.fast.data
-        self._start = data.bodies[0, :, :3].copy()
-        step_kernels.begin_period(self.fast.packed[0])
-
-    def move_obstacles(self, time: float) -> Array:
-        """Moves the obstacles to their poses `time` [s] after the beginning of the period.
-
-        Returns:
-            (K, 7) see `lidar.shapes.BODY`.
-        """
-        data = self.fast.data
-        contact_kernels.move_obstacles(data.bodies, self._start, data.velocity, 0, time)
-        return data.bodies[0, : data.velocity.shape[1]]
-
-    def end_period(self, driven: Driven) -> None:
-        """Takes over the motion of the robots and measures what they sense."""
-        data = self.fast.data
-        data.pose[0], data.state[0] = driven.pose, driven.state
-        data.collided[0] |= driven.touched.astype(np.uint8)
-        step_kernels.end_period(
-            self.fast.packed[0], driven.twist[None], self.wheels[None], driven.wheels[None],
-            driven.counted[None],
-        )  # fmt: skip
-        self.wheels = driven.wheels.copy()
+        self._boxes[part.start].check(checked)
+        return checked

@@ -180,7 +180,7 @@ def _step(
             if scene.crowded:
                 _note_paths(n, skip, state.pose, scratch)
             waiting = sensing.scan_or_wait(n, waiting, state, scene, view, motion, scratch)
-        sensing.scan_together(waiting, state, scene, view, scratch.scans)
+        sensing.scan_together(waiting, state, scene, view, scratch)
         sensing.distort(low, high, state, view)
 
 
@@ -238,7 +238,7 @@ def begin(packed: Any, chosen: Integers) -> None:
         waiting[i] = chosen[i]
         if part.scene.movers.moves:
             obstacles.begin(chosen[i], state, part.scene.movers.plans)
-    sensing.scan_together(chosen.shape[0], state, part.scene, part.lidar, part.scratch.scans)
+    sensing.scan_together(chosen.shape[0], state, part.scene, part.lidar, part.scratch)
     for n in chosen:
         sensing.distort(n, n + 1, state, part.lidar)
 
@@ -272,5 +272,5 @@ def end_period(packed: Any, true: Array, before: Array, wheels: Array, counted: 
         if scene.crowded:
             contacts.sort_bodies(state.bodies, n, scratch.cells)
         waiting = sensing.scan_or_wait(n, waiting, state, scene, part.lidar, motion, scratch)
-    sensing.scan_together(waiting, state, scene, part.lidar, scratch.scans)
+    sensing.scan_together(waiting, state, scene, part.lidar, scratch)
     sensing.distort(0, state.pose.shape[0], state, part.lidar)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import combinations_with_replacement
+
 import numpy as np
 import pytest
 from shapely import affinity, geometry
@@ -54,13 +56,12 @@ def gap(one, other, limit=np.inf):
     return kernels.body_gap(one, other, ARRAYS, limit, SPARE)
 
 
-@pytest.mark.parametrize("one", range(len(SHAPES)))
-@pytest.mark.parametrize("other", range(len(SHAPES)))
+@pytest.mark.parametrize(("one", "other"), combinations_with_replacement(range(len(SHAPES)), 2))
 def test_the_clearance_of_two_bodies_is_that_of_shapely(one, other):
     rng = np.random.default_rng(10 * one + other)
     lines = isinstance(SHAPES[one], Segment) and isinstance(SHAPES[other], Segment)
     overlaps = 0
-    for _ in range(400):
+    for _ in range(150):
         a, b = (rng.uniform(-0.8, 0.8, 3) * [1.0, 1.0, 4.0] for _ in range(2))
         expected = solid(SHAPES[one], a).distance(solid(SHAPES[other], b))
         expected -= radius(SHAPES[one]) + radius(SHAPES[other])
@@ -74,7 +75,7 @@ def test_the_clearance_of_two_bodies_is_that_of_shapely(one, other):
             overlaps += 1
             assert found < 0.0
             assert at_once == pytest.approx(found, abs=1e-9)
-    assert overlaps > 20 or lines
+    assert overlaps > 8 or lines
 
 
 @pytest.mark.parametrize("one", range(len(SHAPES) - 1))
@@ -107,7 +108,7 @@ def test_bodies_that_share_the_lines_of_their_edges_overlap():
 @pytest.mark.parametrize("index", range(len(SHAPES)))
 def test_the_clearance_to_a_straight_wall_is_that_of_shapely(index):
     rng = np.random.default_rng(index)
-    for _ in range(400):
+    for _ in range(150):
         pose, wall = rng.uniform(-0.8, 0.8, 3) * [1.0, 1.0, 4.0], rng.uniform(-1.0, 1.0, 4)
         line = geometry.LineString([wall[:2], wall[2:]])
         expected = solid(SHAPES[index], pose).distance(line) - radius(SHAPES[index])
@@ -131,7 +132,7 @@ def test_the_clearance_to_a_map_is_that_of_shapely(index):
         squares.append(geometry.Polygon(corners @ [[c, s], [-s, c]] + (-1.0, -2.0)))
     known = map_field(grid)
     overlaps = 0
-    for _ in range(400):
+    for _ in range(150):
         pose = rng.uniform(-3.0, 4.0, 3)
         shape = solid(SHAPES[index], pose)
         expected = min(shape.distance(square) for square in squares) - radius(SHAPES[index])
@@ -146,7 +147,7 @@ def test_the_clearance_to_a_map_is_that_of_shapely(index):
             overlaps += 1
             assert found < 0.0
             assert at_once < 0.0
-    assert overlaps >= 10
+    assert overlaps >= 4
 
 
 def test_where_there_is_no_map_nothing_is_near():

@@ -16,8 +16,8 @@ from nics_drl_bridge.extras.mujoco.rig import MujocoRobot, Rig
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.robot.kinds import textbook
+from nics_drl_bridge.sim.device import Driven, DrivenSimulator
 from nics_drl_bridge.sim.scenes import Scenes
-from nics_drl_bridge.sim.simulator import Driven, DrivenSimulator
 from nics_drl_bridge.sim.state import State
 from nics_drl_bridge.sim.world import World
 
