@@ -54,3 +54,18 @@ def episode_seed(seed, number):  # type: ignore[no-untyped-def]
     if number == 0:
         return np.int64(seed)
     return np.int64(uniform(seed, EPISODE_STREAM, number) * 9007199254740992.0)
+
+
+@kernel
+def uniform_between(out, low, high, seeds, stream, first, stride):  # type: ignore[no-untyped-def]
+    """Fills out (n, M, Q) with draws between low (Q,) and high (Q,), or these where both are equal.
+
+    That of seed n (n,), row m and column q has the counter first + m stride + q.
+    """
+    for n in range(out.shape[0]):
+        for m in range(out.shape[1]):
+            for q in range(out.shape[2]):
+                out[n, m, q] = low[q]
+                if high[q] != low[q]:
+                    share = uniform(seeds[n], stream, first + m * stride + q)
+                    out[n, m, q] = low[q] + share * (high[q] - low[q])

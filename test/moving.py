@@ -6,10 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.sim import obstacle_kernels as kernels
-from nics_drl_bridge.sim.obstacles import NO_DISTANCES, plan_arrays
+from nics_drl_bridge.sim.obstacles import plan_arrays
 from nics_drl_bridge.sim.separation_kernels import MARK
+from nics_drl_bridge.sim.state import NO_FIELD, Movers, State, Surroundings
 
 PERIOD = 0.1
 
@@ -69,27 +71,46 @@ def scattered(radii, half, rng, walls=None, free=0.05):
     return np.array(found)
 
 
+def state_of(bodies, marks, velocity, seeds):
+    """The state of N worlds as far as obstacles read and write it."""
+    worlds, none = len(bodies), np.zeros((len(bodies), 0, 3))
+    ints, empty = np.zeros((worlds, 0), np.int64), np.zeros((worlds, 0, 0, 0))
+    return State(
+        pose=none, state=none, history=empty, bodies=bodies, odom=none, twist=none,
+        ranges=none.astype(np.float32), collided=ints.astype(np.uint8),
+        steps=np.zeros(worlds, np.int64), seeds=np.array(seeds, np.int64), faults=none,
+        coefficient=none, delay=ints, age=ints, noise=none, velocity=velocity, past=empty,
+        marks=marks,
+    )  # fmt: skip
+
+
+def surroundings_of(motions, half, walls, grid=NO_FIELD):
+    """A field in which obstacles move."""
+    outlines = OutlineArrays(np.zeros((0, 2)), np.zeros(2, np.int64))
+    movers = Movers(True, *plan_arrays(motions), np.asarray(half, dtype=np.float64))
+    return Surroundings(walls, grid, outlines, False, False, movers)
+
+
 def watch(
-    motions, places, radii, half=(3.0, 3.0), steps=2000, seed=1, walls=None, distances=NO_DISTANCES,
+    motions, places, radii, half=(3.0, 3.0), steps=2000, seed=1, walls=None, grid=NO_FIELD,
     robots=None,
 ):  # fmt: skip
     """Lets the first K of the bodies move, see `Watched`; `robots` (T, M, 2) velocities move the
     others."""
-    count, half = len(motions), np.asarray(half, dtype=np.float64)
+    count = len(motions)
     poses = np.concatenate([places, np.zeros((len(places), 1))], axis=1)[None]
     bodies = place(poses, np.asarray(radii)[None], np.zeros((1, len(places))))
     marks, velocity = np.zeros((1, count, MARK)), np.zeros((1, count, 3))
     walls = sides(half) if walls is None else np.concatenate([sides(half), walls])
-    plans, seen = plan_arrays(motions), []
+    state, seen = state_of(bodies, marks, velocity, [seed]), []
+    scene = surroundings_of(motions, half, walls, grid)
     still = np.zeros((len(places) - count, 2))
-    kernels.begin(marks, 0, bodies, plans, half, seed)
+    kernels.begin(0, state, scene.movers.plans)
     where, headings = [bodies[0, :, :2].copy()], [bodies[0, :count, 2].copy()]
     for t in range(steps):
         speeds = still if robots is None else robots[t]
-        kernels.steer(
-            velocity, marks, 0, bodies, count, speeds, plans, walls, half, seed, t, PERIOD,
-            distances,
-        )  # fmt: skip
+        state.steps[0] = t
+        kernels.steer(0, state, scene, PERIOD, speeds)
         bodies[0, :count, :3] += velocity[0] * PERIOD
         bodies[0, count:, :2] += speeds * PERIOD
         where.append(bodies[0, :, :2].copy())

@@ -14,7 +14,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.robot.kinds import steady_twist
-from nics_drl_bridge.sim.space_kernels import wall_distance
+from nics_drl_bridge.sim.collision_kernels import wall_distance
 
 Array = NDArray[np.float64]
 ADVERSARIES = ("ram", "graze", "late", "jerk")

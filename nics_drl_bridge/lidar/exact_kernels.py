@@ -9,8 +9,10 @@ angle_increment, and 1.0 for a full circle.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 
@@ -35,6 +37,20 @@ ATAN = (
     -0.0071661648959,
     0.0010844927512,
 )
+X, Y, HEADING, COS, SIN, RADIUS, SHAPE = range(7)
+"""Columns of a placed body; the radius of an absent one is 0, `SHAPE` is an index."""
+
+
+class OutlineArrays(NamedTuple):
+    """Outlines of all shapes, see `shapes.Outlines`.
+
+    Attributes:
+        corners: (sum V, 2) of all outlines [m].
+        first: (H + 1,) first corner of each outline; a circle has none.
+    """
+
+    corners: NDArray[np.float64]
+    first: NDArray[np.int64]
 
 
 @kernel(inline=True)

@@ -3,38 +3,25 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot.kernels import SERIES, scratch, term_arrays
-from nics_drl_bridge.sim.contact_kernels import SEVERAL
+from nics_drl_bridge.sim import state as arrays
+from nics_drl_bridge.sim.contact_kernels import FRAME, SEVERAL
 from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT
+from nics_drl_bridge.sim.obstacles import Motion, plan_arrays
 from nics_drl_bridge.sim.sensing_kernels import PAST
 from nics_drl_bridge.sim.separation_kernels import MARK
-from nics_drl_bridge.sim.state import (
-    Cells,
-    Dynamics,
-    Lanes,
-    LidarView,
-    MapField,
-    Movers,
-    Nearby,
-    OutlineArrays,
-    Part,
-    Scans,
-    Scratch,
-    Single,
-    State,
-    Surroundings,
-)
+from nics_drl_bridge.sim.world import World
 
-Array = NDArray[np.float64]
 SLICES = 16
 """Number of groups of beams in which a skewed scan is rendered."""
 LANES = 256
@@ -50,21 +37,13 @@ testing all of them takes less time than a separate scan for each robot."""
 
 @dataclass(frozen=True)
 class Sizes:
-    """Dimensions of a simulation.
+    """Dimensions of a simulation."""
 
-    Attributes:
-        worlds: N.
-        robots: M in each.
-        obstacles: K in each.
-        longest_delay: greatest latency of commands [substeps].
-        longest_age: greatest age of an observation [substeps].
-    """
-
-    worlds: int
-    robots: int
-    obstacles: int
-    longest_delay: int
-    longest_age: int
+    worlds: int  # N
+    robots: int  # M in each
+    obstacles: int  # K in each
+    longest_delay: int  # greatest latency of commands [substeps]
+    longest_age: int  # greatest age of an observation [substeps]
 
     @property
     def crowded(self) -> bool:
@@ -78,7 +57,7 @@ class Sizes:
         return self.crowded and self.robots + self.obstacles >= SCATTERED
 
 
-def allocate(model: SimulatorModel, sizes: Sizes) -> State:
+def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
     """Allocates the arrays of worlds before their first reset, with the model's parameters."""
     size, width = len(model.robot.state), len(model.robot.command)
     _, substeps, delay = model.timing
@@ -86,7 +65,7 @@ def allocate(model: SimulatorModel, sizes: Sizes) -> State:
     noise = [*model.noise.odometry, *model.noise.simulated_drift(model.robot)]
     # One row for the newest; an age within a period needs the end of the period before it, too.
     rows = -(-sizes.longest_age // substeps) + 1
-    return State(
+    return arrays.State(
         pose=np.zeros((*shape, 3)),
         state=np.zeros((*shape, size)),
         history=np.zeros((*shape, -(-sizes.longest_delay // substeps) + 1, width)),
@@ -114,21 +93,35 @@ def split(worlds: int, threads: int) -> tuple[slice, ...]:
     return tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(edges))
 
 
+def map_field(grid: GridMap | None) -> arrays.MapField:
+    """Returns a static map as the kernels take it."""
+    if grid is None:
+        return arrays.NO_FIELD
+    return arrays.MapField(np.ascontiguousarray(grid.distance_field), *grid.arrays[1].tolist())
+
+
+def surroundings(
+    world: World, motions: Sequence[Motion | None], scanner: Scanner, sizes: Sizes
+) -> arrays.Surroundings:
+    """Returns all that stands in every world, with obstacles that move by `motions` (K,)."""
+    low_x, low_y, high_x, high_y = world.extent
+    half = np.array([max(-low_x, high_x), max(-low_y, high_y)])
+    moves = any(motion is not None for motion in motions)
+    outlines = OutlineArrays(*scanner.table.outlines.arguments)
+    return arrays.Surroundings(
+        world.all_walls(), map_field(scanner.grid), outlines, sizes.crowded, sizes.scattered,
+        arrays.Movers(moves, *plan_arrays(motions), half),
+    )  # fmt: skip
+
+
 def part_of(
-    state: State,
-    model: SimulatorModel,
-    scanner: Scanner,
-    walls: Array,
-    movers: Movers,
-    sizes: Sizes,
-    part: slice,
-) -> Part:
+    state: arrays.State, scene: arrays.Surroundings, model: SimulatorModel, scanner: Scanner,
+    sizes: Sizes, part: slice,
+) -> arrays.Part:  # fmt: skip
     """Returns the arguments of the kernels for one part of the worlds, with scratch of its own."""
     lidar, grid = model.lidar, scanner.grid
     dt, substeps, _ = model.timing
-    outlines = OutlineArrays(*scanner.table.outlines.arguments)
-    scene = Surroundings(walls, _grid(grid), outlines, sizes.crowded, sizes.scattered, movers)
-    view = LidarView(
+    view = arrays.LidarView(
         scanner.arguments,
         NO_MAP if grid is None else grid.arrays,
         scanner.renderer == "exact",
@@ -136,17 +129,12 @@ def part_of(
         np.array([lidar.range_min, lidar.range_max], dtype=np.float64),
         float(lidar.sweep_time),
     )
-    motion = Dynamics(term_arrays(model.kinematics), SERIES, float(dt), int(substeps))
-    return Part(state, scene, view, motion, _scratch(model, scanner, sizes, part.stop - part.start))
+    motion = arrays.Dynamics(term_arrays(model.kinematics), SERIES, float(dt), int(substeps))
+    own = _scratch(model, scanner, sizes, part.stop - part.start)
+    return arrays.Part(state, scene, view, motion, own)
 
 
-def _grid(grid: GridMap | None) -> MapField:
-    if grid is None:
-        return MapField(np.zeros((0, 0), np.float32), np.zeros(5))
-    return MapField(np.ascontiguousarray(grid.distance_field), grid.arrays[1])
-
-
-def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int) -> Scratch:
+def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int) -> arrays.Scratch:
     """Returns the scratch memory that one thread needs to step this many worlds."""
     kinematics, robots, count = model.kinematics, sizes.robots, sizes.obstacles
     bodies = count + robots
@@ -155,31 +143,31 @@ def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int)
     side = int(np.sqrt(2.0 * bodies)) if sizes.crowded else 1
     corners = max(int(np.diff(scanner.table.outlines.corner).max(initial=4)), 4)
     x, dq = scratch(kinematics)
-    return Scratch(
-        lanes=Lanes(
+    return arrays.Scratch(
+        lanes=arrays.Lanes(
             pose=np.zeros((6, lanes)),
             x=np.ones((len(kinematics.variables) + 1, lanes)),
             dq=np.zeros((len(kinematics.dofs), lanes)),
             coefficient=np.zeros((np.count_nonzero(kinematics.coefficients), lanes)),
             late=np.zeros(lanes, np.int64),
         ),
-        single=Single(
+        single=arrays.Single(
             x=x, dq=dq, trial=np.zeros(BODY), spare=np.zeros((corners, 2)),
             start=np.zeros((count, 3)), began=np.zeros((count, 3)),
             flights=np.zeros((bodies, FLIGHT)), events=np.zeros((robots, EVENT)),
         ),
-        nearby=Nearby(
+        nearby=arrays.Nearby(
             near=np.zeros((robots, 1 + SEVERAL), np.int64), meets=np.zeros(robots, np.int64),
             way=np.zeros(robots), reach=np.zeros(bodies), speeds=np.zeros((robots, 2)),
         ),
-        cells=Cells(
+        cells=arrays.Cells(
             begin=np.zeros(side * side + 2, np.int64), order=np.zeros(bodies, np.int64),
-            cell_of=np.zeros(bodies, np.int64), frame=np.zeros(5),
+            cell_of=np.zeros(bodies, np.int64), frame=np.zeros(FRAME),
             found=np.zeros(bodies, np.int64),
         ),
-        scans=Scans(
+        scans=arrays.Scans(
             before=np.zeros((lanes, 3)), waiting=np.zeros(worlds, np.int64),
-            seen=np.zeros((bodies + 1) * BODY), spot=np.zeros((1, 1, 3)),
+            seen=np.zeros((bodies + 1, BODY)), spot=np.zeros((1, 1, 3)),
             slices=np.zeros((SLICES, 3)), part=np.zeros((1, 1, model.lidar.beams), np.float32),
             drive=np.zeros(3), none=np.zeros(1, np.int64), lookup=scanner.room(bodies),
         ),

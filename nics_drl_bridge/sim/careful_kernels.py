@@ -2,8 +2,7 @@
 
 All bodies move at the same time. At the first contact, each body that approached the other stops:
 a robot until the end of the substep, an obstacle until the end of the period. Then the next
-contact is sought. Shapes are those of `state`; the columns of `flights` and `events` are in
-`impact_kernels`.
+contact is sought. Shared arguments: m is a robot, until and time are in the substep [s].
 """
 
 from __future__ import annotations
@@ -13,23 +12,11 @@ import math
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, X, Y
 from nics_drl_bridge.robot.kernels import Terms, delayed, move, rates, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import impact_kernels as impact
-from nics_drl_bridge.sim.impact_kernels import (
-    AFTER,
-    DEPTH,
-    NOTHING,
-    OTHERS,
-    OWN,
-    STOP,
-    TIME,
-    TURN,
-    VX,
-    VY,
-    WITH,
-    Moving,
-)
+from nics_drl_bridge.sim.impact_kernels import AFTER, DEPTH, STOP, TIME, TURN, VX, VY, Moving
 from nics_drl_bridge.sim.sensing_kernels import drift_of
 from nics_drl_bridge.sim.state import Array, Dynamics, Nearby, Single, State, Surroundings
 
@@ -42,10 +29,7 @@ MOST_MOVES = 1000
 
 @kernel
 def rates_at(n: int, m: int, j: int, state: State, motion: Dynamics, single: Single) -> None:
-    """Computes the rates of robot m in substep j of a period, under the command then in effect.
-
-    The result is in `single.dq`.
-    """
+    """Writes to `single.dq` the rates of robot m in substep j, by the command then in effect."""
     row = delayed(j, state.delay[n, m], motion.substeps, state.history.shape[2])
     size, terms = state.state.shape[2], motion.terms
     for s in range(size):
@@ -60,24 +44,19 @@ def rates_at(n: int, m: int, j: int, state: State, motion: Dynamics, single: Sin
 def _put(body: Array, base: Array, flight: Array, time: float, series: Array) -> None:
     """Writes to `body` (7,) a robot that began at `base` (7,), after `time` [s]."""
     turn = flight[TURN] * time
-    body[0], body[1], body[3], body[4] = move(
-        base[0], base[1], base[3], base[4], flight[VX], flight[VY], turn, time, series
+    body[X], body[Y], body[COS], body[SIN] = move(
+        base[X], base[Y], base[COS], base[SIN], flight[VX], flight[VY], turn, time, series
     )
-    body[2] = base[2] + turn
-    body[5], body[6] = base[5], base[6]
+    body[HEADING] = base[HEADING] + turn
+    body[RADIUS], body[SHAPE] = base[RADIUS], base[SHAPE]
 
 
 @kernel
 def _first_touch(
-    m: int,
-    begin: float,
-    until: float,
-    scene: Surroundings,
-    nearby: Nearby,
-    events: Array,
+    m: int, begin: float, until: float, scene: Surroundings, nearby: Nearby, events: Array,
     moving: Moving,
-) -> None:
-    """Finds the first contact of robot m from a time of the substep on, see `impact_kernels`."""
+) -> None:  # fmt: skip
+    """Finds the first contact of robot m from a time of the substep on."""
     near, world, meets = nearby.near, moving.world, nearby.meets[m]
     event, me = events[m], moving.first + m
     event[TIME] = until
@@ -85,7 +64,7 @@ def _first_touch(
         listed = near[m, 0] <= contacts.SEVERAL
         for i in range(near[m, 0] if listed else world.shape[0]):
             k = near[m, 1 + i] if listed else i
-            if k != me and world[k, 5] > 0.0:
+            if k != me and world[k, RADIUS] > 0.0:
                 impact.touch_body(event, me, k, begin, moving)
     if meets & contacts.WALLS and event[DEPTH] >= 0.0:
         impact.touch_walls(event, me, scene.walls, begin, moving)
@@ -100,8 +79,8 @@ def _leave(
     """Moves a robot that overlaps something for as long as it gets no deeper."""
     world, events, me = moving.world, single.events, moving.first + m
     flight = moving.flights[me]
-    path = math.sqrt(flight[VX] ** 2 + flight[VY] ** 2) + abs(flight[TURN]) * world[me, 5]
-    moves = int(min(max(math.ceil(path * until / (SMALL * world[me, 5])), 1), MOST_MOVES))
+    path = math.sqrt(flight[VX] ** 2 + flight[VY] ** 2) + abs(flight[TURN]) * world[me, RADIUS]
+    moves = int(min(max(math.ceil(path * until / (SMALL * world[me, RADIUS])), 1), MOST_MOVES))
     flight[STOP], events[m, AFTER] = 0.0, events[m, DEPTH]
     for i in range(1, moves + 1):
         time = until if i == moves else until * i / moves
@@ -116,9 +95,9 @@ def _leave(
 def _within(p: int, b: int, until: float, moving: Moving) -> bool:
     """True if robot p may come near body b within the substep."""
     world, flights, a = moving.world, moving.flights, moving.first + p
-    dx, dy = world[a, 0] - world[b, 0], world[a, 1] - world[b, 1]
+    dx, dy = world[a, X] - world[b, X], world[a, Y] - world[b, Y]
     paths = impact.speed_at(a, -1.0, flights) + impact.speed_at(b, -1.0, flights)
-    far = world[a, 5] + world[b, 5] + paths * until + impact.SLACK
+    far = world[a, RADIUS] + world[b, RADIUS] + paths * until + impact.SLACK
     return dx * dx + dy * dy <= far * far  # type: ignore[no-any-return]
 
 
@@ -128,13 +107,7 @@ def _settle(
 ) -> None:
     """Stops the bodies of a world at their contacts within a substep, in order of time.
 
-    Args:
-        until: length of the substep [s].
-        scene: of the world.
-        nearby: what each robot may meet.
-        events: (M, EVENT), updated in place.
-        touched: (M,) set to 1 by a contact.
-        moving: the bodies; their `flights` are updated in place.
+    `events`, `touched` (M,) and the flights of `moving` are updated.
     """
     flights, first, meets, robots = moving.flights, moving.first, nearby.meets, events.shape[0]
     for m in range(robots):
@@ -146,10 +119,10 @@ def _settle(
         for p in range(1, robots):
             if events[p, TIME] < events[m, TIME]:
                 m = p
-        time, k = events[m, TIME], int(events[m, WITH])
+        time, k = events[m, TIME], int(events[m, impact.WITH])
         if time >= until:
             return
-        own, others = -events[m, OWN], -events[m, OTHERS]
+        own, others = -events[m, impact.OWN], -events[m, impact.OTHERS]
         touched[m] = 1
         if k >= first:
             touched[k - first] = 1
@@ -186,12 +159,11 @@ def _hold_obstacles(n: int, dt: float, state: State, single: Single) -> None:
     for k in range(velocity.shape[1]):
         stop = single.flights[k, STOP]
         if stop < dt:
-            start[k, 0] = bodies[n, k, 0] + velocity[n, k, 0] * stop
-            start[k, 1] = bodies[n, k, 1] + velocity[n, k, 1] * stop
-            start[k, 2] = wrap(bodies[n, k, 2] + velocity[n, k, 2] * stop)
+            start[k, 0] = bodies[n, k, X] + velocity[n, k, 0] * stop
+            start[k, 1] = bodies[n, k, Y] + velocity[n, k, 1] * stop
+            start[k, 2] = wrap(bodies[n, k, HEADING] + velocity[n, k, 2] * stop)
             contacts.put_body(bodies, n, k, start[k])
-            for i in range(3):
-                velocity[n, k, i] = 0.0
+            velocity[n, k, :] = 0.0
 
 
 @kernel
@@ -203,15 +175,9 @@ def move_carefully(
 
     A robot in contact is marked and stops for the rest of the substep, and again in the next ones
     while it would come nearer; it may move away. A robot that already overlaps something gets no
-    deeper. Without a contact it moves exactly as in `robot_kernels.move_freely`. An obstacle
-    stopped by a robot is left with its mean velocity over the period.
-
-    Args:
-        n: index of the world.
-        any_moves: whether any of its obstacles moves.
-        state, scene, motion: see `state`.
-        nearby: what each robot may meet; those that meet nothing are not moved.
-        single: scratch memory.
+    deeper. Without a contact it moves exactly as in `step_kernels.move_freely`. An obstacle stopped
+    by a robot is left with its mean velocity over the period. Robots that may meet nothing are not
+    moved; `any_moves` is true if any obstacle does.
     """
     events, touched, dt = single.events, state.collided[n], motion.dt
     first, meets = state.velocity.shape[1], nearby.meets
@@ -253,9 +219,9 @@ def _check_overlap(
     """Records how deep robot m overlaps anything as the period begins; marks it if it does."""
     events, body = single.events, moving.world[moving.first + m]
     depth, whom = contacts.contact(
-        body, m, moving.world, scene, nearby, single.spare, 2.0 * NOTHING
+        body, m, moving.world, scene, nearby, single.spare, 2.0 * impact.NOTHING
     )
-    events[m, DEPTH] = min(depth, -np.finfo(np.float64).tiny) if depth <= NOTHING else 0.0
+    events[m, DEPTH] = min(depth, -np.finfo(np.float64).tiny) if depth <= impact.NOTHING else 0.0
     if depth < 0.0:
         touched[m] = 1
         if whom >= moving.first:
@@ -285,19 +251,14 @@ def _average_velocities(n: int, period: float, state: State, single: Single) -> 
         if stopped or start[k, 2] != began[k, 2]:
             for i in range(2):
                 velocity[n, k, i] = (bodies[n, k, i] - began[k, i]) / period
-            velocity[n, k, 2] = wrap(bodies[n, k, 2] - began[k, 2]) / period
+            velocity[n, k, 2] = wrap(bodies[n, k, HEADING] - began[k, 2]) / period
 
 
 @kernel
 def drift_carefully(
     n: int, state: State, scene: Surroundings, motion: Dynamics, nearby: Nearby, single: Single
 ) -> None:
-    """Lets the robots of one world drift, one after the other, up to their contacts.
-
-    Args:
-        n: index of the world.
-        state, scene, motion, nearby, single: see `move_carefully`.
-    """
+    """Lets the robots of one world drift, one after the other, up to their contacts."""
     pose, collided, meets = state.pose, state.collided, nearby.meets
     flights, events, first = single.flights, single.events, state.velocity.shape[1]
     moving = Moving(state.bodies[n], flights, first, scene.outlines, motion.series)
@@ -320,8 +281,8 @@ def drift_carefully(
             flight[STOP] = 0.0
             if events[m, TIME] < 1.0:
                 stop, collided[n, m] = events[m, TIME], 1
-                if events[m, WITH] >= first:
-                    collided[n, int(events[m, WITH]) - first] = 1
+                if events[m, impact.WITH] >= first:
+                    collided[n, int(events[m, impact.WITH]) - first] = 1
         x, y, _, _ = move(
             pose[n, m, 0], pose[n, m, 1], math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2]),
             ahead, aside, turn * stop, stop, motion.series,

@@ -1,8 +1,7 @@
 """Compiled contacts: which robots may touch something within a period, and what they touch.
 
 A robot whose circle cannot meet anything within the period moves freely. For the others, `near`
-lists the bodies that they may meet, so that each substep tests only those. Shapes are those of
-`state`; bodies are obstacles, then robots.
+lists the bodies that they may meet, so that each substep tests only those.
 
 In a crowded world the bodies are sorted into square cells, rebuilt each period by a counting sort.
 A robot then tests only the bodies around it, and the cost per robot does not depend on how many
@@ -16,47 +15,39 @@ import math
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
 from nics_drl_bridge.robot.kernels import wrap
-from nics_drl_bridge.sim.collision_kernels import (
-    body_gap,
-    map_bound,
-    map_gap,
-    segment_distance2,
-    wall_gap,
-)
+from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, Cells, Nearby, State, Surroundings
 
 FREE, BODIES, WALLS, MAP = 0, 1, 2, 4
 """Bit flags of what a robot may meet."""
 SEVERAL = 32
 """Greatest number of bodies listed near a robot; if there are more, all bodies are tested."""
+LEFT, BOTTOM, PER_METRE, LARGEST, MOVED, FRAME = range(6)
+"""Columns of `Cells.frame`: x, y of the first cell [m], cells per metre, greatest radius of the
+bodies in cells [m], greatest distance moved since by any body [m]."""
 
 
 @kernel
 def reaches(n: int, state: State, nearby: Nearby, period: float) -> tuple[float, bool]:
-    """Bounds how far the circle of each body may reach from its present centre.
+    """Bounds how far the circle of each body of world n may reach from its present centre.
 
-    Args:
-        n: index of the world.
-        state: of all worlds.
-        nearby: its `way` is given; its `reach` is the result, 0 where there is no body.
-        period: [s].
-
-    Returns:
-        The longest path of any body [m], and whether an obstacle moves.
+    `nearby.reach` is the result, 0 where there is no body, given `nearby.way`; `period` is in [s].
+    Returns the longest path of any body [m], and whether an obstacle moves.
     """
     reach, way, bodies, velocity = nearby.reach, nearby.way, state.bodies, state.velocity
     longest, moving = 0.0, False
     obstacles = velocity.shape[1]
     for k in range(obstacles):
-        reach[k] = bodies[n, k, 5]
+        reach[k] = bodies[n, k, RADIUS]
         vx, vy = velocity[n, k, 0], velocity[n, k, 1]
         if (vx != 0.0 or vy != 0.0 or velocity[n, k, 2] != 0.0) and reach[k] > 0.0:
             moved = math.sqrt(vx * vx + vy * vy) * period
             reach[k] += moved
             longest, moving = max(longest, moved), True
     for m in range(way.shape[0]):
-        reach[obstacles + m] = bodies[n, obstacles + m, 5] + way[m]
+        reach[obstacles + m] = bodies[n, obstacles + m, RADIUS] + way[m]
         longest = max(longest, way[m])
     return longest, moving
 
@@ -65,27 +56,19 @@ def reaches(n: int, state: State, nearby: Nearby, period: float) -> tuple[float,
 def find_near(
     n: int, m: int, bodies: Array, scene: Surroundings, nearby: Nearby, cells: Cells
 ) -> int:
-    """Finds what robot m of world n may meet within the period.
+    """Returns the flags of what robot m of world n may meet within the period.
 
-    Args:
-        n, m: indices of the world and the robot.
-        bodies: (N, K + M, 7).
-        scene: of the world.
-        nearby: its `reach` is given; row m of its `near` is the result.
-        cells: of its bodies, if it is crowded.
-
-    Returns:
-        A combination of the flags of this module.
+    Row m of `nearby.near` is a result too, given `nearby.reach`.
     """
     near, reach, walls = nearby.near, nearby.reach, scene.walls
     me = bodies.shape[1] - near.shape[0] + m
-    x, y, own = bodies[n, me, 0], bodies[n, me, 1], reach[me]
+    x, y, own = bodies[n, me, X], bodies[n, me, Y], reach[me]
     count, several = 0, bodies.shape[1]
     if scene.crowded:
         several = bodies_around(x, y, own, cells)
     for i in range(several):
         k = cells.found[i] if scene.crowded else i
-        dx, dy, far = bodies[n, k, 0] - x, bodies[n, k, 1] - y, own + reach[k]
+        dx, dy, far = bodies[n, k, X] - x, bodies[n, k, Y] - y, own + reach[k]
         if dx * dx + dy * dy <= far * far and k != me and reach[k] > 0.0:
             if count < SEVERAL:
                 near[m, 1 + count] = k
@@ -93,60 +76,54 @@ def find_near(
     near[m, 0] = count
     meets = BODIES if count > 0 else FREE
     for w in range(walls.shape[0]):
-        d2 = segment_distance2(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3])
+        d2 = collision.segment_distance2(x, y, walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3])
         if d2 <= own * own:
             meets |= WALLS
             break
     grid = scene.grid
-    if grid.distances.size > 0 and map_bound(bodies[n, me], grid) <= own - bodies[n, me, 5]:
+    if (
+        grid.distances.size > 0
+        and collision.map_bound(bodies[n, me], grid) <= own - bodies[n, me, RADIUS]
+    ):
         meets |= MAP
     return meets
 
 
 @kernel
 def contact(
-    body: Array,
-    m: int,
-    world: Array,
-    scene: Surroundings,
-    nearby: Nearby,
-    spare: Array,
+    body: Array, m: int, world: Array, scene: Surroundings, nearby: Nearby, spare: Array,
     limit: float,
-) -> tuple[float, int]:
-    """Returns the clearance of a robot, given as `body` (7,), to all that it may meet.
+) -> tuple[float, int]:  # fmt: skip
+    """Returns the clearance of robot m, placed as `body` (7,), to all that it may meet.
 
     Args:
-        body: the robot.
-        m: its index.
+        body, m: the robot.
         world: (K + M, 7) bodies of its world.
-        scene: of the world.
-        nearby: what the robots may meet.
-        spare: scratch memory, see `collision_kernels`.
-        limit: greatest clearance that is measured [m].
+        scene, nearby: see `state`.
+        spare, limit: see `collision_kernels`.
 
     Returns:
         The clearance, at most `limit` [m], negative where it overlaps something; and the nearest
         body, or -1.
     """
-    corners, first, near = scene.outlines.corners, scene.outlines.first, nearby.near
-    least, whom = limit, -1
+    outlines, near, least, whom = scene.outlines, nearby.near, limit, -1
     if nearby.meets[m] & BODIES:
         me = world.shape[0] - near.shape[0] + m
         listed = near[m, 0] <= SEVERAL
         for i in range(near[m, 0] if listed else world.shape[0]):
             k = near[m, 1 + i] if listed else i
-            if k == me or world[k, 5] <= 0.0:
+            if k == me or world[k, RADIUS] <= 0.0:
                 continue
-            gap = body_gap(body, world[k], corners, first, limit, spare)
+            gap = collision.body_gap(body, world[k], outlines, limit, spare)
             if gap < least:
                 least, whom = gap, k
     if nearby.meets[m] & WALLS:
         for w in range(scene.walls.shape[0]):
-            gap = wall_gap(body, scene.walls[w], corners, first, limit, spare)
+            gap = collision.wall_gap(body, scene.walls[w], outlines, limit, spare)
             if gap < least:
                 least, whom = gap, -1
     if nearby.meets[m] & MAP:
-        gap = map_gap(body, scene.grid, corners, first, limit, spare)
+        gap = collision.map_gap(body, scene.grid, outlines, limit, spare)
         if gap < least:
             least, whom = gap, -1
     return least, whom
@@ -154,33 +131,24 @@ def contact(
 
 @kernel
 def move_obstacles(bodies: Array, start: Array, velocity: Array, n: int, time: float) -> None:
-    """Moves the obstacles of world n to their poses `time` after the start of the period.
+    """Moves the obstacles of world n to their poses `time` [s] after the start of the period.
 
-    Args:
-        bodies: (N, K + M, 7), in place.
-        start: (K, 3) poses at the start of the period.
-        velocity: (N, K, 3) [m/s, m/s, rad/s] in `map`.
-        n: index of the world.
-        time: [s].
+    `bodies` (N, K + M, 7) is the result; `start` (K, 3) and `velocity` (N, K, 3) are in `map`.
     """
     for k in range(velocity.shape[1]):
-        bodies[n, k, 0] = start[k, 0] + velocity[n, k, 0] * time
-        bodies[n, k, 1] = start[k, 1] + velocity[n, k, 1] * time
+        bodies[n, k, X] = start[k, 0] + velocity[n, k, 0] * time
+        bodies[n, k, Y] = start[k, 1] + velocity[n, k, 1] * time
         if velocity[n, k, 2] != 0.0:
             heading = wrap(start[k, 2] + velocity[n, k, 2] * time)
-            bodies[n, k, 2] = heading
-            bodies[n, k, 3], bodies[n, k, 4] = math.cos(heading), math.sin(heading)
+            bodies[n, k, HEADING] = heading
+            bodies[n, k, COS], bodies[n, k, SIN] = math.cos(heading), math.sin(heading)
 
 
 @kernel
 def put_body(bodies: Array, n: int, k: int, pose: Array) -> None:
     """Places body k of world n at a pose (3,)."""
-    bodies[n, k, 0], bodies[n, k, 1], bodies[n, k, 2] = pose[0], pose[1], pose[2]
-    bodies[n, k, 3], bodies[n, k, 4] = math.cos(pose[2]), math.sin(pose[2])
-
-
-X, Y, PER_METRE, RADIUS, MOVED = range(5)
-"""Entries of `Cells.frame`."""
+    bodies[n, k, X], bodies[n, k, Y], bodies[n, k, HEADING] = pose[0], pose[1], pose[2]
+    bodies[n, k, COS], bodies[n, k, SIN] = math.cos(pose[2]), math.sin(pose[2])
 
 
 @kernel
@@ -195,22 +163,20 @@ def sort_bodies(bodies: Array, n: int, cells: Cells) -> None:
     count, side = bodies.shape[1], int(math.sqrt(begin.shape[0] - 2))
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
     for k in range(count):
-        if bodies[n, k, 5] > 0.0:
-            low_x, high_x = min(low_x, bodies[n, k, 0]), max(high_x, bodies[n, k, 0])
-            low_y, high_y = min(low_y, bodies[n, k, 1]), max(high_y, bodies[n, k, 1])
+        if bodies[n, k, RADIUS] > 0.0:
+            low_x, high_x = min(low_x, bodies[n, k, X]), max(high_x, bodies[n, k, X])
+            low_y, high_y = min(low_y, bodies[n, k, Y]), max(high_y, bodies[n, k, Y])
     extent = max(high_x - low_x, high_y - low_y, 1e-6)
     per_metre = side / extent if extent < np.inf else 1.0
-    frame[X], frame[Y], frame[PER_METRE], frame[RADIUS], frame[MOVED] = (
-        low_x, low_y, per_metre, 0.0, 0.0,
-    )  # fmt: skip
-    for cell in range(begin.shape[0]):
-        begin[cell] = 0
+    frame[LEFT], frame[BOTTOM], frame[PER_METRE] = low_x, low_y, per_metre
+    frame[LARGEST] = frame[MOVED] = 0.0
+    begin[:] = 0
     for k in range(count):
-        radius, cell = bodies[n, k, 5], side * side
+        radius, cell = bodies[n, k, RADIUS], side * side
         if radius * per_metre <= 1.0:
-            i = _clamp((bodies[n, k, 1] - low_y) * per_metre, side)
-            cell = i * side + _clamp((bodies[n, k, 0] - low_x) * per_metre, side)
-            frame[RADIUS] = max(frame[RADIUS], radius)
+            i = _clamp((bodies[n, k, Y] - low_y) * per_metre, side)
+            cell = i * side + _clamp((bodies[n, k, X] - low_x) * per_metre, side)
+            frame[LARGEST] = max(frame[LARGEST], radius)
         cell_of[k] = cell
         begin[cell + 1] += 1
     for cell in range(begin.shape[0] - 1):
@@ -230,11 +196,11 @@ def bodies_around(x: float, y: float, reach: float, cells: Cells) -> int:
     """Writes to `cells.found` the bodies that may be within `reach` [m] of (x, y); their number."""
     begin, order, frame, found = cells.begin, cells.order, cells.frame, cells.found
     side = int(math.sqrt(begin.shape[0] - 2))
-    reach += frame[RADIUS] + frame[MOVED]
-    left = _clamp((x - reach - frame[X]) * frame[PER_METRE], side)
-    right = _clamp((x + reach - frame[X]) * frame[PER_METRE], side)
-    low = _clamp((y - reach - frame[Y]) * frame[PER_METRE], side)
-    high = _clamp((y + reach - frame[Y]) * frame[PER_METRE], side)
+    reach += frame[LARGEST] + frame[MOVED]
+    left = _clamp((x - reach - frame[LEFT]) * frame[PER_METRE], side)
+    right = _clamp((x + reach - frame[LEFT]) * frame[PER_METRE], side)
+    low = _clamp((y - reach - frame[BOTTOM]) * frame[PER_METRE], side)
+    high = _clamp((y + reach - frame[BOTTOM]) * frame[PER_METRE], side)
     count = 0
     for i in range(low, high + 1):
         for k in range(begin[i * side + left], begin[i * side + right + 1]):

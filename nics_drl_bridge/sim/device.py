@@ -1,7 +1,4 @@
-"""DeviceWorld: one world of a simulator as seen by the devices in it, whatever moves them.
-
-With the covariance of a pose by odometry after a drive, given the noise of the measured twist.
-"""
+"""One world of a simulator: as its devices see it, and with robots that other physics moves."""
 
 from __future__ import annotations
 
@@ -14,34 +11,27 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Simulator
-from nics_drl_bridge.sim.robot_kernels import propagate_in_place
+from nics_drl_bridge.lidar.scanner import Renderer
+from nics_drl_bridge.sim import contact_kernels, step_kernels
+from nics_drl_bridge.sim.scenes import Scenes
+from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Sensed:
-    """Measurements and true state of one robot at a time.
+    """Measurements and true state of one robot at a time."""
 
-    Attributes:
-        odom: (3,) pose by odometry.
-        covariance: (3, 3) of `odom`.
-        twist: (3,) measured body twist.
-        state: (S,) true state.
-        ranges: (B,) scan.
-        pose: (3,) true pose in `map`.
-        before: (3,) true pose one step earlier.
-        period: length of a step [s].
-    """
-
-    odom: Array
-    covariance: Array
-    twist: Array
-    state: Array
-    ranges: NDArray[np.float32]
-    pose: Array
-    before: Array
-    period: float
+    odom: Array  # (3,) pose by odometry
+    covariance: Array  # (3, 3) of `odom`
+    twist: Array  # (3,) measured body twist
+    state: Array  # (S,) true state
+    ranges: NDArray[np.float32]  # (B,) scan
+    pose: Array  # (3,) true pose in `map`
+    before: Array  # (3,) true pose one step earlier
+    period: float  # length of a step [s]
 
     @property
     def true_twist(self) -> Array:
@@ -50,15 +40,12 @@ class Sensed:
 
 
 class DeviceWorld:
-    """Keeps the last command of each robot and the covariance of its odometry.
+    """Keeps the command of each of M robots for the next step and the covariance of its odometry.
 
     Args:
         simulator: moves the robots.
         model: of the robots, with the step of the simulator.
         robots: M.
-
-    Attributes:
-        commands: (M, C) commands for the next step.
     """
 
     def __init__(self, simulator: Simulator, model: SimulatorModel, robots: int) -> None:
@@ -108,15 +95,10 @@ class DeviceWorld:
         """Returns the present values of one robot; the next step may overwrite them."""
         data = self._simulator.data
         return Sensed(
-            data.odom[0, robot],
-            self._covariance[robot],
-            data.twist[0, robot],
-            data.state[0, robot],
-            data.ranges[0, robot],
-            data.pose[0, robot],
-            self._before[robot],
+            data.odom[0, robot], self._covariance[robot], data.twist[0, robot],
+            data.state[0, robot], data.ranges[0, robot], data.pose[0, robot], self._before[robot],
             self._period,
-        )
+        )  # fmt: skip
 
 
 LEAST_VARIANCE = 1e-9
@@ -135,18 +117,78 @@ def step_covariance(std: tuple[float, float], period: float) -> Array:
 
 
 def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Array) -> Array:
-    """Propagates the covariances (M, 3, 3) of poses by odometry by one period.
+    """Propagates the covariances (M, 3, 3) of poses by odometry (M, 3) from before to after.
 
     A heading error rotates the motion that follows: P' = F P F^T + Q, with F the derivative of
-    the new pose with respect to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4).
-
-    Args:
-        covariance: (M, 3, 3) before the period.
-        before: (M, 3) poses by odometry before it.
-        after: (M, 3) poses by odometry after it.
-        added: (3, 3) of one period, see `step_covariance`.
+    the new pose with respect to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4) and
+    Q (3, 3) `added` by a period, see `step_covariance`.
     """
-    after_that = np.array(covariance, np.float64)
-    poses = (np.ascontiguousarray(pose, np.float64) for pose in (before, after))
-    propagate_in_place(after_that, *poses, added)
-    return after_that
+    p, (x, y, _) = np.array(covariance, np.float64), np.subtract(before, after).T
+    turned = np.stack([y, -x], axis=1)  # F differs from the identity only in its last column
+    p[:, :2] += turned[:, :, None] * p[:, 2:]
+    p[:, :, :2] += turned[:, None] * p[:, :, 2:]
+    return p + added
+
+
+@dataclass(frozen=True)
+class Driven:
+    """Motion of the robots in one control period."""
+
+    pose: Array  # (M, 3) true pose of `base_link` in `map` at the end
+    twist: Array  # (M, 3) true body twist at the end [m/s, m/s, rad/s]
+    state: Array  # (M, S) at the end
+    wheels: Array  # (M, 3) pose at the end by wheel odometry, without noise
+    counted: Array  # (M, 3) body twist at the end by wheel odometry
+    touched: NDArray[np.bool_]  # (M,) true for robots that touched anything
+
+
+class DrivenSimulator:
+    """One world of the fast simulator whose robots are moved from outside, by other physics.
+
+    Scenes, motion of the obstacles, noise, faults and scans are those of the FastSimulator for the
+    same seed. Odometry is the wheel odometry with the model's noise.
+
+    Attributes:
+        fast: holds all data; do not call its `step`.
+        wheels: (M, 3) pose by wheel odometry, beginning at the start pose.
+    """
+
+    def __init__(
+        self, model: SimulatorModel, world: World, robots: int = 1, renderer: Renderer = "auto"
+    ) -> None:
+        self.fast = FastSimulator(model, world, robots=robots, renderer=renderer)
+        self._start = self.fast.obstacles[0, :, :3].copy()
+        self.wheels: Array = np.zeros((robots, 3))
+
+    def reset(self, seeds: ArrayLike, starts: ArrayLike | None = None) -> Scenes:
+        """Begins an episode, see `FastSimulator.reset`."""
+        scenes = self.fast.reset(seeds, starts=starts)
+        self.wheels = self.fast.data.pose[0].copy()
+        return scenes
+
+    def begin_period(self) -> None:
+        """Sets the obstacles' velocities for the period that begins."""
+        data = self.fast.data
+        self._start = data.bodies[0, :, :3].copy()
+        step_kernels.begin_period(self.fast.packed[0])
+
+    def move_obstacles(self, time: float) -> Array:
+        """Moves the obstacles to their poses `time` [s] after the beginning of the period.
+
+        Returns:
+            (K, 7) see `lidar.shapes.BODY`.
+        """
+        data = self.fast.data
+        contact_kernels.move_obstacles(data.bodies, self._start, data.velocity, 0, time)
+        return data.bodies[0, : data.velocity.shape[1]]
+
+    def end_period(self, driven: Driven) -> None:
+        """Takes over the motion of the robots and measures what they sense."""
+        data = self.fast.data
+        data.pose[0], data.state[0] = driven.pose, driven.state
+        data.collided[0] |= driven.touched.astype(np.uint8)
+        step_kernels.end_period(
+            self.fast.packed[0], driven.twist[None], self.wheels[None], driven.wheels[None],
+            driven.counted[None],
+        )  # fmt: skip
+        self.wheels = driven.wheels.copy()

@@ -21,9 +21,10 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SIN, OutlineArrays, X, Y
 from nics_drl_bridge.robot.kernels import move
-from nics_drl_bridge.sim.collision_kernels import map_bound, segment_distance2
-from nics_drl_bridge.sim.state import Array, MapField, OutlineArrays
+from nics_drl_bridge.sim import collision_kernels as collision
+from nics_drl_bridge.sim.state import Array, MapField
 
 VX, VY, TURN, STOP, FLIGHT = range(5)
 """Columns of `flights`: velocity [m/s, m/s, rad/s], and time of its stop in the substep [s]."""
@@ -40,22 +41,13 @@ MOST_LOOKS = 2000
 
 
 class Moving(NamedTuple):
-    """The bodies of one world within a substep.
+    """The bodies of one world within a substep."""
 
-    Attributes:
-        world: (K + M, 7) obstacles, then robots, as the substep begins.
-        flights: (K + M, FLIGHT) their motion in it: velocities of obstacles in the map frame, those
-            of robots in the body frame.
-        first: index of the first robot.
-        outlines: of all shapes.
-        series: see `robot.kernels`.
-    """
-
-    world: Array
-    flights: Array
-    first: int
+    world: Array  # (K + M, 7) obstacles, then robots, as the substep begins
+    flights: Array  # (K + M, FLIGHT) their motion; obstacles in the map frame, robots in their own
+    first: int  # index of the first robot
     outlines: OutlineArrays
-    series: Array
+    series: Array  # see `robot.kernels`
 
 
 class Edge(NamedTuple):
@@ -68,22 +60,15 @@ class Edge(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """An edge of a body in the map at a time, and how it moves.
-
-    Attributes:
-        edge: in the map.
-        x, y: origin of the body [m].
-        vx, vy, turn: its velocity in the map [m/s, m/s, rad/s].
-        bend: acceleration of its origin [m/s^2].
-    """
+    """An edge of a body in the map at a time, and how it moves."""
 
     edge: Edge
-    x: float
+    x: float  # origin of the body [m]
     y: float
-    vx: float
+    vx: float  # its velocity in the map [m/s]
     vy: float
-    turn: float
-    bend: float
+    turn: float  # [rad/s]
+    bend: float  # acceleration of its origin [m/s^2]
 
 
 @kernel
@@ -93,7 +78,7 @@ def pose_at(b: int, time: float, moving: Moving) -> tuple[float, float, float, f
         return 0.0, 0.0, 1.0, 0.0
     world, flights = moving.world, moving.flights
     time = min(time, flights[b, STOP])
-    x, y, c, s = world[b, 0], world[b, 1], world[b, 3], world[b, 4]
+    x, y, c, s = world[b, X], world[b, Y], world[b, COS], world[b, SIN]
     vx, vy, turn = flights[b, VX], flights[b, VY], flights[b, TURN] * time
     if b >= moving.first:
         return move(x, y, c, s, vx, vy, turn, time, moving.series)  # type: ignore[no-any-return]
@@ -209,11 +194,8 @@ def _free_time(
 ) -> tuple[float, float, float]:
     """Returns a time in which two edges cannot meet, and the rates of the corners that bound it.
 
-    Args:
-        p, q: the edges, `gap` [m] apart along n, which points from q to p.
-        nx, ny: n.
-        gap: between their surfaces [m].
-        bend: upper bound on the acceleration between them [m/s^2].
+    The surfaces are `gap` [m] apart along n, which points from q to p; `bend` bounds the
+    acceleration between them [m/s^2].
     """
     far, far2 = nx * p.edge.ax + ny * p.edge.ay, nx * p.edge.bx + ny * p.edge.by
     near, near2 = nx * q.edge.ax + ny * q.edge.ay, nx * q.edge.bx + ny * q.edge.by
@@ -240,14 +222,9 @@ def touch(
     a: int, edge: Edge, round_a: float, b: int, other: Edge, round_b: float,
     begin: float, until: float, moving: Moving,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Finds the first contact of an edge of one body with an edge of another.
+    """Finds the first contact of an edge of body a with an edge of body b.
 
-    Args:
-        a, b: the bodies.
-        edge, other: their edges in the bodies' frames [m].
-        round_a, round_b: the radii around them [m].
-        begin, until: times [s].
-        moving: the bodies.
+    The edges are in the bodies' frames, with a radius [m] around each.
 
     Returns:
         The time [s], inf if not before `until`; and the velocities of the nearest points of both
@@ -277,8 +254,9 @@ def touch(
 
 
 @kernel
-def _edge_of(v: int, begin: int, end: int, corners: Array) -> Edge:
+def _edge_of(v: int, outline: collision.Outline) -> Edge:
     """Returns edge v of an outline, or the origin of a circle's, which has none."""
+    corners, begin, end = outline.corners, outline.begin, outline.end
     if begin == end:
         return Edge(0.0, 0.0, 0.0, 0.0)
     i, j = begin + v, begin + (v + 1 if begin + v + 1 < end else 0)
@@ -286,9 +264,9 @@ def _edge_of(v: int, begin: int, end: int, corners: Array) -> Edge:
 
 
 @kernel
-def _edges(begin: int, end: int) -> int:
+def _edges(outline: collision.Outline) -> int:
     """Number of edges of an outline: one of a segment, and a circle counts as a single point."""
-    return end - begin if end - begin > 2 else 1
+    return outline.end - outline.begin if outline.end - outline.begin > 2 else 1
 
 
 @kernel
@@ -297,29 +275,24 @@ def _touch_edge(
 ) -> None:
     """Makes `event` (EVENT,) the first contact of body a with an edge of body b, if it is sooner.
 
-    Args:
-        event: of body a.
-        a, b: the bodies.
-        other: an edge of b, in its frame.
-        round_b: the radius around it [m].
-        begin: time from which to search [s].
-        moving: the bodies.
+    The edge is in the frame of body b, with a radius [m] around it; `begin` [s] is the time from
+    which to search.
     """
-    world, flights, outlines = moving.world, moving.flights, moving.outlines
+    world, flights = moving.world, moving.flights
     x, y, _, _ = pose_at(a, begin, moving)
     ox, oy, oc, os = pose_at(b, begin, moving)
     there = _in_map(other, ox, oy, oc, os)
     spin = abs(flights[b, TURN]) if b >= 0 and begin < flights[b, STOP] else 0.0
     speed = speed_at(a, begin, flights) + speed_at(b, begin, flights) + spin * _reach(other)
-    far = world[a, 5] + round_b + speed * (event[TIME] - begin)
+    far = world[a, RADIUS] + round_b + speed * (event[TIME] - begin)
     if speed == 0.0 and (begin >= flights[a, STOP] or flights[a, TURN] == 0.0):
         return
-    if segment_distance2(x, y, there.ax, there.ay, there.bx, there.by) > far * far:
+    if collision.segment_distance2(x, y, there.ax, there.ay, there.bx, there.by) > far * far:
         return
-    low, high = outlines.first[int(world[a, 6])], outlines.first[int(world[a, 6]) + 1]
-    round_a = world[a, 5] if low == high else 0.0
-    for v in range(_edges(low, high)):
-        edge = _edge_of(v, low, high, outlines.corners)
+    outline = collision.outline_of(world[a], moving.outlines)
+    round_a = world[a, RADIUS] if outline.begin == outline.end else 0.0
+    for v in range(_edges(outline)):
+        edge = _edge_of(v, outline)
         time, own, others = touch(a, edge, round_a, b, other, round_b, begin, event[TIME], moving)
         if time < event[TIME]:
             event[TIME], event[WITH], event[OWN], event[OTHERS] = time, b, own, others
@@ -328,18 +301,17 @@ def _touch_edge(
 @kernel
 def touch_body(event: Array, a: int, b: int, begin: float, moving: Moving) -> None:
     """Does the same as `_touch_edge` for all of body b."""
-    world, flights, outlines = moving.world, moving.flights, moving.outlines
+    world, flights = moving.world, moving.flights
     x, y, _, _ = pose_at(a, begin, moving)
     ox, oy, _, _ = pose_at(b, begin, moving)
     speed = speed_at(a, begin, flights) + speed_at(b, begin, flights)
-    far = world[a, 5] + world[b, 5] + speed * (event[TIME] - begin)
+    far = world[a, RADIUS] + world[b, RADIUS] + speed * (event[TIME] - begin)
     if (x - ox) * (x - ox) + (y - oy) * (y - oy) > far * far:
         return
-    low, high = outlines.first[int(world[b, 6])], outlines.first[int(world[b, 6]) + 1]
-    round_b = world[b, 5] if low == high else 0.0
-    for v in range(_edges(low, high)):
-        edge = _edge_of(v, low, high, outlines.corners)
-        _touch_edge(event, a, b, edge, round_b, begin, moving)
+    outline = collision.outline_of(world[b], moving.outlines)
+    round_b = world[b, RADIUS] if outline.begin == outline.end else 0.0
+    for v in range(_edges(outline)):
+        _touch_edge(event, a, b, _edge_of(v, outline), round_b, begin, moving)
 
 
 @kernel
@@ -357,40 +329,33 @@ def _solid(distances: Array, i: int, j: int) -> bool:
 
 
 @kernel
-def _side_of_cell(i: int, j: int, side: int, frame: Array) -> Edge:
+def _side_of_cell(i: int, j: int, side: int, grid: MapField) -> Edge:
     """Returns a side of cell (i, j) of a map: below, right, above or left, in the map."""
-    size, c, s = frame[4], frame[2], frame[3]
-    u, v = (0, 1, 1, 0)[side], (1, 1, 0, 0)[side]
+    size, u, v = grid.cell, (0, 1, 1, 0)[side], (1, 1, 0, 0)[side]
     u2, v2 = (1, 1, 0, 0)[side], (1, 0, 0, 1)[side]
-    x, y, x2, y2 = (j + u) * size, (i + v) * size, (j + u2) * size, (i + v2) * size
-    return Edge(
-        frame[0] + c * x - s * y, frame[1] + s * x + c * y,
-        frame[0] + c * x2 - s * y2, frame[1] + s * x2 + c * y2,
-    )  # fmt: skip
+    local = Edge((j + u) * size, (i + v) * size, (j + u2) * size, (i + v2) * size)
+    return _in_map(local, grid.x, grid.y, grid.cos, grid.sin)  # type: ignore[no-any-return]
 
 
 @kernel
 def touch_map(event: Array, a: int, grid: MapField, begin: float, moving: Moving) -> None:
     """Does the same as `_touch_edge` for the sides of the solid cells of a map."""
-    distances, frame, world = grid.distances, grid.frame, moving.world
+    distances, world = grid.distances, moving.world
     if distances.size == 0:
         return
     speed = speed_at(a, begin, moving.flights)
-    if map_bound(world[a], grid) > speed * event[TIME]:
+    if collision.map_bound(world[a], grid) > speed * event[TIME]:
         return
-    path = speed * (event[TIME] - begin)
     px, py, _, _ = pose_at(a, begin, moving)
-    size, c, s = frame[4], frame[2], frame[3]
-    x, y = c * (px - frame[0]) + s * (py - frame[1]), c * (py - frame[1]) - s * (px - frame[0])
-    far = world[a, 5] + path + SLACK
-    low_i, high_i = max(math.floor((y - far) / size), 0), math.floor((y + far) / size)
-    low_j, high_j = max(math.floor((x - far) / size), 0), math.floor((x + far) / size)
-    for i in range(low_i, min(high_i, distances.shape[0] - 1) + 1):
-        for j in range(low_j, min(high_j, distances.shape[1] - 1) + 1):
+    x, y = collision.in_grid(px, py, grid)
+    far = world[a, RADIUS] + speed * (event[TIME] - begin) + SLACK
+    low_i, end_i, low_j, end_j = collision.cells_near(x, y, far, grid)
+    for i in range(low_i, end_i):
+        for j in range(low_j, end_j):
             if distances[i, j] > 0.0:
                 continue
             for side in range(4):
                 # A side between two solid cells is met by nothing.
                 if not _solid(distances, i + (1, 0, -1, 0)[side], j + (0, 1, 0, -1)[side]):
-                    edge = _side_of_cell(i, j, side, frame)
+                    edge = _side_of_cell(i, j, side, grid)
                     _touch_edge(event, a, -1, edge, 0.0, begin, moving)

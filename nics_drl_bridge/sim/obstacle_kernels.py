@@ -1,18 +1,15 @@
 """Compiled motion of obstacles: one call at reset, and one per world and control period.
 
-Shared arguments: `marks` (N, K, F) the obstacles' memory, and `plans`, the rows (K, P) and
-waypoints (Q, 2) of `obstacles.plan_arrays`; their columns are in `separation_kernels`. `bodies`
-(N, K + M, 7), obstacles, then from index `first` the robots, see `lidar.shapes.BODY`. Each
+The columns of the obstacles' memory `marks` and of their plans are in `separation_kernels`. Each
 obstacle is represented by its enclosing circle. All draws depend on seed, step and k alone.
 
-Compiled pedestrians: the social force model of Helbing and Molnar (1995).
-
-"Social force model for pedestrian dynamics", Phys. Rev. E 51, 4282; equation numbers are theirs.
-A walker is driven towards its goal (2), repelled by others along ellipses that anticipate their
-next step (3, 4) and by walls (5), less by what is out of sight (8), and disturbed by a
-fluctuation. Bodies are discs of any size, so distances are between surfaces. The anticipated step
-is that of the relative motion (Johansson, Helbing, Shukla 2007): with the other's motion alone, a
-walker reacts too late to a robot that stands in its way, and pushes against it.
+Pedestrians move by the social force model of Helbing and Molnar (1995), "Social force model for
+pedestrian dynamics", Phys. Rev. E 51, 4282; equation numbers are theirs. A walker is driven towards
+its goal (2), repelled by others along ellipses that anticipate their next step (3, 4) and by walls
+(5), less by what is out of sight (8), and disturbed by a fluctuation. Bodies are discs of any size,
+so distances are between surfaces. The anticipated step is that of the relative motion (Johansson,
+Helbing, Shukla 2007): with the other's motion alone, a walker reacts too late to a robot that
+stands in its way, and pushes against it.
 """
 
 from __future__ import annotations
@@ -21,14 +18,18 @@ import math
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, X, Y
+from nics_drl_bridge.robot.kernels import wrap
 from nics_drl_bridge.sim import separation_kernels as at
+from nics_drl_bridge.sim.collision_kernels import on_wall
 from nics_drl_bridge.sim.separation_kernels import (
+    Traffic,
     clearance,
     map_direction,
     map_distance,
-    on_wall,
     restrain,
 )
+from nics_drl_bridge.sim.state import Array, State, Surroundings
 
 DRAWS = 64
 """Greatest number of draws per obstacle and period."""
@@ -42,158 +43,6 @@ TRIES = 8
 """Directions that it tries in one period."""
 MOST_CORNERS = 32
 """Greatest number of waypoints that a patrol passes in a period."""
-
-
-@kernel(allocates=True)
-def _wrap(angle):  # type: ignore[no-untyped-def]
-    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
-
-
-@kernel(allocates=True)
-def _share(seed, counter):  # type: ignore[no-untyped-def]
-    return random.uniform(seed, random.MOTION_STREAM, counter)
-
-
-@kernel(allocates=True)
-def begin(marks, n, bodies, plans, half, seed):  # type: ignore[no-untyped-def]
-    """Begins an episode of world n: draws the speed and initial direction of each obstacle.
-
-    Args:
-        half: (2,) half the size of the field [m].
-        seed: of the episode.
-    """
-    rows, _ = plans
-    for k in range(marks.shape[1]):
-        mark, row, counter = marks[n, k], rows[k], k * DRAWS
-        mark[:] = 0.0
-        if row[at.KIND] == at.STILL:
-            continue
-        low, high = row[at.SPEED_LOW], row[at.SPEED_HIGH]
-        mark[at.SPEED] = low + (high - low) * _share(seed, counter)
-        mark[at.DIRECTION] = (2.0 * _share(seed, counter + 1) - 1.0) * math.pi
-        mark[at.AIM] = mark[at.DIRECTION]
-        mark[at.GOAL_X], mark[at.GOAL_Y] = bodies[n, k, 0], bodies[n, k, 1]
-        mark[at.UNTIL], mark[at.WAY] = -1.0, 1.0
-
-
-@kernel(allocates=True)
-def steer(velocity, marks, n, bodies, first, speeds, plans, walls, half, seed, step, period, distances):  # type: ignore[no-untyped-def]  # fmt: skip  # noqa: E501
-    """Sets the velocities of the obstacles of world n for one control period.
-
-    Moving by its velocity for the period, an obstacle neither leaves the field nor crosses a wall
-    nor touches another obstacle, and does not run into a robot that keeps its velocity.
-
-    Args:
-        velocity: (N, K, 3) result [m/s, m/s, rad/s] in `map`; 0 for those that stand still.
-        speeds: (M, 2) velocity of its robots in `map` [m/s].
-        walls: (W, 4).
-        half: (2,) half the size of the field [m].
-        seed: of the episode.
-        step: control periods since the reset, from 0 or 1.
-        period: [s].
-        distances: of a static map, see `obstacles.distance_arrays`.
-    """
-    rows, waypoints = plans
-    count = velocity.shape[1]
-    scene = (bodies[n], walls, half, distances)
-    draws = (step + 1) * count
-    for k in range(count):  # walkers first: they react to the velocities of the last period
-        velocity[n, k, :] = 0.0
-        if rows[k, at.KIND] == at.PEDESTRIAN and bodies[n, k, 5] > 0.0:
-            velocity[n, k, 0], velocity[n, k, 1] = walk(
-                marks[n], k, scene, first, speeds, rows[k], seed, (draws + k) * DRAWS, step,
-                period,
-            )  # fmt: skip
-    for k in range(count):
-        kind, mark = rows[k, at.KIND], marks[n, k]
-        if kind == at.STILL or bodies[n, k, 5] <= 0.0:
-            continue
-        dx, dy = velocity[n, k, 0] * period, velocity[n, k, 1] * period
-        if kind == at.WANDER:
-            dx, dy = _wander(mark, k, scene, seed, (draws + k) * DRAWS, period)
-        elif kind == at.PATROL:
-            dx, dy = _follow(mark, bodies[n, k], rows[k], waypoints, period, False)
-        wished_x, wished_y = dx, dy
-        dx, dy = restrain(dx, dy, k, scene, first, speeds, rows, period, kind != at.PATROL)
-        if kind == at.PATROL and dx == wished_x and dy == wished_y:
-            _follow(mark, bodies[n, k], rows[k], waypoints, period, True)
-        mark[at.VX], mark[at.VY] = dx / period, dy / period
-        velocity[n, k, 0], velocity[n, k, 1] = mark[at.VX], mark[at.VY]
-        if dx != 0.0 or dy != 0.0:  # it faces the direction of motion
-            turn = _wrap(math.atan2(dy, dx) - bodies[n, k, 2]) / period
-            velocity[n, k, 2] = min(max(turn, -TURN), TURN)
-
-
-@kernel(allocates=True)
-def _blocked(x, y, angle, reach, here, room, k, scene):  # type: ignore[no-untyped-def]
-    """True if something is near the path ahead, and nearer than at the outset."""
-    for part in (0.5, 1.0):
-        way = part * reach
-        free, _, _ = clearance(x + way * math.cos(angle), y + way * math.sin(angle), k, scene)
-        if free < room and free < here:
-            return True
-    return False
-
-
-@kernel(allocates=True)
-def _wander(mark, k, scene, seed, counter, period):  # type: ignore[no-untyped-def]
-    """Displacement of a wandering obstacle: ahead, turning to a free direction if blocked."""
-    body, speed = scene[0][k], mark[at.SPEED]
-    x, y, radius = body[0], body[1], body[5]
-    here, nx, ny = clearance(x, y, k, scene)
-    reach = LOOK * speed + radius
-    aim, near = mark[at.AIM], here < reach + radius + MARGIN
-    if near and _blocked(x, y, aim, reach, here, radius + MARGIN, k, scene):
-        away = math.atan2(-ny, -nx)
-        for i in range(TRIES):
-            aim = away + (_share(seed, counter + i) - 0.5) * math.pi
-            if not _blocked(x, y, aim, reach, here, radius + MARGIN, k, scene):
-                break
-        mark[at.AIM] = aim
-    turn = _wrap(aim - mark[at.DIRECTION])
-    mark[at.DIRECTION] = _wrap(mark[at.DIRECTION] + min(max(turn, -TURN * period), TURN * period))
-    # It slows down in turns, so that it does not move far off its intended direction.
-    way = speed * period * max(math.cos(aim - mark[at.DIRECTION]), 0.0)
-    return way * math.cos(mark[at.DIRECTION]), way * math.sin(mark[at.DIRECTION])
-
-
-@kernel(allocates=True)
-def _follow(mark, body, row, waypoints, period, keep):  # type: ignore[no-untyped-def]
-    """Displacement of a patrol along its path, by the arc length of a period.
-
-    Args:
-        keep: whether its progress along the waypoints is stored.
-    """
-    index, way, rest = int(mark[at.INDEX]), mark[at.WAY], mark[at.REST]
-    x, y, left = body[0], body[1], period
-    for _ in range(MOST_CORNERS):
-        pause = min(rest, left)
-        rest, left = rest - pause, left - pause
-        if left <= 0.0:
-            break
-        goal = waypoints[int(row[at.FIRST]) + index]
-        away, reach = math.hypot(goal[0] - x, goal[1] - y), mark[at.SPEED] * left
-        if away > reach:
-            x, y = x + (goal[0] - x) * reach / away, y + (goal[1] - y) * reach / away
-            break
-        x, y, left, rest = goal[0], goal[1], left - away / mark[at.SPEED], row[at.PAUSE]
-        index, way = _after(index, way, row)
-    if keep:
-        mark[at.INDEX], mark[at.WAY], mark[at.REST] = index, way, rest
-    return x - body[0], y - body[1]
-
-
-@kernel(allocates=True)
-def _after(index, way, row):  # type: ignore[no-untyped-def]
-    """Returns the next waypoint and the direction along the list: 1, or -1 for backwards."""
-    count = int(row[at.COUNT])
-    if row[at.LOOP] != 0.0:
-        return (index + 1) % count, 1.0
-    if not 0 <= index + way < count:
-        way = -way
-    return index + int(way), way
-
-
 NEAREST = 1e-3
 """Least distance for which a force is computed [m]: at 0 it has no direction."""
 FAR = 8.0
@@ -211,7 +60,126 @@ PATIENCE = 5.0
 CANDIDATES = 16
 
 
-@kernel(allocates=True)
+@kernel
+def _share(seed, counter):  # type: ignore[no-untyped-def]
+    return random.uniform(seed, random.MOTION_STREAM, counter)
+
+
+@kernel
+def begin(n: int, state: State, plans: Array) -> None:
+    """Begins an episode of world n: draws the speed and initial direction of each obstacle."""
+    seed, bodies = state.seeds[n], state.bodies
+    for k in range(plans.shape[0]):
+        mark, row, counter = state.marks[n, k], plans[k], k * DRAWS
+        mark[:] = 0.0
+        if row[at.KIND] == at.STILL:
+            continue
+        low, high = row[at.SPEED_LOW], row[at.SPEED_HIGH]
+        mark[at.SPEED] = low + (high - low) * _share(seed, counter)
+        mark[at.DIRECTION] = (2.0 * _share(seed, counter + 1) - 1.0) * math.pi
+        mark[at.AIM] = mark[at.DIRECTION]
+        mark[at.GOAL_X], mark[at.GOAL_Y] = bodies[n, k, X], bodies[n, k, Y]
+        mark[at.UNTIL], mark[at.WAY] = -1.0, 1.0
+
+
+@kernel
+def steer(n: int, state: State, scene: Surroundings, period: float, speeds: Array) -> None:
+    """Sets the velocities of the obstacles of world n for the period [s] that begins.
+
+    Moving by its velocity for the period, an obstacle neither leaves the field nor crosses a wall
+    nor touches another obstacle, and does not run into a robot that keeps its velocity; `speeds`
+    (M, 2) are the robots' [m/s] in `map`.
+    """
+    velocity, seed, step, movers = state.velocity[n], state.seeds[n], state.steps[n], scene.movers
+    count, plans, bodies = velocity.shape[0], movers.plans, state.bodies[n]
+    traffic = Traffic(bodies, count, speeds, plans, scene.walls, movers.half, scene.grid, period)
+    draws = (step + 1) * count
+    for k in range(count):  # walkers first: they react to the velocities of the last period
+        velocity[k, :] = 0.0
+        if plans[k, at.KIND] == at.PEDESTRIAN and bodies[k, RADIUS] > 0.0:
+            velocity[k, 0], velocity[k, 1] = _walk(
+                state.marks[n], k, traffic, seed, (draws + k) * DRAWS, step
+            )
+    for k in range(count):
+        kind, mark, body = plans[k, at.KIND], state.marks[n, k], bodies[k]
+        if kind == at.STILL or body[RADIUS] <= 0.0:
+            continue
+        dx, dy = velocity[k, 0] * period, velocity[k, 1] * period
+        if kind == at.WANDER:
+            dx, dy = _wander(mark, k, traffic, seed, (draws + k) * DRAWS)
+        elif kind == at.PATROL:
+            dx, dy = _follow(mark, body, plans[k], movers.waypoints, period, False)
+        wished_x, wished_y = dx, dy
+        dx, dy = restrain(dx, dy, k, traffic, kind != at.PATROL)
+        if kind == at.PATROL and dx == wished_x and dy == wished_y:
+            _follow(mark, body, plans[k], movers.waypoints, period, True)
+        mark[at.VX], mark[at.VY] = dx / period, dy / period
+        velocity[k, 0], velocity[k, 1] = mark[at.VX], mark[at.VY]
+        if dx != 0.0 or dy != 0.0:  # it faces the direction of motion
+            turn = wrap(math.atan2(dy, dx) - body[HEADING]) / period
+            velocity[k, 2] = min(max(turn, -TURN), TURN)
+
+
+@kernel
+def _blocked(x, y, angle, reach, here, room, k, traffic):  # type: ignore[no-untyped-def]
+    """True if something is near the path ahead, and nearer than at the outset."""
+    for part in (0.5, 1.0):
+        way = part * reach
+        free, _, _ = clearance(x + way * math.cos(angle), y + way * math.sin(angle), k, traffic)
+        if free < room and free < here:
+            return True
+    return False
+
+
+@kernel
+def _wander(mark, k, traffic, seed, counter):  # type: ignore[no-untyped-def]
+    """Displacement of a wandering obstacle: ahead, turning to a free direction if blocked."""
+    body, speed, period = traffic.bodies[k], mark[at.SPEED], traffic.period
+    x, y, radius = body[X], body[Y], body[RADIUS]
+    here, nx, ny = clearance(x, y, k, traffic)
+    reach = LOOK * speed + radius
+    aim, near = mark[at.AIM], here < reach + radius + MARGIN
+    if near and _blocked(x, y, aim, reach, here, radius + MARGIN, k, traffic):
+        away = math.atan2(-ny, -nx)
+        for i in range(TRIES):
+            aim = away + (_share(seed, counter + i) - 0.5) * math.pi
+            if not _blocked(x, y, aim, reach, here, radius + MARGIN, k, traffic):
+                break
+        mark[at.AIM] = aim
+    turn = wrap(aim - mark[at.DIRECTION])
+    mark[at.DIRECTION] = wrap(mark[at.DIRECTION] + min(max(turn, -TURN * period), TURN * period))
+    # It slows down in turns, so that it does not move far off its intended direction.
+    way = speed * period * max(math.cos(aim - mark[at.DIRECTION]), 0.0)
+    return way * math.cos(mark[at.DIRECTION]), way * math.sin(mark[at.DIRECTION])
+
+
+@kernel
+def _follow(mark, body, row, waypoints, period, keep):  # type: ignore[no-untyped-def]
+    """Displacement of a patrol along its path in a period; `keep` stores its progress."""
+    index, way, rest = int(mark[at.INDEX]), mark[at.WAY], mark[at.REST]
+    x, y, left = body[X], body[Y], period
+    for _ in range(MOST_CORNERS):
+        pause = min(rest, left)
+        rest, left = rest - pause, left - pause
+        if left <= 0.0:
+            break
+        goal = waypoints[int(row[at.FIRST]) + index]
+        away, reach = math.hypot(goal[0] - x, goal[1] - y), mark[at.SPEED] * left
+        if away > reach:
+            x, y = x + (goal[0] - x) * reach / away, y + (goal[1] - y) * reach / away
+            break
+        x, y, left, rest = goal[0], goal[1], left - away / mark[at.SPEED], row[at.PAUSE]
+        if row[at.LOOP] != 0.0:
+            index = (index + 1) % int(row[at.COUNT])
+        else:
+            way = way if 0 <= index + way < int(row[at.COUNT]) else -way
+            index += int(way)
+    if keep:
+        mark[at.INDEX], mark[at.WAY], mark[at.REST] = index, way, rest
+    return x - body[X], y - body[Y]
+
+
+@kernel
 def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-untyped-def]
     """Computes the force (3, 4) of another walker; 2 b = sqrt((|r| + |r - v dt|)^2 - (v dt)^2).
 
@@ -236,27 +204,20 @@ def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-un
     return size * (rx / one + qx / two), size * (ry / one + qy / two)
 
 
-@kernel(allocates=True)
-def _sight(ex, ey, fx, fy, row):  # type: ignore[no-untyped-def]
-    """Weight (8) of a force on a walker that looks along e: 1, or less from behind."""
-    seen = -(ex * fx + ey * fy) >= row[at.VIEW] * math.sqrt(fx * fx + fy * fy)
-    return 1.0 if seen else row[at.BEHIND]
-
-
-@kernel(allocates=True)
-def _from_bodies(k, ex, ey, bodies, marks, first, speeds, row):  # type: ignore[no-untyped-def]
+@kernel
+def _from_bodies(k, ex, ey, marks, traffic):  # type: ignore[no-untyped-def]
     """Sums the forces of all other bodies on walker k: walkers, obstacles, robots."""
-    ax, ay = 0.0, 0.0
+    bodies, first, row, ax, ay = traffic.bodies, traffic.first, traffic.plans[k], 0.0, 0.0
     for j in range(bodies.shape[0]):
-        if j == k or bodies[j, 5] <= 0.0:
+        if j == k or bodies[j, RADIUS] <= 0.0:
             continue
-        rx, ry = bodies[k, 0] - bodies[j, 0], bodies[k, 1] - bodies[j, 1]
+        rx, ry = bodies[k, X] - bodies[j, X], bodies[k, Y] - bodies[j, Y]
         if j < first:
             vx, vy = marks[j, at.VX], marks[j, at.VY]
         else:
-            vx, vy = speeds[j - first, 0], speeds[j - first, 1]
+            vx, vy = traffic.speeds[j - first, 0], traffic.speeds[j - first, 1]
         vx, vy = vx - marks[k, at.VX], vy - marks[k, at.VY]
-        near = bodies[k, 5] + bodies[j, 5]
+        near = bodies[k, RADIUS] + bodies[j, RADIUS]
         far = near + FAR * row[at.RANGE] + math.sqrt(vx * vx + vy * vy) * row[at.FORESIGHT]
         away2 = rx * rx + ry * ry
         if away2 > far * far or away2 == 0.0:
@@ -266,15 +227,18 @@ def _from_bodies(k, ex, ey, bodies, marks, first, speeds, row):  # type: ignore[
         fx, fy = repulsion(
             rx * share, ry * share, vx, vy, row[at.FORESIGHT], row[at.REPULSION], row[at.RANGE]
         )
-        weight = _sight(ex, ey, fx, fy, row)
+        # Less (8) from outside the angle of sight of a walker that looks along e.
+        seen = -(ex * fx + ey * fy) >= row[at.VIEW] * math.sqrt(fx * fx + fy * fy)
+        weight = 1.0 if seen else row[at.BEHIND]
         ax, ay = ax + weight * fx, ay + weight * fy
     return ax, ay
 
 
-@kernel(allocates=True)
-def _from_walls(x, y, radius, walls, distances, row):  # type: ignore[no-untyped-def]
+@kernel
+def _from_walls(k, traffic):  # type: ignore[no-untyped-def]
     """Sums the forces (5) of the nearest point of each wall, and of the static map."""
-    ax, ay, reach = 0.0, 0.0, row[at.WALL_RANGE]
+    body, row, walls, ax, ay = traffic.bodies[k], traffic.plans[k], traffic.walls, 0.0, 0.0
+    x, y, radius, reach = body[X], body[Y], body[RADIUS], row[at.WALL_RANGE]
     far = radius + FAR * reach
     for w in range(walls.shape[0]):
         px, py = on_wall(x, y, walls[w])
@@ -284,58 +248,49 @@ def _from_walls(x, y, radius, walls, distances, row):  # type: ignore[no-untyped
             away = math.sqrt(away2)
             size = row[at.WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
             ax, ay = ax + size * ox / away, ay + size * oy / away
-    away = map_distance(x, y, distances)
+    away = map_distance(x, y, traffic.grid)
     if away < far:
-        nx, ny = map_direction(x, y, distances)
+        nx, ny = map_direction(x, y, traffic.grid)
         size = row[at.WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
         ax, ay = ax - size * nx, ay - size * ny
     return ax, ay
 
 
-@kernel(allocates=True)
-def _new_goal(mark, k, scene, seed, counter, step, period):  # type: ignore[no-untyped-def]
+@kernel
+def _new_goal(mark, k, traffic, seed, counter, step):  # type: ignore[no-untyped-def]
     """Draws the next goal of walker k; the last draw is kept if none is free."""
-    bodies, _, half, _ = scene
-    x, y, radius = bodies[k, 0], bodies[k, 1], bodies[k, 5]
+    body, half = traffic.bodies[k], traffic.half
+    x, y, radius = body[X], body[Y], body[RADIUS]
     wide, deep = max(half[0] - radius - ROOM, 0.0), max(half[1] - radius - ROOM, 0.0)
     for i in range(CANDIDATES):
-        gx = (2.0 * random.uniform(seed, random.MOTION_STREAM, counter + 2 * i) - 1.0) * wide
-        gy = (2.0 * random.uniform(seed, random.MOTION_STREAM, counter + 2 * i + 1) - 1.0) * deep
+        gx = (2.0 * _share(seed, counter + 2 * i) - 1.0) * wide
+        gy = (2.0 * _share(seed, counter + 2 * i + 1) - 1.0) * deep
         mark[at.GOAL_X], mark[at.GOAL_Y] = gx, gy
         if math.hypot(gx - x, gy - y) >= LEAST_WALK:
-            free, _, _ = clearance(gx, gy, k, scene)
+            free, _, _ = clearance(gx, gy, k, traffic)
             if free >= radius + ROOM:
                 break
     way = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)
-    mark[at.UNTIL] = step + (2.0 * way / mark[at.SPEED] + PATIENCE) / period
+    mark[at.UNTIL] = step + (2.0 * way / mark[at.SPEED] + PATIENCE) / traffic.period
 
 
-@kernel(allocates=True)
-def walk(marks, k, scene, first, speeds, row, seed, counter, step, period):  # type: ignore[no-untyped-def]
-    """Returns the next velocity of walker k and updates its goal in its row of marks.
+@kernel
+def _walk(marks, k, traffic, seed, counter, step):  # type: ignore[no-untyped-def]
+    """Returns the next velocity of walker k in `map` [m/s]; its row of `marks` gets its goal.
 
-    Args:
-        marks: (K, F) of this world, columns as in `separation_kernels`.
-        scene, first, speeds: see `separation_kernels`.
-        row: (P,) the walker's plan.
-        seed, counter: of the random draws; it takes fewer than 64.
-        step: periods since the reset.
-        period: [s].
-
-    Returns:
-        vx, vy in `map` [m/s].
+    It takes fewer than `DRAWS` draws from `counter` on; `step` counts periods since the reset.
     """
-    bodies, walls, _, distances = scene
-    mark, x, y = marks[k], bodies[k, 0], bodies[k, 1]
+    mark, row, body, period = marks[k], traffic.plans[k], traffic.bodies[k], traffic.period
+    x, y = body[X], body[Y]
     away = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)
     if step >= mark[at.UNTIL] or away < ARRIVED:
-        _new_goal(mark, k, scene, seed, counter + 4, step, period)
+        _new_goal(mark, k, traffic, seed, counter + 4, step)
         away = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)
     ex, ey = 0.0, 0.0
     if away > 0.0:
         ex, ey = (mark[at.GOAL_X] - x) / away, (mark[at.GOAL_Y] - y) / away
-    ax, ay = _from_bodies(k, ex, ey, bodies, marks, first, speeds, row)
-    bx, by = _from_walls(x, y, bodies[k, 5], walls, distances, row)
+    ax, ay = _from_bodies(k, ex, ey, marks, traffic)
+    bx, by = _from_walls(k, traffic)
     ax += bx + (mark[at.SPEED] * ex - mark[at.VX]) / row[at.RELAXATION]
     ay += by + (mark[at.SPEED] * ey - mark[at.VY]) / row[at.RELAXATION]
     if row[at.FLUCTUATION] > 0.0:

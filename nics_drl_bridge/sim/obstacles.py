@@ -12,45 +12,16 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
 from nics_drl_bridge.config import Schema
-from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import Coordinate
-from nics_drl_bridge.sim.separation_kernels import (
-    BEHIND,
-    COUNT,
-    FIRST,
-    FLUCTUATION,
-    FORESIGHT,
-    KIND,
-    LOOP,
-    PATROL,
-    PAUSE,
-    PEDESTRIAN,
-    PLAN,
-    RANGE,
-    RELAXATION,
-    REPULSION,
-    SPEED_HIGH,
-    SPEED_LOW,
-    VIEW,
-    WALL_RANGE,
-    WALL_REPULSION,
-    WANDER,
-)  # fmt: skip
+from nics_drl_bridge.sim import separation_kernels as at
 
-__all__ = [
-    "NO_DISTANCES", "Motion", "Patrol", "Pedestrian", "Wander",
-    "distance_arrays", "plan_arrays",
-]  # fmt: skip
+__all__ = ["Motion", "Patrol", "Pedestrian", "Wander", "plan_arrays"]
 
 Array = NDArray[np.float64]
-Plans = tuple[Array, Array]
-Distances = tuple[NDArray[np.float32], Array]
 FASTEST = 10.0
 """Greatest speed of an obstacle [m/s]; beyond it a control period would be too coarse."""
 STRONGEST = 1e3
 """Upper bound on the parameters of the social force model, each in its unit."""
-NO_DISTANCES: Distances = (np.full((1, 1), np.inf, np.float32), np.array([0.0, 0.0, 1.0, 0.0, 1.0]))
-"""Argument of the kernels where there is no static map."""
 
 
 def _fast(speed: tuple[float, float]) -> tuple[float, float]:
@@ -60,14 +31,12 @@ def _fast(speed: tuple[float, float]) -> tuple[float, float]:
 
 
 Speed = Annotated[tuple[float, float], AfterValidator(_fast)]
+Strength = Annotated[float, Field(ge=0.0, le=STRONGEST)]
+Distance = Annotated[float, Field(ge=1e-3, le=STRONGEST)]
 
 
 class Wander(Schema):
-    """Moves straight ahead and turns to a free direction when something is near.
-
-    Attributes:
-        speed: least and greatest; one is drawn per episode [m/s].
-    """
+    """Moves straight ahead, by a speed drawn per episode, and turns when something is near."""
 
     kind: Literal["wander"] = "wander"
     speed: Speed
@@ -109,13 +78,10 @@ class Pedestrian(Schema):
     standard deviation of 0.26 m/s.
 
     Attributes:
-        speed: least and greatest desired speed; one is drawn per episode, and the walker is
-            never faster than the greatest [m/s].
+        speed: least and greatest desired speed, and the walker's greatest; drawn per episode [m/s].
         relaxation: tau, the time constant of approaching the desired velocity [s].
-        repulsion: V0 of walkers, obstacles and robots [m^2/s^2].
-        range: sigma, the range of `repulsion` [m].
-        wall_repulsion: U0 of walls [m^2/s^2].
-        wall_range: R, the range of `wall_repulsion` [m].
+        repulsion, range: V0 [m^2/s^2] and sigma [m], of walkers, obstacles and robots.
+        wall_repulsion, wall_range: U0 [m^2/s^2] and R [m], of walls.
         foresight: delta t, the time by which the others' motion is extrapolated [s].
         view: 2 phi, the angle of sight [rad].
         behind: c, the weight of forces from outside the angle of sight.
@@ -125,48 +91,39 @@ class Pedestrian(Schema):
     kind: Literal["pedestrian"] = "pedestrian"
     speed: Speed = (1.08, 1.6)
     relaxation: float = Field(default=0.5, ge=0.1, le=10.0)
-    repulsion: float = Field(default=2.1, ge=0.0, le=STRONGEST)
-    range: float = Field(default=0.3, ge=1e-3, le=STRONGEST)
-    wall_repulsion: float = Field(default=10.0, ge=0.0, le=STRONGEST)
-    wall_range: float = Field(default=0.2, ge=1e-3, le=STRONGEST)
-    foresight: float = Field(default=1.0, ge=0.0, le=STRONGEST)
+    repulsion: Strength = 2.1
+    range: Distance = 0.3
+    wall_repulsion: Strength = 10.0
+    wall_range: Distance = 0.2
+    foresight: Strength = 1.0
     view: float = Field(default=math.radians(200.0), ge=0.0, le=2.0 * math.pi)
     behind: float = Field(default=0.5, ge=0.0, le=1.0)
-    fluctuation: float = Field(default=0.1, ge=0.0, le=STRONGEST)
+    fluctuation: Strength = 0.1
 
 
 Motion = Annotated[Wander | Patrol | Pedestrian, Field(discriminator="kind")]
 
 
-def plan_arrays(motions: Sequence[Wander | Patrol | Pedestrian | None]) -> Plans:
-    """Returns the kernels' argument `plans`: obstacle k of every world moves by motion k.
+def plan_arrays(motions: Sequence[Wander | Patrol | Pedestrian | None]) -> tuple[Array, Array]:
+    """Returns the kernels' plans: obstacle k of every world moves by motion k, if not None.
 
-    Args:
-        motions: (K), None for an obstacle that stands still.
-
-    Returns:
-        (K, P) rows, columns as in `separation_kernels`, and (Q, 2) waypoints of all patrols [m].
+    They are (K, P) rows, columns as in `separation_kernels`, and (Q, 2) waypoints of all patrols.
     """
-    rows, waypoints = np.zeros((len(motions), PLAN)), np.zeros((0, 2))
+    rows, waypoints = np.zeros((len(motions), at.PLAN)), np.zeros((0, 2))
     for row, motion in zip(rows, motions, strict=True):
-        if isinstance(motion, Patrol):
-            row[KIND], row[SPEED_LOW : SPEED_HIGH + 1] = PATROL, motion.speed
-            row[FIRST], row[COUNT] = len(waypoints), len(motion.waypoints)
-            row[LOOP], row[PAUSE] = motion.loop, motion.pause
+        if motion is None:
+            continue
+        row[[at.SPEED_LOW, at.SPEED_HIGH]] = motion.speed
+        if isinstance(motion, Wander):
+            row[at.KIND] = at.WANDER
+        elif isinstance(motion, Patrol):
+            row[at.KIND], row[at.LOOP], row[at.PAUSE] = at.PATROL, motion.loop, motion.pause
+            row[at.FIRST], row[at.COUNT] = len(waypoints), len(motion.waypoints)
             waypoints = np.concatenate([waypoints, motion.waypoints])
-        elif motion is not None:
-            row[SPEED_LOW : SPEED_HIGH + 1] = motion.speed
-            row[KIND] = WANDER
-        if isinstance(motion, Pedestrian):
-            row[KIND] = PEDESTRIAN
-            row[RELAXATION], row[FLUCTUATION] = motion.relaxation, motion.fluctuation
-            row[REPULSION], row[RANGE] = motion.repulsion, motion.range
-            row[WALL_REPULSION], row[WALL_RANGE] = motion.wall_repulsion, motion.wall_range
-            row[FORESIGHT], row[BEHIND] = motion.foresight, motion.behind
-            row[VIEW] = math.cos(motion.view / 2.0)
+        else:
+            row[at.RELAXATION], row[at.FLUCTUATION] = motion.relaxation, motion.fluctuation
+            row[at.REPULSION], row[at.RANGE] = motion.repulsion, motion.range
+            row[at.WALL_REPULSION], row[at.WALL_RANGE] = motion.wall_repulsion, motion.wall_range
+            row[at.FORESIGHT], row[at.BEHIND] = motion.foresight, motion.behind
+            row[at.KIND], row[at.VIEW] = at.PEDESTRIAN, math.cos(motion.view / 2.0)
     return rows, waypoints
-
-
-def distance_arrays(grid: GridMap | None) -> Distances:
-    """Returns the kernels' argument `distances`: distance field of a static map, and its frame."""
-    return NO_DISTANCES if grid is None else (grid.distance_field, grid.arrays[1])

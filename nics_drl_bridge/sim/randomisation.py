@@ -1,39 +1,187 @@
-"""Domain randomisation: robot, sensors and scene of an episode, drawn from ranges in YAML."""
+"""Domain randomisation: robot, sensors and scene of an episode, drawn from ranges in YAML.
+
+Each number is fixed by seed, robot, group and column alone, so that no group shifts the draws of
+another. A column whose bounds are equal takes that value.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import AfterValidator, Field, model_validator
 
-from nics_drl_bridge.config import find_config, load_yaml
+from nics_drl_bridge import random_kernels as random
+from nics_drl_bridge.config import Schema, find_config, load_yaml, validate
+from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import fault_kernels
+from nics_drl_bridge.lidar.faults import SKEW, TOO_CLOSE, Skew, TooClose
+from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.kernels import term_arrays
+from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.seeds import checked_seeds
-from nics_drl_bridge.sim import randomisation_ranges as bounds
-from nics_drl_bridge.sim.randomisation_kernels import (
-    KINEMATICS,
-    LATENCY,
-    LIDAR,
-    OBSTACLES,
-    ODOMETRY,
-    draw_between,
-    draw_choice,
-    draw_whole,
-)
-from nics_drl_bridge.sim.randomisation_ranges import Randomisation
 
-__all__ = ["Draws", "Label", "Randomisation", "Sampler", "load_randomisation"]
+__all__ = ["Draws", "Label", "LidarRanges", "Randomisation", "Sampler", "load_randomisation"]
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Bounds = tuple[Array, Array]
+MOST_OBSTACLES = 10_000
+NOISE_NAMES = ("odom_linear", "odom_angular", "position_drift", None, "heading_drift")
+"""Columns of the noise, before those of the state; the drift of y equals that of x."""
+SCALED = {
+    "noise": (slice(0, 2), ("odom_linear", "odom_angular")),
+    "drift": (slice(2, None), ("position_drift", "heading_drift")),
+}
+"""Columns that a factor scales, and the levels that may be given instead."""
+CORNERS = 256
+"""Number of mixtures of least and greatest factors that are checked for stability."""
 FAULT_COLUMNS = (
     "noise_std", "noise_proportional", "dropout", "dropout_far", "too_close", "quantisation",
     "skew",
 )  # fmt: skip
 """Columns of the faults, see `lidar.fault_kernels`."""
+CHOICES: dict[str, tuple[int, Mapping[Any, int]]] = {
+    "skew": (fault_kernels.SKEW, SKEW),
+    "too_close": (fault_kernels.TOO_CLOSE, TOO_CLOSE),
+}
+"""Faults that are drawn from several words, with their columns and values."""
+KINEMATICS_GROUP, LATENCY_GROUP, ODOMETRY_GROUP, LIDAR_GROUP, CHOICES_GROUP, SCENE_GROUP = range(6)
+GROUPS = 8
+PLACES = 1 << 20
+"""More than a group has columns; the counters of two groups never collide."""
+UNIT = (np.zeros(1), np.ones(1))
+
+
+def _ordered(span: tuple[float, float]) -> tuple[float, float]:
+    if span[0] > span[1]:
+        raise ValueError("a range is [least, greatest]")
+    return span
+
+
+NotNegative = Annotated[float, Field(ge=0.0, le=1e6)]
+Positive = Annotated[float, Field(ge=1e-3, le=1e3)]
+Periods = Annotated[float, Field(ge=0.0, le=50.0)]  # the simulator stores as many
+Level = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_ordered)]
+Factor = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
+Latency = Annotated[tuple[Periods, Periods], AfterValidator(_ordered)]
+AS_IT_IS: Factor = (1.0, 1.0)
+
+
+class KinematicRanges(Schema):
+    """Factors on the coefficients of the Taylor model, drawn independently for each coefficient.
+
+    Attributes:
+        scale: for every coefficient.
+        dofs: overrides `scale` for the coefficients of a rate, by its name in `model.yaml` (`wz`).
+        terms: overrides both, by rate and term: `{wz: {speed*steering: [0.8, 1.2]}}`.
+    """
+
+    scale: Factor = AS_IT_IS
+    dofs: dict[str, Factor] = Field(default_factory=dict)
+    terms: dict[str, dict[str, Factor]] = Field(default_factory=dict)
+
+
+class OdometryRanges(Schema):
+    """Errors of odometry and motion: factors on the model's levels, or levels instead.
+
+    Attributes:
+        noise: factor on the noise of the measured twist.
+        drift: factor on the part of the motion that the model does not explain; only a drift that
+            was found in the recording can be scaled.
+        odom_linear, odom_angular: noise of velocity [m/s] and yaw rate [rad/s].
+        position_drift, heading_drift: of x and y [m/sqrt(s)], and [rad/sqrt(s)].
+    """
+
+    noise: Factor | None = None
+    drift: Factor | None = None
+    odom_linear: Level | None = None
+    odom_angular: Level | None = None
+    position_drift: Level | None = None
+    heading_drift: Level | None = None
+
+    @model_validator(mode="after")
+    def _once(self) -> OdometryRanges:
+        for factor, (_, levels) in SCALED.items():
+            for level in levels:
+                if getattr(self, factor) is not None and getattr(self, level) is not None:
+                    raise ValueError(f"give either the factor {factor} or the level {level}")
+        return self
+
+
+class LidarRanges(Schema):
+    """The lidar's noise and faults, instead of the model's; the fields of `LidarFaults`.
+
+    Attributes:
+        noise_std: see `LidarSpec` [m].
+        noise_proportional, quantisation, dropout, dropout_far: [least, greatest].
+        skew, too_close: the words that may be drawn, all equally likely.
+    """
+
+    noise_std: Level | None = None
+    noise_proportional: Level | None = None
+    quantisation: Level | None = None
+    dropout: Level | None = None
+    dropout_far: Level | None = None
+    skew: tuple[Skew, ...] | None = Field(default=None, min_length=1)
+    too_close: tuple[TooClose, ...] | None = Field(default=None, min_length=1)
+
+    @model_validator(mode="after")
+    def _probable(self) -> LidarRanges:
+        likely = [name for name in ("dropout", "dropout_far") if getattr(self, name)]
+        if sum(getattr(self, name)[1] for name in likely) > 1.0:
+            raise ValueError("the greatest dropout and dropout_far must add up to at most 1")
+        return self
+
+
+class ObstacleRanges(Schema):
+    """Number and size of the obstacles of a scene.
+
+    Attributes:
+        count: [least, greatest], instead of the world's.
+        size: factor on the size of every obstacle, one per episode.
+        rungs: number of sizes to draw from, evenly spaced: each is baked beforehand.
+    """
+
+    count: tuple[int, int] | None = None
+    size: Factor = AS_IT_IS
+    rungs: int = Field(default=5, ge=2, le=100)
+
+    @model_validator(mode="after")
+    def _countable(self) -> ObstacleRanges:
+        if self.count and not 0 <= self.count[0] <= self.count[1] <= MOST_OBSTACLES:
+            raise ValueError(f"count must be [least, greatest] from 0 to {MOST_OBSTACLES}")
+        return self
+
+
+class Randomisation(Schema):
+    """Ranges that are drawn from in every episode; all else stays as in model and world.
+
+    Attributes:
+        action_latency: in addition to the model's [control periods].
+        observation_latency: age of scan and odometry [control periods].
+    """
+
+    name: str
+    kinematics: KinematicRanges = KinematicRanges()
+    action_latency: Latency = (0.0, 0.0)
+    observation_latency: Latency = (0.0, 0.0)
+    odometry: OdometryRanges = OdometryRanges()
+    lidar: LidarRanges = LidarRanges()
+    obstacles: ObstacleRanges = ObstacleRanges()
+
+    @property
+    def sizes(self) -> tuple[float, ...]:
+        """The factors on the obstacles' size that may be drawn, ascending."""
+        low, high = self.obstacles.size
+        rungs = self.obstacles.rungs if high > low else 1
+        return tuple(np.linspace(low, high, rungs).tolist())
 
 
 def load_randomisation(name: str | Path) -> Randomisation:
@@ -43,47 +191,27 @@ def load_randomisation(name: str | Path) -> Randomisation:
 
 @dataclass(frozen=True)
 class Label:
-    """Name of a drawn number and its place in `Draws`.
+    """Name of a drawn number and its place in `Draws`."""
 
-    Attributes:
-        name: human-readable: `kinematics.wz.speed*steering`, `action_latency_s`.
-        field: of `Draws`.
-        column: index along the last axis; None where there is none.
-        unit: factor to multiply by, such as seconds per substep.
-    """
-
-    name: str
-    field: str
-    column: int | None = None
-    unit: float = 1.0
+    name: str  # human-readable: `kinematics.wz.speed*steering`, `action_latency_s`
+    field: str  # of `Draws`
+    column: int | None = None  # index along the last axis; None where there is none
+    unit: float = 1.0  # factor to multiply by, such as seconds per substep
 
 
 @dataclass(frozen=True)
 class Draws:
-    """Draws for n episodes of M robots: every number the simulator needs, drawn or the model's.
+    """Draws for n episodes of M robots: every number the simulator needs, drawn or the model's."""
 
-    Attributes:
-        coefficient: (n, M, T) of the kept terms, in the order of `robot.kernels.term_arrays`.
-        delay: (n, M) from a command to its effect, including the model's [substeps].
-        age: (n, M) of scan and odometry when they are observed [substeps].
-        noise: (n, M, 2 + 3 + S) standard deviations: odometry, linear [m/s] and angular [rad/s],
-            and the drift of x, y, heading and state after a second.
-        faults: (n, M, P) of each lidar, columns as in `lidar.fault_kernels`.
-        count: (n,) obstacles in the scene; None leaves it to the world.
-        size: (n,) index into `Randomisation.sizes`; None where there is only one.
-        sizes: (R,) the sizes of `Randomisation.sizes`.
-        labels: of the drawn numbers that may differ from episode to episode.
-    """
-
-    coefficient: Array
-    delay: NDArray[np.int64]
-    age: NDArray[np.int64]
-    noise: Array
-    faults: Array
-    count: NDArray[np.int64] | None
-    size: NDArray[np.int64] | None
-    sizes: Array
-    labels: tuple[Label, ...]
+    coefficient: Array  # (n, M, T) kept terms, in the order of `robot.kernels.term_arrays`
+    delay: Integers  # (n, M) from a command to its effect, including the model's [substeps]
+    age: Integers  # (n, M) of scan and odometry when they are observed [substeps]
+    noise: Array  # (n, M, 2 + 3 + S) see `State.noise`
+    faults: Array  # (n, M, P) of each lidar, columns as in `lidar.fault_kernels`
+    count: Integers | None  # (n,) obstacles in the scene; None leaves it to the world
+    size: Integers | None  # (n,) index into `Randomisation.sizes`; None where there is only one
+    sizes: Array  # (R,) the sizes of `Randomisation.sizes`
+    labels: tuple[Label, ...]  # of the drawn numbers that may differ from episode to episode
 
     def named(self) -> dict[str, NDArray[np.generic]]:
         """Returns the drawn numbers by name: (n, M) per robot, (n,) per scene."""
@@ -109,50 +237,45 @@ class Sampler:
     Attributes:
         longest_delay: greatest latency of a command that may occur [substeps].
         longest_age: greatest age of an observation that may occur [substeps].
-        skews: True if a lidar may measure its beams one after the other.
     """
 
     def __init__(
         self, randomisation: Randomisation, model: SimulatorModel, robots: int = 1
     ) -> None:
-        self.randomisation = randomisation
-        self._robots = robots
+        self.randomisation, self._robots = randomisation, robots
         where = f"randomisation {randomisation.name!r}"
-        self._coefficient = bounds.coefficients(randomisation.kinematics, model.kinematics, where)
-        self._timing, self._step = bounds.latencies(randomisation, model), model.timing[0]
-        self._noise = bounds.levels(randomisation, model, where)
-        self._faults = bounds.faults(randomisation, model.lidar, where)
-        self._choices = tuple(bounds.choices(randomisation))
-        self._scene = bounds.scene(randomisation)
+        self._coefficient = _coefficients(randomisation.kinematics, model.kinematics, where)
+        self._timing, self._step = _latencies(randomisation, model), model.timing[0]
+        self._noise = _levels(randomisation, model, where)
+        self._faults = _faults(randomisation, model.lidar, where)
+        self._choices = {
+            column: np.array([values[word] for word in words], np.float64)
+            for name, (column, values) in CHOICES.items()
+            if (words := getattr(randomisation.lidar, name)) is not None
+        }
+        # Bounds such that flooring makes all numbers, and all sizes, equally likely.
+        least, most = randomisation.obstacles.count or (0, 0)
+        self._scene = np.array([least, 0.0]), np.array([most + 1.0, len(randomisation.sizes)])
         self._sizes = np.array(randomisation.sizes)
         self.longest_delay, self.longest_age = (int(most) for most in self._timing[1])
-        skew = [values for column, values in self._choices if column == fault_kernels.SKEW]
-        turns = skew[0] if skew else self._faults[0][fault_kernels.SKEW :][:1]
-        self.skews = bool(np.any(turns != fault_kernels.AT_ONCE))
         self._labels = tuple(self._name(model))
 
     def draw(self, seeds: ArrayLike) -> Draws:
         """Draws the numbers of the episodes of some seeds (n,)."""
-        chosen = checked_seeds(seeds)
-        shape = (len(chosen), self._robots)
-        coefficient = np.empty((*shape, len(self._coefficient[0])))
-        noise = np.empty((*shape, len(self._noise[0])))
-        faults = np.empty((*shape, len(self._faults[0])))
-        timing = np.empty((2, *shape), np.int64)
-        scene = np.empty((2, len(chosen), 1), np.int64)
-        draw_between(coefficient, *self._coefficient, chosen, KINEMATICS)
-        draw_between(noise, *self._noise, chosen, ODOMETRY)
-        draw_between(faults, *self._faults, chosen, LIDAR)
-        draw_whole(timing.transpose(1, 2, 0), *self._timing, chosen, LATENCY)
-        draw_whole(scene.transpose(1, 2, 0), *self._scene, chosen, OBSTACLES)
+        chosen, robots = checked_seeds(seeds), self._robots
+        timing = np.floor(_between(self._timing, chosen, robots, LATENCY_GROUP)).astype(np.int64)
+        scene = np.floor(_between(self._scene, chosen, 1, SCENE_GROUP)[:, 0]).astype(np.int64)
+        noise = _between(self._noise, chosen, robots, ODOMETRY_GROUP)
+        faults = _between(self._faults, chosen, robots, LIDAR_GROUP)
         noise[..., 3] = noise[..., 2]
-        for column, values in self._choices:
-            draw_choice(faults, column, values, chosen)
+        for column, values in self._choices.items():
+            drawn = _between(UNIT, chosen, robots, CHOICES_GROUP, column)[..., 0]
+            faults[..., column] = values[(drawn * len(values)).astype(np.int64)]
         counts = self.randomisation.obstacles.count is not None
         return Draws(
-            coefficient, timing[0], timing[1], noise, faults,
-            scene[0, :, 0] if counts else None,
-            scene[1, :, 0] if len(self._sizes) > 1 else None,
+            _between(self._coefficient, chosen, robots, KINEMATICS_GROUP),
+            timing[..., 0].copy(), timing[..., 1].copy(), noise, faults,
+            scene[:, 0] if counts else None, scene[:, 1] if len(self._sizes) > 1 else None,
             self._sizes, self._labels,
         )  # fmt: skip
 
@@ -167,12 +290,11 @@ class Sampler:
             if _varies(self._timing, row):
                 yield Label(f"{name}_latency_s", ("delay", "age")[row], None, self._step)
         states = tuple(f"state_drift.{variable.name}" for variable in model.robot.state)
-        for column, noise in enumerate((*bounds.NOISE_NAMES, *states)):
+        for column, noise in enumerate((*NOISE_NAMES, *states)):
             if noise and _varies(self._noise, column):
                 yield Label(f"odometry.{noise}", "noise", column)
-        chosen = [column for column, _ in self._choices]
         for column, fault in enumerate(FAULT_COLUMNS):
-            if column in chosen or _varies(self._faults, column):
+            if column in self._choices or _varies(self._faults, column):
                 yield Label(f"lidar.{fault}", "faults", column)
         if self.randomisation.obstacles.count is not None:
             yield Label("obstacles.count", "count")
@@ -180,5 +302,122 @@ class Sampler:
             yield Label("obstacles.size", "size")
 
 
-def _varies(ends: bounds.Bounds, column: int) -> bool:
+def _between(bounds: Bounds, seeds: Integers, robots: int, group: int, column: int = 0) -> Array:
+    """Draws (n, M, Q) numbers between bounds (Q,), for the columns of a group from one on."""
+    drawn = np.empty((len(seeds), robots, len(bounds[0])))
+    first, stride, stream = group * PLACES + column, GROUPS * PLACES, random.RANDOMISATION_STREAM
+    random.uniform_between(drawn, *bounds, seeds, stream, first, stride)
+    return drawn
+
+
+def _varies(ends: Bounds, column: int) -> bool:
     return bool(ends[0][column] != ends[1][column])
+
+
+def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bounds:
+    """Bounds (T,) of the coefficients. Raises ConfigError for an invalid name or range."""
+    spans = np.tile(ranges.scale, (*model.coefficients.shape, 1))
+    for dof, span in ranges.dofs.items():
+        spans[_rate(dof, model, f"{where}: key 'kinematics.dofs'")] = span
+    for dof, terms in ranges.terms.items():
+        place = f"{where}: key 'kinematics.terms'"
+        d = _rate(dof, model, place)
+        for term, span in terms.items():
+            spans[d, _term(d, term, model, f"{place}, rate {dof!r}")] = span
+    _check_stable(model, spans, where)
+    kept = np.nonzero(model.coefficients)
+    base = term_arrays(model).coefficient
+    return base * spans[kept][:, 0], base * spans[kept][:, 1]
+
+
+def _rate(name: str, model: TaylorModel, where: str) -> int:
+    if name not in model.dofs:
+        raise ConfigError(f"{where}: unknown rate {name!r}; {nearest(name, model.dofs)}")
+    return model.dofs.index(name)
+
+
+def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
+    kept = np.flatnonzero(model.coefficients[d])
+    try:
+        row = taylor.parse_term(name, model.variables)
+    except ValueError:
+        row = None
+    for k in kept:
+        if row is not None and np.array_equal(model.powers[k], row):
+            return int(k)
+    known = [model.term_names[k] for k in kept]
+    raise ConfigError(
+        f"{where}: the model has no term {name!r} there; "
+        + (nearest(name, known) if known else "it has none at all: remove it.")
+    )
+
+
+def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
+    """Raises ConfigError if a decaying state would grow for some factors.
+
+    Checks the linear part of the state's step: no eigenvalue may exceed 1 in magnitude.
+    """
+    size = model.state_size
+    if not size:
+        return
+    linear = np.zeros((size, size))
+    low, high = np.ones_like(linear), np.ones_like(linear)
+    for k in np.flatnonzero(model.powers.sum(axis=1) == 1):
+        v = int(np.argmax(model.powers[k]))
+        if v < size:
+            linear[:, v] = model.coefficients[3:, k]
+            low[:, v], high[:, v] = spans[3:, k].T
+    mixed = np.random.default_rng(0).integers(0, 2, (CORNERS, size, size)).astype(bool)
+    steps = np.eye(size) + model.dt * linear * np.where(mixed, low, high)
+    nominal = np.abs(np.linalg.eigvals(np.eye(size) + model.dt * linear)).max()
+    worst = np.abs(np.linalg.eigvals(steps)).max()
+    if worst > max(1.0, nominal) + 1e-9:
+        raise ConfigError(
+            f"{where}: key 'kinematics': with some of these factors the state of the robot grows "
+            f"by itself (eigenvalue {worst:.4g} of a step of {model.dt:g} s); narrow the ranges."
+        )
+
+
+def _latencies(ranges: Randomisation, model: SimulatorModel) -> Bounds:
+    """Bounds (2,) of delay and age, such that flooring the draws rounds them [substeps]."""
+    _, substeps, delay = model.timing
+    spans = np.array([ranges.action_latency, ranges.observation_latency]) * substeps + 0.5
+    spans[0] += delay
+    same = np.floor(spans[:, 0]) == np.floor(spans[:, 1])
+    spans[same] = np.floor(spans[same])  # equal bounds: nothing is drawn
+    return np.ascontiguousarray(spans[:, 0]), np.ascontiguousarray(spans[:, 1])
+
+
+def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
+    """Bounds (2 + 3 + S,) of the noise."""
+    odometry = ranges.odometry
+    base = np.array([*model.noise.odometry, *model.noise.simulated_drift(model.robot)])
+    low, high = base.copy(), base.copy()
+    for key, (part, (one, other)) in SCALED.items():
+        factor = getattr(odometry, key)
+        if factor is None:
+            continue
+        if not base[part].any():
+            raise ConfigError(
+                f"{where}: key 'odometry.{key}': the model of {model.robot.name!r} has no "
+                f"measured {key} to scale; give {one!r} and {other!r} instead."
+            )
+        low[part], high[part] = base[part] * factor[0], base[part] * factor[1]
+    for column, name in enumerate(NOISE_NAMES):
+        level = getattr(odometry, name) if name else None
+        if level is not None:
+            low[column], high[column] = level
+    return low, high
+
+
+def _faults(ranges: Randomisation, lidar: LidarSpec, where: str) -> Bounds:
+    """Bounds (P,) of the lidar's noise and faults."""
+    bounds = []
+    for end in range(2):
+        spans = {name: span for name, span in ranges.lidar if span is not None}
+        numbers = {name: span[end] for name, span in spans.items() if name not in CHOICES}
+        std = numbers.pop("noise_std", lidar.noise_std)
+        spec = lidar.model_dump() | {"noise_std": std}
+        spec["faults"] |= numbers
+        bounds.append(validate(spec, LidarSpec, f"{where} of the lidar {lidar.name!r}"))
+    return bounds[0].fault_parameters, bounds[1].fault_parameters

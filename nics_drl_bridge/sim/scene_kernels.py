@@ -3,27 +3,34 @@
 The scene of a seed does not depend on the batch: every number is drawn from its own counter.
 Obstacles are placed one after the other where they overlap nothing, then starts and goals in pairs;
 if placement fails, the scene is restarted with fresh numbers. Points are drawn in the cells of a
-grid that are known to be free.
+grid that are known to be free; free poses are decided by true distances between outlines.
 
-Shared arguments: `static`, `outlines` and `spare` are those of `space_kernels`; `seed` and
-`counter` are those of the next draw.
+Shared arguments: `seed` and `counter` are those of the next draw, `plan` is the ScenePlan of the
+world, `scratch` the SceneScratch, `disc` a body without corners.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.sim.space_kernels import (
-    area_of,
-    clear_of_bodies,
-    clear_of_walls,
-    joined,
-    place_in,
+from nics_drl_bridge.lidar.exact_kernels import (
+    COS,
+    HEADING,
+    RADIUS,
+    SHAPE,
+    SIN,
+    OutlineArrays,
+    X,
+    Y,
 )
+from nics_drl_bridge.sim import collision_kernels as collision
+from nics_drl_bridge.sim.state import Array, Integers, MapField
 
 TRIES = 2000
 RESTARTS = 50
@@ -32,8 +39,208 @@ DETOURS = 4
 MARGIN = 1e-9
 """Least distance of obstacles from walls and from each other [m]."""
 DRAWN, NO_OBSTACLES, NO_ROBOTS = 0, 1, 2
-LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING = range(7)
-"""Columns of a group."""
+LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING, GROUP = range(8)
+"""Columns of a group of obstacles."""
+X1, Y1, X2, Y2, LEAST_HEADING, GREATEST_HEADING, SHARE, PLACE = range(8)
+"""Columns of a place: a region [m], headings [rad], cumulative share of the places up to it."""
+
+
+class FreeSpace(NamedTuple):
+    """All that stands in every scene, and where robots fit between it."""
+
+    cells: MapField  # distances to the nearest wall or solid cell of the map
+    area: NDArray[np.int32]  # (rows, columns) number of the connected free space; 0 for none
+    bounds: Array  # (4,) least x, y and greatest x, y of the field [m]
+    walls: Array  # (W, 4)
+    grid: MapField  # the static map
+    for_robots: Integers  # (C,) row-major indices of the cells where a robot may start
+    for_anything: Integers  # (C,) row-major indices of the cells with any free space
+    room: float  # free space that a robot on its path needs around the centre of a cell [m]
+
+
+class ScenePlan(NamedTuple):
+    """Basis of the scenes of a world: K obstacles in G groups, of H shapes in S sizes."""
+
+    space: FreeSpace
+    outlines: OutlineArrays  # of all shapes, the last of which is a disc
+    radii: Array  # (H,) of the circles around them [m]
+    groups: Array  # (G, GROUP)
+    group: Integers  # (K,) of each obstacle
+    choices: Integers  # shapes that each group may take, one group after the other
+    variants: Integers  # (S, H) index of each shape in each size
+    poses: Array  # (K, 3) of the obstacles at fixed poses
+    starts: Array  # (P, PLACE); no rows for anywhere
+    goals: Array  # (P, PLACE)
+    footprint: float  # radius of a robot [m]
+    clearance: float  # [m]
+    least: float  # distance of a goal from its start [m]
+    greatest: float
+    around: bool  # True to draw goals around their starts
+
+
+class SceneScratch(NamedTuple):
+    """Scratch memory of one call; threads may draw at the same time."""
+
+    seen: Integers  # (rows * columns,) number of the search that last visited each cell
+    stack: Integers  # (2, rows * columns) cells to visit, from either end
+    latest: Integers  # (1,) number of the latest search
+    active: NDArray[np.bool_]  # (K,) obstacles of the scene
+    gaps: Array  # (K,) free space around each obstacle [m]
+    trial: Array  # (7,) an obstacle
+    disc: Array  # (7,) a robot
+    spare: Array  # see `collision_kernels`
+
+
+@kernel
+def wall_distances(cells, walls):  # type: ignore[no-untyped-def]
+    """Lowers the distances of cells to the distances to the walls, in place."""
+    distances = cells.distances
+    for i in range(distances.shape[0]):
+        for j in range(distances.shape[1]):
+            x, y = place_in(i + 0.5, j + 0.5, cells)
+            distances[i, j] = min(distances[i, j], collision.wall_distance(x, y, walls))
+
+
+@kernel
+def place_in(row, column, cells):  # type: ignore[no-untyped-def]
+    """Returns x, y [m] of a place in the grid, given as fractional row and column."""
+    u, v = column * cells.cell, row * cells.cell
+    return cells.x + cells.cos * u - cells.sin * v, cells.y + cells.sin * u + cells.cos * v
+
+
+@kernel
+def cell_of(x, y, cells):  # type: ignore[no-untyped-def]
+    """Returns row and column of a point, and its distance from the centre of that cell [m]."""
+    u, v = collision.in_grid(x, y, cells)
+    u, v = u / cells.cell, v / cells.cell
+    i, j = math.floor(v), math.floor(u)
+    return i, j, cells.cell * math.sqrt((u - j - 0.5) ** 2 + (v - i - 0.5) ** 2)
+
+
+@kernel
+def area_of(x, y, space):  # type: ignore[no-untyped-def]
+    """Returns the number of the area that contains a point; 0 for none."""
+    i, j, _ = cell_of(x, y, space.cells)
+    if 0 <= i < space.area.shape[0] and 0 <= j < space.area.shape[1]:
+        return space.area[i, j]
+    return 0
+
+
+@kernel
+def _within(x, y, space):  # type: ignore[no-untyped-def]
+    """True if a point is in field and grid; with lower and upper bound of its distance to walls."""
+    distances, bounds = space.cells.distances, space.bounds
+    i, j, off = cell_of(x, y, space.cells)
+    inside = 0 <= i < distances.shape[0] and 0 <= j < distances.shape[1]
+    inside = inside and bounds[0] <= x <= bounds[2] and bounds[1] <= y <= bounds[3]
+    if not inside:
+        return False, 0.0, 0.0
+    middle = distances[i, j]
+    return True, middle * (1.0 - collision.FLOAT32) - off, middle * (1.0 + collision.FLOAT32) + off
+
+
+@kernel
+def _clear_of_walls(body, room, plan, spare):  # type: ignore[no-untyped-def]
+    """True if a body lies in the field and keeps `room` [m] from walls and map."""
+    space, outlines = plan.space, plan.outlines
+    inside, low, high = _within(body[X], body[Y], space)
+    if inside and low >= body[RADIUS] + room:
+        return True
+    if collision.is_round(body, outlines):
+        if not inside or high < body[RADIUS] + room:
+            return False
+    else:  # its origin may lie outside its outline
+        first = outlines.corners[outlines.first[int(body[SHAPE])]]
+        x = body[X] + body[COS] * first[0] - body[SIN] * first[1]
+        y = body[Y] + body[SIN] * first[0] + body[COS] * first[1]
+        if not _within(x, y, space)[0]:
+            return False
+    for w in range(space.walls.shape[0]):
+        if collision.wall_gap(body, space.walls[w], outlines, room, spare) < room:
+            return False
+    return collision.map_gap(body, space.grid, outlines, room, spare) >= room
+
+
+@kernel
+def _clear_of(body, other, room, outlines, spare):  # type: ignore[no-untyped-def]
+    """True if a body keeps `room` [m] from another."""
+    dx, dy, far = body[X] - other[X], body[Y] - other[Y], body[RADIUS] + other[RADIUS] + room
+    if dx * dx + dy * dy >= far * far:
+        return True
+    if collision.is_round(body, outlines) and collision.is_round(other, outlines):
+        return False
+    return collision.body_gap(body, other, outlines, room, spare) >= room
+
+
+@kernel
+def _is_free(disc, x, y, plan, bodies, spare):  # type: ignore[no-untyped-def]
+    """True if a robot with the clearance around it fits at a point."""
+    disc[X], disc[Y] = x, y
+    for k in range(bodies.shape[0]):
+        there = bodies[k, RADIUS] > 0.0
+        if there and not _clear_of(disc, bodies[k], plan.clearance, plan.outlines, spare):
+            return False
+    return _clear_of_walls(disc, plan.clearance, plan, spare)
+
+
+@kernel
+def _may_pass(disc, x, y, plan, bodies, spare):  # type: ignore[no-untyped-def]
+    """True if a robot on its path may be at the centre of a cell, for all static obstacles."""
+    disc[X], disc[Y] = x, y
+    room = plan.space.room - plan.footprint
+    for k in range(bodies.shape[0]):
+        there = bodies[k, RADIUS] > 0.0 and plan.groups[plan.group[k], MOVING] == 0.0
+        if there and not _clear_of(disc, bodies[k], room, plan.outlines, spare):
+            return False
+    return True
+
+
+@kernel
+def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-def]
+    """True if a robot can move between two points of an area, from cell to cell.
+
+    Searches from both ends, each towards the other first: where there is no path, one end is often
+    enclosed and its search ends soon. The cells of both points count as free.
+    """
+    cells, label, disc, spare = plan.space.cells, plan.space.area, scratch.disc, scratch.spare
+    seen, stack, latest = scratch.seen, scratch.stack, scratch.latest
+    rows, columns = label.shape
+    i, j, _ = cell_of(x, y, cells)
+    gi, gj, _ = cell_of(gx, gy, cells)
+    area, start, goal = label[i, j], i * columns + j, gi * columns + gj
+    if start == goal:
+        return True
+    latest[0] += 2
+    stack[0, 0], stack[1, 0] = start, goal
+    seen[start], seen[goal] = latest[0], latest[0] + 1
+    height, other = 1, 1  # of the stack of this side, and of that of the other one
+    side = 0
+    while height > 0:
+        height -= 1
+        cell = stack[side, height]
+        i, j = cell // columns, cell % columns
+        ti, tj = (gi, gj) if side == 0 else (start // columns, start % columns)
+        up, right = (1 if ti >= i else -1), (1 if tj >= j else -1)
+        steep = abs(ti - i) >= abs(tj - j)
+        for way in range(4):  # the last one is popped first
+            toward = 1 if way > 1 else -1
+            along = (way == 0 or way == 3) == steep
+            row = i + (toward * up if along else 0)
+            column = j + (0 if along else toward * right)
+            if not (0 <= row < rows and 0 <= column < columns):
+                continue
+            new = row * columns + column
+            if seen[new] == latest[0] + 1 - side:
+                return True
+            if label[row, column] != area or seen[new] == latest[0] + side:
+                continue
+            cx, cy = place_in(row + 0.5, column + 0.5, cells)
+            if _may_pass(disc, cx, cy, plan, bodies, spare):
+                seen[new] = latest[0] + side
+                stack[side, height] = new
+                height += 1
+        height, other, side = other, height, 1 - side
+    return False
 
 
 @kernel
@@ -42,26 +249,25 @@ def _uniform(seed, counter):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _point(seed, counter, cells, static):  # type: ignore[no-untyped-def]
-    """Draws a point in one of the cells, given by row-major indices; takes 3 counters."""
-    distance, frame = static[0], static[2]
-    cell = cells[int(_uniform(seed, counter) * cells.shape[0])]
-    i, j = cell // distance.shape[1], cell % distance.shape[1]
-    return place_in(i + _uniform(seed, counter + 1), j + _uniform(seed, counter + 2), frame)
+def _point(seed, counter, chosen, cells):  # type: ignore[no-untyped-def]
+    """Draws a point in one of the chosen cells, given by row-major indices; takes 3 counters."""
+    cell = chosen[int(_uniform(seed, counter) * chosen.shape[0])]
+    i, j = cell // cells.distances.shape[1], cell % cells.distances.shape[1]
+    return place_in(i + _uniform(seed, counter + 1), j + _uniform(seed, counter + 2), cells)
 
 
 @kernel
-def _put(body, x, y, heading, shape, outlines):  # type: ignore[no-untyped-def]
-    body[0], body[1], body[2] = x, y, heading
-    body[3], body[4] = math.cos(heading), math.sin(heading)
-    body[5], body[6] = outlines[2][shape], shape
+def _put(body, x, y, heading, shape, plan):  # type: ignore[no-untyped-def]
+    body[X], body[Y], body[HEADING] = x, y, heading
+    body[COS], body[SIN] = math.cos(heading), math.sin(heading)
+    body[RADIUS], body[SHAPE] = plan.radii[shape], shape
 
 
 @kernel
-def _choose(seed, counter, wanted, size, plan, bodies, active):  # type: ignore[no-untyped-def]
-    """Draws which obstacles exist, marked in `active` (K,), and the shape of each."""
-    groups, _, base, index, _ = plan
-    total, before, k = 0, 0, 0
+def _choose(seed, wanted, size, plan, bodies, active):  # type: ignore[no-untyped-def]
+    """Draws which obstacles exist and the shape of each; returns the next counter."""
+    groups = plan.groups
+    counter, total, before, k = 0, 0, 0, 0
     for g in range(groups.shape[0]):
         if groups[g, FIXED] == 0.0:
             total += int(groups[g, GREATEST])
@@ -71,51 +277,47 @@ def _choose(seed, counter, wanted, size, plan, bodies, active):  # type: ignore[
         counter += 1
         if groups[g, FIXED] == 0.0:
             if wanted >= 0:  # each group gets its share
-                asked, after = min(wanted, total), before + greatest
-                count = (asked * after + total // 2) // total - (
-                    (asked * before + total // 2) // total
-                )
+                most, after = min(wanted, total), before + greatest
+                count = (most * after + total // 2) // total - (most * before + total // 2) // total
             before += greatest
         first, shapes = int(groups[g, FIRST_SHAPE]), int(groups[g, SHAPES])
         for number in range(greatest):
-            taken = base[first + int(_uniform(seed, counter) * shapes)]
+            taken = plan.choices[first + int(_uniform(seed, counter) * shapes)]
             counter += 1
             active[k] = number < count
-            for i in range(6):
-                bodies[k, i] = 1.0 if i == 3 else 0.0
-            bodies[k, 6] = index[size, taken]
+            bodies[k, :] = 0.0
+            bodies[k, COS], bodies[k, SHAPE] = 1.0, plan.variants[size, taken]
             k += 1
     return counter
 
 
 @kernel
-def _place_obstacles(  # type: ignore[no-untyped-def]
-    seed, counter, plan, static, cells, outlines, bodies, active, gaps, trial, spare
-):
+def _place_obstacles(seed, counter, plan, bodies, scratch):  # type: ignore[no-untyped-def]
     """Places the obstacles: first those at fixed poses, then the others."""
-    groups, slot, _, _, poses = plan
-    corner = outlines[1]
+    space, outlines, gaps, trial = plan.space, plan.outlines, scratch.gaps, scratch.trial
     for k in range(bodies.shape[0]):
-        gaps[k] = max(groups[slot[k], GAP], MARGIN)
-        bodies[k, 5] = 0.0
-        if groups[slot[k], FIXED] > 0.0:
-            _put(bodies[k], poses[k, 0], poses[k, 1], poses[k, 2], int(bodies[k, 6]), outlines)
+        group, shape = plan.groups[plan.group[k]], int(bodies[k, SHAPE])
+        gaps[k] = max(group[GAP], MARGIN)
+        bodies[k, RADIUS] = 0.0
+        if group[FIXED] > 0.0:
+            pose = plan.poses[k]
+            _put(bodies[k], pose[0], pose[1], pose[2], shape, plan)
     for k in range(bodies.shape[0]):
-        if groups[slot[k], FIXED] > 0.0 or not active[k]:
+        if plan.groups[plan.group[k], FIXED] > 0.0 or not scratch.active[k]:
             continue
-        shape, heading, placed = int(bodies[k, 6]), 0.0, False
+        shape, heading, placed = int(bodies[k, SHAPE]), 0.0, False
         for _ in range(TRIES):
-            x, y = _point(seed, counter, cells, static)
+            x, y = _point(seed, counter, space.for_anything, space.cells)
             counter += 3
-            if corner[shape] < corner[shape + 1]:
+            if outlines.first[shape] < outlines.first[shape + 1]:
                 heading = (2.0 * _uniform(seed, counter) - 1.0) * math.pi
                 counter += 1
-            _put(trial, x, y, heading, shape, outlines)
-            if clear_of_bodies(trial, gaps[k], bodies, gaps, outlines, spare) and clear_of_walls(
-                trial, MARGIN, static, outlines, spare
-            ):
-                _put(bodies[k], x, y, heading, shape, outlines)
-                placed = True
+            _put(trial, x, y, heading, shape, plan)
+            placed = _is_apart(k, plan, bodies, scratch) and _clear_of_walls(
+                trial, MARGIN, plan, scratch.spare
+            )
+            if placed:
+                _put(bodies[k], x, y, heading, shape, plan)
                 break
         if not placed:
             return counter, False
@@ -123,35 +325,32 @@ def _place_obstacles(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _spot(seed, counter, places, cells, static):  # type: ignore[no-untyped-def]
-    """Draws x, y, heading of a start or goal; takes 4 counters.
-
-    Args:
-        seed, counter: of the draw.
-        places: (P, 7) x1, y1, x2, y2 of a region, least and greatest heading, cumulative share of
-            the places up to this one; no rows for anywhere.
-        cells: used if there are no places.
-        static: see the module.
-    """
-    turn = _uniform(seed, counter + 3)
-    if places.shape[0] == 0:
-        x, y = _point(seed, counter, cells, static)
-        return x, y, (2.0 * turn - 1.0) * math.pi
-    share, p = _uniform(seed, counter), 0
-    while p < places.shape[0] - 1 and share >= places[p, 6]:
-        p += 1
-    x = places[p, 0] + _uniform(seed, counter + 1) * (places[p, 2] - places[p, 0])
-    y = places[p, 1] + _uniform(seed, counter + 2) * (places[p, 3] - places[p, 1])
-    return x, y, places[p, 4] + turn * (places[p, 5] - places[p, 4])
+def _is_apart(k, plan, bodies, scratch):  # type: ignore[no-untyped-def]
+    """True if obstacle k, placed as `scratch.trial`, keeps the gaps to all that are placed."""
+    trial, gaps = scratch.trial, scratch.gaps
+    for other in range(bodies.shape[0]):
+        if bodies[other, RADIUS] > 0.0:
+            gap = max(gaps[k], gaps[other])
+            if not _clear_of(trial, bodies[other], gap, plan.outlines, scratch.spare):
+                return False
+    return True
 
 
 @kernel
-def _free(disc, x, y, rules, static, bodies, none, outlines, spare):  # type: ignore[no-untyped-def]
-    """True if a robot with the clearance around it fits at a point."""
-    disc[0], disc[1] = x, y
-    return clear_of_bodies(disc, rules[1], bodies, none, outlines, spare) and clear_of_walls(
-        disc, rules[1], static, outlines, spare
-    )
+def _spot(seed, counter, places, space):  # type: ignore[no-untyped-def]
+    """Draws x, y, heading of a start or goal in one of the places; takes 4 counters."""
+    turn = _uniform(seed, counter + 3)
+    if places.shape[0] == 0:
+        x, y = _point(seed, counter, space.for_robots, space.cells)
+        return x, y, (2.0 * turn - 1.0) * math.pi
+    share, p = _uniform(seed, counter), 0
+    while p < places.shape[0] - 1 and share >= places[p, SHARE]:
+        p += 1
+    place = places[p]
+    x = place[X1] + _uniform(seed, counter + 1) * (place[X2] - place[X1])
+    y = place[Y1] + _uniform(seed, counter + 2) * (place[Y2] - place[Y1])
+    spread = place[GREATEST_HEADING] - place[LEAST_HEADING]
+    return x, y, place[LEAST_HEADING] + turn * spread
 
 
 @kernel
@@ -165,8 +364,12 @@ def _apart(x, y, others, m, least):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _in_ring(seed, counter, x, y, least, greatest):  # type: ignore[no-untyped-def]
-    """Draws a point uniformly in the ring of these distances [m] around another."""
+def _goal_of(seed, counter, x, y, plan):  # type: ignore[no-untyped-def]
+    """Draws a goal, for some worlds uniformly in the ring around the start; takes 4 counters."""
+    if not plan.around:
+        gx, gy, _ = _spot(seed, counter, plan.goals, plan.space)
+        return gx, gy
+    least, greatest = plan.least, plan.greatest
     turn = 2.0 * math.pi * _uniform(seed, counter)
     share = _uniform(seed, counter + 1)
     far = math.sqrt(least * least + share * (greatest * greatest - least * least))
@@ -174,40 +377,36 @@ def _in_ring(seed, counter, x, y, least, greatest):  # type: ignore[no-untyped-d
 
 
 @kernel
-def _place_robots(  # type: ignore[no-untyped-def]
-    seed, counter, rules, where, still, static, outlines, bodies, none, starts, goals, disc,
-    search, spare,
-):  # fmt: skip
+def _fits(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-def]
+    """True if a start and a goal are free, in one area and neither too near nor too far."""
+    distance2 = (gx - x) * (gx - x) + (gy - y) * (gy - y)
+    if not plan.least * plan.least <= distance2 <= plan.greatest * plan.greatest:
+        return False
+    return area_of(gx, gy, plan.space) == area_of(x, y, plan.space) and _is_free(
+        scratch.disc, gx, gy, plan, bodies, scratch.spare
+    )
+
+
+@kernel
+def _place_robots(seed, counter, plan, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
     """Places starts and goals in pairs, each pair with a path between them."""
-    start_places, goal_places, cells, _ = where
-    footprint, clearance, least, greatest, room, around = rules
+    between = 2.0 * plan.footprint + plan.clearance
     for m in range(starts.shape[0]):
         placed, detours = False, 0
         for _ in range(TRIES):
-            x, y, heading = _spot(seed, counter, start_places, cells, static)
+            x, y, heading = _spot(seed, counter, plan.starts, plan.space)
             counter += 4
-            area = area_of(x, y, static)
-            if area == 0 or not _free(disc, x, y, rules, static, bodies, none, outlines, spare):
+            if area_of(x, y, plan.space) == 0:
                 continue
-            if around > 0.0:
-                gx, gy = _in_ring(seed, counter, x, y, least, greatest)
-            else:
-                gx, gy, _ = _spot(seed, counter, goal_places, cells, static)
+            if not _is_free(scratch.disc, x, y, plan, bodies, scratch.spare):
+                continue
+            gx, gy = _goal_of(seed, counter, x, y, plan)
             counter += 4
-            distance2 = (gx - x) * (gx - x) + (gy - y) * (gy - y)
-            if not least * least <= distance2 <= greatest * greatest:
+            if not _fits(x, y, gx, gy, plan, bodies, scratch):
                 continue
-            if area_of(gx, gy, static) != area:
-                continue
-            if not _free(disc, gx, gy, rules, static, bodies, none, outlines, spare):
-                continue
-            between = 2.0 * footprint + clearance
             if not (_apart(x, y, starts, m, between) and _apart(gx, gy, goals, m, between)):
                 continue
-            if not joined(
-                x, y, gx, gy, disc, room - footprint, still, static, bodies, none, outlines,
-                search, spare,
-            ):  # fmt: skip
+            if not _is_joined(x, y, gx, gy, plan, bodies, scratch):
                 detours += 1
                 if detours == DETOURS:
                     break
@@ -221,58 +420,25 @@ def _place_robots(  # type: ignore[no-untyped-def]
     return counter, True
 
 
-@kernel(allocates=True)
-def draw_scenes(  # type: ignore[no-untyped-def]
-    seeds, wanted, sizes, plan, static, outlines, rules, where, bodies, starts, goals, search
-):
-    """Draws the scenes of some seeds.
+@kernel
+def draw_scenes(seeds, wanted, sizes, plan, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
+    """Draws the scenes of some seeds (n,) to bodies (n, K, 7), starts (n, M, 3), goals (n, M, 2).
 
-    Args:
-        seeds: (n,).
-        wanted: (n,) number of random obstacles, -1 for the world's own.
-        sizes: (n,) rows of the shapes' index.
-        plan: groups (G, 7), group of each obstacle (K,), shapes that each group may take, one
-            group after the other, index (S, H) of each shape in each size, poses (K, 3) of the
-            obstacles at fixed poses.
-        static, outlines: see the module.
-        rules: footprint and clearance [m], least and greatest distance of the goal [m], free space
-            required at the centre of a cell [m], 1 to draw goals around their starts.
-        where: places of starts and of goals, see `_spot`; cells free for robots, and cells with
-            any free space.
-        bodies: (n, K, 7) result, see `lidar.shapes.BODY`.
-        starts: (n, M, 3) result.
-        goals: (n, M, 2) result.
-        search: scratch, see `joined`.
-
-    Returns:
-        The first row that could not be drawn, or n, and the reason.
+    `wanted` (n,) are numbers of random obstacles, -1 for the world's own, and `sizes` (n,) rows of
+    `plan.variants`. Returns the first row that could not be drawn, or n, and the reason.
     """
-    count = bodies.shape[1]
-    gaps, none = np.zeros(count), np.zeros(count)
-    active, still = np.zeros(count, np.bool_), np.zeros(count, np.uint8)
-    disc, trial = np.zeros(7), np.zeros(7)
-    corner = outlines[1]
-    most = 4
-    for h in range(corner.shape[0] - 1):
-        most = max(most, corner[h + 1] - corner[h])
-    spare = np.zeros((most, 2))
-    disc[3], disc[5], disc[6] = 1.0, rules[0], corner.shape[0] - 2
-    for k in range(count):
-        still[k] = plan[0][plan[1][k], MOVING] == 0.0
+    _put(scratch.disc, 0.0, 0.0, 0.0, plan.radii.shape[0] - 1, plan)
+    scratch.disc[RADIUS] = plan.footprint
     for n in range(seeds.shape[0]):
         state = NO_OBSTACLES
-        counter = _choose(seeds[n], 0, wanted[n], sizes[n], plan, bodies[n], active)
+        counter = _choose(seeds[n], wanted[n], sizes[n], plan, bodies[n], scratch.active)
         for _ in range(RESTARTS):
-            counter, placed = _place_obstacles(
-                seeds[n], counter, plan, static, where[3], outlines, bodies[n], active, gaps,
-                trial, spare,
-            )  # fmt: skip
+            counter, placed = _place_obstacles(seeds[n], counter, plan, bodies[n], scratch)
             if placed:
                 state = NO_ROBOTS
                 counter, placed = _place_robots(
-                    seeds[n], counter, rules, where, still, static, outlines, bodies[n], none,
-                    starts[n], goals[n], disc, search, spare,
-                )  # fmt: skip
+                    seeds[n], counter, plan, bodies[n], starts[n], goals[n], scratch
+                )
             if placed:
                 state = DRAWN
                 break

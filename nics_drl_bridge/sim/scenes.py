@@ -1,4 +1,4 @@
-"""Scenes drawn from worlds: obstacles, starts and goals of each seed."""
+"""Scenes drawn from worlds: obstacles, starts and goals of each seed, in connected free space."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
+from scipy import ndimage
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
+from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.shapes import (
     BODY,
     LARGEST,
@@ -27,56 +29,46 @@ from nics_drl_bridge.lidar.shapes import (
 )
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim import scene_kernels as kernels
-from nics_drl_bridge.sim.free_space import Areas, areas_of
 from nics_drl_bridge.sim.obstacles import Motion
-from nics_drl_bridge.sim.world import Goals, Starts, World
+from nics_drl_bridge.sim.scene_kernels import FreeSpace, ScenePlan, SceneScratch
+from nics_drl_bridge.sim.state import NO_FIELD, MapField
+from nics_drl_bridge.sim.world import Goals, Starts, World, check_places
 
 __all__ = ["Scene", "SceneSampler", "Scenes", "sample_scene", "scaled"]
 
 Array = NDArray[np.float64]
-Search = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
+CELL = 0.1
+"""Side of the cells of a field without a map [m]; larger in large fields, smaller in small ones."""
+FEWEST_CELLS = 20
+MOST_CELLS = 4_000_000
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Scene of one seed in a world.
+    """Scene of one seed in a world."""
 
-    Attributes:
-        bodies: (K, 7) obstacles as in `lidar.shapes.BODY`; the index of the shape is that in
-            `SceneSampler.shapes`, the radius is 0 for an absent obstacle.
-        starts: (M, 3) pose of each robot.
-        goals: (M, 2) position of each goal [m].
-    """
-
+    # (K, 7) obstacles as in `lidar.shapes.BODY`; the index of the shape is that in
+    # `SceneSampler.shapes`, the radius is 0 for an absent obstacle
     bodies: Array
-    starts: Array
-    goals: Array
+    starts: Array  # (M, 3) pose of each robot
+    goals: Array  # (M, 2) position of each goal [m]
 
 
 @dataclass(frozen=True)
 class Scenes:
-    """Scenes of n seeds in a world; `scenes[i]` is the Scene of one.
-
-    Attributes:
-        bodies: (n, K, 7) see `Scene`.
-        starts: (n, M, 3).
-        goals: (n, M, 2).
-    """
+    """Scenes of n seeds in a world, arrays (n, ...) as in `Scene`; `scenes[i]` is that of one."""
 
     bodies: Array
     starts: Array
     goals: Array
 
     def __len__(self) -> int:
-        """Number of scenes."""
         return len(self.bodies)
 
     def __getitem__(self, row: int) -> Scene:
-        """Returns one scene."""
         return Scene(self.bodies[row], self.starts[row], self.goals[row])
 
     def __iter__(self) -> Iterator[Scene]:
-        """Iterates over the scenes."""
         return (self[row] for row in range(len(self)))
 
 
@@ -113,24 +105,14 @@ class SceneSampler:
         sizes: Sequence[float] = (1.0,),
         most: int | None = None,
     ) -> None:
-        world = world if most is None else _with_room(world, most)
-        self.world, self.robots = world, robots
+        self.world = world = world if most is None else _with_room(world, most)
+        self.robots, self._sizes = robots, len(sizes)
         self.shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
-        self._sizes = len(sizes)
         slots = [g for g, group in enumerate(world.obstacles) for _ in range(group.counts[1])]
         self.count = len(slots)
         self.motions: tuple[Motion | None, ...] = tuple(world.obstacles[g].motion for g in slots)
-        outlines = Outlines.of((*self.shapes, Circle(radius=1.0)))
-        self._outlines = (*outlines.arguments, outlines.radii)
-        areas = areas_of(world, footprint_radius)
-        self._static = areas.static
-        self._rules = _rules(world, footprint_radius, areas)
-        self._where = (
-            _places(world.starts), _places(world.goals), areas.for_robots, areas.for_anything,
-        )  # fmt: skip
-        self._plan = _plan(world, slots, len(sizes))
-        self._footprint = footprint_radius
-        self._searches: list[Search] = []
+        self._plan = _plan(world, footprint_radius, slots, self.shapes, len(sizes))
+        self._scratches: list[SceneScratch] = []
 
     def draw(
         self,
@@ -138,10 +120,10 @@ class SceneSampler:
         count: ArrayLike | None = None,
         size: ArrayLike | None = None,
     ) -> Scenes:
-        """Draws the scenes of seeds; identical in every process and batch.
+        """Draws the scenes of seeds (n,); identical in every process and batch.
 
         Args:
-            seeds: (n,).
+            seeds: of the episodes.
             count: (n,) number of random obstacles of each scene, at most as many as the world
                 allows; by default that of the world.
             size: (n,) index of the size of all obstacles of a scene; the first by default.
@@ -157,30 +139,20 @@ class SceneSampler:
             raise ConfigError(f"count {wanted.shape} and size {sizes.shape} must be ({n},).")
         if n and not 0 <= sizes.min() <= sizes.max() < self._sizes:
             raise ConfigError(f"size must be from 0 to {self._sizes - 1}.")
-        scenes = Scenes(
-            np.zeros((n, self.count, BODY)),
-            np.zeros((n, self.robots, 3)),
-            np.zeros((n, self.robots, 2)),
-        )
-        search = self._search()
+        bodies, starts = np.zeros((n, self.count, BODY)), np.zeros((n, self.robots, 3))
+        scenes = Scenes(bodies, starts, np.zeros((n, self.robots, 2)))
+        try:
+            scratch = self._scratches.pop()
+        except IndexError:
+            scratch = _scratch(self._plan)
         row, why = kernels.draw_scenes(
-            numbers, wanted.astype(np.int64), sizes, self._plan, self._static, self._outlines,
-            self._rules, self._where, scenes.bodies, scenes.starts, scenes.goals, search,
+            numbers, wanted.astype(np.int64), sizes, self._plan, bodies, starts, scenes.goals,
+            scratch,
         )  # fmt: skip
-        self._searches.append(search)
+        self._scratches.append(scratch)
         if row < n:
             raise ConfigError(self._no_room(int(numbers[row]), why))
         return scenes
-
-    def _search(self) -> Search:
-        """Returns scratch memory for one call; threads may draw at the same time."""
-        try:
-            return self._searches.pop()
-        except IndexError:
-            cells = self._static[1].size
-            return (
-                np.zeros(cells, np.int64), np.zeros((2, cells), np.int64), np.zeros(1, np.int64),
-            )  # fmt: skip
 
     def _no_room(self, seed: int, why: int) -> str:
         world = self.world
@@ -190,22 +162,17 @@ class SceneSampler:
                 f"the scene of seed {seed}; lower `count` or `gap`, or enlarge `size`."
             )
         others = f" among {self.count} obstacles" if self.count else ""
+        least, greatest = world.goal_distance
         return (
             f"{world.source}: key 'goal_distance': no free places for {self.robots} start(s) and "
-            f"goal(s) of robots of radius {self._footprint:g} m, {world.goal_distance[0]:g} to "
-            f"{world.goal_distance[1]:g} m apart with a way between{others}, in the scene of seed "
-            f"{seed}; change `goal_distance`, lower `clearance` or `obstacles`, or enlarge `size`."
+            f"goal(s) of robots of radius {self._plan.footprint:g} m, {least:g} to {greatest:g} m "
+            f"apart with a way between{others}, in the scene of seed {seed}; change "
+            "`goal_distance`, lower `clearance` or `obstacles`, or enlarge `size`."
         )
 
 
 def sample_scene(world: World, footprint: float, seed: int, robots: int = 1) -> Scene:
-    """Draws the scene of a seed; identical in every process.
-
-    Args:
-        world: the field, its map and its obstacles.
-        footprint: radius of a robot [m].
-        seed: of the episode.
-        robots: M.
+    """Draws the scene of a seed for M robots of a radius [m]; identical in every process.
 
     Raises:
         ConfigError: the world has no room for it.
@@ -223,23 +190,19 @@ def scaled(shape: Shape, factor: float) -> Shape:
     if factor == 1.0:
         return shape
     try:
-        return _scaled(shape, factor)
+        if isinstance(shape, Circle):
+            return Circle(radius=shape.radius * factor)
+        if isinstance(shape, Rectangle):
+            return Rectangle(size=(shape.size[0] * factor, shape.size[1] * factor))
+        if isinstance(shape, Segment):
+            (x1, y1), (x2, y2) = shape.ends
+            return Segment(ends=((x1 * factor, y1 * factor), (x2 * factor, y2 * factor)))
+        return Polygon(points=tuple((x * factor, y * factor) for x, y in shape.points))
     except ValidationError:
         raise ConfigError(
             f"the {describe(shape)}, {factor:g} times as large, is beyond {SMALLEST:g} m to "
             f"{LARGEST:g} m; narrow the factors of its size."
         ) from None
-
-
-def _scaled(shape: Shape, factor: float) -> Shape:
-    if isinstance(shape, Circle):
-        return Circle(radius=shape.radius * factor)
-    if isinstance(shape, Rectangle):
-        return Rectangle(size=(shape.size[0] * factor, shape.size[1] * factor))
-    if isinstance(shape, Segment):
-        (x1, y1), (x2, y2) = shape.ends
-        return Segment(ends=((x1 * factor, y1 * factor), (x2 * factor, y2 * factor)))
-    return Polygon(points=tuple((x * factor, y * factor) for x, y in shape.points))
 
 
 def _with_room(world: World, most: int) -> World:
@@ -262,41 +225,166 @@ def _with_room(world: World, most: int) -> World:
     return world.model_copy(update={"obstacles": tuple(groups)})
 
 
-def _rules(world: World, footprint: float, areas: Areas) -> tuple[float, ...]:
-    """Returns the argument `rules` of `scene_kernels.draw_scenes`."""
+def _plan(
+    world: World, footprint: float, slots: Sequence[int], shapes: Sequence[Shape], sizes: int
+) -> ScenePlan:
+    """Prepares a world for the kernels; obstacle k belongs to group `slots[k]`."""
+    space = _free_space(world, footprint)
+    outlines = Outlines.of((*shapes, Circle(radius=1.0)))
+    groups = np.zeros((len(world.obstacles), kernels.GROUP))
+    choices: list[int] = []
+    poses = np.zeros((len(slots), 3))
+    for g, group in enumerate(world.obstacles):
+        fixed, moving = float(bool(group.at)), float(group.motion is not None)
+        groups[g] = *group.counts, group.gap, len(choices), len(group.shapes), fixed, moving
+        choices += [world.shapes.index(shape) for shape in group.shapes]
+        if group.at:
+            poses[np.flatnonzero(np.equal(slots, g))] = group.at
     least, greatest = world.goal_distance
-    cell = areas.static[2][4]
     ring = math.pi * (greatest * greatest - least * least)
-    around = world.goals is None and ring < len(areas.for_robots) * cell * cell
-    return footprint, world.clearance, least, greatest, areas.room, float(around)
+    cell = space.cells.cell
+    return ScenePlan(
+        space=space,
+        outlines=OutlineArrays(*outlines.arguments),
+        radii=outlines.radii,
+        groups=groups,
+        group=np.array(slots, dtype=np.int64),
+        choices=np.array(choices, dtype=np.int64),
+        variants=np.arange(sizes * len(world.shapes)).reshape(sizes, -1),
+        poses=poses,
+        starts=_places(world.starts),
+        goals=_places(world.goals),
+        footprint=float(footprint),
+        clearance=world.clearance,
+        least=least,
+        greatest=greatest,
+        around=world.goals is None and ring < len(space.for_robots) * cell * cell,
+    )
 
 
 def _places(places: Starts | Goals | None) -> Array:
-    """Returns the places (P, 7), see `scene_kernels.draw_scenes`."""
+    """Returns places (P, PLACE), see `scene_kernels`."""
     if places is None:
-        return np.zeros((0, 7))
-    rows = np.zeros((len(places.at) + len(places.regions), 7))
+        return np.zeros((0, kernels.PLACE))
+    rows = np.zeros((len(places.at) + len(places.regions), kernels.PLACE))
     for row, at in zip(rows, places.at, strict=False):
         row[:2], row[2:4], row[4:6] = at[:2], at[:2], at[2] if len(at) > 2 else 0.0
     for row, (x1, y1, x2, y2) in zip(rows, places.regions, strict=False):
         row[:6] = min(x1, x2), min(y1, y2), max(x1, x2), max(y1, y2), -math.pi, math.pi
     sizes = (rows[:, 2] - rows[:, 0]) * (rows[:, 3] - rows[:, 1])
     shares = sizes if sizes.all() else np.ones(len(rows))
-    rows[:, 6] = np.cumsum(shares) / shares.sum()
+    rows[:, kernels.SHARE] = np.cumsum(shares) / shares.sum()
     return rows
 
 
-def _plan(world: World, slots: Sequence[int], sizes: int) -> tuple[Any, ...]:
-    """Returns the argument `plan` of `scene_kernels.draw_scenes`."""
-    groups = np.zeros((len(world.obstacles), 7))
-    base: list[int] = []
-    poses = np.zeros((len(slots), 3))
-    for g, group in enumerate(world.obstacles):
-        fixed, moving = float(bool(group.at)), float(group.motion is not None)
-        groups[g] = *group.counts, group.gap, len(base), len(group.shapes), fixed, moving
-        base += [world.shapes.index(shape) for shape in group.shapes]
-        if group.at:
-            poses[np.flatnonzero(np.equal(slots, g))] = group.at
-    index = np.arange(sizes * len(world.shapes)).reshape(sizes, -1)
-    slot, taken = np.array(slots, dtype=np.int64), np.array(base, dtype=np.int64)
-    return groups, slot, taken, index, poses
+def _scratch(plan: ScenePlan) -> SceneScratch:
+    cells, count = plan.space.area.size, len(plan.group)
+    corners = max(int(np.diff(plan.outlines.first).max()), 4)
+    return SceneScratch(
+        np.zeros(cells, np.int64), np.zeros((2, cells), np.int64), np.zeros(1, np.int64),
+        np.zeros(count, np.bool_), np.zeros(count), np.zeros(BODY), np.zeros(BODY),
+        np.zeros((corners, 2)),
+    )  # fmt: skip
+
+
+def _free_space(world: World, footprint: float) -> FreeSpace:
+    """Finds the free space of a world and the areas within which a robot can move.
+
+    A robot moves between the centres of neighbouring cells, with the clearance of the world around
+    it. Areas too small for a start and a goal are dropped.
+
+    Raises:
+        ConfigError: no room for a start and a goal; the message names the key.
+    """
+    check_places(world)
+    grid = NO_FIELD if world.grid is None else _closed(world.grid)
+    cells = _cells_of(world) if world.grid is None else grid
+    cells = cells._replace(distances=np.array(cells.distances, order="C"))
+    walls, bounds = world.all_walls(), np.array([-np.inf, -np.inf, np.inf, np.inf])
+    kernels.wall_distances(cells, walls)
+    if world.size is not None:
+        bounds = np.array(world.extent)
+        x, y = _centres(cells)
+        inside = (x > bounds[0]) & (x < bounds[2]) & (y > bounds[1]) & (y < bounds[3])
+        cells.distances[~inside] = 0.0
+    # Between two cell centres the path is nearer to a corner than at either end.
+    room = math.hypot(footprint + world.clearance, cells.cell / 2.0)
+    area, _ = ndimage.label(cells.distances >= room)
+    robot = f"a robot of radius {footprint:g} m with {world.clearance:g} m around it"
+    if not area.any():
+        raise ConfigError(
+            f"{world.source}: key 'clearance': no free space for {robot}; lower `clearance`, or "
+            "enlarge the world."
+        )
+    least = world.goal_distance[0]
+    area = _large_enough(area, cells.cell, least)
+    if not area.any():
+        raise ConfigError(
+            f"{world.source}: key 'goal_distance': nowhere can {robot} reach a goal {least:g} m "
+            "away; lower `goal_distance` or `clearance`, or enlarge the world."
+        )
+    for key, places in (("starts", world.starts), ("goals", world.goals)):
+        _check(world, key, places, area, cells)
+    free = np.flatnonzero(area), np.flatnonzero(cells.distances > 0.0)
+    return FreeSpace(cells, area, bounds, walls, grid, *free, room)
+
+
+def _closed(grid: GridMap) -> MapField:
+    """Returns a map plus a border: unknown cells and everything outside the map are occupied."""
+    closed = np.pad(grid.cells, 1, constant_values=OCCUPIED)
+    x, y = grid.cell_to_world([-1.5, -1.5]).tolist()
+    heading = grid.origin[2]
+    whole = GridMap(closed, grid.resolution, (x, y, heading), unknown_stops=True)
+    distances, cosine, sine = whole.distance_field, math.cos(heading), math.sin(heading)
+    return MapField(np.ascontiguousarray(distances), x, y, cosine, sine, float(grid.resolution))
+
+
+def _cells_of(world: World) -> MapField:
+    """Returns the cells of a field without a map."""
+    x1, y1, x2, y2 = world.extent
+    size = min(CELL, min(x2 - x1, y2 - y1) / FEWEST_CELLS)
+    size = max(size, math.sqrt((x2 - x1) * (y2 - y1) / MOST_CELLS))
+    shape = max(1, math.ceil((y2 - y1) / size)), max(1, math.ceil((x2 - x1) / size))
+    return MapField(np.full(shape, np.inf, np.float32), x1, y1, 1.0, 0.0, size)
+
+
+def _centres(cells: MapField) -> Array:
+    """Returns x, y of the centres of the cells (2, rows, columns) [m]."""
+    rows, columns = np.indices(cells.distances.shape) + 0.5
+    return np.array(kernels.place_in.py_func(rows, columns, cells))
+
+
+def _large_enough(area: NDArray[np.int32], cell: float, least: float) -> NDArray[np.int32]:
+    """Keeps areas whose bounding box has a diagonal >= `least` [m]; zeroes the others."""
+    spans = [
+        cell * math.hypot(*(part.stop - part.start for part in parts))
+        for parts in ndimage.find_objects(area)
+    ]
+    keep = np.array([0, *(i + 1 if span >= least else 0 for i, span in enumerate(spans))], np.int32)
+    return np.asarray(keep[area])
+
+
+def _check(
+    world: World, key: str, places: Starts | Goals | None, area: NDArray[np.int32], cells: MapField
+) -> None:
+    """Raises ConfigError for a region or a place where no robot fits."""
+    if places is None:
+        return
+    free = np.zeros((2, 0)) if places.at else _centres(cells)[:, area > 0]
+    wrong: dict[str, tuple[float, ...]] = {}
+    for number, (x1, y1, x2, y2) in enumerate(places.regions):
+        within = (free[0] >= min(x1, x2)) & (free[0] <= max(x1, x2))
+        within &= (free[1] >= min(y1, y2)) & (free[1] <= max(y1, y2))
+        if not within.any():
+            wrong[f"{key}.regions.{number}"] = places.regions[number]
+    for number, at in enumerate(places.at):
+        i, j, _ = kernels.cell_of(at[0], at[1], cells)
+        inside = 0 <= i < area.shape[0] and 0 <= j < area.shape[1]
+        if not inside or area[i, j] == 0:
+            wrong[f"{key}.at.{number}"] = at
+    if wrong:
+        place, value = next(iter(wrong.items()))
+        raise ConfigError(
+            f"{world.source}: key {place!r}: a robot with {world.clearance:g} m around it does not "
+            f"fit there, at {list(value)}; move it, or lower `clearance`."
+        )

@@ -2,8 +2,7 @@
 
 Observations may be delayed: `past` (N, M, R, 12) is a ring buffer of the values at the ends of the
 last R periods, step i in row i % R: true pose, true twist, pose by odometry, measured twist.
-Between two rows, values are interpolated linearly. Shapes are those of `state`; G slices of a
-sweep.
+Between two rows, values are interpolated linearly.
 """
 
 from __future__ import annotations
@@ -13,18 +12,10 @@ import math
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import fault_kernels, scan_kernels
+from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
 from nics_drl_bridge.robot.kernels import move, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
-from nics_drl_bridge.sim.state import (
-    Array,
-    Cells,
-    Dynamics,
-    LidarView,
-    Scans,
-    Scratch,
-    State,
-    Surroundings,
-)
+from nics_drl_bridge.sim.state import Array, Dynamics, LidarView, Scratch, State, Surroundings
 
 POSE, TWIST, ODOM, MEASURED, PAST = 0, 3, 6, 9, 12
 """Columns of `past`."""
@@ -86,13 +77,8 @@ def measure(
 ) -> None:
     """Measures a robot's odometry of one period: a drifting pose and a noisy twist, maybe delayed.
 
-    Args:
-        n, m: indices of world and robot.
-        state: its `odom`, `twist` and the row of this period in `past` are the results.
-        pose: (N, M, 3) poses at the end of the period, as the wheels have it.
-        before: (3,) pose at its start.
-        now: (3 + S,) rates at its end.
-        motion: of the robots.
+    Updates `odom`, `twist` and `past` of the state, given by the wheels the poses (N, M, 3) at the
+    end of the period, the pose (3,) `before` it, and the rates (3 + S,) `now`, at its end.
     """
     steps, rows, substeps = state.steps[n], state.past.shape[2], motion.substeps
     this = steps % rows
@@ -134,18 +120,12 @@ def most_drift(std: Array, n: int, m: int, period: float) -> float:
 
 @kernel
 def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float, float]:
-    """Draws the motion of a robot that its model does not explain; it grows with root time.
+    """Draws the motion of a robot in a period [s] that its model does not explain.
 
-    Args:
-        n, m: indices of world and robot.
-        state: its `state` is updated in place.
-        period: [s].
-
-    Returns:
-        Ahead and aside [m], and turn [rad].
+    Updates its state; returns the motion ahead and aside [m], and turn [rad].
     """
     std, counter = state.noise, state.steps[n] * state.pose.shape[1] + m
-    # Uniform draws of this variance are cheap, and over some periods they add up to a normal one.
+    # It grows with root time. Uniform draws are cheap, and over some periods they add up to normal.
     count, scale = std.shape[2] - 2, math.sqrt(12.0 * period)
     ahead = aside = turn = 0.0
     for i in range(count):
@@ -174,21 +154,10 @@ def _needs_own(n: int, state: State) -> bool:
 
 @kernel(inline=True)
 def scan_or_wait(
-    n: int,
-    waiting: int,
-    state: State,
-    scene: Surroundings,
-    view: LidarView,
-    motion: Dynamics,
+    n: int, waiting: int, state: State, scene: Surroundings, view: LidarView, motion: Dynamics,
     scratch: Scratch,
-) -> int:
-    """Scans world n, unless `scan_together` can; returns how many worlds now wait for it.
-
-    Args:
-        n: index of the world.
-        waiting: number of worlds that waited before.
-        state, scene, view, motion, scratch: see `state`.
-    """
+) -> int:  # fmt: skip
+    """Scans world n, unless `scan_together` can; returns how many worlds now wait for it."""
     if not scene.scattered and not _needs_own(n, state):
         scratch.scans.waiting[waiting] = n
         return waiting + 1
@@ -199,9 +168,10 @@ def scan_or_wait(
 
 @kernel
 def scan_together(
-    waiting: int, state: State, scene: Surroundings, view: LidarView, scans: Scans
+    waiting: int, state: State, scene: Surroundings, view: LidarView, scratch: Scratch
 ) -> None:
-    """Scans the first `waiting` worlds of the list in `scans`, as they stand."""
+    """Scans the first `waiting` worlds of the list in the scratch memory, as they stand."""
+    scans = scratch.scans
     chosen, first = scans.waiting[:waiting], state.velocity.shape[1]
     scan_kernels.scan_worlds(
         state.ranges, state.pose, chosen, state.bodies, first, scene.walls, view.sensor,
@@ -226,9 +196,9 @@ def distort(low: int, high: int, state: State, view: LidarView) -> None:
 
 
 @kernel
-def _place_lidar(n: int, m: int, lag: int, state: State, scans: Scans, substeps: int) -> None:
+def _place_lidar(n: int, m: int, lag: int, state: State, scratch: Scratch, substeps: int) -> None:
     """Writes pose and twist of a robot, `lag` substeps ago, to `spot` and `drive`."""
-    spot, drive, steps = scans.spot[0, 0], scans.drive, state.steps[n]
+    spot, drive, steps = scratch.scans.spot[0, 0], scratch.scans.drive, state.steps[n]
     row = state.past[n, m, steps % state.past.shape[2]]
     for i in range(3):
         spot[i] = state.pose[n, m, i]
@@ -240,28 +210,19 @@ def _place_lidar(n: int, m: int, lag: int, state: State, scans: Scans, substeps:
 
 @kernel
 def _scan_alone(
-    n: int,
-    m: int,
-    state: State,
-    scene: Surroundings,
-    view: LidarView,
-    motion: Dynamics,
+    n: int, m: int, state: State, scene: Surroundings, view: LidarView, motion: Dynamics,
     scratch: Scratch,
-) -> None:
+) -> None:  # fmt: skip
     """Scans one robot from its own place and time, maybe skewed."""
-    scans, beams, skew = (
-        scratch.scans,
-        state.ranges.shape[2],
-        state.faults[n, m, fault_kernels.SKEW],
-    )
-    spot, drive = scans.spot, scans.drive
+    scans, beams = scratch.scans, state.ranges.shape[2]
+    spot, drive, skew = scans.spot, scans.drive, state.faults[n, m, fault_kernels.SKEW]
     lag = lag_of(state.age[n, m], state.steps[n], state.past.shape[2], motion.substeps)
-    _place_lidar(n, m, lag, state, scans, motion.substeps)
+    _place_lidar(n, m, lag, state, scratch, motion.substeps)
     reach = view.limits[1] + math.hypot(view.mount[0], view.mount[1])
     if skew != 0.0:
         reach += math.hypot(drive[0], drive[1]) * view.sweep_time
-    count = _gather(n, m, lag, reach, state, scene, motion, scans, scratch.cells)
-    seen = scans.seen[: count * 7].reshape((1, count, 7))
+    count = _gather(n, m, lag, reach, state, scene, motion, scratch)
+    seen = scans.seen[:count].reshape((1, count, 7))
     begin = (n * state.ranges.shape[1] + m) * beams
     scan = state.ranges.reshape(-1)[begin : begin + beams].reshape((1, 1, beams))
     groups = 1 if skew == 0.0 else scans.slices.shape[0]
@@ -285,10 +246,11 @@ def _scan_alone(
 @kernel
 def _gather(
     n: int, m: int, lag: int, reach: float, state: State, scene: Surroundings, motion: Dynamics,
-    scans: Scans, cells: Cells,
+    scratch: Scratch,
 ) -> int:  # fmt: skip
     """Copies the bodies around `spot`, as they were `lag` substeps ago; returns their number."""
-    seen, spot, bodies, velocity = scans.seen, scans.spot[0, 0], state.bodies, state.velocity
+    scans, cells, bodies, velocity = scratch.scans, scratch.cells, state.bodies, state.velocity
+    spot = scans.spot[0, 0]
     first, several = velocity.shape[1], bodies.shape[1]
     in_cells = scene.scattered and lag == 0  # the cells are of this period
     if in_cells:
@@ -296,26 +258,26 @@ def _gather(
     count, ago = 0, lag * motion.dt
     for i in range(several):
         k = cells.found[i] if in_cells else i
-        radius = bodies[n, k, 5]
+        radius = bodies[n, k, RADIUS]
         if k == first + m or radius <= 0.0:
             continue
-        at = 7 * count
+        body = scans.seen[count]
         for j in range(7):
-            seen[at + j] = bodies[n, k, j]
+            body[j] = bodies[n, k, j]
         turned = False
         if lag > 0 and k >= first:
-            seen[at], seen[at + 1], seen[at + 2] = at_lag(
+            body[X], body[Y], body[HEADING] = at_lag(
                 state.past, n, k - first, POSE, lag, state.steps[n], motion.substeps
             )
             turned = True
         elif lag > 0:
-            seen[at] -= velocity[n, k, 0] * ago
-            seen[at + 1] -= velocity[n, k, 1] * ago
+            body[X] -= velocity[n, k, 0] * ago
+            body[Y] -= velocity[n, k, 1] * ago
             turned = velocity[n, k, 2] != 0.0
-            seen[at + 2] -= velocity[n, k, 2] * ago
+            body[HEADING] -= velocity[n, k, 2] * ago
         if turned:
-            seen[at + 3], seen[at + 4] = math.cos(seen[at + 2]), math.sin(seen[at + 2])
-        dx, dy = seen[at] - spot[0], seen[at + 1] - spot[1]
+            body[COS], body[SIN] = math.cos(body[HEADING]), math.sin(body[HEADING])
+        dx, dy = body[X] - spot[0], body[Y] - spot[1]
         if dx * dx + dy * dy <= (reach + radius) * (reach + radius):
             count += 1
     return count

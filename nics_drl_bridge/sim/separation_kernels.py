@@ -4,34 +4,32 @@ Each wall, body and side of the field limits an obstacle to a half plane: along 
 the nearest point it may move by `room`. Of two that both move, each may use half of the gap, so
 that neither needs to know the other's step (buffered Voronoi cells; Zhou, Wang, Bandyopadhyay,
 Schwager 2017). A displacement within all half planes is free of contacts throughout the period.
-
-Shared arguments, all of one world: `bodies` (K + M, 7), see `lidar.shapes.BODY`, robots from index
-`first`; `walls` (W, 4); `half` (2,) half the size of the field [m]; `distances` see
-`obstacles.distance_arrays`; `scene` is (bodies, walls, half, distances).
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
+from nics_drl_bridge.sim.collision_kernels import in_grid, on_wall
+from nics_drl_bridge.sim.state import Array, MapField
 
 # A row of a plan (K, P): the motion of an obstacle.
 (
     KIND, SPEED_LOW, SPEED_HIGH, FIRST, COUNT, LOOP, PAUSE,
     RELAXATION, REPULSION, RANGE, WALL_REPULSION, WALL_RANGE, FORESIGHT, VIEW, BEHIND,
-    FLUCTUATION,
-) = range(16)  # fmt: skip
-PLAN = 16
+    FLUCTUATION, PLAN,
+) = range(17)  # fmt: skip
 
 # Values of the column KIND.
 STILL, WANDER, PATROL, PEDESTRIAN = range(4)
 
 # Memory of an obstacle, a row of marks (N, K, F).
-SPEED, VX, VY, DIRECTION, AIM, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST = range(11)
-MARK = 11
+SPEED, VX, VY, DIRECTION, AIM, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST, MARK = range(12)
 
 SLACK = 1e-6
 """Margin that is never used [m]: rounding must not make two bodies touch."""
@@ -43,53 +41,54 @@ HALVINGS = 8
 """Number of bisections of its last step to find the end of the free path."""
 
 
-@kernel(allocates=True)
-def on_wall(x, y, wall):  # type: ignore[no-untyped-def]
-    """Returns the point of a straight wall (4,) nearest to a point."""
-    ex, ey = wall[2] - wall[0], wall[3] - wall[1]
-    length2 = ex * ex + ey * ey
-    share = 0.0
-    if length2 > 0.0:
-        share = min(max(((x - wall[0]) * ex + (y - wall[1]) * ey) / length2, 0.0), 1.0)
-    return wall[0] + share * ex, wall[1] + share * ey
+class Traffic(NamedTuple):
+    """All that the moving obstacles of one world keep clear of in a period."""
+
+    bodies: Array  # (K + M, 7) obstacles, then robots
+    first: int  # index of the first robot
+    speeds: Array  # (M, 2) velocity of the robots in `map` [m/s]
+    plans: Array  # (K, P) motions of the obstacles
+    walls: Array  # (W, 4)
+    half: Array  # (2,) half the size of the field [m]
+    grid: MapField
+    period: float  # [s]
 
 
-@kernel(allocates=True)
-def map_distance(x, y, distances):  # type: ignore[no-untyped-def]
+@kernel
+def map_distance(x, y, grid):  # type: ignore[no-untyped-def]
     """Distance from a point to the static map [m], bilinear between the centres of cells."""
-    grid, frame = distances
-    rows, columns = grid.shape
+    distances = grid.distances
+    rows, columns = distances.shape
     if rows < 2 or columns < 2:
         return np.inf
-    dx, dy = x - frame[0], y - frame[1]
-    u = (frame[2] * dx + frame[3] * dy) / frame[4] - 0.5
-    v = (frame[2] * dy - frame[3] * dx) / frame[4] - 0.5
+    u, v = in_grid(x, y, grid)
+    u, v = u / grid.cell - 0.5, v / grid.cell - 0.5
     u, v = min(max(u, 0.0), columns - 1.0), min(max(v, 0.0), rows - 1.0)
     j, i = min(int(u), columns - 2), min(int(v), rows - 2)
-    if grid[i, j] == np.inf:
+    if distances[i, j] == np.inf:
         return np.inf
     u, v = u - j, v - i
-    low = grid[i, j] * (1.0 - u) + grid[i, j + 1] * u
-    high = grid[i + 1, j] * (1.0 - u) + grid[i + 1, j + 1] * u
+    low = distances[i, j] * (1.0 - u) + distances[i, j + 1] * u
+    high = distances[i + 1, j] * (1.0 - u) + distances[i + 1, j + 1] * u
     return low * (1.0 - v) + high * v
 
 
-@kernel(allocates=True)
-def map_direction(x, y, distances):  # type: ignore[no-untyped-def]
+@kernel
+def map_direction(x, y, grid):  # type: ignore[no-untyped-def]
     """Unit vector to the nearest point of the static map; zero where there is none."""
-    step = 0.5 * distances[1][4]
-    gx = map_distance(x - step, y, distances) - map_distance(x + step, y, distances)
-    gy = map_distance(x, y - step, distances) - map_distance(x, y + step, distances)
+    step = 0.5 * grid.cell
+    gx = map_distance(x - step, y, grid) - map_distance(x + step, y, grid)
+    gy = map_distance(x, y - step, grid) - map_distance(x, y + step, grid)
     length = math.hypot(gx, gy)
     if not 0.0 < length < np.inf:
         return 0.0, 0.0
     return gx / length, gy / length
 
 
-@kernel(allocates=True)
-def clearance(x, y, k, scene):  # type: ignore[no-untyped-def]
+@kernel
+def clearance(x, y, k, traffic):  # type: ignore[no-untyped-def]
     """Distance from a point to the nearest object except body k [m], and the unit vector to it."""
-    bodies, walls, half, distances = scene
+    bodies, walls, half = traffic.bodies, traffic.walls, traffic.half
     least, nx, ny = half[0] - abs(x), math.copysign(1.0, x), 0.0
     if half[1] - abs(y) < least:
         least, nx, ny = half[1] - abs(y), 0.0, math.copysign(1.0, y)
@@ -101,20 +100,20 @@ def clearance(x, y, k, scene):  # type: ignore[no-untyped-def]
             least = math.sqrt(away2)
             nx, ny = ox / least, oy / least
     for j in range(bodies.shape[0]):
-        if j != k and bodies[j, 5] > 0.0:
-            ox, oy, reach = bodies[j, 0] - x, bodies[j, 1] - y, least + bodies[j, 5]
+        if j != k and bodies[j, RADIUS] > 0.0:
+            ox, oy, reach = bodies[j, X] - x, bodies[j, Y] - y, least + bodies[j, RADIUS]
             away2 = ox * ox + oy * oy
             if reach > 0.0 and 0.0 < away2 < reach * reach:
                 away = math.sqrt(away2)
-                least, nx, ny = away - bodies[j, 5], ox / away, oy / away
-    away = map_distance(x, y, distances)
+                least, nx, ny = away - bodies[j, RADIUS], ox / away, oy / away
+    away = map_distance(x, y, traffic.grid)
     if away < least:
-        nx, ny = map_direction(x, y, distances)
+        nx, ny = map_direction(x, y, traffic.grid)
         least = away
     return least, nx, ny
 
 
-@kernel(allocates=True)
+@kernel
 def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
     """Limits a displacement to `room` along n.
 
@@ -129,15 +128,16 @@ def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
     return dx * (room / ahead), dy * (room / ahead)
 
 
-@kernel(allocates=True)
-def _hold_bodies(dx, dy, k, bodies, first, speeds, rows, period, bend):  # type: ignore[no-untyped-def]
+@kernel
+def _hold_bodies(dx, dy, k, traffic, bend):  # type: ignore[no-untyped-def]
     """Limits the displacement of body k to the room that the other bodies leave."""
-    x, y, radius = bodies[k, 0], bodies[k, 1], bodies[k, 5]
+    bodies, first, speeds, period = traffic.bodies, traffic.first, traffic.speeds, traffic.period
+    x, y, radius = bodies[k, X], bodies[k, Y], bodies[k, RADIUS]
     length = math.sqrt(dx * dx + dy * dy)
     for j in range(bodies.shape[0]):
-        if j == k or bodies[j, 5] <= 0.0:
+        if j == k or bodies[j, RADIUS] <= 0.0:
             continue
-        ox, oy, near = bodies[j, 0] - x, bodies[j, 1] - y, radius + bodies[j, 5]
+        ox, oy, near = bodies[j, X] - x, bodies[j, Y] - y, radius + bodies[j, RADIUS]
         step = 0.0
         if j >= first:
             vx, vy = speeds[j - first, 0], speeds[j - first, 1]
@@ -151,15 +151,16 @@ def _hold_bodies(dx, dy, k, bodies, first, speeds, rows, period, bend):  # type:
         if j >= first:
             towards = speeds[j - first, 0] * nx + speeds[j - first, 1] * ny
             room += min(towards, 0.0) * period
-        elif rows[j, KIND] != STILL:
+        elif traffic.plans[j, KIND] != STILL:
             room *= 0.5
         dx, dy = _hold(dx, dy, nx, ny, room, bend)
     return dx, dy
 
 
-@kernel(allocates=True)
-def _hold_walls(dx, dy, x, y, radius, walls, half, bend):  # type: ignore[no-untyped-def]
+@kernel
+def _hold_walls(dx, dy, body, traffic, bend):  # type: ignore[no-untyped-def]
     """Limits a displacement to the field and to this side of the walls."""
+    x, y, radius, walls, half = body[X], body[Y], body[RADIUS], traffic.walls, traffic.half
     reach = radius + math.sqrt(dx * dx + dy * dy) + 2.0 * SLACK
     for side in (-1.0, 1.0):
         dx, dy = _hold(dx, dy, side, 0.0, half[0] - radius - side * x, bend)
@@ -174,57 +175,51 @@ def _hold_walls(dx, dy, x, y, radius, walls, half, bend):  # type: ignore[no-unt
     return dx, dy
 
 
-@kernel(allocates=True)
-def _hold_map(dx, dy, x, y, radius, distances, bend):  # type: ignore[no-untyped-def]
+@kernel
+def _hold_map(dx, dy, body, grid, bend):  # type: ignore[no-untyped-def]
     """Limits a displacement to keep clear of the static map, by marching along the path."""
+    x, y, radius = body[X], body[Y], body[RADIUS]
     length = math.sqrt(dx * dx + dy * dy)
-    here = map_distance(x, y, distances) - radius
+    here = map_distance(x, y, grid) - radius
     if here - SLACK > length or length == 0.0:
         return dx, dy
-    nx, ny = map_direction(x, y, distances)
+    nx, ny = map_direction(x, y, grid)
     if bend:
         return _hold(dx, dy, nx, ny, here, True)
     if here <= SLACK and dx * nx + dy * ny <= 0.0 and nx * nx + ny * ny > 0.0:
         # In contact with the map it may only move to where there is no less room.
-        return (dx, dy) if map_distance(x + dx, y + dy, distances) - radius >= here else (0.0, 0.0)
-    free, way, finest = 0.0, 0.0, FINEST * distances[1][4] / length
-    room = here
+        return (dx, dy) if map_distance(x + dx, y + dy, grid) - radius >= here else (0.0, 0.0)
+    free, way, room, finest = 0.0, 0.0, here, FINEST * grid.cell / length
     while way < 1.0:
         way = min(way + max(room / length, finest), 1.0)
-        room = map_distance(x + dx * way, y + dy * way, distances) - radius
+        room = map_distance(x + dx * way, y + dy * way, grid) - radius
         if room < SLACK:
             break
         free = way
     for _ in range(HALVINGS if free < way else 0):
         middle = 0.5 * (free + way)
-        if map_distance(x + dx * middle, y + dy * middle, distances) - radius < SLACK:
+        if map_distance(x + dx * middle, y + dy * middle, grid) - radius < SLACK:
             way = middle
         else:
             free = middle
     return dx * free, dy * free
 
 
-@kernel(allocates=True)
-def restrain(dx, dy, k, scene, first, speeds, rows, period, bends):  # type: ignore[no-untyped-def]
-    """Returns the part of a displacement [m] that body k can make within a period.
+@kernel
+def restrain(dx, dy, k, traffic, bends):  # type: ignore[no-untyped-def]
+    """Returns the part of a displacement [m] that obstacle k can make within the period.
 
-    Args:
-        k: index of the body, below `first`.
-        speeds: (M, 2) velocity of the robots in `map` [m/s].
-        rows: (K, P) plans, which define the moving obstacles.
-        period: [s].
-        bends: whether it slides along obstructions or keeps its direction.
+    With `bends`, it slides along obstructions; otherwise it keeps its direction.
     """
-    bodies, walls, half, distances = scene
-    x, y, radius = bodies[k, 0], bodies[k, 1], bodies[k, 5]
+    body = traffic.bodies[k]
     for _ in range(PASSES if bends else 0):
         wished_x, wished_y = dx, dy
-        dx, dy = _hold_bodies(dx, dy, k, bodies, first, speeds, rows, period, True)
-        dx, dy = _hold_walls(dx, dy, x, y, radius, walls, half, True)
-        dx, dy = _hold_map(dx, dy, x, y, radius, distances, True)
+        dx, dy = _hold_bodies(dx, dy, k, traffic, True)
+        dx, dy = _hold_walls(dx, dy, body, traffic, True)
+        dx, dy = _hold_map(dx, dy, body, traffic.grid, True)
         if dx == wished_x and dy == wished_y:
             break
     # Shortening preserves limits already met, so all are met afterwards.
-    dx, dy = _hold_bodies(dx, dy, k, bodies, first, speeds, rows, period, False)
-    dx, dy = _hold_walls(dx, dy, x, y, radius, walls, half, False)
-    return _hold_map(dx, dy, x, y, radius, distances, False)
+    dx, dy = _hold_bodies(dx, dy, k, traffic, False)
+    dx, dy = _hold_walls(dx, dy, body, traffic, False)
+    return _hold_map(dx, dy, body, traffic.grid, False)

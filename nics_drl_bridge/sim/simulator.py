@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any, TypeVar
@@ -12,24 +13,18 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.lidar.bake import with_shapes
+from nics_drl_bridge.lidar.exact_kernels import SHAPE
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
-from nics_drl_bridge.lidar.shapes import SHAPE, place
+from nics_drl_bridge.lidar.shapes import place
+from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim import step_kernels
-from nics_drl_bridge.sim.allocation import SLICES, Sizes, allocate, part_of, split
-from nics_drl_bridge.sim.obstacles import distance_arrays, plan_arrays
+from nics_drl_bridge.sim.allocation import Sizes, allocate, part_of, split, surroundings
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
-from nics_drl_bridge.sim.state import Movers, State
-from nics_drl_bridge.sim.validity import (
-    CommandBox,
-    OutsideValidityWarning,
-    require_sane_speed,
-    warn,
-)
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.threads import Crew
-
-__all__ = ["SLICES", "FastSimulator", "OutsideValidityWarning", "State"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -39,6 +34,79 @@ MOST_ROBOTS = 1_000
 MOST_NUMBERS = 2**30
 """Greatest number of values in all worlds, some GB: beams of robots, states of obstacles."""
 PER_BODY = 64
+TOLERANCE = 0.05
+"""Tolerance beyond the range of commands that was recorded, as a share of their limits."""
+EVERY = 16
+"""Commands are checked in the first step after a reset and then at this interval [steps]."""
+
+
+class OutsideValidityWarning(UserWarning):
+    """Commands lie outside the range that the model's recording covered."""
+
+
+def warn(message: str) -> None:
+    """Issues an OutsideValidityWarning to the caller that steps the simulator."""
+    warnings.warn(message, OutsideValidityWarning, stacklevel=5)
+
+
+class CommandBox:
+    """The range of commands that a model was fitted to, save those whose effect was assumed.
+
+    `tell` is called with the message of a warning.
+    """
+
+    def __init__(
+        self, model: TaylorModel, robot: RobotSpec, tell: Callable[[str], None] = warn
+    ) -> None:
+        first, margin = len(robot.state), TOLERANCE * (robot.command_high - robot.command_low)
+        self._tell, self._names = tell, robot.variable_names[first:]
+        self._range = model.low[first:], model.high[first:]
+        self._low: Array = self._range[0] - margin
+        self._high: Array = self._range[1] + margin
+        for _, term in model.assumed:
+            assumed = taylor.parse_term(term, model.variables)[first:] > 0
+            self._low[assumed], self._high[assumed] = -np.inf, np.inf
+        self.begin()
+
+    def begin(self) -> None:
+        """Begins an episode: the next step is checked, and one warning may be issued."""
+        self._steps, self._armed = 0, True
+
+    def check(self, commands: Array) -> None:
+        """Warns once per episode if commands (..., C) are outside the range."""
+        steps, self._steps = self._steps, self._steps + 1
+        if not self._armed or steps % EVERY:
+            return
+        flat = commands.reshape(-1, commands.shape[-1])
+        least, most = flat.min(axis=0), flat.max(axis=0)
+        outside = (least < self._low) | (most > self._high)
+        if outside.any():
+            self._armed = False
+            i = int(np.argmax(outside))
+            value = least[i] if least[i] < self._low[i] else most[i]
+            self._tell(
+                f"{self._names[i]} is {value:.4g}, but the model was fitted to "
+                f"{self._range[0][i]:.4g} to {self._range[1][i]:.4g} only: its motion there is "
+                "extrapolated; record a drive that covers it."
+            )
+
+
+def _check_speed(model: TaylorModel, robot: RobotSpec, world: World) -> None:
+    """Raises ConfigError if a robot could cross a whole world in one step of its kinematics."""
+    first = len(robot.state)
+    most = np.maximum(np.abs(model.low), np.abs(model.high))
+    limits = np.maximum(np.abs(robot.command_low), np.abs(robot.command_high))
+    most[first:] = np.maximum(most[first:], limits)
+    products = np.prod(most**model.powers, axis=1)
+    step = float((np.abs(model.coefficients[:2]) @ products).max() * model.dt)
+    x1, y1, x2, y2 = world.extent
+    least = min(x2 - x1, y2 - y1)
+    if not step < least:
+        raise ConfigError(
+            f"the robot {robot.name!r} could drive {step:.3g} m in a step of {model.dt:g} s, "
+            f"across a world of {least:.3g} m; lower the limits of its commands, or generate its "
+            "model with a shorter step."
+        )
 
 
 def _check_memory(model: SimulatorModel, world: World, worlds: int, robots: int) -> None:
@@ -101,7 +169,7 @@ class FastSimulator:
         _check_memory(model, world, worlds, robots)
         if isinstance(randomisation, str):
             randomisation = load_randomisation(randomisation)
-        require_sane_speed(model.kinematics, model.robot, world.extent)
+        _check_speed(model.kinematics, model.robot, world)
         self.model, self.world = model, world
         self.randomisation = randomisation
         self._draws = None if randomisation is None else Sampler(randomisation, model, robots)
@@ -137,12 +205,8 @@ class FastSimulator:
     @cached_property
     def packed(self) -> dict[int, Any]:
         """Packed arguments of the kernels, by the first world of each part."""
-        walls, motions = self.world.all_walls(), self.sampler.motions
-        moves = any(motion is not None for motion in motions)
-        low_x, low_y, high_x, high_y = self.world.extent
-        half = np.array([max(-low_x, high_x), max(-low_y, high_y)])
-        movers = Movers(moves, plan_arrays(motions), half, distance_arrays(self.world.grid))
-        of = (self.data, self.model, self._scanner, walls, movers, self._sizes)
+        scene = surroundings(self.world, self.sampler.motions, self._scanner, self._sizes)
+        of = (self.data, scene, self.model, self._scanner, self._sizes)
         return {part.start: step_kernels.pack(part_of(*of, part)) for part in self.parts}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -161,9 +225,6 @@ class FastSimulator:
             seeds: of each episode (n,); a seed fixes scene, start, goal, noise and randomisation.
             worlds: (n,) indices of the worlds to reset, all by default.
             starts: (n, M, 3) poses to begin at instead of the scene's.
-
-        Returns:
-            The scene of each episode.
 
         Raises:
             ConfigError: the seeds or starts do not fit, or the world has no room for a scene.
@@ -208,10 +269,8 @@ class FastSimulator:
     def _place(self, chosen: Indices, seeds: Indices, scenes: Scenes, starts: Array) -> None:
         data = self.data
         data.pose[chosen], data.odom[chosen] = starts, starts
-        for zeroed in (
-            data.state, data.history, data.twist, data.collided, data.steps, data.velocity,
-        ):  # fmt: skip
-            zeroed[chosen] = 0
+        for name in ("state", "history", "twist", "collided", "steps", "velocity"):
+            getattr(data, name)[chosen] = 0
         data.seeds[chosen] = seeds
         bodies = scenes.bodies.copy()
         bodies[..., SHAPE] = self._in_table[bodies[..., SHAPE].astype(np.int64)]
@@ -227,49 +286,42 @@ class FastSimulator:
         data.faults[chosen] = draws.faults
         for name, values in draws.named().items():
             if name not in self.drawn:
-                shape = (len(data.steps), *values.shape[1:])
-                self.drawn[name] = np.zeros(shape, values.dtype)
+                self.drawn[name] = np.zeros((len(data.steps), *values.shape[1:]), values.dtype)
             self.drawn[name][chosen] = values
 
     def step(self, commands: ArrayLike) -> None:
         """Moves every world by one control period; the results are in `data`.
 
-        Args:
-            commands: (N, M, C) in the units and the order of the RobotSpec.
+        The commands are (N, M, C), in the units and the order of the RobotSpec.
         """
-        commands = np.ascontiguousarray(commands, dtype=np.float64)
-        self._check_shape(commands, len(self.data.steps))
-        self._boxes[0].check(commands)
-        if len(self.parts) == 1:
-            step_kernels.step_worlds(self.packed[0], commands, 0)
-        else:
-            self.run_parts(
-                lambda part: step_kernels.step_worlds(
-                    self.packed[part.start], commands[part], part.start
-                )
+        checked = self._checked(slice(0, len(self.data.steps)), commands)
+        self.run_parts(
+            lambda part: step_kernels.step_worlds(
+                self.packed[part.start], checked[part], part.start
             )
+        )
 
     def run_parts(self, function: Callable[[slice], R]) -> list[R]:
         """Runs a function for each of `parts`, one thread per part; returns the results."""
         return self._crew.run(function, self.parts)
 
     def step_part(self, part: slice, commands: ArrayLike) -> None:
-        """Moves the worlds of one part by one control period, in the calling thread.
+        """Moves the worlds of one of `parts` by one control period, in the calling thread.
 
-        Args:
-            part: one of `parts`; different parts may be stepped in parallel.
-            commands: (n, M, C) of the worlds of the part.
+        The commands (n, M, C) are of these worlds; different parts may be stepped in parallel.
         """
-        commands = np.ascontiguousarray(commands, dtype=np.float64)
-        self._check_shape(commands, part.stop - part.start)
-        self._boxes[part.start].check(commands)
-        step_kernels.step_worlds(self.packed[part.start], commands, part.start)
+        checked = self._checked(part, commands)
+        step_kernels.step_worlds(self.packed[part.start], checked, part.start)
 
-    def _check_shape(self, commands: Array, worlds: int) -> None:
-        """Raises ConfigError if the kernels would read beyond the commands."""
+    def _checked(self, part: slice, commands: ArrayLike) -> Array:
+        """Returns commands as the kernels read them. Raises ConfigError for another shape."""
+        checked = np.ascontiguousarray(commands, dtype=np.float64)
         robots, _, width = self.data.history.shape[1:]
-        if commands.shape != (worlds, robots, width):
+        expected = (part.stop - part.start, robots, width)
+        if checked.shape != expected:
             raise ConfigError(
-                f"commands are {commands.shape}; they must be {(worlds, robots, width)}: worlds, "
-                "robots, and a robot's commands."
+                f"commands are {checked.shape}; they must be {expected}: worlds, robots, and a "
+                "robot's commands."
             )
+        self._boxes[part.start].check(checked)
+        return checked

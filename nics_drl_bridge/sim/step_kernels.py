@@ -1,7 +1,5 @@
 """Compiled inner loops of the simulator: motion, and the step of some worlds.
 
-What one robot does is a scalar function that the batched loops call. Shapes are those of `state`.
-
 A world is bit-identical in any batch, part or thread: nothing is summed over worlds, and what is
 drawn at random is drawn by the world's own seed and counter.
 """
@@ -16,15 +14,16 @@ from numba import types
 from numba.experimental import structref
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.robot.kernels import Terms, delayed, run, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import obstacle_kernels as obstacles
-from nics_drl_bridge.sim import robot_kernels as robots
 from nics_drl_bridge.sim import sensing_kernels as sensing
-from nics_drl_bridge.sim.careful_kernels import rates_at
+from nics_drl_bridge.sim.careful_kernels import drift_carefully, move_carefully, rates_at
 from nics_drl_bridge.sim.state import (
     Array,
     Dynamics,
     Integers,
+    Lanes,
     LidarView,
     Part,
     Scratch,
@@ -64,6 +63,83 @@ def _send(history: Array, commands: Array, begin: int) -> None:
 
 
 @kernel
+def move_freely(begin: int, end: int, state: State, motion: Dynamics, lanes: Lanes) -> None:
+    """Moves the robots of the worlds [begin, end) over one period as if nothing were in the way.
+
+    The results stay in the lanes: robot m of world n is in lane (n - begin) M + m.
+    """
+    robots, size = state.pose.shape[1], state.state.shape[2]
+    substeps, history = motion.substeps, state.history
+    where, x, late = lanes.pose, lanes.x, lanes.late
+    for n in range(begin, end):
+        for m in range(robots):
+            i, heading = (n - begin) * robots + m, state.pose[n, m, 2]
+            where[0, i], where[1, i] = state.pose[n, m, 0], state.pose[n, m, 1]
+            where[2, i], where[3, i] = math.cos(heading), math.sin(heading)
+            where[4, i], where[5, i] = heading, 0.0
+            for s in range(size):
+                x[s, i] = state.state[n, m, s]
+            for t in range(lanes.coefficient.shape[0]):
+                lanes.coefficient[t, i] = state.coefficient[n, m, t]
+            late[i] = state.delay[n, m] % substeps  # its command changes once, after this many
+    terms = Terms(motion.terms.dof, lanes.coefficient, motion.terms.factors, motion.terms.degree)
+    at, used = 0, (end - begin) * robots
+    while at < substeps:
+        until = substeps
+        for i in range(used):
+            if late[i] > at:
+                until = min(until, late[i])
+            if late[i] == at or at == 0:
+                n, m = begin + i // robots, i % robots
+                row = delayed(at, state.delay[n, m], substeps, history.shape[2])
+                for c in range(history.shape[3]):
+                    x[size + c, i] = history[n, m, row, c]
+        run(where, x, lanes.dq, terms, motion.series, motion.dt, until - at)
+        at = until
+
+
+@kernel
+def _move_world(
+    n: int, skip: int, state: State, scene: Surroundings, motion: Dynamics, scratch: Scratch
+) -> None:
+    """Moves obstacles and robots of world n: freely, and carefully in tight spots.
+
+    `move_freely` has moved its first robot in lane `skip`, the others in those that follow.
+    """
+    lanes, nearby, single = scratch.lanes, scratch.nearby, scratch.single
+    pose, period = state.pose, motion.dt * motion.substeps
+    robots, first = pose.shape[1], state.velocity.shape[1]
+    for m in range(robots):
+        nearby.way[m] = lanes.pose[5, skip + m] + sensing.most_drift(state.noise, n, m, period)
+    longest, moving = contacts.reaches(n, state, nearby, period)
+    if scene.crowded:
+        contacts.sort_bodies(state.bodies, n, scratch.cells)
+        scratch.cells.frame[contacts.MOVED] = longest
+    tight = False
+    for m in range(robots):
+        nearby.meets[m] = contacts.find_near(n, m, state.bodies, scene, nearby, scratch.cells)
+        tight = tight or nearby.meets[m] != contacts.FREE
+    for m in range(robots):
+        if nearby.meets[m] == contacts.FREE:
+            i = skip + m
+            pose[n, m, 0], pose[n, m, 1] = lanes.pose[0, i], lanes.pose[1, i]
+            pose[n, m, 2] = lanes.pose[4, i]
+            for s in range(state.state.shape[2]):
+                state.state[n, m, s] = lanes.x[s, i]
+    if moving:
+        for k in range(first):
+            for i in range(3):
+                single.start[k, i] = single.began[k, i] = state.bodies[n, k, i]
+    if tight:
+        move_carefully(n, moving, state, scene, motion, nearby, single)
+    elif moving:
+        contacts.move_obstacles(state.bodies, single.start, state.velocity, n, period)
+    for m in range(robots):
+        pose[n, m, 2] = wrap(pose[n, m, 2])
+    drift_carefully(n, state, scene, motion, nearby, single)
+
+
+@kernel
 def _note_paths(n: int, skip: int, pose: Array, scratch: Scratch) -> None:
     """Reports to the cells how far the robots of world n came, drift included."""
     before, frame = scratch.scans.before, scratch.cells.frame
@@ -74,12 +150,9 @@ def _note_paths(n: int, skip: int, pose: Array, scratch: Scratch) -> None:
 
 @kernel(allocates=True)
 def step_worlds(packed: Any, commands: Array, begin: int) -> None:
-    """One control period of the worlds of a part.
+    """Steps the worlds of a part, from `begin` on, by one control period.
 
-    Args:
-        packed: the part, see `pack`; its state is updated in place.
-        commands: (n, M, C).
-        begin: the first world.
+    The commands are (n, M, C).
     """
     part = packed.part
     _step(part.state, part.scene, part.lidar, part.motion, part.scratch, commands, begin)
@@ -97,18 +170,31 @@ def _step(
     for low in range(begin, end, block):
         high = min(low + block, end)
         _begin_period(low, high, state, scene, motion, scratch)
-        robots.move_freely(low, high, state, motion, scratch.lanes)
+        move_freely(low, high, state, motion, scratch.lanes)
         waiting = np.int64(0)
         for n in range(low, high):
             state.steps[n] += 1
             skip = (n - low) * many
-            robots.move_world(n, skip, state, scene, motion, scratch)
+            _move_world(n, skip, state, scene, motion, scratch)
             _measure(n, skip, state, motion, scratch)
             if scene.crowded:
                 _note_paths(n, skip, state.pose, scratch)
             waiting = sensing.scan_or_wait(n, waiting, state, scene, view, motion, scratch)
-        sensing.scan_together(waiting, state, scene, view, scratch.scans)
+        sensing.scan_together(waiting, state, scene, view, scratch)
         sensing.distort(low, high, state, view)
+
+
+@kernel
+def _note_speeds(n: int, state: State, speeds: Array) -> None:
+    """Writes the velocities (M, 2) in `map` of the robots of world n, as the period begins."""
+    pose, past, step = state.pose, state.past, state.steps[n]
+    row = step % past.shape[2]
+    for m in range(pose.shape[1]):
+        vx = vy = 0.0
+        if step > 0:
+            vx, vy = past[n, m, row, sensing.TWIST], past[n, m, row, sensing.TWIST + 1]
+        c, s = math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2])
+        speeds[m, 0], speeds[m, 1] = c * vx - s * vy, s * vx + c * vy
 
 
 @kernel(inline=True)
@@ -119,7 +205,8 @@ def _begin_period(
     pose, before = state.pose, scratch.scans.before
     for n in range(low, high):
         if scene.movers.moves:
-            steer_world(n, state, scene, motion.dt * motion.substeps, scratch.nearby.speeds)
+            _note_speeds(n, state, scratch.nearby.speeds)
+            obstacles.steer(n, state, scene, motion.dt * motion.substeps, scratch.nearby.speeds)
         for m in range(pose.shape[1]):
             i = (n - low) * pose.shape[1] + m
             before[i, 0], before[i, 1], before[i, 2] = pose[n, m, 0], pose[n, m, 1], pose[n, m, 2]
@@ -139,85 +226,36 @@ def _measure(n: int, skip: int, state: State, motion: Dynamics, scratch: Scratch
 
 
 @kernel(allocates=True)
-def steer_world(n: int, state: State, scene: Surroundings, period: float, speeds: Array) -> None:
-    """Sets the velocities of the obstacles of world n for the period that begins.
-
-    Args:
-        n: index of the world.
-        state, scene: see `state`.
-        period: [s].
-        speeds: (M, 2) scratch memory.
-    """
-    pose, past, step = state.pose, state.past, state.steps[n]
-    row = step % past.shape[2]
-    for m in range(pose.shape[1]):
-        vx = vy = 0.0
-        if step > 0:
-            vx, vy = past[n, m, row, sensing.TWIST], past[n, m, row, sensing.TWIST + 1]
-        c, s = math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2])
-        speeds[m, 0], speeds[m, 1] = c * vx - s * vy, s * vx + c * vy
-    movers = scene.movers
-    obstacles.steer(
-        state.velocity, state.marks, n, state.bodies, state.velocity.shape[1], speeds,
-        movers.plans, scene.walls, movers.half, state.seeds[n], step, period, movers.distances,
-    )  # fmt: skip
-
-
-@kernel(allocates=True)
 def begin(packed: Any, chosen: Integers) -> None:
     """Begins episodes in the worlds `chosen` (n,), whose robots and obstacles are in place.
 
-    Their moving obstacles draw what they need, and the robots take their first scans.
+    Their moving obstacles draw what they need, and the robots take their first scans: everything
+    stands still, so no scan is older or skewed.
     """
     part = packed.part
-    if part.scene.movers.moves:
-        for n in chosen:
-            obstacles.begin(
-                part.state.marks, n, part.state.bodies, part.scene.movers.plans,
-                part.scene.movers.half, part.state.seeds[n],
-            )  # fmt: skip
-    _scan_first(part.state, part.scene, part.lidar, part.scratch, chosen)
-
-
-@kernel
-def _scan_first(
-    state: State, scene: Surroundings, view: LidarView, scratch: Scratch, chosen: Integers
-) -> None:
-    """Scans as the episodes begin: everything stands still, so no scan is older or skewed."""
+    state, waiting = part.state, part.scratch.scans.waiting
     for i in range(chosen.shape[0]):
-        scratch.scans.waiting[i] = chosen[i]
-    sensing.scan_together(chosen.shape[0], state, scene, view, scratch.scans)
+        waiting[i] = chosen[i]
+        if part.scene.movers.moves:
+            obstacles.begin(chosen[i], state, part.scene.movers.plans)
+    sensing.scan_together(chosen.shape[0], state, part.scene, part.lidar, part.scratch)
     for n in chosen:
-        sensing.distort(n, n + 1, state, view)
+        sensing.distort(n, n + 1, state, part.lidar)
 
 
 @kernel(allocates=True)
 def begin_period(packed: Any) -> None:
-    """Begins a period of worlds whose robots are moved from outside.
-
-    Args:
-        packed: see `step_worlds`; the robots stand where the period begins.
-    """
-    state, scene, motion = packed.part.state, packed.part.scene, packed.part.motion
-    for n in range(state.pose.shape[0]):
-        if scene.movers.moves:
-            speeds = packed.part.scratch.nearby.speeds
-            steer_world(n, state, scene, motion.dt * motion.substeps, speeds)
-        for m in range(state.pose.shape[1]):
-            if state.steps[n] == 0:
-                sensing.begin(n, m, state)
+    """Begins a period of worlds whose robots are moved from outside, from where they stand."""
+    part = packed.part
+    _begin_period(0, part.state.pose.shape[0], part.state, part.scene, part.motion, part.scratch)
 
 
 @kernel(allocates=True)
 def end_period(packed: Any, true: Array, before: Array, wheels: Array, counted: Array) -> None:
     """Measures what the robots sense at the end of a period in which they were moved from outside.
 
-    Args:
-        packed: see `step_worlds`; robots and obstacles stand where the period ends.
-        true: (N, M, 3) true twist at its end.
-        before: (N, M, 3) pose by the wheels alone at its start.
-        wheels: (N, M, 3) the same at its end.
-        counted: (N, M, 3) twist by the wheels at its end.
+    Robots and obstacles stand where the period ends. All others are (N, M, 3): the true twist at
+    the end, the pose by the wheels alone before and after, and the twist by the wheels at the end.
     """
     part = packed.part
     state, scene, motion, scratch = part.state, part.scene, part.motion, part.scratch
@@ -234,5 +272,5 @@ def end_period(packed: Any, true: Array, before: Array, wheels: Array, counted: 
         if scene.crowded:
             contacts.sort_bodies(state.bodies, n, scratch.cells)
         waiting = sensing.scan_or_wait(n, waiting, state, scene, part.lidar, motion, scratch)
-    sensing.scan_together(waiting, state, scene, part.lidar, scratch.scans)
+    sensing.scan_together(waiting, state, scene, part.lidar, scratch)
     sensing.distort(0, state.pose.shape[0], state, part.lidar)

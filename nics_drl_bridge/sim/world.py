@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated
@@ -16,8 +15,8 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.lidar.maps import GridMap, load_map
 from nics_drl_bridge.lidar.shapes import LARGEST, MOST_SHAPES, Coordinate, Heading, Shape
+from nics_drl_bridge.sim.collision_kernels import wall_distance
 from nics_drl_bridge.sim.obstacles import Motion, Patrol
-from nics_drl_bridge.sim.space_kernels import wall_distance
 
 Array = NDArray[np.float64]
 MOST_OBSTACLES = 10_000
@@ -53,19 +52,17 @@ class Obstacles(Schema):
     @classmethod
     def _numbers(cls, count: object) -> object:
         several = count if isinstance(count, list | tuple) else (count, count)
-        if count is not None and not (len(several) == 2 and all(type(n) is int for n in several)):
-            raise ValueError("count must be a whole number, or [least, greatest]")
+        whole = len(several) == 2 and all(type(n) is int for n in several)
+        if count is not None and not (whole and 0 <= several[0] <= several[1] <= MOST_OBSTACLES):
+            raise ValueError(
+                f"count must be a whole number, or [least, greatest], from 0 to {MOST_OBSTACLES}"
+            )
         return count
 
     @model_validator(mode="after")
     def _consistent(self) -> Obstacles:
         if (self.count is None) == (not self.at):
             raise ValueError("a group needs either `count` or `at`")
-        least, greatest = self.counts
-        if not 0 <= least <= greatest <= MOST_OBSTACLES:
-            raise ValueError(
-                f"count must be a whole number, or [least, greatest], from 0 to {MOST_OBSTACLES}"
-            )
         return self
 
     @property
@@ -76,43 +73,32 @@ class Obstacles(Schema):
         return (self.count, self.count) if isinstance(self.count, int) else self.count
 
 
-class Starts(Schema):
-    """Starts of the robots: anywhere in one of the regions, or at one of the poses.
+class Places(Schema):
+    """Places anywhere in one of the regions, x1, y1, x2, y2 of opposite corners [m], or at points.
 
-    Attributes:
-        regions: x1, y1, x2, y2 of opposite corners [m].
-        at: x, y [m], heading [rad].
+    Of starts these are x, y [m], heading [rad]; of goals x, y [m].
     """
 
     regions: tuple[Region, ...] = Field(default=(), max_length=MOST_PLACES)
+    at: tuple[Pose | Point, ...] = Field(default=(), max_length=MOST_PLACES)
+
+    @model_validator(mode="after")
+    def _one(self) -> Places:
+        if bool(self.regions) == bool(self.at):
+            raise ValueError("give either `regions` or `at`")
+        return self
+
+
+class Starts(Places):
+    """Places where robots start."""
+
     at: tuple[Pose, ...] = Field(default=(), max_length=MOST_PLACES)
 
-    @model_validator(mode="after")
-    def _one(self) -> Starts:
-        _either(self.regions, self.at)
-        return self
 
+class Goals(Places):
+    """Places that robots are to reach."""
 
-class Goals(Schema):
-    """Goals of the robots: anywhere in one of the regions, or at one of the points.
-
-    Attributes:
-        regions: x1, y1, x2, y2 of opposite corners [m].
-        at: x, y [m].
-    """
-
-    regions: tuple[Region, ...] = Field(default=(), max_length=MOST_PLACES)
     at: tuple[Point, ...] = Field(default=(), max_length=MOST_PLACES)
-
-    @model_validator(mode="after")
-    def _one(self) -> Goals:
-        _either(self.regions, self.at)
-        return self
-
-
-def _either(regions: tuple[Region, ...], at: tuple[object, ...]) -> None:
-    if bool(regions) == bool(at):
-        raise ValueError("give either `regions` or `at`")
 
 
 class World(Schema):
@@ -127,8 +113,7 @@ class World(Schema):
         obstacles: groups of obstacles, see `Obstacles`.
         clearance: free space around the footprint at start and goal, and on a path between [m].
         goal_distance: least and greatest straight-line distance from start to goal [m].
-        starts: places of the starts; by default anywhere.
-        goals: places of the goals; by default anywhere.
+        starts, goals: by default anywhere.
     """
 
     name: str
@@ -219,46 +204,32 @@ def load_world(name: str | Path) -> World:
 
 
 def check_places(world: World) -> None:
-    """Checks that the fixed obstacles and waypoints of the file lie in free places.
-
-    Raises:
-        ConfigError: an obstacle of `at` stands outside the world, or an obstacle of a patrol does
-            not fit at a waypoint.
-    """
+    """Raises ConfigError for an obstacle outside the world, or that does not fit at a waypoint."""
+    x1, y1, x2, y2 = world.extent
     for g, group in enumerate(world.obstacles):
-        for n, at in enumerate(group.at):
-            if _room_at(world, at, static=False) < 0.0:
+        for n, (x, y, heading) in enumerate(group.at):
+            if not (x1 <= x <= x2 and y1 <= y <= y2):
                 raise ConfigError(
-                    f"{world.source}: key 'obstacles.{g}.at.{n}': {list(at)} is outside of the "
-                    "world; move it."
+                    f"{world.source}: key 'obstacles.{g}.at.{n}': {[x, y, heading]} is outside of "
+                    "the world; move it."
                 )
         if not isinstance(group.motion, Patrol):
             continue
         radius = max(shape.radius for shape in group.shapes)
         for n, point in enumerate(group.motion.waypoints):
-            if _room_at(world, point) < radius:
+            if _room_at(world, *point) < radius:
                 raise ConfigError(
                     f"{world.source}: key 'obstacles.{g}.motion.waypoints.{n}': an obstacle of "
                     f"radius {radius:g} m does not fit there, at {list(point)}; move it."
                 )
 
 
-def _room_at(world: World, point: Sequence[float], static: bool = True) -> float:
-    """Free space around a point [m], negative outside the world.
-
-    Args:
-        world: the field and its static map.
-        point: x, y [m].
-        static: whether inner walls and a map's solid cells count, or the outer bounds alone.
-    """
-    x, y = point[:2]
+def _room_at(world: World, x: float, y: float) -> float:
+    """Free space around a point among walls and map [m], negative outside the world."""
     x1, y1, x2, y2 = world.extent
-    room = min(x - x1, x2 - x, y - y1, y2 - y)
-    if not static or room < 0.0:
-        return room
-    if world.size is None:
-        room = np.inf  # a map is bounded by its cells alone
-    room = min(room, wall_distance(x, y, world.all_walls()))
+    if not (x1 <= x <= x2 and y1 <= y <= y2):
+        return -1.0
+    room = wall_distance(x, y, world.all_walls())
     if world.grid is not None:
         i, j = world.grid.world_to_cell([x, y])
         rows, columns = world.grid.cells.shape

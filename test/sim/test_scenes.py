@@ -20,7 +20,7 @@ from nics_drl_bridge.sim.world import World, load_world
 SHIPPED = ("arena", "empty", "corridor", "doorway", "clutter", "crowd", "room")
 SEEDS = range(50)
 ROBOT = 0.25
-FINE = 0.02
+FINE = 0.04
 SLACK = 1e-6
 
 
@@ -84,10 +84,10 @@ def check_places(world, sampler, scene, static, there):
     assert (np.abs(scene.starts[:, 2]) <= np.pi).all()
 
 
-def check_way(world, sampler, scene, static, there, groups):
+def check_way(world, sampler, scene, static, there, groups, fine=FINE):
     """On a grid finer than the sampler's and turned against it: a robot gets through."""
     x1, y1, x2, y2 = world.extent
-    x, y = np.meshgrid(np.arange(x1, x2, FINE), np.arange(y1, y2, FINE))
+    x, y = np.meshgrid(np.arange(x1, x2, fine), np.arange(y1, y2, fine))
     points = shapely.points(x, y)
     shapely.prepare(static)
     free = shapely.distance(points, static) >= ROBOT
@@ -98,22 +98,29 @@ def check_way(world, sampler, scene, static, there, groups):
     label, _ = ndimage.label(free)
 
     def area(place):
-        return label[round((place[1] - y1) / FINE), round((place[0] - x1) / FINE)]
+        return label[round((place[1] - y1) / fine), round((place[0] - x1) / fine)]
 
     for start, goal in zip(scene.starts, scene.goals, strict=True):
         assert area(start) == area(goal) != 0
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_every_scene_of_a_shipped_world_is_as_its_file_says(name):
+@pytest.mark.parametrize(
+    ("seeds", "fine"),
+    [
+        pytest.param(8, FINE, marks=pytest.mark.slow, id="some"),
+        pytest.param(50, 0.02, marks=pytest.mark.campaign, id="many"),
+    ],
+)
+def test_every_scene_of_a_shipped_world_is_as_its_file_says(name, seeds, fine):
     world = load_world(name)
     sampler = SceneSampler(world, ROBOT, robots=2 if name in ("arena", "clutter") else 1)
     static = static_of(world)
-    for row, scene in enumerate(sampler.draw(SEEDS)):
+    for row, scene in enumerate(sampler.draw(range(seeds))):
         there, groups = check_obstacles(world, sampler, scene, static)
         check_places(world, sampler, scene, static, there)
         if row % 10 == 0:
-            check_way(world, sampler, scene, static, there, groups)
+            check_way(world, sampler, scene, static, there, groups, fine)
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +138,7 @@ def test_a_seed_gives_the_same_scene_in_every_batch_and_another_seed_another(wor
     assert len({scene.bodies.tobytes() for scene in together}) == len(SEEDS)
 
 
+@pytest.mark.process
 def test_a_seed_gives_the_same_scene_in_another_process(world):
     code = (
         "from nics_drl_bridge.sim.scenes import sample_scene\n"
@@ -237,7 +245,7 @@ def test_an_obstacle_never_shuts_the_only_door():
         starts={"regions": [[-1.9, -1.9, -0.3, 1.9]]}, goals={"regions": [[0.3, -1.9, 1.9, 1.9]]},
     )  # fmt: skip
     sampler, static = SceneSampler(world, ROBOT), static_of(world)
-    for scene in sampler.draw(range(30)):
+    for scene in sampler.draw(range(8)):
         there, groups = check_obstacles(world, sampler, scene, static)
         check_way(world, sampler, scene, static, there, groups)
 

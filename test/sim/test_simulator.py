@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from robots import FOOTPRINT, RADIUS, circles, direct_model, field, lidar
@@ -9,7 +12,11 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.lidar.faults import scan_skewed, slice_poses
 from nics_drl_bridge.lidar.scanner import Scanner
-from nics_drl_bridge.sim.simulator import SLICES, FastSimulator, State
+from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.robot.taylor import TaylorModel
+from nics_drl_bridge.sim.allocation import SLICES
+from nics_drl_bridge.sim.simulator import EVERY, CommandBox, FastSimulator, OutsideValidityWarning
+from nics_drl_bridge.sim.state import State
 from nics_drl_bridge.sim.world import load_world
 
 ORIGIN = np.zeros((1, 1, 3))
@@ -290,3 +297,43 @@ def test_a_simulator_of_nothing_is_refused(worlds, robots):
 def test_more_copies_or_robots_than_fit_are_refused_before_any_is_made(worlds, robots):
     with pytest.raises(ConfigError, match="copies of it are the most"):
         FastSimulator(direct_model(), field(), worlds, robots)
+
+
+@pytest.fixture
+def model():
+    spec = load_robot("ackermann")
+    return TaylorModel(
+        spec.variable_names, spec.dof_names, spec.dof_units, np.eye(4, dtype=np.int64),
+        np.zeros((5, 4)), 0.01, np.array([0.0, -0.4, 0.1, -0.4]), np.array([1.0, -0.4, 0.8, -0.4]),
+    )  # fmt: skip
+
+
+def box(model):
+    return CommandBox(model, load_robot("ackermann"))
+
+
+def test_a_command_outside_the_drive_warns_once_per_episode(model):
+    checked = box(model)
+    for _ in range(2):
+        checked.begin()
+        with pytest.warns(OutsideValidityWarning, match=r"speed_command is 1, .* 0.1 to 0.8"):
+            checked.check(np.array([[[1.0, -0.4]]]))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            for _ in range(3 * EVERY):
+                checked.check(np.array([[[1.0, -0.4]]]))
+
+
+def test_commands_of_the_drive_do_not_warn(model):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        box(model).check(np.array([[[0.1, -0.4]], [[0.84, -0.36]]]))
+
+
+def test_what_was_assumed_does_not_warn(model):
+    assumed = replace(model, assumed=(("d_steering", "steering_command"),))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        box(assumed).check(np.array([[[0.5, 0.5]]]))
+    with pytest.warns(OutsideValidityWarning, match="steering_command"):
+        box(model).check(np.array([[[0.5, 0.5]]]))

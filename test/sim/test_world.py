@@ -12,7 +12,7 @@ from robots import circles, field
 from nics_drl_bridge.config import share_folder, validate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.maps import load_map
-from nics_drl_bridge.sim.space_kernels import wall_distance
+from nics_drl_bridge.sim.collision_kernels import wall_distance
 from nics_drl_bridge.sim.world import World, load_world
 
 CIRCLE = {"kind": "circle", "radius": 0.2}

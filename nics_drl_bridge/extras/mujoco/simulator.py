@@ -18,7 +18,7 @@ from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.sim.driven import Driven, DrivenSimulator
+from nics_drl_bridge.sim.device import Driven, DrivenSimulator
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.state import State
 from nics_drl_bridge.sim.world import World

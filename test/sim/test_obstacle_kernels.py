@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from moving import PERIOD, scattered, sides, watch
+from moving import PERIOD, scattered, sides, state_of, surroundings_of, watch
 from pydantic import TypeAdapter
 from shapely import LineString, MultiLineString, box, unary_union
 
@@ -14,15 +14,9 @@ from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.sim import obstacle_kernels as kernels
 from nics_drl_bridge.sim import separation_kernels as at
-from nics_drl_bridge.sim.obstacles import (
-    NO_DISTANCES,
-    Motion,
-    Patrol,
-    Pedestrian,
-    Wander,
-    distance_arrays,
-    plan_arrays,
-)
+from nics_drl_bridge.sim.allocation import map_field
+from nics_drl_bridge.sim.obstacle_kernels import FAR, repulsion
+from nics_drl_bridge.sim.obstacles import Motion, Patrol, Pedestrian, Wander, plan_arrays
 from nics_drl_bridge.sim.separation_kernels import MARK
 
 WANDER, WALKER = Wander(speed=(0.3, 0.8)), Pedestrian()
@@ -193,13 +187,11 @@ def walk_on(marks, places, radii, half, seed, steps=120):
     poses = np.concatenate([places, np.zeros((2, 1))], axis=1)[None]
     bodies = place(poses, np.asarray(radii)[None], np.zeros((1, 2)))
     marks, velocity, track = marks[None].copy(), np.zeros((1, 1, 3)), []
-    walls, half, plans = sides(half), np.asarray(half), plan_arrays([WALKER])
-    goal = marks[0, 0, at.GOAL_X].copy()
+    scene = surroundings_of([WALKER], half, sides(half))
+    state, goal = state_of(bodies, marks, velocity, [seed]), marks[0, 0, at.GOAL_X].copy()
     for t in range(steps):
-        kernels.steer(
-            velocity, marks, 0, bodies, 1, np.zeros((1, 2)), plans, walls, half, seed, t + 1,
-            PERIOD, NO_DISTANCES,
-        )  # fmt: skip
+        state.steps[0] = t + 1
+        kernels.steer(0, state, scene, PERIOD, np.zeros((1, 2)))
         if marks[0, 0, at.GOAL_X] != goal:
             break
         bodies[0, 0, :2] += velocity[0, 0, :2] * PERIOD
@@ -222,15 +214,14 @@ def in_batch(seeds, motions=tuple(MIXED), steps=200):
     poses = np.tile(np.concatenate([places, np.zeros((count + 1, 1))], 1), (worlds, 1, 1))
     bodies = place(poses, radii, np.zeros_like(radii))
     marks, velocity = np.full((worlds, count, MARK), 7.0), np.full((worlds, count, 3), 9.0)
-    plans, still = plan_arrays(motions), np.zeros((1, 2))
-    for n, seed in enumerate(seeds):
-        kernels.begin(marks, n, bodies, plans, half, seed)
+    scene, still = surroundings_of(motions, half, sides(half)), np.zeros((1, 2))
+    state = state_of(bodies, marks, velocity, seeds)
+    for n in range(worlds):
+        kernels.begin(n, state, scene.movers.plans)
     for t in range(steps):
-        for n, seed in enumerate(seeds):
-            kernels.steer(
-                velocity, marks, n, bodies, count, still, plans, sides(half), half, seed, t,
-                PERIOD, NO_DISTANCES,
-            )  # fmt: skip
+        state.steps[:] = t
+        for n in range(worlds):
+            kernels.steer(n, state, scene, PERIOD, still)
         bodies[:, :count, :3] += velocity * PERIOD
     return bodies
 
@@ -262,7 +253,7 @@ def test_what_moves_keeps_clear_of_a_static_map(motion, heading):
         ):
             places.append(spot)
     seen = watch([motion] * count, np.array(places), [radius] * count,
-                 distances=distance_arrays(grid))  # fmt: skip
+                 grid=map_field(grid))  # fmt: skip
     d = seen.places - (x, y)
     local = np.stack([c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0]], axis=-1)
     for k in range(count):
@@ -305,3 +296,45 @@ def test_plans_hold_the_waypoints_of_all_patrols_one_after_the_other():
     assert rows[[1, 3], at.FIRST].tolist() == [0, 4]
     assert np.array_equal(waypoints, [*SQUARE.waypoints, (0, 0), (1, 1)])
     assert [part.shape for part in plan_arrays([])] == [(0, 16), (0, 2)]
+
+
+STRENGTH, REACH = 2.1, 0.3
+
+
+def potential(r, v, foresight):
+    """Equations 3 and 4 of Helbing and Molnar (1995), as they stand there."""
+    step = v * foresight
+    both = np.linalg.norm(r) + np.linalg.norm(r - step)
+    return STRENGTH * np.exp(-0.5 * np.sqrt(both**2 - step @ step) / REACH)
+
+
+@pytest.mark.parametrize("foresight", [0.0, 0.4, 2.0])
+def test_the_force_is_the_downhill_slope_of_the_potential(foresight):
+    rng, delta = np.random.default_rng(0), 1e-6
+    for _ in range(300):
+        r, v = rng.uniform(-1.0, 1.0, 2), rng.uniform(-1.5, 1.5, 2)
+        slope = [
+            (potential(r + d, v, foresight) - potential(r - d, v, foresight)) / (2.0 * delta)
+            for d in delta * np.eye(2)
+        ]
+        force = np.array(repulsion(*r, *v, foresight, STRENGTH, REACH))
+        if potential(r, v, foresight) < STRENGTH * np.exp(-FAR):
+            assert (force == 0.0).all()  # so far away that it is left out
+        else:
+            assert np.allclose(force, -np.array(slope), rtol=1e-4, atol=1e-6)
+
+
+def test_the_force_is_that_of_the_library_socialforce():
+    potentials = pytest.importorskip("socialforce.potentials")
+    torch = pytest.importorskip("torch")
+    rng, count = np.random.default_rng(1), 6
+    model = potentials.PedPedPotential(v0=STRENGTH, sigma=REACH)
+    places, v = rng.uniform(-1.0, 1.0, (count, 2)), rng.uniform(-1.5, 1.5, (count, 2))
+    state = np.concatenate([places, v, 0.0 * v, places + 10.0 * v], axis=1)
+    expected = -model.grad_r_ab(torch.tensor(state)).detach().numpy()
+    for a in range(count):
+        for b in range(count):
+            if a != b:
+                r = places[a] - places[b]
+                force = repulsion(*r, *v[b], model.delta_t_step, STRENGTH, REACH)
+                assert np.allclose(force, expected[a, b], rtol=1e-3, atol=5e-3)
