@@ -82,6 +82,14 @@ def kernel(
     return compiled if function is None else compiled(function)
 
 
+class _Index(IndexDataCacheFile):  # type: ignore[misc]
+    def _load_index(self) -> dict[Any, Any]:
+        try:
+            return dict(super()._load_index())
+        except (AttributeError, ImportError):  # it names a NamedTuple that has moved since
+            return {}
+
+
 class _Cache(FunctionCache):  # type: ignore[misc]
     """Machine code on disk, stamped with the content of all that it was compiled from."""
 
@@ -90,7 +98,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         # Without the line of the function: it may move, and leaves nothing behind.
         name = re.sub(r"-\d+(\.py\d+\w*)$", r"\1", self._impl.filename_base)
         stamp = digest_of(Path(function.__code__.co_filename))
-        self._cache_file = IndexDataCacheFile(self._cache_path, name, stamp)
+        self._cache_file = _Index(self._cache_path, name, stamp)
 
     @property
     def is_warm(self) -> bool:

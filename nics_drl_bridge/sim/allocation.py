@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
@@ -25,7 +26,6 @@ from nics_drl_bridge.sim.state import (
     MapField,
     Movers,
     Nearby,
-    OutlineArrays,
     Part,
     Scans,
     Scratch,
@@ -126,8 +126,7 @@ def part_of(
     """Returns the arguments of the kernels for one part of the worlds, with scratch of its own."""
     lidar, grid = model.lidar, scanner.grid
     dt, substeps, _ = model.timing
-    outlines = OutlineArrays(*scanner.table.outlines.arguments)
-    scene = Surroundings(walls, _grid(grid), outlines, sizes.crowded, sizes.scattered, movers)
+    scene = Surroundings(walls, _grid(grid), scanner.table.outlines.arguments, sizes.crowded, sizes.scattered, movers)
     view = LidarView(
         scanner.arguments,
         NO_MAP if grid is None else grid.arrays,
@@ -143,7 +142,7 @@ def part_of(
 def _grid(grid: GridMap | None) -> MapField:
     if grid is None:
         return MapField(np.zeros((0, 0), np.float32), np.zeros(5))
-    return MapField(np.ascontiguousarray(grid.distance_field), grid.arrays[1])
+    return MapField(np.ascontiguousarray(grid.distance_field), grid.arrays.frame)
 
 
 def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int) -> Scratch:
@@ -181,6 +180,6 @@ def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int)
             before=np.zeros((lanes, 3)), waiting=np.zeros(worlds, np.int64),
             seen=np.zeros((bodies + 1) * BODY), spot=np.zeros((1, 1, 3)),
             slices=np.zeros((SLICES, 3)), part=np.zeros((1, 1, model.lidar.beams), np.float32),
-            drive=np.zeros(3), none=np.zeros(1, np.int64), lookup=scanner.room(bodies),
+            drive=np.zeros(3), none=np.zeros(1, np.int64), lookup=scan_kernels.lanes(),
         ),
     )  # fmt: skip

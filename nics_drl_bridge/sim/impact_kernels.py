@@ -21,9 +21,10 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.robot.kernels import move
 from nics_drl_bridge.sim.collision_kernels import map_bound, segment_distance2
-from nics_drl_bridge.sim.state import Array, MapField, OutlineArrays
+from nics_drl_bridge.sim.state import Array, MapField
 
 VX, VY, TURN, STOP, FLIGHT = range(5)
 """Columns of `flights`: velocity [m/s, m/s, rad/s], and time of its stop in the substep [s]."""

@@ -169,4 +169,4 @@ def plan_arrays(motions: Sequence[Wander | Patrol | Pedestrian | None]) -> Plans
 
 def distance_arrays(grid: GridMap | None) -> Distances:
     """Returns the kernels' argument `distances`: distance field of a static map, and its frame."""
-    return NO_DISTANCES if grid is None else (grid.distance_field, grid.arrays[1])
+    return NO_DISTANCES if grid is None else (grid.distance_field, grid.arrays.frame)

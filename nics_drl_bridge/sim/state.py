@@ -12,6 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.lidar.baked_kernels import LidarArrays
+from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
+from nics_drl_bridge.lidar.map_kernels import GridArrays
+from nics_drl_bridge.lidar.scan_kernels import Lanes as ScanLanes
 from nics_drl_bridge.robot.kernels import Terms
 
 Array = NDArray[np.float64]
@@ -68,18 +72,6 @@ class State(NamedTuple):
     marks: Array
 
 
-class OutlineArrays(NamedTuple):
-    """Outlines of all shapes, see `lidar.shapes.Outlines`.
-
-    Attributes:
-        corners: (sum V, 2) of all outlines [m].
-        first: (H + 1,) first corner of each outline.
-    """
-
-    corners: Array
-    first: Integers
-
-
 class MapField(NamedTuple):
     """The static map, see `collision_kernels`; without cells where there is none.
 
@@ -132,16 +124,16 @@ class LidarView(NamedTuple):
     """The lidar.
 
     Attributes:
-        sensor: see `lidar.scanner.Scanner.arguments`.
-        grid: the static map as scanned, see `lidar.maps.GridMap.arrays`.
+        sensor: the lidar and its table.
+        grid: the static map as scanned.
         exact: whether the map is scanned exactly.
         mount: (3,) pose of the lidar on the robot.
         limits: (2,) least and greatest range [m].
         sweep_time: duration of a sweep [s].
     """
 
-    sensor: Any
-    grid: Any
+    sensor: LidarArrays
+    grid: GridArrays
     exact: bool
     mount: Array
     limits: Array
@@ -252,7 +244,7 @@ class Scans(NamedTuple):
         part: (1, 1, B) scan of a slice.
         drive: (3,) twist of one robot.
         none: (1,) index of the only world of one robot.
-        lookup: see `lidar.scanner.Scanner.room`.
+        lookup: of the lidar.
     """
 
     before: Array
@@ -263,7 +255,7 @@ class Scans(NamedTuple):
     part: NDArray[np.float32]
     drive: Array
     none: Integers
-    lookup: Any
+    lookup: ScanLanes
 
 
 class Scratch(NamedTuple):
