@@ -19,7 +19,7 @@ from scipy import ndimage
 from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.exact_kernels import Beams, LidarPose
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
-from nics_drl_bridge.lidar.scan_kernels import lanes
+from nics_drl_bridge.lidar.scan_kernels import scan_lanes
 from nics_drl_bridge.lidar.spec import load_lidar
 
 CONTROLS = {
@@ -123,11 +123,11 @@ def measure(seed: int, control: str | None) -> dict[str, Any]:
             beams = Beams(directions, spec.angle_min, spec.angle_increment, spec.full_circle)
             at = poses(grid, seed + 1)
             arguments = (beams, at, spec.range_max, grid.arrays)
-            exact, exact_speed = timed(*arguments, True, lanes())
+            exact, exact_speed = timed(*arguments, True, scan_lanes())
             if control == "shifted":
                 moved = np.column_stack([at[:, :1] + RESOLUTION, at[:, 1:]])
                 arguments = (beams, moved, spec.range_max, grid.arrays)
-            baked, baked_speed = timed(*arguments, control == "slow", lanes())
+            baked, baked_speed = timed(*arguments, control == "slow", scan_lanes())
             if control == "nan":
                 baked[0, 0] = np.nan
             error = baked.astype(np.float64) - exact

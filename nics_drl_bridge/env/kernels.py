@@ -9,15 +9,31 @@ the remainder of a batch differently from its body.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.sector_kernels import resample
+from nics_drl_bridge.lidar.sector_kernels import SectorPlan, resample
 from nics_drl_bridge.random_kernels import episode_seed
 
 LIMIT = 1000.0
 """Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation."""
+
+
+class ScanShares(NamedTuple):
+    """The scan part of an observation.
+
+    Attributes:
+        per_metre: 1 / maximum range [1/m].
+        leaves: (B,) range at which each beam leaves the footprint [m].
+        plan: of the sectors; without any, the beams are used directly.
+    """
+
+    per_metre: np.float32
+    leaves: NDArray[np.float32]
+    plan: SectorPlan
 
 
 @kernel(allocates=True)
@@ -71,19 +87,17 @@ def look(shares, ranges, per_metre, leaves):  # type: ignore[no-untyped-def]
 def look_by_sector(shares, ranges, sensor):  # type: ignore[no-untyped-def]
     """Writes the nearest returns of sectors (S,) as shares; returns True if something is too close.
 
-    Contact is judged from the beams (B,) themselves. `sensor` contains per_metre and leaves of
-    `look`, and the mapping of beams to sectors, see `sectors.SectorPlan.arguments`.
+    Contact is judged from the beams (B,) themselves. `sensor` is `ScanShares`.
     """
-    per_metre, leaves, plan = sensor
     zero, one = np.float32(0.0), np.float32(1.0)
-    resample(shares, ranges, plan)
+    resample(shares, ranges, sensor.plan)
     for s in range(shares.shape[0]):
-        share = shares[s] * per_metre
+        share = shares[s] * sensor.per_metre
         share = share if share > zero else zero
         shares[s] = share if share < one else one
     hits = np.int32(0)
     for b in range(ranges.shape[0]):
-        hits |= np.int32(ranges[b] < leaves[b])
+        hits |= np.int32(ranges[b] < sensor.leaves[b])
     return hits != 0
 
 
@@ -111,8 +125,8 @@ def bearings(out, poses, points):  # type: ignore[no-untyped-def]
 def looks(shares, touched, ranges, sensor):  # type: ignore[no-untyped-def]
     """Writes scans of R robots with `look` or `look_by_sector`; touched (R,) is their result."""
     for i in range(ranges.shape[0]):
-        if sensor[2][0].shape[0] == 0:
-            touched[i] = look(shares[i], ranges[i], sensor[0], sensor[1])
+        if sensor.plan.first.shape[0] == 0:
+            touched[i] = look(shares[i], ranges[i], sensor.per_metre, sensor.leaves)
         else:
             touched[i] = look_by_sector(shares[i], ranges[i], sensor)
 
@@ -129,13 +143,13 @@ def navigate(out, approach, reached, touched, before, pose, twist, ranges, goals
         pose, twist: (R, 3).
         ranges: (R, B) float32.
         goals: (R, 2) [m].
-        sensor: see `look_by_sector`; with a plan without sectors, the beams are used directly.
+        sensor: `ScanShares`.
         radius: of a goal [m].
     """
     parts = out.shape[1] - 6
     for i in range(out.shape[0]):
-        if sensor[2][0].shape[0] == 0:
-            touched[i] = look(out[i, :parts], ranges[i], sensor[0], sensor[1])
+        if sensor.plan.first.shape[0] == 0:
+            touched[i] = look(out[i, :parts], ranges[i], sensor.per_metre, sensor.leaves)
         else:
             touched[i] = look_by_sector(out[i, :parts], ranges[i], sensor)
         distance, c, s = bearing(pose[i], goals[i, 0], goals[i, 1])

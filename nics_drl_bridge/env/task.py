@@ -20,7 +20,8 @@ from nics_drl_bridge.env.actions import Actions, action_space, discrete_commands
 from nics_drl_bridge.env.kernels import LIMIT
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, SectorPlan, plan_of
+from nics_drl_bridge.lidar.sector_kernels import SectorPlan
+from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -230,9 +231,9 @@ class Task(ABC):
         return NO_PLAN if self.scan is None else plan_of(self.lidar, self.scan)
 
     @cached_property
-    def sensor(self) -> tuple[Any, ...]:
-        """Arguments of the kernels: `per_metre`, `contact_ranges`, and the plan's arrays."""
-        return self.per_metre, self.contact_ranges, self.plan.arguments
+    def sensor(self) -> kernels.ScanShares:
+        """The scan part of an observation for the kernels."""
+        return kernels.ScanShares(self.per_metre, self.contact_ranges, self.plan)
 
     @cached_property
     def per_metre(self) -> np.float32:

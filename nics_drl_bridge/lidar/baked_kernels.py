@@ -1,4 +1,4 @@
-"""Compiled scans: each body looked up in the table (Eq. 3) or computed, fused by the minimum (Eq. 4).
+"""Compiled scans: each body is looked up (Eq. 3) or computed; fused by the minimum (Eq. 4).
 
 A plain look-up takes the nearest row of the table. Here the rows of the two grid distances around
 the true one are blended, and in each the two points around a beam; and the beams that hit follow
@@ -121,26 +121,25 @@ def scan_robot(out, pose, bodies, me, walls, lidar):  # type: ignore[no-untyped-
     for i in range(out.shape[0]):
         out[i] = np.float32(np.inf)
     x, y, heading = sensor_pose(pose, lidar.mount)
-    computed = 0
+    computed = False
     for k in range(bodies.shape[0]):
         way = way_of(bodies[k], x, y, lidar) if k != me else UNSEEN
         if way == LOOKED_UP:
             look_up(out, x, y, heading, bodies[k], lidar)
-        computed += way == COMPUTED
-    if computed > 0 or walls.shape[0] > 0:
-        compute(out, x, y, heading, bodies, me, walls, lidar, computed)
+        computed |= way == COMPUTED
+    here = LidarPose(x, y, math.cos(heading), math.sin(heading))
+    compute(out, here, bodies, me, computed, walls, lidar)
 
 
 @kernel
-def compute(out, x, y, heading, bodies, me, walls, lidar, computed):  # type: ignore[no-untyped-def]
-    """Fuses what is not looked up into a scan: walls, and so many bodies, or none."""
-    here = LidarPose(x, y, math.cos(heading), math.sin(heading))
-    for k in range(bodies.shape[0] if computed > 0 else 0):
-        if k != me and way_of(bodies[k], x, y, lidar) == COMPUTED:
+def compute(out, here, bodies, me, computed, walls, lidar):  # type: ignore[no-untyped-def]
+    """Fuses walls, and the bodies that are not looked up, if there are any."""
+    for k in range(bodies.shape[0] if computed else 0):
+        if k != me and way_of(bodies[k], here.x, here.y, lidar) == COMPUTED:
             body, outlines = bodies[k], lidar.outlines
             exact_kernels.body_into(out, lidar.beams, here, body, outlines, lidar.range_max)
     near = exact_kernels.walls_into(out, lidar.beams, here, walls, lidar.range_max)
-    if near > 0 or computed > 0:
+    if near > 0 or computed:
         exact_kernels.finish(out, lidar.range_min, lidar.range_max)
 
 
@@ -165,9 +164,7 @@ def look_up(out, x, y, heading, body, lidar):  # type: ignore[no-untyped-def]
     distance, bearing = polar(dx, dy)
     cell, hull, blend = nearest_cell(distance, bearing, body[RADIUS], body[HEADING], shape, table)
     near, far = table.cells[np.uintp(cell)], table.cells[np.uintp(cell + 1)]
-    seen = Seen(
-        dx * dx + dy * dy, body[COS] * dx + body[SIN] * dy, body[SIN] * dx - body[COS] * dy
-    )
+    seen = seen_at(dx, dy, body[COS], body[SIN])
     right = silhouette(near[2], hull, shape, table.hulls, seen, 1.0)
     left = silhouette(near[3], hull, shape, table.hulls, seen, -1.0)
     middle, low, high = in_beams(right, left, bearing, heading, lidar.beams)
@@ -212,6 +209,12 @@ class Seen(NamedTuple):
     d2: float
     cos: float
     sin: float
+
+
+@kernel(contracts=True, inline=True)
+def seen_at(dx, dy, c, s):  # type: ignore[no-untyped-def]
+    """Returns a shape at (dx, dy) from the lidar, turned by (c, s), as seen from there."""
+    return Seen(dx * dx + dy * dy, c * dx + s * dy, s * dx - c * dy)
 
 
 @kernel(contracts=True, inline=True)
@@ -276,26 +279,31 @@ def fuse(out, middle, low, high, near, far, blend, lidar):  # type: ignore[no-un
         blend: share of the farther.
         lidar: `LidarArrays`.
     """
-    rows, phases = lidar.table.rows, 1 << lidar.table.shift
-    begin, hits = beams_between(low, high, out.shape[0])
-    exact = (begin - middle) * phases + ABOVE_ZERO
-    point = np.int32(exact)
-    share, point = np.float32(exact - point), point - np.int32(ABOVE_ZERO)
-    one, one2 = points_of(near[0], near[1], point, lidar.table.shift, hits)
-    other, other2 = points_of(far[0], far[1], point, lidar.table.shift, hits)
+    rows, shift = lidar.table.rows, lidar.table.shift
+    begin, hits, point, share = beams_between(middle, low, high, out.shape[0], shift)
+    one, two = points_of(near[0], near[1], point, shift, hits)
+    other, other2 = points_of(far[0], far[1], point, shift, hits)
     range_min, range_max = np.float32(lidar.range_min), np.float32(lidar.range_max)
     for j in range(hits):
-        value = blended(rows, one + j, one2 + j, other + j, other2 + j, share, blend)
+        value = blended(rows, one + j, two + j, other + j, other2 + j, share, blend)
         value = limited(value, range_min, range_max)
         out[begin + j] = min(out[begin + j], value)
 
 
 @kernel(contracts=True, inline=True)
-def beams_between(low, high, count):  # type: ignore[no-untyped-def]
-    """Returns the first of `count` beams between two directions [beams], and their number."""
-    begin = np.int32(low)  # conversion is faster than rounding up or down
+def beams_between(middle, low, high, count, shift):  # type: ignore[no-untyped-def]
+    """Finds the beams of a scan of `count` between two silhouettes [beams].
+
+    Returns:
+        The first and their number; the point of a row before the first one, counted from the
+        bearing, and the share of the point after it.
+    """
+    begin = np.int32(low)  # conversion is faster than rounding up
     begin = np.int32(max(np.int32(begin + np.int32(low > begin)), np.int32(0)))
-    return begin, np.int32(min(np.int32(high), np.int32(count - 1)) - begin + 1)
+    hits = np.int32(min(np.int32(high), np.int32(count - 1)) - begin + 1)
+    exact = (begin - middle) * np.int32(1 << shift) + ABOVE_ZERO
+    point = np.int32(exact)
+    return begin, hits, np.int32(point - np.int32(ABOVE_ZERO)), np.float32(exact - point)
 
 
 @kernel(inline=True)
@@ -310,10 +318,10 @@ def points_of(start, place, point, shift, hits):  # type: ignore[no-untyped-def]
 
 
 @kernel(contracts=True, inline=True)
-def blended(rows, one, one2, other, other2, share, blend):  # type: ignore[no-untyped-def]
+def blended(rows, one, two, other, other2, share, blend):  # type: ignore[no-untyped-def]
     """Range between two points of a row and two of the farther one [m]."""
     value, farther = rows[np.uintp(one)], rows[np.uintp(other)]
-    value += share * (rows[np.uintp(one2)] - value)
+    value += share * (rows[np.uintp(two)] - value)
     farther += share * (rows[np.uintp(other2)] - farther)
     return value + blend * (farther - value)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -106,16 +104,15 @@ def _small(squares: Array, counts: Array, greatest: float) -> bool:
     return True
 
 
-def _scans(
-    bodies: Array, exact: LidarArrays, baked: LidarArrays
-) -> tuple[Array, Array]:
+def _scans(bodies: Array, exact: LidarArrays, baked: LidarArrays) -> tuple[Array, Array]:
     """Ranges (P, B) to one body (P, 1, 7) in each of P places: exact, and looked up."""
     mount, directions = exact.mount, exact.beams.directions
     robots = np.tile([-mount[0], -mount[1], 0.0], (PLACES, 1, 1))  # the lidar is at the origin
     scans = np.empty((2, PLACES, 1, len(directions)), np.float32)
     for ranges, sensor in zip(scans, (exact, baked), strict=True):
         worlds = np.arange(PLACES)
-        scan_kernels.scan_worlds(ranges, robots, worlds, bodies, -1, NO_WALLS, sensor, scan_kernels.lanes())
+        lanes = scan_kernels.scan_lanes()
+        scan_kernels.scan_worlds(ranges, robots, worlds, bodies, -1, NO_WALLS, sensor, lanes)
     one, other = scans[:, :, 0].astype(np.float64)
     return one, other
 

@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.errors import ConfigError, ModelError, nearest
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.bake import bake
+from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import SHAPE, Beams
 from nics_drl_bridge.lidar.lookup_error import lookup_distances
 from nics_drl_bridge.lidar.maps import GridMap
-from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.shapes import BODY, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable
@@ -167,14 +167,14 @@ class Scanner:
         if not (out.flags.c_contiguous or out.strides[1] == out.itemsize):
             out[:] = self.scan(poses, bodies, walls)  # the kernels need contiguous beams
             return out
-        worlds = np.arange(len(poses))
+        worlds, lanes = np.arange(len(poses)), scan_kernels.scan_lanes()
         scan_kernels.scan_worlds(
-            out[:, None], poses[:, None], worlds, bodies, -1, walls, self.arguments, scan_kernels.lanes()
+            out[:, None], poses[:, None], worlds, bodies, -1, walls, self.arguments, lanes
         )
         if self.grid is not None:
             scan_kernels.add_map(
                 out[:, None], poses[:, None], worlds, self.arguments, self.grid.arrays,
-                self.renderer == "exact", scan_kernels.lanes(),
+                self.renderer == "exact", lanes,
             )  # fmt: skip
         return out
 

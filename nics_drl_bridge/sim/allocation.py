@@ -126,7 +126,8 @@ def part_of(
     """Returns the arguments of the kernels for one part of the worlds, with scratch of its own."""
     lidar, grid = model.lidar, scanner.grid
     dt, substeps, _ = model.timing
-    scene = Surroundings(walls, _grid(grid), scanner.table.outlines.arguments, sizes.crowded, sizes.scattered, movers)
+    outlines = scanner.table.outlines.arguments
+    scene = Surroundings(walls, _grid(grid), outlines, sizes.crowded, sizes.scattered, movers)
     view = LidarView(
         scanner.arguments,
         NO_MAP if grid is None else grid.arrays,
@@ -180,6 +181,6 @@ def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int)
             before=np.zeros((lanes, 3)), waiting=np.zeros(worlds, np.int64),
             seen=np.zeros((bodies + 1) * BODY), spot=np.zeros((1, 1, 3)),
             slices=np.zeros((SLICES, 3)), part=np.zeros((1, 1, model.lidar.beams), np.float32),
-            drive=np.zeros(3), none=np.zeros(1, np.int64), lookup=scan_kernels.lanes(),
+            drive=np.zeros(3), none=np.zeros(1, np.int64), lookup=scan_kernels.scan_lanes(),
         ),
     )  # fmt: skip

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.lidar.bake import with_shapes
-from nics_drl_bridge.lidar.scanner import Renderer, Scanner
 from nics_drl_bridge.lidar.exact_kernels import SHAPE
+from nics_drl_bridge.lidar.scanner import Renderer, Scanner
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.sim import step_kernels
 from nics_drl_bridge.sim.allocation import SLICES, Sizes, allocate, part_of, split

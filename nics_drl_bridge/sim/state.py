@@ -7,7 +7,7 @@ W walls, B beams, L lanes, R periods of the past.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.map_kernels import GridArrays
-from nics_drl_bridge.lidar.scan_kernels import Lanes as ScanLanes
+from nics_drl_bridge.lidar.scan_kernels import ScanLanes
 from nics_drl_bridge.robot.kernels import Terms
 
 Array = NDArray[np.float64]
