@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from nics_drl_bridge.lidar import map_kernels
+from nics_drl_bridge.lidar.exact_kernels import Beams, LidarPose
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
+from nics_drl_bridge.lidar.scan_kernels import scan_lanes
 from nics_drl_bridge.lidar.spec import load_lidar
 
 CONTROLS = {
@@ -31,7 +33,6 @@ LIDARS = ("paper", "paper_12m")
 SCANS, REPEATS, CLEARANCE = 1000, 7, 0.2
 FASTER, RMSE_M, MOST_OFF = 3.0, 1e-5, 1e-5
 """Bars: times the walk's speed, RMSE, and the share of beams that may be off by 1 mm."""
-SCRATCH = max(map_kernels.FLOATS, map_kernels.INTS) * map_kernels.LANES
 
 
 def cells(metres: float) -> int:
@@ -86,35 +87,29 @@ def poses(grid: GridMap, seed: int) -> NDArray[np.float64]:
     return np.column_stack([at, np.cos(heading), np.sin(heading)])
 
 
-def batch(kernel: Callable[..., None]) -> Callable[..., None]:
-    """A compiled loop over scans."""
-
-    @njit(error_model="numpy")
-    def run(out, directions, beams, at, range_max, arrays, room):
-        for n in range(at.shape[0]):
-            out[n] = np.inf
-            x, y, c, s = at[n]
-            kernel(out[n], directions, beams, x, y, c, s, range_max, arrays, room)
-
-    return run
+@njit(error_model="numpy")
+def run(out, beams, at, range_max, arrays, walk, lanes):
+    """Scans from poses `at`, walking or jumping."""
+    for n in range(at.shape[0]):
+        out[n] = np.inf
+        x, y, c, s = at[n]
+        map_kernels.map_into(out[n], beams, LidarPose(x, y, c, s), range_max, arrays, walk, lanes)
 
 
-def timed(run: Callable[..., None], *arguments: Any) -> tuple[NDArray[np.float32], float]:
+def timed(*arguments: Any) -> tuple[NDArray[np.float32], float]:
     """Scans, and scans per second of the best of some runs."""
-    out = np.empty((SCANS, len(arguments[0])), np.float32)
+    out = np.empty((SCANS, len(arguments[0].directions)), np.float32)
     run(out, *arguments)
     best = np.inf
     for _ in range(REPEATS):
         begin = time.perf_counter()
         run(out, *arguments)
         best = min(best, time.perf_counter() - begin)
-    return np.minimum(out, arguments[3]), SCANS / best
+    return np.minimum(out, arguments[2]), SCANS / best
 
 
 def measure(seed: int, control: str | None) -> dict[str, Any]:
     """One row per map and lidar."""
-    room = tuple(np.zeros(SCRATCH, kind) for kind in (np.float64, np.float32, np.int32))
-    walk, jump = batch(map_kernels.exact_map_into), batch(map_kernels.map_into)
     rows = []
     for name, make in MAPS.items():
         grid = GridMap((make(seed) * OCCUPIED).astype(np.int8), RESOLUTION)
@@ -124,15 +119,15 @@ def measure(seed: int, control: str | None) -> dict[str, Any]:
         bake = time.perf_counter() - begin
         for lidar in LIDARS:
             spec = load_lidar(lidar)
-            beams = np.array([spec.angle_min, spec.angle_increment, float(spec.full_circle)])
+            directions = spec.directions.astype(np.float64)
+            beams = Beams(directions, spec.angle_min, spec.angle_increment, spec.full_circle)
             at = poses(grid, seed + 1)
-            arguments = (spec.directions, beams, at, spec.range_max, grid.arrays, room)
-            exact, exact_speed = timed(walk, *arguments)
-            way = walk if control == "slow" else jump
+            arguments = (beams, at, spec.range_max, grid.arrays)
+            exact, exact_speed = timed(*arguments, True, scan_lanes())
             if control == "shifted":
                 moved = np.column_stack([at[:, :1] + RESOLUTION, at[:, 1:]])
-                arguments = (*arguments[:2], moved, *arguments[3:])
-            baked, baked_speed = timed(way, *arguments)
+                arguments = (beams, moved, spec.range_max, grid.arrays)
+            baked, baked_speed = timed(*arguments, control == "slow", scan_lanes())
             if control == "nan":
                 baked[0, 0] = np.nan
             error = baked.astype(np.float64) - exact

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from measuring.adversaries import ADVERSARIES, Adversary, Driver, GoalDriver, Standing, Truth
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.lidar.shapes import RADIUS, X, Y
+from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
 

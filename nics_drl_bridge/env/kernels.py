@@ -9,13 +9,13 @@ a batch differently from its body.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.sector_kernels import resample
+from nics_drl_bridge.lidar.sector_kernels import SectorPlan, resample
 from nics_drl_bridge.random_kernels import episode_seed
 
 LIMIT = 1000.0
@@ -29,13 +29,13 @@ class ScanScale(NamedTuple):
         per_metre: 1 / the range that a share of 1 stands for [1/m], float32.
         leaves: (B,) float32 range at which each beam leaves the footprint [m].
         sectors: number of sectors that are observed; 0 if the beams themselves are.
-        plan: mapping of beams to sectors, see `sectors.SectorPlan.arguments`.
+        plan: mapping of beams to sectors.
     """
 
     per_metre: np.float32
     leaves: NDArray[np.float32]
     sectors: int
-    plan: Any
+    plan: SectorPlan
 
 
 class GoalProgress(NamedTuple):

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE
 from nics_drl_bridge.lidar.maps import GridMap
-from nics_drl_bridge.lidar.shapes import HEADING, RADIUS, SHAPE
 from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]

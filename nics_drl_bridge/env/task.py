@@ -15,7 +15,8 @@ from nics_drl_bridge.env import kernels
 from nics_drl_bridge.env.kernels import LIMIT, ScanScale
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.interface import RobotView
-from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, SectorPlan, plan_of
+from nics_drl_bridge.lidar.sector_kernels import SectorPlan
+from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -234,7 +235,7 @@ class Task(ABC):
         leaves = contact_ranges(self.robot, self.lidar, self.contact_margin)
         sectors = 0 if self.scan is None else self.scan.sectors
         per_metre = np.float32(1.0 / self.sight.range_max)
-        return ScanScale(per_metre, leaves, sectors, self.plan.arguments)
+        return ScanScale(per_metre, leaves, sectors, self.plan)
 
 
 def discrete_commands(robot: RobotSpec) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,6 +11,16 @@ from nics_drl_bridge.kernels import kernel
 
 WIDTH = 0.02
 """Old beams within this angle of a bearing are compared [rad]."""
+
+
+class MountedBeams(NamedTuple):
+    """Angle of beam 0 and between beams [rad], and the mount: x, y [m], heading [rad]."""
+
+    first: float
+    step: float
+    x: float
+    y: float
+    heading: float
 
 
 @kernel(allocates=True)
@@ -21,24 +32,23 @@ def entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-
     Args:
         out: (B,) bool, set where a beam is marked; otherwise left as it is.
         ranges, old: (B,) the newer and the older scan, REP-117 [m].
-        lidar: angle_min, angle_increment [rad], mount x, y [m] and heading [rad].
+        lidar: that both scans are from.
         moved: (3,) present pose of the robot relative to that of the older scan.
         far: greatest range [m].
         tolerance: for noise, in metres and as a share of the range.
     """
-    first, increment, mount_x, mount_y, mount_turn = lidar
-    beams, circle = len(ranges), 2.0 * math.pi / abs(increment)
-    whole, wide = round(circle), math.ceil(WIDTH / abs(increment))
+    beams, circle = len(ranges), 2.0 * math.pi / abs(lidar.step)
+    whole, wide = round(circle), math.ceil(WIDTH / abs(lidar.step))
     cosine, sine = math.cos(moved[2]), math.sin(moved[2])
     for b in range(beams):
         if out[b] or not np.isfinite(ranges[b]):
             continue
-        angle = first + b * increment + mount_turn
-        x, y = mount_x + ranges[b] * math.cos(angle), mount_y + ranges[b] * math.sin(angle)
-        dx = moved[0] + cosine * x - sine * y - mount_x
-        dy = moved[1] + sine * x + cosine * y - mount_y
+        angle = lidar.first + b * lidar.step + lidar.heading
+        x, y = lidar.x + ranges[b] * math.cos(angle), lidar.y + ranges[b] * math.sin(angle)
+        dx = moved[0] + cosine * x - sine * y - lidar.x
+        dy = moved[1] + sine * x + cosine * y - lidar.y
         away = math.hypot(dx, dy)
-        at = (math.atan2(dy, dx) - mount_turn - first) / increment
+        at = (math.atan2(dy, dx) - lidar.heading - lidar.first) / lidar.step
         middle, seen = round(at - circle * math.floor(at / circle)), far
         for i in range(middle - wide, middle + wide + 1):
             index = i % whole

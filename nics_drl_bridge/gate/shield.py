@@ -67,7 +67,9 @@ def movers(config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]) ->
     marked = np.zeros(len(newest.ranges), np.bool_)
     if len(angles) < 2 or shield.obstacle_speed == 0.0:
         return marked
-    lidar = (float(angles[0]), float(angles[1] - angles[0]), *config.mount)
+    lidar = moving_kernels.MountedBeams(
+        float(angles[0]), float(angles[1] - angles[0]), *config.mount
+    )
     noise, share = (DEVIATIONS * std for std in shield.range_noise)
     for view in views[:-1]:
         moved = geometry.between(view.pose, newest.pose)
@@ -140,7 +142,7 @@ def obstacles(config: GateConfig, ranges: Ranges, views: tuple[View, ...]) -> Ar
 def rehearse() -> None:
     """Compiles what `shield` calls: that takes seconds, which a moving robot does not have."""
     shield_kernels.free(np.zeros((1, 3)), np.zeros((1, 3)), 0.0, 1.0, 0.0, STEP)
-    lidar, scan = (0.0, 0.1, 0.0, 0.0, 0.0), np.ones(1, np.float32)
+    lidar, scan = moving_kernels.MountedBeams(0.0, 0.1, 0.0, 0.0, 0.0), np.ones(1, np.float32)
     moving_kernels.entered(np.zeros(1, np.bool_), scan, scan, lidar, np.zeros(3), 1.0, (0.0, 0.0))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
+from nics_drl_bridge.lidar.exact_kernels import Beams
 
 EDGE = 1e-6
 """Ranges at an edge are taken this far inside it, as a share of the whole width."""
@@ -51,11 +52,11 @@ def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untype
     """Range to a shape straight ahead in one direction [rad]; see `row`."""
     ray, out = np.empty((1, 2)), np.full(1, np.inf, np.float32)
     ray[0, 0], ray[0, 1] = math.cos(angle), math.sin(angle)
-    beams = (angle, 1.0, 0.0)
+    beams = Beams(ray, angle, 1.0, False)
     if corners.shape[0] == 0:
-        exact_kernels.circle(out, ray, beams, distance, 0.0, radius, np.inf)
+        exact_kernels.circle(out, beams, distance, 0.0, radius, np.inf)
     else:
-        exact_kernels.polygon(out, ray, beams, distance, 0.0, cos, sin, corners)
+        exact_kernels.polygon(out, beams, distance, 0.0, cos, sin, corners)
         if not np.isfinite(out[0]):  # a wall seen edge-on
             for v in range(corners.shape[0]):
                 x, y = exact_kernels.turned(distance, 0.0, cos, sin, corners[v])
@@ -64,12 +65,12 @@ def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untype
 
 
 @kernel(allocates=True)
-def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # type: ignore[no-untyped-def]
+def row(fine, beams, corners, radius, distance, cos, sin, edge):  # type: ignore[no-untyped-def]
     """Ranges (P,) of a shape straight ahead, continued beyond its edges.
 
     Args:
         fine: (P,) result [m].
-        directions, beams: of the P points, see `kernels`.
+        beams: of the P points.
         corners: (V, 2) of its outline, none for a circle [m].
         radius: of a circle [m].
         distance: of its origin [m].
@@ -78,12 +79,12 @@ def row(fine, directions, beams, corners, radius, distance, cos, sin, edge):  # 
     """
     fine[:] = np.inf
     if corners.shape[0] == 0:
-        exact_kernels.circle(fine, directions, beams, distance, 0.0, radius, np.inf)
+        exact_kernels.circle(fine, beams, distance, 0.0, radius, np.inf)
     else:
-        exact_kernels.polygon(fine, directions, beams, distance, 0.0, cos, sin, corners)
+        exact_kernels.polygon(fine, beams, distance, 0.0, cos, sin, corners)
     count = fine.shape[0]
-    first = min(max(math.ceil((edge[0] - beams[0]) / beams[1]), 0), count - 1)
-    last = max(min(math.floor((edge[1] - beams[0]) / beams[1]), count - 1), 0)
+    first = min(max(math.ceil((edge[0] - beams.first) / beams.step), 0), count - 1)
+    last = max(min(math.floor((edge[1] - beams.first) / beams.step), count - 1), 0)
     while first < last and not np.isfinite(fine[first]):
         first += 1
     while last > first and not np.isfinite(fine[last]):
@@ -128,29 +129,29 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
         directions = np.empty((points, 2))
         directions[:, 0], directions[:, 1] = np.cos(angles), np.sin(angles)
         fine = np.empty(points, np.float32)
-        beams = (angles[0], step / phases, 0.0)
-        row(fine, directions, beams, corners, radius, distances[d], c, s, edges[d])
+        beams = Beams(directions, angles[0], step / phases, False)
+        row(fine, beams, corners, radius, distances[d], c, s, edges[d])
         into_phases(rows[start : start + points], fine, width, phases)
 
 
 @kernel
-def _circle(scan, directions, beams, x, radius):  # type: ignore[no-untyped-def]
+def _circle(scan, beams, x, radius):  # type: ignore[no-untyped-def]
     """Cosines on a circle straight ahead, whose normal is the direction from its centre."""
     nearest, cosines, _ = scan
-    exact_kernels.circle(nearest, directions, beams, x, 0.0, radius, np.inf)
+    exact_kernels.circle(nearest, beams, x, 0.0, radius, np.inf)
     for i in range(nearest.shape[0]):
         if nearest[i] < np.inf:
-            cosine = abs((nearest[i] - directions[i, 0] * x) / radius)
+            cosine = abs((nearest[i] - beams.directions[i, 0] * x) / radius)
             cosines[i] = min(cosine, 1.0)
 
 
 @kernel
-def _segment(scan, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
+def _segment(scan, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
     """Cosines on a segment where it is nearest: the distance of its line over the range."""
     nearest, cosines, before = scan
     for i in range(nearest.shape[0]):
         before[i] = nearest[i]
-    exact_kernels.segment(nearest, directions, beams, x1, y1, x2, y2)
+    exact_kernels.segment(nearest, beams, x1, y1, x2, y2)
     ex, ey = x2 - x1, y2 - y1
     away = np.float32(abs(x1 * ey - y1 * ex) / math.sqrt(ex * ex + ey * ey))
     for i in range(nearest.shape[0]):
@@ -162,16 +163,16 @@ def _segment(scan, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untype
 def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[no-untyped-def]
     """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it."""
     directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
-    beams, count = (angles[0], step, 0.0), len(angles)
+    beams, count = Beams(directions, angles[0], step, False), len(angles)
     nearest, before = np.full(count, np.inf, np.float32), np.empty(count, np.float32)
     scan = (nearest, np.zeros(count, np.float32), before)
     if corners.shape[0] == 0:
-        _circle(scan, directions, beams, distance, radius)
+        _circle(scan, beams, distance, radius)
         return scan[1]
     ax, ay = exact_kernels.turned(distance, 0.0, c, s, corners[corners.shape[0] - 1])
     for v in range(corners.shape[0]):
         bx, by = exact_kernels.turned(distance, 0.0, c, s, corners[v])
-        _segment(scan, directions, beams, ax, ay, bx, by)
+        _segment(scan, beams, ax, ay, bx, by)
         ax, ay = bx, by
     return scan[1]
 

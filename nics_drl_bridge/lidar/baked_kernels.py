@@ -1,46 +1,38 @@
-"""Compiled inner loops of the baked lidar: table look-up (Eq. 3); see also `fuse_kernels`.
+"""Compiled scans: each body is looked up (Eq. 3) or computed; fused by the minimum (Eq. 4).
 
-The visible bodies of several scans go through a number of passes together, each a short loop
-without branches: nearly all the time of a look-up goes into cache misses and branch mispredictions,
-and so the latency of one body overlaps with the work on the next. Passes hand on their results in
-lanes: one array per number type, in which every quantity has `LANES` places at a fixed offset, so
-that LLVM can prove that they do not overlap. The result for a body depends on that body only, so
-that a scan is identical in any batch.
+A plain look-up takes the nearest row of the table. Here the rows of the two grid distances around
+the true one are blended, and in each the two points around a beam; and the beams that hit follow
+from the true silhouette: one on the wrong side of a beam is by far the largest error of a plain
+look-up.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.map_kernels import get, peek, put
+from nics_drl_bridge.lidar import exact_kernels
+from nics_drl_bridge.lidar.exact_kernels import (
+    COS,
+    HEADING,
+    RADIUS,
+    SHAPE,
+    SIN,
+    Beams,
+    LidarPose,
+    OutlineArrays,
+    X,
+    Y,
+)
 
-LANES = 144
-"""Number of bodies that go through the passes together: a multiple of `BLOCK`, and few enough that
-their scans stay in the L1 cache."""
-WIDE, SINGLE, WHOLE = 20, 8, 15
-"""Numbers of quantities in double precision, in single precision and in integers."""
-X, Y, TURN, COS, SIN, RADIUS, AHEAD, AT, ROUND, MIDDLE, RIGHT, LEFT = (k * LANES for k in range(12))
-"""Of a body: offset from the lidar, heading, cos, sin, radius; the bearing of beam 0 in the world
-and the index of the scan in memory; radius of a circle or 0; bearing and silhouettes in beams."""
-RIGHT_X, RIGHT_Y, RIGHT_X2, RIGHT_Y2, LEFT_X, LEFT_Y, LEFT_X2, LEFT_Y2 = (
-    k * LANES for k in range(12, 20)
-)
-"""The two corners of the hull that can be the right silhouette, and the left one."""
-DISTANCE, BEARING, ALONG, ACROSS, ALONG2, ACROSS2, PART, BLEND = (k * LANES for k in range(8))
-"""The silhouettes along and across the bearing, then `ALONG` and `ALONG2` as angles; shares of the
-next point and of the farther row."""
-SHAPE, CELL, HULL, CLIMB, START, PLACE, START2, PLACE2, BEGIN, HITS, BACK = (
-    k * LANES for k in range(11)
-)
-NEAR, NEAR2, FAR, FAR2 = (k * LANES for k in range(11, 15))
-"""The cell and the next one, packed as in the table; the span of beams; indices of the points."""
-PER_METRE, ROTATIONS, PARTS_PER_ROTATION, FIRST_CELL, CELLS_PER_PART = range(5)
-HULL_END, CORNERS_PER_PART, CORNERS, ROUND_RADIUS, ABOUT = range(5, 10)
-"""Parameters of a shape in the kernels, see `table.LidarTable.lookup`, and their number."""
+ABOVE_ZERO = 2.0**24
+"""Added before truncation to an integer, so that numbers are rounded down."""
 PER_TURN = 0.5 / math.pi
+UNSEEN, LOOKED_UP, COMPUTED = range(3)
 ATAN = tuple(
     np.float32(factor)
     for factor in (
@@ -54,68 +46,321 @@ ATAN = tuple(
         -0.00466877315,
     )
 )
+TABLE_SHAPE = np.dtype(
+    [
+        ("per_metre", np.float64),  # grid distances per metre
+        ("rotations", np.float64),  # in a full turn, 0 for a circle
+        ("parts_per_rotation", np.float64),  # periods of the rotational symmetry
+        ("first_cell", np.int64),
+        ("cells_per_part", np.int64),
+        ("hull_end", np.int64),  # the corner after its last
+        ("corners_per_part", np.int64),
+        ("corners", np.int64),
+        ("round_radius", np.float64),  # of a circle [m], 0 for others
+    ]
+)
+"""Parameters of a shape in the table."""
+
+
+class TableArrays(NamedTuple):
+    """A `table.LidarTable` for the kernels.
+
+    Attributes:
+        shapes: (H,) of `TABLE_SHAPE`.
+        distances: grid distances of each shape.
+        cells: (cells, 4) of each grid distance at each rotation: begin of its row; its first beam,
+            relative to the bearing, and its width; the other and the first corner of the hull that
+            may be its right silhouette; those of the left one. Pairs are 16 bits each.
+        rows: (R,) ranges [m], one phase of the points after the other.
+        shift: log2 of the phases.
+        hulls: (sum V, 2) corners, see `shapes.Outlines`.
+    """
+
+    shapes: Any
+    distances: int
+    cells: NDArray[np.int32]
+    rows: NDArray[np.float32]
+    shift: int
+    hulls: NDArray[np.float64]
+
+
+class LidarArrays(NamedTuple):
+    """A lidar with its table for the kernels.
+
+    Attributes:
+        mount: (3,) pose on the robot.
+        beams: their directions.
+        range_min, range_max: [m].
+        between: (H, 2) squares of the distances between which a shape is looked up [m^2].
+        outlines: of the shapes.
+        table: of the shapes.
+    """
+
+    mount: NDArray[np.float64]
+    beams: Beams
+    range_min: float
+    range_max: float
+    between: NDArray[np.float64]
+    outlines: OutlineArrays
+    table: TableArrays
+
+
+@kernel(inline=True)
+def sensor_pose(pose, mount):  # type: ignore[no-untyped-def]
+    """Returns x, y, heading of a lidar in its world, from the pose (3,) of its robot."""
+    x, y, heading = pose[0], pose[1], pose[2]
+    if mount[0] != 0.0 or mount[1] != 0.0:
+        c, s = math.cos(heading), math.sin(heading)
+        x, y = x + c * mount[0] - s * mount[1], y + s * mount[0] + c * mount[1]
+    return x, y, heading + mount[2]
+
+
+@kernel
+def scan_robot(out, pose, bodies, me, walls, lidar):  # type: ignore[no-untyped-def]
+    """One scan (B,): the minimum over all bodies (K, 7) but the robot's own, and walls (Eq. 4)."""
+    for i in range(out.shape[0]):
+        out[i] = np.float32(np.inf)
+    x, y, heading = sensor_pose(pose, lidar.mount)
+    computed = False
+    for k in range(bodies.shape[0]):
+        way = way_of(bodies[k], x, y, lidar) if k != me else UNSEEN
+        if way == LOOKED_UP:
+            look_up(out, x, y, heading, bodies[k], lidar)
+        computed |= way == COMPUTED
+    here = LidarPose(x, y, math.cos(heading), math.sin(heading))
+    compute(out, here, bodies, me, computed, walls, lidar)
+
+
+@kernel
+def compute(out, here, bodies, me, computed, walls, lidar):  # type: ignore[no-untyped-def]
+    """Fuses walls, and the bodies that are not looked up, if there are any."""
+    for k in range(bodies.shape[0] if computed else 0):
+        if k != me and way_of(bodies[k], here.x, here.y, lidar) == COMPUTED:
+            body, outlines = bodies[k], lidar.outlines
+            exact_kernels.body_into(out, lidar.beams, here, body, outlines, lidar.range_max)
+    near = exact_kernels.walls_into(out, lidar.beams, here, walls, lidar.range_max)
+    if near > 0 or computed:
+        exact_kernels.finish(out, lidar.range_min, lidar.range_max)
 
 
 @kernel(contracts=True, inline=True)
-def in_sight(found, begin, end, bodies, n, me, scan, range_max, baked, wide, whole):  # type: ignore[no-untyped-def]
-    """First pass: packs the bodies within range of one scan into the lanes.
+def way_of(body, x, y, lidar):  # type: ignore[no-untyped-def]
+    """Way to scan a body: computed where the lidar is in its circle, or the table is too coarse."""
+    dx, dy, radius = body[X] - x, body[Y] - y, body[RADIUS]
+    d2, reach = dx * dx + dy * dy, lidar.range_max + radius
+    if not (radius > 0.0 and d2 <= reach * reach):
+        return UNSEEN
+    h = np.uintp(np.int32(body[SHAPE]))
+    kept = d2 >= radius * radius and lidar.between[h, 0] <= d2 <= lidar.between[h, 1]
+    return LOOKED_UP if kept else COMPUTED
+
+
+@kernel(contracts=True, inline=True)
+def look_up(out, x, y, heading, body, lidar):  # type: ignore[no-untyped-def]
+    """Fuses one body into a scan (B,) by the table row of its nearest relative pose (Eq. 3)."""
+    table = lidar.table
+    shape = table.shapes[np.uintp(np.int32(body[SHAPE]))]
+    dx, dy = body[X] - x, body[Y] - y
+    distance, bearing = polar(dx, dy)
+    cell, hull, blend = nearest_cell(distance, bearing, body[RADIUS], body[HEADING], shape, table)
+    near, far = table.cells[np.uintp(cell)], table.cells[np.uintp(cell + 1)]
+    seen = seen_at(dx, dy, body[COS], body[SIN])
+    right = silhouette(near[2], hull, shape, table.hulls, seen, 1.0)
+    left = silhouette(near[3], hull, shape, table.hulls, seen, -1.0)
+    middle, low, high = in_beams(right, left, bearing, heading, lidar.beams)
+    fuse(out, middle, low, high, near, far, blend, lidar)
+    turn = 2.0 * math.pi / lidar.beams.step
+    if high >= turn:  # across the seam of the circle
+        fuse(out, middle - turn, low - turn, high - turn, near, far, blend, lidar)
+
+
+@kernel(contracts=True, inline=True)
+def polar(dx, dy):  # type: ignore[no-untyped-def]
+    """Returns distance [m] and bearing [rad] of a place, in single precision."""
+    distance = math.sqrt(np.float32(dx * dx + dy * dy))
+    return distance, arctan2_single(np.float32(dy), np.float32(dx))
+
+
+@kernel(contracts=True, inline=True)
+def nearest_cell(distance, bearing, radius, heading, shape, table):  # type: ignore[no-untyped-def]
+    """Returns the cell below a distance, at the nearest rotation of a shape.
+
+    Also the first corner of its hull, and the share of the next cell's row.
+    """
+    place = (distance - radius) * shape.per_metre
+    ring = np.int32(max(min(np.int32(place), np.int32(table.distances - 2)), np.int32(0)))
+    share = (heading - bearing) * PER_TURN
+    share -= np.floor(share)
+    turn = np.int32(share * shape.rotations + 0.5)
+    turn = np.int32(max(min(turn, np.int32(shape.rotations)), np.int32(0)))
+    part = np.int32((turn + 0.5) * shape.parts_per_rotation)
+    cell = turn * table.distances - part * shape.cells_per_part + shape.first_cell + ring
+    return cell, shape.hull_end - part * shape.corners_per_part, np.float32(place - ring)
+
+
+class Seen(NamedTuple):
+    """A shape as seen from the lidar.
+
+    Attributes:
+        d2: square of its distance [m^2].
+        cos, sin: of its heading relative to its bearing, times the distance [m].
+    """
+
+    d2: float
+    cos: float
+    sin: float
+
+
+@kernel(contracts=True, inline=True)
+def seen_at(dx, dy, c, s):  # type: ignore[no-untyped-def]
+    """Returns a shape at (dx, dy) from the lidar, turned by (c, s), as seen from there."""
+    return Seen(dx * dx + dy * dy, c * dx + s * dy, s * dx - c * dy)
+
+
+@kernel(contracts=True, inline=True)
+def silhouette(pair, hull, shape, hulls, seen, side):  # type: ignore[no-untyped-def]
+    """Direction of the right (side 1) or left (-1) silhouette of a shape from its bearing [rad].
 
     Args:
-        found: number of lanes in use.
-        begin, end: range of the bodies; there are lanes for all of them.
-        bodies: (N, K, 7), see `shapes.BODY`.
-        n: index of the world.
-        me: the body that carries the lidar, or -1.
-        scan: x and y of the lidar in the world [m], the bearing of beam 0 [rad], and the index
-            of its range in the array of the ranges.
-        range_max: [m].
-        baked: (H, 2) squares of the distances between which a shape is looked up [m^2]; inf if it
-            never is.
-        wide, whole: lanes.
+        pair: the two corners of the hull that it may be; a negative one is minus the stride of
+            climbing the hull from the other.
+        hull: index of the hull's first corner.
+        shape: row of `TABLE_SHAPE`.
+        hulls: see `TableArrays`.
+        seen: the shape.
+        side: 1 or -1.
+    """
+    first, other = hull + (pair & 0xFFFF), pair >> 16
+    if other < 0:
+        along, across = outermost(hulls, hull, shape.corners, first - hull, -other, seen, side)
+        return arctan2_single(np.float32(across), np.float32(along))
+    one, two = hulls[np.uintp(first)], hulls[np.uintp(hull + other)]
+    return tangent(seen, one[0], one[1], two[0], two[1], shape.round_radius, side)
+
+
+@kernel(contracts=True, inline=True)
+def tangent(seen, x1, y1, x2, y2, radius, side):  # type: ignore[no-untyped-def]
+    """Direction of a silhouette: the outer of two corners, or the tangent to a circle [rad]."""
+    ax, ay = seen_from(seen, x1, y1)
+    bx, by = seen_from(seen, x2, y2)
+    outer = side * (ax * by - ay * bx) < 0.0
+    ax, ay = bx if outer else ax, by if outer else ay
+    along = math.sqrt(max(seen.d2 - radius * radius, 0.0))
+    ax, ay = along if radius > 0.0 else ax, -side * radius if radius > 0.0 else ay
+    return arctan2_single(np.float32(ay), np.float32(ax))
+
+
+@kernel(contracts=True, inline=True)
+def seen_from(seen, x, y):  # type: ignore[no-untyped-def]
+    """Returns a corner (x, y) of a hull along and across the bearing, times the distance."""
+    return seen.d2 + seen.cos * x - seen.sin * y, seen.sin * x + seen.cos * y
+
+
+@kernel(contracts=True, inline=True)
+def in_beams(right, left, bearing, heading, beams):  # type: ignore[no-untyped-def]
+    """Returns a bearing and both silhouettes in beams, the right one in the first turn."""
+    per_beam = 1.0 / beams.step
+    turn = 2.0 * math.pi * per_beam
+    per_turn = 1.0 / turn
+    low, high = right * per_beam, left * per_beam
+    middle = (bearing - (heading + beams.first)) * per_beam
+    middle -= np.floor((middle + low) * per_turn) * turn
+    return middle, middle + low, middle + high
+
+
+@kernel(contracts=True, inline=True)
+def fuse(out, middle, low, high, near, far, blend, lidar):  # type: ignore[no-untyped-def]
+    """Lowers the beams from `low` to `high` to two blended rows (Eq. 4).
+
+    Args:
+        out: (B,).
+        middle, low, high: bearing and silhouettes [beams].
+        near, far: (4,) cells of the two rows.
+        blend: share of the farther.
+        lidar: `LidarArrays`.
+    """
+    rows, shift = lidar.table.rows, lidar.table.shift
+    begin, hits, point, share = beams_between(middle, low, high, out.shape[0], shift)
+    one, two = points_of(near[0], near[1], point, shift, hits)
+    other, other2 = points_of(far[0], far[1], point, shift, hits)
+    range_min, range_max = np.float32(lidar.range_min), np.float32(lidar.range_max)
+    for j in range(hits):
+        value = blended(rows, one + j, two + j, other + j, other2 + j, share, blend)
+        value = limited(value, range_min, range_max)
+        out[begin + j] = min(out[begin + j], value)
+
+
+@kernel(contracts=True, inline=True)
+def beams_between(middle, low, high, count, shift):  # type: ignore[no-untyped-def]
+    """Finds the beams of a scan of `count` between two silhouettes [beams].
 
     Returns:
-        Number of lanes in use, and number of bodies within range that are not looked up: the lidar
-        is within their circle, or not between the distances of their shape.
+        The first and their number; the point of a row before the first one, counted from the
+        bearing, and the share of the point after it.
     """
-    n, left = np.uintp(n), 0
-    sx, sy, ahead, at = scan
-    for k in range(begin, end):
-        b = np.uintp(k)
-        dx, dy, radius = bodies[n, b, 0] - sx, bodies[n, b, 1] - sy, bodies[n, b, 5]
-        d2 = dx * dx + dy * dy
-        reach = range_max + radius
-        shape = np.int32(bodies[n, b, 6])
-        put(wide, found + X, dx)
-        put(wide, found + Y, dy)
-        put(wide, found + TURN, bodies[n, b, 2])
-        put(wide, found + COS, bodies[n, b, 3])
-        put(wide, found + SIN, bodies[n, b, 4])
-        put(wide, found + RADIUS, radius)
-        put(wide, found + AHEAD, ahead)
-        put(wide, found + AT, at)
-        put(whole, found + SHAPE, np.int32(shape * ABOUT))
-        seen = (d2 <= reach * reach) & (radius > 0.0) & (k != me)
-        h = np.uintp(shape)
-        kept = seen & (d2 >= radius * radius) & (d2 >= baked[h, 0]) & (d2 <= baked[h, 1])
-        found += kept
-        left += seen & (not kept)
-    return found, left
+    begin = np.int32(low)  # conversion is faster than rounding up
+    begin = np.int32(max(np.int32(begin + np.int32(low > begin)), np.int32(0)))
+    hits = np.int32(min(np.int32(high), np.int32(count - 1)) - begin + 1)
+    exact = (begin - middle) * np.int32(1 << shift) + ABOVE_ZERO
+    point = np.int32(exact)
+    return begin, hits, np.int32(point - np.int32(ABOVE_ZERO)), np.float32(exact - point)
+
+
+@kernel(inline=True)
+def points_of(start, place, point, shift, hits):  # type: ignore[no-untyped-def]
+    """Indices of the points of a row around the first beam; the next may be of the next beam."""
+    phases, width = np.int32(1 << shift), np.int32(place & 0xFFFF)
+    beam, phase = point >> shift, np.int32(point & (phases - 1))
+    skip = max(min(np.int32(beam - (place >> 16)), np.int32(width - hits - 1)), np.int32(0))
+    at = np.int32(start + phase * width + skip)
+    last = np.int32(phase + 1) == phases
+    return at, np.int32(at - phase * width + 1 if last else at + width)
+
+
+@kernel(contracts=True, inline=True)
+def blended(rows, one, two, other, other2, share, blend):  # type: ignore[no-untyped-def]
+    """Range between two points of a row and two of the farther one [m]."""
+    value, farther = rows[np.uintp(one)], rows[np.uintp(other)]
+    value += share * (rows[np.uintp(two)] - value)
+    farther += share * (rows[np.uintp(other2)] - farther)
+    return value + blend * (farther - value)
+
+
+@kernel(inline=True)
+def limited(value, range_min, range_max):  # type: ignore[no-untyped-def]
+    """A range within the limits: too far becomes `inf`, too close `-inf` (REP-117)."""
+    value = value if value <= range_max else np.float32(np.inf)
+    return value if value >= range_min else np.float32(-np.inf)
 
 
 @kernel(contracts=True)
-def left_out(bodies, n, k, me, sx, sy, range_max, baked):  # type: ignore[no-untyped-def]
-    """True if body k is within range but not looked up; see `in_sight`."""
-    dx, dy, radius = bodies[n, k, 0] - sx, bodies[n, k, 1] - sy, bodies[n, k, 5]
-    d2 = dx * dx + dy * dy
-    reach = range_max + radius
-    seen = radius > 0.0 and k != me and d2 <= reach * reach
-    h = int(bodies[n, k, 6])
-    return seen and (d2 < radius * radius or d2 < baked[h, 0] or d2 > baked[h, 1])
+def outermost(hulls, hull, corners, first, stride, seen, side):  # type: ignore[no-untyped-def]
+    """Climbs along a hull to a silhouette, see `silhouette`, from the corner `first`.
+
+    Seen from outside, the direction of the corners rises and falls once around the hull, so that a
+    local optimum is the global one. Only shapes with many corners need it, at short distances.
+    """
+    best = first
+    x, y = seen_from(seen, hulls[np.uintp(hull + best), 0], hulls[np.uintp(hull + best), 1])
+    while stride > 0:
+        for _ in range(corners):
+            moved = False
+            for step in (stride, corners - stride):
+                other = best + step
+                other -= corners if other >= corners else 0
+                corner = hulls[np.uintp(hull + other)]
+                ax, ay = seen_from(seen, corner[0], corner[1])
+                if side * (x * ay - y * ax) < 0.0:
+                    best, x, y, moved = other, ax, ay, True
+            if not moved:
+                break
+        stride >>= 1
+    return x, y
 
 
 @kernel(contracts=True, inline=True)
 def arctan2_single(y, x):  # type: ignore[no-untyped-def]
-    """Like `kernels.arctan2`, in single precision, within 2e-7 rad."""
+    """Like `exact_kernels.arctan2`, in single precision, within 2e-7 rad."""
     ax, ay = abs(x), abs(y)
     ratio = min(ax, ay) / max(ax, ay)
     s = ratio * ratio
@@ -130,161 +375,3 @@ def arctan2_single(y, x):  # type: ignore[no-untyped-def]
     r = np.float32(0.5 * math.pi) - r if ay > ax else r
     r = np.float32(math.pi) - r if x < np.float32(0.0) else r
     return math.copysign(r, y)
-
-
-@kernel(contracts=True)
-def directions(padded, wide, single):  # type: ignore[no-untyped-def]
-    """Second pass: distance and bearing in the world of each body."""
-    for k in range(padded):
-        x, y = get(wide, k + X), get(wide, k + Y)
-        put(single, k + ALONG, np.float32(x))
-        put(single, k + ACROSS, np.float32(y))
-        put(single, k + DISTANCE, np.float32(x * x + y * y))
-    for k in range(padded):
-        put(single, k + DISTANCE, math.sqrt(get(single, k + DISTANCE)))
-        put(single, k + BEARING, arctan2_single(get(single, k + ACROSS), get(single, k + ALONG)))
-
-
-@kernel(contracts=True)
-def cells_of(padded, distances, about, wide, single, whole):  # type: ignore[no-untyped-def]
-    """Third pass: the table cell of each body, and the first corner of its hull.
-
-    All indices are clamped to the table: a heading may be NaN, and unused lanes contain old values.
-    """
-    zero, last = np.int32(0), np.int32(distances - 2)
-    for k in range(padded):
-        h = np.int64(get(whole, k + SHAPE))
-        place = (get(single, k + DISTANCE) - get(wide, k + RADIUS)) * peek(about, h + PER_METRE)
-        step = np.int32(max(min(np.int32(place), last), zero))
-        put(single, k + BLEND, np.float32(place - step))
-        share = (get(wide, k + TURN) - get(single, k + BEARING)) * PER_TURN
-        share -= np.floor(share)
-        rotations = peek(about, h + ROTATIONS)
-        turn = np.int32(share * rotations + 0.5)
-        turn = np.int32(max(min(turn, np.int32(rotations)), zero))
-        sector = np.int32((turn + 0.5) * peek(about, h + PARTS_PER_ROTATION))
-        cell = turn * distances - sector * peek(about, h + CELLS_PER_PART)
-        put(whole, k + CELL, np.int32(np.int32(cell + peek(about, h + FIRST_CELL)) + step))
-        hull = peek(about, h + HULL_END) - sector * peek(about, h + CORNERS_PER_PART)
-        put(whole, k + HULL, np.int32(hull))
-        put(wide, k + ROUND, peek(about, h + ROUND_RADIUS))
-
-
-@kernel(contracts=True)
-def fetch(found, cells, hulls, wide, whole):  # type: ignore[no-untyped-def]
-    """Fourth pass: loads the cells, the only pass with these cache misses.
-
-    Args:
-        found: number of lanes in use.
-        cells: (cells * 4,) int32, see `table.LidarTable.lookup`.
-        hulls: (2 * corners,), see `shapes.Outlines`.
-        wide, whole: lanes.
-    """
-    zero = np.int32(0)
-    for k in range(found):
-        cell, skip = np.int64(get(whole, k + CELL)) * 4, get(whole, k + HULL)
-        put(whole, k + START, cells[np.uintp(cell)])
-        put(whole, k + PLACE, cells[np.uintp(cell + 1)])
-        put(whole, k + START2, cells[np.uintp(cell + 4)])
-        put(whole, k + PLACE2, cells[np.uintp(cell + 5)])
-        right, left = cells[np.uintp(cell + 2)], cells[np.uintp(cell + 3)]
-        other, other2 = np.int32(right >> 16), np.int32(left >> 16)
-        put(whole, k + CLIMB, np.int32(other | other2))  # negative if either is
-        corner = 2 * np.int64(skip + (right & 0xFFFF))
-        put(wide, k + RIGHT_X, hulls[np.uintp(corner)])
-        put(wide, k + RIGHT_Y, hulls[np.uintp(corner + 1)])
-        corner = 2 * np.int64(skip + max(other, zero))
-        put(wide, k + RIGHT_X2, hulls[np.uintp(corner)])
-        put(wide, k + RIGHT_Y2, hulls[np.uintp(corner + 1)])
-        corner = 2 * np.int64(skip + (left & 0xFFFF))
-        put(wide, k + LEFT_X, hulls[np.uintp(corner)])
-        put(wide, k + LEFT_Y, hulls[np.uintp(corner + 1)])
-        corner = 2 * np.int64(skip + max(other2, zero))
-        put(wide, k + LEFT_X2, hulls[np.uintp(corner)])
-        put(wide, k + LEFT_Y2, hulls[np.uintp(corner + 1)])
-
-
-@kernel(contracts=True, inline=True)
-def seen_from(d2, cos, sin, x, y):  # type: ignore[no-untyped-def]
-    """Returns a corner (x, y) of a hull along and across the bearing, times the distance.
-
-    `d2` is the square of the distance; `cos` and `sin` are those of the heading relative to the
-    bearing, times the distance.
-    """
-    return d2 + cos * x - sin * y, sin * x + cos * y
-
-
-@kernel(contracts=True)
-def silhouettes(padded, wide, single):  # type: ignore[no-untyped-def]
-    """Fifth pass: the two silhouettes as (along, across), each from the outer of two corners."""
-    for k in range(padded):
-        x, y, c, s = get(wide, k + X), get(wide, k + Y), get(wide, k + COS), get(wide, k + SIN)
-        d2, cos, sin = x * x + y * y, c * x + s * y, s * x - c * y
-        radius = get(wide, k + ROUND)
-        tangent = math.sqrt(max(d2 - radius * radius, 0.0))
-        ax, ay = seen_from(d2, cos, sin, get(wide, k + RIGHT_X), get(wide, k + RIGHT_Y))
-        bx, by = seen_from(d2, cos, sin, get(wide, k + RIGHT_X2), get(wide, k + RIGHT_Y2))
-        outer = ax * by - ay * bx < 0.0
-        ax, ay = bx if outer else ax, by if outer else ay
-        put(single, k + ALONG, np.float32(tangent if radius > 0.0 else ax))
-        put(single, k + ACROSS, np.float32(-radius if radius > 0.0 else ay))
-        ax, ay = seen_from(d2, cos, sin, get(wide, k + LEFT_X), get(wide, k + LEFT_Y))
-        bx, by = seen_from(d2, cos, sin, get(wide, k + LEFT_X2), get(wide, k + LEFT_Y2))
-        outer = ax * by - ay * bx > 0.0
-        ax, ay = bx if outer else ax, by if outer else ay
-        put(single, k + ALONG2, np.float32(tangent if radius > 0.0 else ax))
-        put(single, k + ACROSS2, np.float32(radius if radius > 0.0 else ay))
-
-
-@kernel(contracts=True)
-def outermost(hulls, skip, corners, first, stride, d2, cos, sin, side):  # type: ignore[no-untyped-def]
-    """Climbs along a hull to its right (side 1) or left (-1) silhouette, as (along, across).
-
-    Seen from outside, the direction of the corners rises and falls once around the hull, so that a
-    local optimum is the global one. Only shapes with many corners need it, at short distances.
-
-    Args:
-        hulls: (2 * corners,) of all hulls, see `shapes.Outlines`.
-        skip, corners: index of the hull's first corner, and number of its corners.
-        first: the corner to begin at.
-        stride: initial stride, a power of 2.
-        d2, cos, sin: of the shape, see `seen_from`.
-        side: 1 or -1.
-    """
-    best = first
-    one = 2 * (skip + best)
-    x, y = seen_from(d2, cos, sin, hulls[np.uintp(one)], hulls[np.uintp(one + 1)])
-    while stride > 0:
-        for _ in range(corners):
-            moved = False
-            for step in (stride, corners - stride):
-                other = best + step
-                other -= corners if other >= corners else 0
-                one = 2 * (skip + other)
-                ax, ay = seen_from(d2, cos, sin, hulls[np.uintp(one)], hulls[np.uintp(one + 1)])
-                if side * (x * ay - y * ax) < 0.0:
-                    best, x, y, moved = other, ax, ay, True
-            if not moved:
-                break
-        stride >>= 1
-    return x, y
-
-
-@kernel(contracts=True, inline=True)
-def climb(k, about, cells, hulls, wide, single, whole):  # type: ignore[no-untyped-def]
-    """Replaces the silhouettes of one body that the two corners of its cell do not determine."""
-    x, y, c, s = get(wide, k + X), get(wide, k + Y), get(wide, k + COS), get(wide, k + SIN)
-    d2, cos, sin = x * x + y * y, c * x + s * y, s * x - c * y
-    cell, skip = np.int64(get(whole, k + CELL)) * 4, np.int64(get(whole, k + HULL))
-    corners = np.int64(peek(about, np.int64(get(whole, k + SHAPE)) + CORNERS))
-    right, left = np.int64(peek(cells, cell + 2)), np.int64(peek(cells, cell + 3))
-    if right < 0:
-        first, stride = right & 0xFFFF, -(right >> 16)
-        ax, ay = outermost(hulls, skip, corners, first, stride, d2, cos, sin, 1.0)
-        put(single, k + ALONG, np.float32(ax))
-        put(single, k + ACROSS, np.float32(ay))
-    if left < 0:
-        first, stride = left & 0xFFFF, -(left >> 16)
-        ax, ay = outermost(hulls, skip, corners, first, stride, d2, cos, sin, -1.0)
-        put(single, k + ALONG2, np.float32(ax))
-        put(single, k + ACROSS2, np.float32(ay))

@@ -1,9 +1,8 @@
-"""Compiled inner loops of the lidar: the exact ranges of one object in one scan.
+"""Compiled exact scanner: the ranges of one object in one scan.
 
 Each function lowers the beams that hit its object in a scan `out` (B,), float32, in metres, and
-leaves the others unchanged, so that calling them one after the other is the fusion by minimum of
-Eq. 4. Positions are in the frame of the lidar. `beams` is the geometry of the beams: angle_min,
-angle_increment, and 1.0 for a full circle.
+leaves the others unchanged: calling them one after the other is the minimum of Eq. 4. Positions are
+in the frame of the lidar.
 """
 
 from __future__ import annotations
@@ -19,8 +18,6 @@ from nics_drl_bridge.kernels import kernel
 TWO_PI = 2.0 * math.pi
 ROUNDING = 1e-6
 """Beams this near to an edge, in beams, are candidates; the exact test decides."""
-
-
 HALF_PI = 0.5 * math.pi
 TINY = 1e-300
 """Avoids NaN for the angle of a zero vector."""
@@ -39,6 +36,30 @@ ATAN = (
 )
 X, Y, HEADING, COS, SIN, RADIUS, SHAPE = range(7)
 """Columns of a placed body; the radius of an absent one is 0, `SHAPE` is an index."""
+
+
+class Beams(NamedTuple):
+    """Directions of the beams in the frame of the lidar.
+
+    Attributes:
+        directions: (B, 2) cosine and sine.
+        first, step: angle of beam 0, and between beams [rad].
+        closed: True for a full circle.
+    """
+
+    directions: NDArray[np.float64]
+    first: float
+    step: float
+    closed: bool
+
+
+class LidarPose(NamedTuple):
+    """Pose of a lidar in its world: position [m], cosine and sine of its heading."""
+
+    x: float
+    y: float
+    c: float
+    s: float
 
 
 class OutlineArrays(NamedTuple):
@@ -79,28 +100,22 @@ def arctan2(y, x):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _lower(out, i, value):  # type: ignore[no-untyped-def]
-    """Fuses one return into beam i."""
-    if value < out[i]:
-        out[i] = value
-
-
-@kernel
-def beam_span(low, high, beams, count):  # type: ignore[no-untyped-def]
+def beam_span(low, high, beams):  # type: ignore[no-untyped-def]
     """Returns the first beam and the number of beams in the angles [low, high].
 
     In a full circle the beams may cross the seam: indices are modulo the count.
     """
-    first = math.ceil((low - beams[0]) / beams[1] - ROUNDING)
-    last = math.floor((high - beams[0]) / beams[1] + ROUNDING)
-    if beams[2] > 0.0:
+    count = beams.directions.shape[0]
+    first = math.ceil((low - beams.first) / beams.step - ROUNDING)
+    last = math.floor((high - beams.first) / beams.step + ROUNDING)
+    if beams.closed:
         return first % count, min(last - first + 1, count)
     first, last = max(first, 0), min(last, count - 1)
     return first, max(last - first + 1, 0)
 
 
 @kernel
-def circle(out, directions, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
+def circle(out, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
     """Fuses the exact ranges to a circle at (x, y)."""
     d2 = x * x + y * y
     r2 = radius * radius
@@ -110,35 +125,35 @@ def circle(out, directions, beams, x, y, radius, range_max):  # type: ignore[no-
     count = out.shape[0]
     if d2 <= r2:  # the lidar is inside: every beam hits the far side
         for i in range(count):
-            c, s = directions[i, 0], directions[i, 1]
+            c, s = beams.directions[i, 0], beams.directions[i, 1]
             across = c * y - s * x
-            _lower(out, i, c * x + s * y + math.sqrt(max(r2 - across * across, 0.0)))
+            out[i] = min(out[i], c * x + s * y + math.sqrt(max(r2 - across * across, 0.0)))
         return
     bearing = math.atan2(y, x)
     half = math.asin(radius / d)
-    turns = 1 if beams[2] > 0.0 else 3
+    turns = 1 if beams.closed else 3
     for turn in range(turns):
         shift = 0.0 if turns == 1 else (turn - 1) * TWO_PI
-        first, hits = beam_span(bearing - half + shift, bearing + half + shift, beams, count)
+        first, hits = beam_span(bearing - half + shift, bearing + half + shift, beams)
         for k in range(hits):
             i = first + k
             if i >= count:
                 i -= count
-            c, s = directions[i, 0], directions[i, 1]
+            c, s = beams.directions[i, 0], beams.directions[i, 1]
             across = c * y - s * x
             rest = r2 - across * across
             if rest >= 0.0:
-                _lower(out, i, c * x + s * y - math.sqrt(rest))
+                out[i] = min(out[i], c * x + s * y - math.sqrt(rest))
 
 
 @kernel
-def segment(out, directions, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
+def segment(out, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
     """Fuses the exact ranges to the straight wall from (x1, y1) to (x2, y2)."""
-    edge(out, directions, beams, x1, y1, arctan2(y1, x1), x2, y2, arctan2(y2, x2), False)
+    edge(out, beams, x1, y1, arctan2(y1, x1), x2, y2, arctan2(y2, x2), False)
 
 
 @kernel(inline=True)
-def edge(out, directions, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore[no-untyped-def]
+def edge(out, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore[no-untyped-def]
     """Like `segment`, with directions of its ends [rad]; `one_sided`: visible from its right."""
     count = out.shape[0]
     ex, ey = x2 - x1, y2 - y1
@@ -148,13 +163,13 @@ def edge(out, directions, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # 
     low, high = (angle1, angle2) if cross > 0.0 else (angle2, angle1)
     if high < low:
         high += TWO_PI
-    turns = 1 if beams[2] > 0.0 else 3
+    turns = 1 if beams.closed else 3
     for turn in range(turns):
         shift = 0.0 if turns == 1 else (turn - 1) * TWO_PI
-        first, hits = beam_span(low + shift, high + shift, beams, count)
+        first, hits = beam_span(low + shift, high + shift, beams)
         if hits > 0:
-            _cross(out, directions, first, min(first + hits, count), cross, ex, ey)
-            _cross(out, directions, 0, first + hits - count, cross, ex, ey)
+            _cross(out, beams.directions, first, min(first + hits, count), cross, ex, ey)
+            _cross(out, beams.directions, 0, first + hits - count, cross, ex, ey)
 
 
 @kernel(inline=True)
@@ -169,7 +184,7 @@ def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyp
 
 
 @kernel
-def polygon(out, directions, beams, x, y, c, s, corners):  # type: ignore[no-untyped-def]
+def polygon(out, beams, x, y, c, s, corners):  # type: ignore[no-untyped-def]
     """Fuses the exact ranges to the outline `corners` (V, 2), turned by (c, s), at (x, y)."""
     last, cull = corners.shape[0] - 1, beside_convex(x, y, c, s, corners)
     ax, ay = turned(x, y, c, s, corners[last])
@@ -177,7 +192,7 @@ def polygon(out, directions, beams, x, y, c, s, corners):  # type: ignore[no-unt
     for v in range(last + 1):
         bx, by = turned(x, y, c, s, corners[v])
         next_angle = arctan2(by, bx)
-        edge(out, directions, beams, ax, ay, angle, bx, by, next_angle, cull)
+        edge(out, beams, ax, ay, angle, bx, by, next_angle, cull)
         ax, ay, angle = bx, by, next_angle
 
 
@@ -210,14 +225,6 @@ def turned(x, y, c, s, corner):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def clear(ranges, n, m):  # type: ignore[no-untyped-def]
-    """Sets the scan of robot m in world n of `ranges` (N, M, B) to no return."""
-    nothing = np.float32(np.inf)
-    for i in range(ranges.shape[2]):
-        ranges[n, m, i] = nothing
-
-
-@kernel
 def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
     """Applies the limits to a scan (B,): too far becomes `inf`, too close `-inf` (REP-117)."""
     low, high = np.float32(range_min), np.float32(range_max)
@@ -227,36 +234,19 @@ def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
         out[i] = value if value >= low else np.float32(-np.inf)
 
 
-@kernel(inline=True)
-def sensor_pose(poses, n, m, mount):  # type: ignore[no-untyped-def]
-    """Returns x, y, heading of a lidar in its world, from poses (N, M, 3) and the mount (3,)."""
-    x, y, heading = poses[n, m, 0], poses[n, m, 1], poses[n, m, 2]
-    if mount[0] != 0.0 or mount[1] != 0.0:
-        c, s = math.cos(heading), math.sin(heading)
-        x, y = x + c * mount[0] - s * mount[1], y + s * mount[0] + c * mount[1]
-    return x, y, heading + mount[2]
-
-
 @kernel
-def to_sensor(poses, n, m, mount):  # type: ignore[no-untyped-def]
-    """Like `sensor_pose`, with cos and sin of the heading."""
-    x, y, heading = sensor_pose(poses, n, m, mount)
-    return x, y, heading, math.cos(heading), math.sin(heading)
-
-
-@kernel
-def walls_into(out, directions, beams, sx, sy, c, s, walls, range_max):  # type: ignore[no-untyped-def]
-    """Fuses straight walls (W, 4), given in the world, into a scan from (sx, sy, c, s).
+def walls_into(out, beams, lidar, walls, range_max):  # type: ignore[no-untyped-def]
+    """Fuses straight walls (W, 4), given in the world, into a scan from a `LidarPose`.
 
     Only beams that can meet the part of a wall within `range_max` are computed.
 
     Returns:
         Number of walls within range.
     """
-    near = 0
+    near, c, s = 0, lidar.c, lidar.s
     for w in range(walls.shape[0]):
-        ax, ay = walls[w, 0] - sx, walls[w, 1] - sy
-        bx, by = walls[w, 2] - sx, walls[w, 3] - sy
+        ax, ay = walls[w, 0] - lidar.x, walls[w, 1] - lidar.y
+        bx, by = walls[w, 2] - lidar.x, walls[w, 3] - lidar.y
         ax, ay = c * ax + s * ay, c * ay - s * ax
         bx, by = c * bx + s * by, c * by - s * bx
         ex, ey = bx - ax, by - ay
@@ -271,19 +261,20 @@ def walls_into(out, directions, beams, sx, sy, c, s, walls, range_max):  # type:
             near += 1
             one = arctan2(ay + first * ey, ax + first * ex)
             other = arctan2(ay + last * ey, ax + last * ex)
-            edge(out, directions, beams, ax, ay, one, bx, by, other, False)
+            edge(out, beams, ax, ay, one, bx, by, other, False)
     return near
 
 
 @kernel
-def body_into(out, directions, beams, sx, sy, c, s, body, corners, corner, range_max):  # type: ignore[no-untyped-def]
-    """Fuses one body (7,), see `shapes.BODY`, into a scan from (sx, sy, c, s)."""
-    dx, dy = body[0] - sx, body[1] - sy
+def body_into(out, beams, lidar, body, outlines, range_max):  # type: ignore[no-untyped-def]
+    """Fuses one body (7,) into a scan from a `LidarPose`."""
+    c, s = lidar.c, lidar.s
+    dx, dy = body[X] - lidar.x, body[Y] - lidar.y
     x, y = c * dx + s * dy, c * dy - s * dx
-    shape = int(body[6])
-    begin, end = corner[shape], corner[shape + 1]
+    shape = int(body[SHAPE])
+    begin, end = outlines.first[shape], outlines.first[shape + 1]
     if begin == end:
-        circle(out, directions, beams, x, y, body[5], range_max)
+        circle(out, beams, x, y, body[RADIUS], range_max)
     else:
-        cos, sin = body[3] * c + body[4] * s, body[4] * c - body[3] * s
-        polygon(out, directions, beams, x, y, cos, sin, corners[begin:end])
+        cos, sin = body[COS] * c + body[SIN] * s, body[SIN] * c - body[COS] * s
+        polygon(out, beams, x, y, cos, sin, outlines.corners[begin:end])

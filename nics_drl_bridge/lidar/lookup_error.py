@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar import scan_kernels
+from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.shapes import place
 
 Array = NDArray[np.float64]
@@ -29,9 +28,8 @@ NO_WALLS = np.zeros((0, 4))
 
 
 def lookup_distances(
-    exact: tuple[Any, ...],
-    baked: tuple[Any, ...],
-    room: tuple[NDArray[Any], ...],
+    exact: LidarArrays,
+    baked: LidarArrays,
     shape: int,
     radius: float,
     greatest: float,
@@ -47,7 +45,6 @@ def lookup_distances(
     Args:
         exact: `Scanner.arguments` of that renderer.
         baked: `Scanner.arguments` of the renderer `baked`.
-        room: see `scanner.Scanner.room`.
         shape: its index in the table.
         radius: of the shape [m].
         greatest: RMSE [m].
@@ -56,8 +53,8 @@ def lookup_distances(
         Least and greatest distance from the lidar to the shape's origin [m]; both inf if it may not
         be looked up.
     """
-    (low, high), (corners, corner) = exact[3], exact[5]
-    outline = corners[corner[shape] : corner[shape + 1]]
+    low, high, (corners, first) = exact.range_min, exact.range_max, exact.outlines
+    outline = corners[first[shape] : first[shape + 1]]
     rings = np.concatenate([[0.0], np.geomspace(TOUCHING * high, high, RINGS)]) + radius
     edges = np.geomspace(max(low, TOUCHING * high), high, BANDS + 1)[1:-1]
     squares, counts = np.zeros((2, RINGS, PLACES, BANDS))
@@ -65,7 +62,7 @@ def lookup_distances(
     for i in range(RINGS):
         poses = _around(exact, rings[i : i + 2], SEED + i)
         for some in (poses, _slanted(poses, outline, SEED + i)) if len(outline) else (poses,):
-            one, other = _scans(place(some[:, None], radius, shape), exact, baked, room)
+            one, other = _scans(place(some[:, None], radius, shape), exact, baked)
             both = np.isfinite(one) & np.isfinite(other)
             found, truth = other[both] - one[both], one[both]
             worst[i] = max(worst[i], np.abs(found).max(initial=0.0))
@@ -107,25 +104,25 @@ def _small(squares: Array, counts: Array, greatest: float) -> bool:
     return True
 
 
-def _scans(
-    bodies: Array, exact: tuple[Any, ...], baked: tuple[Any, ...], room: tuple[NDArray[Any], ...]
-) -> tuple[Array, Array]:
+def _scans(bodies: Array, exact: LidarArrays, baked: LidarArrays) -> tuple[Array, Array]:
     """Ranges (P, B) to one body (P, 1, 7) in each of P places: exact, and looked up."""
-    mount, directions = exact[0], exact[1]
+    mount, directions = exact.mount, exact.beams.directions
     robots = np.tile([-mount[0], -mount[1], 0.0], (PLACES, 1, 1))  # the lidar is at the origin
     scans = np.empty((2, PLACES, 1, len(directions)), np.float32)
     for ranges, sensor in zip(scans, (exact, baked), strict=True):
         worlds = np.arange(PLACES)
-        scan_kernels.scan_worlds(ranges, robots, worlds, bodies, -1, NO_WALLS, sensor, room)
+        lanes = scan_kernels.scan_lanes()
+        scan_kernels.scan_worlds(ranges, robots, worlds, bodies, -1, NO_WALLS, sensor, lanes)
     one, other = scans[:, :, 0].astype(np.float64)
     return one, other
 
 
-def _around(exact: tuple[Any, ...], between: Array, seed: int) -> Array:
+def _around(exact: LidarArrays, between: Array, seed: int) -> Array:
     """Draws poses (PLACES, 3) of a body in the lidar's field of view, between two distances."""
-    rng, (mount, _, beams) = np.random.default_rng(seed), exact[:3]
+    rng, beams = np.random.default_rng(seed), exact.beams
     distance = rng.uniform(between[0], between[1], PLACES)
-    bearing = mount[2] + beams[0] + rng.uniform(0.0, beams[1] * beams[3], PLACES)
+    bearing = exact.mount[2] + beams.first
+    bearing += rng.uniform(0.0, beams.step * len(beams.directions), PLACES)
     heading = rng.uniform(-np.pi, np.pi, PLACES)
     return np.stack([distance * np.cos(bearing), distance * np.sin(bearing), heading], axis=1)
 

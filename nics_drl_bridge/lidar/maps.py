@@ -10,7 +10,7 @@ import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +24,7 @@ from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.shapes import Coordinate, Heading
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
-NO_MAP: tuple[NDArray[Any], NDArray[Any]] = (np.zeros((0, 0), np.uint32), np.zeros(0))
+NO_MAP = map_kernels.GridArrays(np.zeros((0, 0), np.uint32), np.zeros(0))
 """Argument of the kernels without a map."""
 
 
@@ -60,11 +60,11 @@ class GridMap:
         return np.asarray(~self.free if self.unknown_stops else occupied)
 
     @cached_property
-    def arrays(self) -> tuple[NDArray[np.uint32], NDArray[np.float64]]:
-        """The argument `map_arrays` of `map_kernels`; baked on first use."""
+    def arrays(self) -> map_kernels.GridArrays:
+        """The map for the kernels; baked on first use."""
         x, y, heading = self.origin
         frame = np.array([x, y, np.cos(heading), np.sin(heading), self.resolution])
-        return map_kernels.free_squares(self.blocked), frame
+        return map_kernels.GridArrays(map_kernels.free_squares(self.blocked), frame)
 
     def world_to_cell(self, points: ArrayLike) -> NDArray[np.int64]:
         """Returns row and column (..., 2) of points (..., 2) x, y [m]; may be outside the map."""

@@ -1,92 +1,298 @@
-"""Compiled inner loops of the lidar: scans of whole worlds."""
+"""Scans of whole worlds; and the fast path of the look-up, which goes through many bodies at once.
+
+Nearly all time of a look-up goes into cache misses, branch mispredictions and latencies. So the
+visible bodies of several scans go through each step of `baked_kernels.look_up` together, in loops
+without branches that LLVM turns into vector instructions. Steps hand on their results in lanes: one
+array for each type of number, in which every quantity has `LANES` places from a constant on, so
+that LLVM can prove that they do not overlap. A scan is that of `baked_kernels.scan_robot` to the
+bit, in any batch.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar import baked_kernels as baking
-from nics_drl_bridge.lidar import exact_kernels, fuse_kernels, map_kernels
+from nics_drl_bridge.lidar import baked_kernels as baked
+from nics_drl_bridge.lidar import exact_kernels, map_kernels
+from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, LidarPose, X, Y
+
+BLOCK = 16
+"""Beams that are fused at once."""
+LANES = 9 * BLOCK
+"""Bodies that are looked up together: few enough that their scans stay in the L1 cache."""
+DX, DY, TURNED, COSINE, SINE, SIZE, BEARING_0, AT, MIDDLE, LOW, HIGH = (
+    np.uintp(k * LANES) for k in range(11)
+)
+"""Of a body: offset from the lidar, heading, cosine, sine, radius; the bearing of beam 0 and the
+index of the scan in memory; bearing and silhouettes [beams]."""
+RIGHT_X, RIGHT_Y, RIGHT_X2, RIGHT_Y2, LEFT_X, LEFT_Y, LEFT_X2, LEFT_Y2 = (
+    np.uintp(k * LANES) for k in range(11, 19)
+)
+"""The two corners of the hull that can be the right silhouette, and the left one."""
+DISTANCE, BEARING, BLEND, SHARE = (np.uintp(k * LANES) for k in range(4))
+"""The latter two are those of the farther row and of the next point."""
+KIND, CELL, HULL, CLIMBS, START, PLACE, START2, PLACE2 = (np.uintp(k * LANES) for k in range(8))
+"""Shape, cell, first corner of the hull; begin and place of the row and of the farther one."""
+BEGIN, HITS, BACK, ONE, TWO, OTHER, OTHER2 = (np.uintp(k * LANES) for k in range(8, 15))
+"""First beam, beams, beams before the first; points of the row, and of the farther one."""
+
+
+class ScanLanes(NamedTuple):
+    """Scratch memory of the scans of one thread."""
+
+    wide: NDArray[np.float64]
+    single: NDArray[np.float32]
+    whole: NDArray[np.int32]
+
+
+def scan_lanes() -> ScanLanes:
+    """Allocates the memory that one thread needs to scan."""
+    return ScanLanes(
+        np.zeros(19 * LANES), np.zeros(4 * LANES, np.float32), np.zeros(15 * LANES, np.int32)
+    )
+
+
+class Device(NamedTuple):
+    """Lidar of one robot: place in its world [m], bearing of beam 0 [rad], index of its scan."""
+
+    x: float
+    y: float
+    heading: float
+    at: int
 
 
 @kernel
-def scan_worlds(ranges, poses, chosen, bodies, first, walls, sensor, room):  # type: ignore[no-untyped-def]
+def scan_worlds(ranges, poses, chosen, bodies, first, walls, lidar, lanes):  # type: ignore[no-untyped-def]
     """Scans from the robots of some worlds.
 
-    Bodies to be looked up are collected in the lanes until these are full, across scans: the
-    minimum does not depend on the order. All arrays are unpacked from their tuples once, here:
-    doing so for each scan took as long as the look-ups.
-
     Args:
-        ranges: (N, M, B) result, with contiguous beams.
+        ranges: (N, M, B) result, contiguous.
         poses: (N, M, 3) of `base_link` in the world.
         chosen: (n,) indices of the worlds.
         bodies: (N, K, 7), see `shapes.BODY`.
         first: index of the body of robot 0, the others follow; -1 if robots are not bodies.
         walls: (W, 4) x1, y1, x2, y2 [m], the same in every world.
-        sensor: see `scanner.Scanner.arguments`.
-        room: see `scanner.Scanner.room`.
+        lidar: `baked_kernels.LidarArrays`.
+        lanes: `ScanLanes`; bodies wait there across scans until it is full.
     """
-    mount, directions, beams, limits, baked, outlines, lookup = sensor
-    corners, corner = outlines
-    wide, _, whole = room
-    high, count, found = limits[1], bodies.shape[1], 0
-    of_world, of_robot = ranges.strides[0] // 4, ranges.strides[1] // 4
+    count, robots, found = bodies.shape[1], poses.shape[1], 0
     for n in chosen:
-        for m in range(poses.shape[1]):
-            exact_kernels.clear(ranges, n, m)
-            me = first + m if first >= 0 else -1
-            sx, sy, heading = exact_kernels.sensor_pose(poses, n, m, mount)
-            scan = sx, sy, heading + beams[0], float(n * of_world + m * of_robot)
-            begin, missed = 0, 0
+        for m in range(robots):
+            out, me = ranges[n, m], first + m if first >= 0 else -1
+            for i in range(out.shape[0]):
+                out[i] = np.float32(np.inf)
+            x, y, heading = baked.sensor_pose(poses[n, m], lidar.mount)
+            device = Device(x, y, heading, (n * robots + m) * out.shape[0])
+            begin, computed = 0, 0
             while begin < count:
-                end = min(count, begin + baking.LANES - found)
-                found, left = baking.in_sight(
-                    found, begin, end, bodies, n, me, scan, high, baked, wide, whole
-                )
-                begin, missed = end, missed + left
-                if found == baking.LANES:
-                    fuse_kernels.look_up(found, ranges, beams, limits, lookup, room)
+                end = min(count, begin + LANES - found)
+                found, more = select(found, begin, end, bodies[n], me, device, lidar, lanes)
+                begin, computed = end, computed + more
+                if found == LANES:
+                    look_up(found, ranges, lidar, lanes)
                     found = 0
-            if missed > 0 or walls.shape[0] > 0:
-                out = ranges[n, m]
-                c, s = math.cos(heading), math.sin(heading)
-                for k in range(count if missed > 0 else 0):
-                    if baking.left_out(bodies, n, k, me, sx, sy, high, baked):
-                        exact_kernels.body_into(
-                            out, directions, beams, sx, sy, c, s, bodies[n, k], corners, corner,
-                            high,
-                        )  # fmt: skip
-                near = exact_kernels.walls_into(out, directions, beams, sx, sy, c, s, walls, high)
-                if near > 0 or missed > 0:
-                    exact_kernels.finish(out, limits[0], high)
-    fuse_kernels.look_up(found, ranges, beams, limits, lookup, room)
+            if computed > 0 or walls.shape[0] > 0:
+                here = LidarPose(x, y, math.cos(heading), math.sin(heading))
+                baked.compute(out, here, bodies[n], me, computed > 0, walls, lidar)
+    look_up(found, ranges, lidar, lanes)
+
+
+@kernel(contracts=True, inline=True)
+def select(found, begin, end, bodies, me, device, lidar, lanes):  # type: ignore[no-untyped-def]
+    """Puts the bodies [begin, end) that a device looks up into the lanes from `found` on.
+
+    Returns:
+        Number of lanes in use, and number of bodies that are computed, see `baked_kernels.way_of`.
+    """
+    wide, computed = lanes.wide, 0
+    for j in range(begin, end):
+        b, k = np.uintp(j), np.uintp(found)
+        dx, dy, radius = bodies[b, X] - device.x, bodies[b, Y] - device.y, bodies[b, RADIUS]
+        d2, reach, shape = dx * dx + dy * dy, lidar.range_max + radius, np.int32(bodies[b, SHAPE])
+        wide[k + DX], wide[k + DY], wide[k + TURNED] = dx, dy, bodies[b, HEADING]
+        wide[k + COSINE], wide[k + SINE], wide[k + SIZE] = bodies[b, COS], bodies[b, SIN], radius
+        wide[k + BEARING_0], wide[k + AT] = device.heading, device.at
+        lanes.whole[k + KIND] = shape
+        h = np.uintp(shape)
+        seen = (d2 <= reach * reach) & (radius > 0.0) & (j != me)
+        kept = seen & (d2 >= radius * radius)
+        kept &= (d2 >= lidar.between[h, 0]) & (d2 <= lidar.between[h, 1])
+        found += kept
+        computed += seen & (not kept)
+    return found, computed
 
 
 @kernel
-def add_map(ranges, poses, chosen, sensor, map_arrays, exact, room):  # type: ignore[no-untyped-def]
-    """Fuses a static map into the scans of some worlds.
+def look_up(found, ranges, lidar, lanes):  # type: ignore[no-untyped-def]
+    """Fuses the bodies in the lanes into their scans (N, M, B)."""
+    wide, table, flat = lanes.wide, lidar.table, ranges.reshape(-1)
+    padded, turn = (found + BLOCK - 1) // BLOCK * BLOCK, 2.0 * math.pi / lidar.beams.step
+    count = np.int32(ranges.shape[2])
+    places(padded, lanes)
+    cells(found, table, lanes)
+    fetch(found, table, lanes)
+    spans(padded, lidar.beams, lanes)
+    for j in range(found):
+        if lanes.whole[np.uintp(j) + CLIMBS] < 0:
+            climb(np.uintp(j), lidar, lanes)
+    aims(padded, count, np.int32(table.shift), lanes)
+    for j in range(found):
+        fuse(flat, np.uintp(j), lidar, lanes)
+    for j in range(found):
+        if wide[np.uintp(j) + HIGH] >= turn:  # across the seam of the circle
+            aim(np.uintp(j), turn, count, np.int32(table.shift), lanes)
+            fuse(flat, np.uintp(j), lidar, lanes)
+
+
+@kernel(contracts=True)
+def places(padded, lanes):  # type: ignore[no-untyped-def]
+    """Distance and bearing of each body; unused lanes contain old values."""
+    for j in range(padded):
+        k = np.uintp(j)
+        distance, bearing = baked.polar(lanes.wide[k + DX], lanes.wide[k + DY])
+        lanes.single[k + DISTANCE], lanes.single[k + BEARING] = distance, bearing
+
+
+@kernel(contracts=True)
+def cells(found, table, lanes):  # type: ignore[no-untyped-def]
+    """Table cell of each body, and the first corner of its hull."""
+    wide, single, whole = lanes.wide, lanes.single, lanes.whole
+    for j in range(found):
+        k = np.uintp(j)
+        shape, distance = table.shapes[np.uintp(whole[k + KIND])], single[k + DISTANCE]
+        whole[k + CELL], whole[k + HULL], single[k + BLEND] = baked.nearest_cell(
+            distance, single[k + BEARING], wide[k + SIZE], wide[k + TURNED], shape, table
+        )
+        wide[k + SIZE] = shape.round_radius
+
+
+@kernel
+def fetch(found, table, lanes):  # type: ignore[no-untyped-def]
+    """Loads cells and corners, the step with most cache misses: nothing waits for them here."""
+    wide, whole = lanes.wide, lanes.whole
+    for j in range(found):
+        k = np.uintp(j)
+        hull, cell = whole[k + HULL], np.uintp(whole[k + CELL])
+        near, far = table.cells[cell], table.cells[cell + np.uintp(1)]
+        whole[k + START], whole[k + PLACE] = near[0], near[1]
+        whole[k + START2], whole[k + PLACE2] = far[0], far[1]
+        whole[k + CLIMBS] = (near[2] | near[3]) >> 16
+        for pair, at in ((near[2], RIGHT_X), (near[3], LEFT_X)):
+            one = table.hulls[np.uintp(hull + (pair & 0xFFFF))]
+            two = table.hulls[np.uintp(hull + max(pair >> 16, 0))]
+            wide[k + at], wide[k + at + np.uintp(LANES)] = one[0], one[1]
+            wide[k + at + np.uintp(2 * LANES)], wide[k + at + np.uintp(3 * LANES)] = two[0], two[1]
+
+
+@kernel(contracts=True)
+def spans(padded, beams, lanes):  # type: ignore[no-untyped-def]
+    """Bearing and silhouettes of each body in beams, from the outer of two corners."""
+    wide = lanes.wide
+    for j in range(padded):
+        k = np.uintp(j)
+        seen = baked.seen_at(wide[k + DX], wide[k + DY], wide[k + COSINE], wide[k + SINE])
+        radius = wide[k + SIZE]
+        x, y, x2, y2 = wide[k + RIGHT_X], wide[k + RIGHT_Y], wide[k + RIGHT_X2], wide[k + RIGHT_Y2]
+        right = baked.tangent(seen, x, y, x2, y2, radius, 1.0)
+        x, y, x2, y2 = wide[k + LEFT_X], wide[k + LEFT_Y], wide[k + LEFT_X2], wide[k + LEFT_Y2]
+        left = baked.tangent(seen, x, y, x2, y2, radius, -1.0)
+        bearing, ahead = lanes.single[k + BEARING], wide[k + BEARING_0]
+        wide[k + MIDDLE], wide[k + LOW], wide[k + HIGH] = baked.in_beams(
+            right, left, bearing, ahead, beams
+        )
+
+
+@kernel(contracts=True)
+def climb(k, lidar, lanes):  # type: ignore[no-untyped-def]
+    """Replaces the silhouettes of a body that two corners do not determine."""
+    wide, whole, table = lanes.wide, lanes.whole, lidar.table
+    seen = baked.seen_at(wide[k + DX], wide[k + DY], wide[k + COSINE], wide[k + SINE])
+    shape, cell = table.shapes[np.uintp(whole[k + KIND])], table.cells[np.uintp(whole[k + CELL])]
+    right = baked.silhouette(cell[2], whole[k + HULL], shape, table.hulls, seen, 1.0)
+    left = baked.silhouette(cell[3], whole[k + HULL], shape, table.hulls, seen, -1.0)
+    bearing, ahead = lanes.single[k + BEARING], wide[k + BEARING_0]
+    wide[k + MIDDLE], wide[k + LOW], wide[k + HIGH] = baked.in_beams(
+        right, left, bearing, ahead, lidar.beams
+    )
+
+
+@kernel(contracts=True, inline=True)
+def aim(k, turn, count, shift, lanes):  # type: ignore[no-untyped-def]
+    """Finds the beams and the points of one body.
+
+    The beams are fused in whole blocks, at least two, which most bodies need: a number of blocks
+    that varies would mean a branch misprediction for every other one. Blocks that would go beyond
+    the last of `count` beams begin `BACK` beams earlier.
+    """
+    wide, whole, zero = lanes.wide, lanes.whole, np.int32(0)
+    middle, low, high = wide[k + MIDDLE] - turn, wide[k + LOW] - turn, wide[k + HIGH] - turn
+    begin, hits, point, share = baked.beams_between(middle, low, high, count, shift)
+    blocks = np.int32(max(np.int32(hits + BLOCK - 1) & np.int32(-BLOCK), np.int32(2 * BLOCK)))
+    back = np.int32(max(np.int32(begin + blocks - count), zero))
+    whole[k + BEGIN], whole[k + HITS], whole[k + BACK] = np.int32(begin - back), hits, back
+    one, two = baked.points_of(whole[k + START], whole[k + PLACE], point, shift, hits)
+    other, other2 = baked.points_of(whole[k + START2], whole[k + PLACE2], point, shift, hits)
+    whole[k + ONE], whole[k + TWO] = np.int32(one - back), np.int32(two - back)
+    whole[k + OTHER], whole[k + OTHER2] = np.int32(other - back), np.int32(other2 - back)
+    lanes.single[k + SHARE] = share
+
+
+@kernel(contracts=True)
+def aims(padded, count, shift, lanes):  # type: ignore[no-untyped-def]
+    """Finds the beams and the points of each body."""
+    for j in range(padded):
+        aim(np.uintp(j), 0.0, count, shift, lanes)
+
+
+@kernel(contracts=True, inline=True)
+def fuse(flat, k, lidar, lanes):  # type: ignore[no-untyped-def]
+    """Lowers the beams of one body in blocks, or beam by beam where no block fits."""
+    whole, rows = lanes.whole, lidar.table.rows
+    begin, hits, back = whole[k + BEGIN], whole[k + HITS], whole[k + BACK]
+    one, two, other, other2 = whole[k + ONE], whole[k + TWO], whole[k + OTHER], whole[k + OTHER2]
+    if hits <= 0:
+        return
+    share, blend = lanes.single[k + SHARE], lanes.single[k + BLEND]
+    least, most = np.float32(lidar.range_min), np.float32(lidar.range_max)
+    fits = min(begin, one, two, min(other, other2)) >= 0
+    first = np.int64(0 if fits else back)  # few beams, or at the begin of the table
+    at, one, two = np.uintp(lanes.wide[k + AT] + begin + first), one + first, two + first
+    one, two, other, other2 = np.uintp(one), np.uintp(two), other + first, other2 + first
+    other, other2 = np.uintp(other), np.uintp(other2)
+    place = np.int32(-back)
+    if fits:
+        for j in range(max((hits + back + BLOCK - 1) // BLOCK, 2) * BLOCK):
+            i = np.uintp(j)
+            value = baked.blended(rows, one + i, two + i, other + i, other2 + i, share, blend)
+            value = baked.limited(value, least, most)
+            value = value if np.uint32(place) < np.uint32(hits) else np.float32(np.inf)
+            place = np.int32(place + np.int32(1))  # of 32 bits, as the ranges
+            flat[at + i] = min(flat[at + i], value)
+    else:
+        for j in range(hits):
+            i = np.uintp(j)
+            value = baked.blended(rows, one + i, two + i, other + i, other2 + i, share, blend)
+            flat[at + i] = min(flat[at + i], baked.limited(value, least, most))
+
+
+@kernel
+def add_map(ranges, poses, chosen, lidar, grid, exact, lanes):  # type: ignore[no-untyped-def]
+    """Fuses a static map into the scans of some worlds, see `scan_worlds`.
 
     Args:
-        ranges: (N, M, B) scans, in place.
-        poses: (N, M, 3) of `base_link` in the world.
-        chosen: (n,) indices of the worlds.
-        sensor: see `scanner.Scanner.arguments`.
-        map_arrays: see `maps_grid.GridMap.arrays`.
-        exact: whether to walk from cell to cell.
-        room: see `scanner.Scanner.room`.
+        ranges, poses, chosen, lidar, lanes: as there.
+        grid: `map_kernels.GridArrays`.
+        exact: True to walk from cell to cell.
     """
-    mount, directions, beams, limits = sensor[0], sensor[1], sensor[2], sensor[3]
     for n in chosen:
         for m in range(poses.shape[1]):
-            sx, sy, _, c, s = exact_kernels.to_sensor(poses, n, m, mount)
+            x, y, heading = baked.sensor_pose(poses[n, m], lidar.mount)
+            here = LidarPose(x, y, math.cos(heading), math.sin(heading))
             out = ranges[n, m]
-            if exact:
-                map_kernels.exact_map_into(
-                    out, directions, beams, sx, sy, c, s, limits[1], map_arrays, room
-                )
-            else:
-                map_kernels.map_into(
-                    out, directions, beams, sx, sy, c, s, limits[1], map_arrays, room
-                )
-            exact_kernels.finish(out, limits[0], limits[1])
+            map_kernels.map_into(out, lidar.beams, here, lidar.range_max, grid, exact, lanes)
+            exact_kernels.finish(out, lidar.range_min, lidar.range_max)

@@ -14,16 +14,16 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.errors import ConfigError, ModelError, nearest
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.bake import bake
-from nics_drl_bridge.lidar.baked_kernels import LANES, SINGLE, WHOLE, WIDE
+from nics_drl_bridge.lidar.baked_kernels import LidarArrays
+from nics_drl_bridge.lidar.exact_kernels import SHAPE, Beams
 from nics_drl_bridge.lidar.lookup_error import lookup_distances
 from nics_drl_bridge.lidar.maps import GridMap
-from nics_drl_bridge.lidar.shapes import BODY, SHAPE, Shape, place
+from nics_drl_bridge.lidar.shapes import BODY, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable
 
 Renderer = Literal["auto", "baked", "exact"]
 RENDERERS: tuple[Renderer, ...] = ("auto", "baked", "exact")
-Room = tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.int32]]
 Array = NDArray[np.float64]
 NO_WALLS = np.zeros((0, 4))
 GREATEST_ERROR = 0.01
@@ -82,24 +82,18 @@ class Scanner:
             )
 
     @cached_property
-    def arguments(self) -> tuple[Any, ...]:
-        """The argument `sensor` of the kernels.
-
-        Mount (3,), directions (B, 2), beams (angle_min, angle_increment, 1 for a full circle,
-        B), limits (range_min, range_max), squares of the distances between which each shape is
-        looked up (H, 2), the outlines, the table's arrays.
-        """
+    def arguments(self) -> LidarArrays:
+        """Lidar and table for the kernels."""
         spec, table = self.spec, self.table
-        beams = (spec.angle_min, spec.angle_increment, float(spec.full_circle), float(spec.beams))
-        limits = np.array([spec.range_min, spec.range_max])
-        return (
+        directions = np.stack([np.cos(spec.angles), np.sin(spec.angles)], axis=1)
+        return LidarArrays(
             np.array(spec.mount),
-            np.stack([np.cos(spec.angles), np.sin(spec.angles)], axis=1),
-            np.array(beams),
-            limits,
+            Beams(directions, spec.angle_min, spec.angle_increment, spec.full_circle),
+            spec.range_min,
+            spec.range_max,
             self._looked_up(),
             table.outlines.arguments,
-            table.lookup,
+            table.arrays,
         )
 
     def _looked_up(self) -> Array:
@@ -123,20 +117,9 @@ class Scanner:
         if key not in _MEASURED:
             exact, baked = (replace(self, renderer=way, grid=None) for way in ("exact", "baked"))
             _MEASURED[key] = lookup_distances(
-                exact.arguments, baked.arguments, self.room(1), shape, radius, GREATEST_ERROR
+                exact.arguments, baked.arguments, shape, radius, GREATEST_ERROR
             )
         return _MEASURED[key]
-
-    def room(self, bodies: int) -> Room:
-        """Returns the scratch memory of one thread for a world with any number of bodies.
-
-        Arrays of float64, float32 and int32; map look-ups need less than these.
-        """
-        return (
-            np.zeros(WIDE * LANES),
-            np.zeros(SINGLE * LANES, np.float32),
-            np.zeros(WHOLE * LANES, np.int32),
-        )
 
     def place(self, shapes: Sequence[Shape], poses: ArrayLike) -> NDArray[np.float64]:
         """Returns bodies (..., K, 7) of K shapes at poses (..., K, 3): x, y [m], heading [rad].
@@ -184,15 +167,14 @@ class Scanner:
         if not (out.flags.c_contiguous or out.strides[1] == out.itemsize):
             out[:] = self.scan(poses, bodies, walls)  # the kernels need contiguous beams
             return out
-        worlds = np.arange(len(poses))
-        room = self.room(bodies.shape[1])
+        worlds, lanes = np.arange(len(poses)), scan_kernels.scan_lanes()
         scan_kernels.scan_worlds(
-            out[:, None], poses[:, None], worlds, bodies, -1, walls, self.arguments, room
+            out[:, None], poses[:, None], worlds, bodies, -1, walls, self.arguments, lanes
         )
         if self.grid is not None:
             scan_kernels.add_map(
                 out[:, None], poses[:, None], worlds, self.arguments, self.grid.arrays,
-                self.renderer == "exact", room,
+                self.renderer == "exact", lanes,
             )  # fmt: skip
         return out
 

@@ -1,28 +1,54 @@
 """Compiled inner loops of the canonical scan: from the beams of a lidar to sectors of a layout.
 
 Ranges follow REP-117: `inf` no return, `-inf` too close, NaN unknown. Shapes: B beams, S sectors.
-`plan` is `sectors.SectorPlan.arguments`.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 
 TURN = 2.0 * math.pi
 
 
-@kernel(allocates=True)
-def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
-    """Writes the nearest return in each sector (S,) of one scan (B,)."""
-    first, count, directions, shift, ring = plan
-    if shift[0] != 0.0 or shift[1] != 0.0:
-        _by_place(out, ranges, directions, shift, ring)
-    else:
-        _by_beam(out, ranges, first, count)
+class SectorPlan(NamedTuple):
+    """Assignment of the beams of one lidar to the sectors of one layout.
+
+    Attributes:
+        first, hits: (S,) first beam of each sector, and number of its beams; they continue with
+            beam 0 after the last.
+        directions: (B, 2) of the beams in `base_link`.
+        shift: (2,) of the lidar from the viewpoint [m]; if zero, sectors are filled by beam.
+        angle_min, width: begin of sector 0, and width of the sectors [rad].
+        range_min, range_max: of the lidar [m].
+        closed: True if the last beam and the first are neighbours.
+    """
+
+    first: NDArray[np.int32]
+    hits: NDArray[np.int32]
+    directions: NDArray[np.float64]
+    shift: NDArray[np.float64]
+    angle_min: float
+    width: float
+    range_min: float
+    range_max: float
+    closed: bool
+
+    def resample(self, ranges: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Resamples scans (..., B) to the nearest return (..., S) in each sector [m], REP-117.
+
+        A sector without a beam takes the nearer return of the two adjacent beams. NaN stays where
+        nothing was measured.
+        """
+        rows = np.ascontiguousarray(ranges, np.float32).reshape(-1, len(self.directions))
+        out = np.empty((len(rows), len(self.first)), np.float32)
+        resample_all(out, rows, self)
+        return out.reshape(*np.shape(ranges)[:-1], -1)
 
 
 @kernel(allocates=True)
@@ -30,6 +56,15 @@ def resample_all(out, ranges, plan):  # type: ignore[no-untyped-def]
     """Applies `resample` to scans (R, B), into (R, S)."""
     for i in range(ranges.shape[0]):
         resample(out[i], ranges[i], plan)
+
+
+@kernel(allocates=True)
+def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
+    """Writes the nearest return in each sector (S,) of one scan (B,)."""
+    if plan.shift[0] != 0.0 or plan.shift[1] != 0.0:
+        _by_place(out, ranges, plan)
+    else:
+        _by_beam(out, ranges, plan.first, plan.hits)
 
 
 @kernel(allocates=True)
@@ -49,18 +84,10 @@ def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def _by_place(out, ranges, directions, shift, ring):  # type: ignore[no-untyped-def]
+def _by_place(out, ranges, plan):  # type: ignore[no-untyped-def]
     """Fills each sector from the returns that lie in it as seen from the layout's viewpoint.
 
     A sector left empty between the returns of two neighbouring beams takes the nearer of the two.
-
-    Args:
-        out: (S,) result.
-        ranges: (B,).
-        directions: (B, 2) of the beams in `base_link`.
-        shift: (2,) of the lidar from the viewpoint [m].
-        ring: angle_min and width of the sectors [rad], limits of the lidar [m], 1 if the last beam
-            and the first are neighbours.
     """
     sectors, beams = out.shape[0], ranges.shape[0]
     where, value = np.empty(beams, np.int32), np.empty(beams, np.float32)
@@ -68,13 +95,13 @@ def _by_place(out, ranges, directions, shift, ring):  # type: ignore[no-untyped-
     for s in range(sectors):
         out[s] = np.nan
     for b in range(beams):
-        where[b], value[b] = _seen(ranges[b], directions[b], shift, ring)
+        where[b], value[b] = _seen(ranges[b], plan.directions[b], plan)
         s = where[b]
         if 0 <= s < sectors:
             own[s] = True
             out[s] = _nearer(out[s], value[b])
-    around = round(TURN / ring[1])
-    for b in range(beams if ring[4] > 0.0 else beams - 1):
+    around = round(TURN / plan.width)
+    for b in range(beams if plan.closed else beams - 1):
         after = b + 1 if b + 1 < beams else 0
         if where[b] < 0 or where[after] < 0:
             continue
@@ -89,14 +116,14 @@ def _by_place(out, ranges, directions, shift, ring):  # type: ignore[no-untyped-
 
 
 @kernel(allocates=True)
-def _seen(r, direction, shift, ring):  # type: ignore[no-untyped-def]
+def _seen(r, direction, plan):  # type: ignore[no-untyped-def]
     """Sector of a return seen from the viewpoint, -1 if unknown, and its distance from there."""
     if r != r:
         return -1, np.float32(np.nan)
-    reach = min(max(float(r), 0.5 * ring[2]), ring[3])
-    x, y = shift[0] + reach * direction[0], shift[1] + reach * direction[1]
-    angle = (math.atan2(y, x) - ring[0]) % TURN
-    s = int(angle / ring[1]) if angle < TURN else 0  # a tiny negative angle is rounded to TURN
+    reach = min(max(float(r), 0.5 * plan.range_min), plan.range_max)
+    x, y = plan.shift[0] + reach * direction[0], plan.shift[1] + reach * direction[1]
+    angle = (math.atan2(y, x) - plan.angle_min) % TURN
+    s = int(angle / plan.width) if angle < TURN else 0  # a tiny negative angle is rounded to TURN
     return s, np.float32(math.sqrt(x * x + y * y)) if math.isfinite(r) else r
 
 

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 from nics_drl_bridge.config import Schema, validate
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.geometry import wrap_angle
-from nics_drl_bridge.lidar import sector_kernels as kernels
+from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.shapes import LARGEST, Place
 from nics_drl_bridge.lidar.spec import FULL_CIRCLE_TOLERANCE, LidarSpec, ScanHeader
 
@@ -115,45 +115,10 @@ def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
     )
 
 
-@dataclass(frozen=True)
-class SectorPlan:
-    """Assignment of the beams of one lidar to the sectors of one layout; computed once.
-
-    Attributes:
-        first: (S,) int32, the first beam of each sector.
-        count: (S,) int32, number of its beams; they continue with beam 0 after the last.
-        directions: (B, 2) of the beams in `base_link`.
-        shift: (2,) of the lidar from the viewpoint [m]; if zero, sectors are filled by beam.
-        ring: (5,) angle_min and width of the sectors [rad], limits of the lidar [m], and 1 if
-            the last beam and the first are neighbours.
-    """
-
-    first: NDArray[np.int32]
-    count: NDArray[np.int32]
-    directions: Array
-    shift: Array
-    ring: Array
-
-    @property
-    def arguments(self) -> tuple[NDArray[Any], ...]:
-        """Arguments of the kernels."""
-        return self.first, self.count, self.directions, self.shift, self.ring
-
-    def resample(self, ranges: Ranges) -> Ranges:
-        """Resamples scans (..., B) to the nearest return (..., S) in each sector [m], REP-117.
-
-        A sector without a beam takes the nearer return of the two adjacent beams. NaN stays where
-        nothing was measured.
-        """
-        rows = np.ascontiguousarray(ranges, np.float32).reshape(-1, len(self.directions))
-        out = np.empty((len(rows), len(self.first)), np.float32)
-        kernels.resample_all(out, rows, self.arguments)
-        return out.reshape(*np.shape(ranges)[:-1], -1)
-
-
 NO_PLAN = SectorPlan(
-    np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(2), np.zeros(5)
-)
+    np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(2),
+    angle_min=0.0, width=0.0, range_min=0.0, range_max=0.0, closed=False,
+)  # fmt: skip
 """Plan without sectors, for policies that observe the beams themselves."""
 
 
@@ -177,7 +142,11 @@ def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
         count,
         np.stack([np.cos(angles), np.sin(angles)], axis=1),
         np.array([x - layout.viewpoint[0], y - layout.viewpoint[1]]),
-        np.array([layout.angle_min, layout.width, lidar.range_min, lidar.range_max, float(closed)]),
+        float(layout.angle_min),
+        float(layout.width),
+        float(lidar.range_min),
+        float(lidar.range_max),
+        bool(closed),
     )
 
 

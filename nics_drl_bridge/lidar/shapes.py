@@ -13,6 +13,7 @@ from pydantic import Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, load_yaml
 from nics_drl_bridge.errors import ModelError
+from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN, OutlineArrays
 
 Array = NDArray[np.float64]
 MOST_CORNERS = 16_384
@@ -168,8 +169,7 @@ SQUARE = Rectangle(size=(0.3, 0.3))
 STRIP = Rectangle(size=(0.6, 0.06))
 
 BODY = 7
-"""Columns of a placed body: x, y, heading, cos, sin, radius (0: none), index of its shape."""
-X, Y, HEADING, COS, SIN, RADIUS, SHAPE = range(BODY)
+"""Number of columns of a placed body."""
 
 
 def _reach(outline: Array) -> float:
@@ -286,9 +286,9 @@ class Outlines:
         return np.asarray(np.diff(self.corner) > np.diff(self.hull) // 2)
 
     @property
-    def arguments(self) -> tuple[Array, NDArray[np.int64]]:
-        """Arguments of the exact kernels: corners, and the first corner of each outline."""
-        return self.corners, self.corner
+    def arguments(self) -> OutlineArrays:
+        """The outlines for the kernels."""
+        return OutlineArrays(self.corners, self.corner)
 
     def index_of(self, shape: Shape) -> int:
         """Returns the index of a shape. Raises ModelError if it is not among them."""

@@ -24,19 +24,7 @@ from nics_drl_bridge.files import (
     write_sums,
     write_text,
 )
-from nics_drl_bridge.lidar.baked_kernels import (
-    ABOUT,
-    CELLS_PER_PART,
-    CORNERS,
-    CORNERS_PER_PART,
-    FIRST_CELL,
-    HULL_END,
-    PARTS_PER_ROTATION,
-    PER_METRE,
-    ROTATIONS,
-    ROUND_RADIUS,
-)
-from nics_drl_bridge.lidar.block_kernels import BLOCK
+from nics_drl_bridge.lidar.baked_kernels import TABLE_SHAPE, TableArrays
 from nics_drl_bridge.lidar.sensor_models import SensorModel, SensorModels
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec
@@ -95,7 +83,7 @@ def padding(beam_angle: float) -> int:
 
     Half a turn, as a shape that does not enclose the lidar covers less, and a block.
     """
-    return math.ceil(math.pi / beam_angle) + 1 + BLOCK
+    return math.ceil(math.pi / beam_angle) + 1 + 16
 
 
 @dataclass(frozen=True)
@@ -163,42 +151,27 @@ class LidarTable:
         return Outlines.of(self.shapes)
 
     @cached_property
-    def lookup(self) -> tuple[Any, ...]:
-        """The argument `lookup` of the kernels.
-
-        Flat (H * ABOUT,) numbers of each shape: cells per metre; rotations in a full turn, 0 for a
-        circle; parts (periods of the rotational symmetry) per grid rotation; first cell; cells per
-        part; the corner after the hull's last; corners per part; corners; radius of a circle [m],
-        0 for others. Then the number of distances, the cells, the rows, log2 of the phases, and the
-        hulls.
-        """
+    def arrays(self) -> TableArrays:
+        """The table for the kernels."""
         outlines, distances = self.outlines, self.density.distances
         parts, rotations = outlines.orders, self.grid[:, 1]
         corners = np.diff(outlines.hull) // 2
-        round_ = np.array([isinstance(shape, Circle) for shape in self.shapes], bool)
-        about = np.zeros((len(self.shapes), ABOUT))
-        about[:, PER_METRE] = (distances - 1) / (self.grid[:, 0] - outlines.radii)
-        about[:, ROTATIONS] = np.where(round_, 0.0, rotations * parts)
-        about[:, PARTS_PER_ROTATION] = 1.0 / rotations
-        about[:, FIRST_CELL], about[:, CELLS_PER_PART] = self.grid[:, 2], rotations * distances
-        about[:, HULL_END] = outlines.hull[:-1] + corners
-        about[:, CORNERS_PER_PART], about[:, CORNERS] = corners // parts, corners
-        about[:, ROUND_RADIUS] = np.where(round_, outlines.radii, 0.0)
-        missing = max(2 * BLOCK - padding(self.beam_angle), 0)  # at least two blocks are read
-        rows = np.append(self.rows, np.zeros(missing, np.float32)) if missing else self.rows
+        circles = np.array([isinstance(shape, Circle) for shape in self.shapes], bool)
+        shapes = np.zeros(len(self.shapes), TABLE_SHAPE)
+        shapes["per_metre"] = (distances - 1) / (self.grid[:, 0] - outlines.radii)
+        shapes["rotations"] = np.where(circles, 0.0, rotations * parts)
+        shapes["parts_per_rotation"] = 1.0 / rotations
+        shapes["first_cell"], shapes["cells_per_part"] = self.grid[:, 2], rotations * distances
+        shapes["hull_end"] = outlines.hull[:-1] + corners
+        shapes["corners_per_part"], shapes["corners"] = corners // parts, corners
+        shapes["round_radius"] = np.where(circles, outlines.radii, 0.0)
         shift = self.density.phases.bit_length() - 1
-        return about.ravel(), distances, self._packed, rows, shift, outlines.hulls.ravel()
-
-    @property
-    def _packed(self) -> NDArray[np.int32]:
-        """(cells * 4,) `start` and `cell`, packed so that both share a cache line.
-
-        Begin of the row; its first beam and its width; the other and the first corner of the right
-        edge; those of the left edge.
-        """
         cell = self.cell.astype(np.int32)
         pairs = (cell[:, [0, 3, 5]] << 16) | (cell[:, [1, 2, 4]] & MOST_WIDE)
-        return np.column_stack([self.start, pairs]).ravel()
+        cells = np.column_stack([self.start, pairs])
+        missing = max(32 - padding(self.beam_angle), 0)  # at least two blocks are read
+        rows = np.append(self.rows, np.zeros(missing, np.float32)) if missing else self.rows
+        return TableArrays(shapes, distances, cells, rows, shift, outlines.hulls)
 
     @property
     def memory(self) -> int:

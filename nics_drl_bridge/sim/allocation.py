@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
+from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
@@ -97,7 +97,7 @@ def map_field(grid: GridMap | None) -> arrays.MapField:
     """Returns a static map as the kernels take it."""
     if grid is None:
         return arrays.NO_FIELD
-    return arrays.MapField(np.ascontiguousarray(grid.distance_field), *grid.arrays[1].tolist())
+    return arrays.MapField(np.ascontiguousarray(grid.distance_field), *grid.arrays.frame.tolist())
 
 
 def surroundings(
@@ -107,7 +107,7 @@ def surroundings(
     low_x, low_y, high_x, high_y = world.extent
     half = np.array([max(-low_x, high_x), max(-low_y, high_y)])
     moves = any(motion is not None for motion in motions)
-    outlines = OutlineArrays(*scanner.table.outlines.arguments)
+    outlines = scanner.table.outlines.arguments
     return arrays.Surroundings(
         world.all_walls(), map_field(scanner.grid), outlines, sizes.crowded, sizes.scattered,
         arrays.Movers(moves, *plan_arrays(motions), half),
@@ -169,6 +169,6 @@ def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int)
             before=np.zeros((lanes, 3)), waiting=np.zeros(worlds, np.int64),
             seen=np.zeros((bodies + 1, BODY)), spot=np.zeros((1, 1, 3)),
             slices=np.zeros((SLICES, 3)), part=np.zeros((1, 1, model.lidar.beams), np.float32),
-            drive=np.zeros(3), none=np.zeros(1, np.int64), lookup=scanner.room(bodies),
+            drive=np.zeros(3), none=np.zeros(1, np.int64), lookup=scan_kernels.scan_lanes(),
         ),
     )  # fmt: skip

@@ -13,7 +13,6 @@ from pydantic import ValidationError
 from scipy import ndimage
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.shapes import (
     BODY,
@@ -245,7 +244,7 @@ def _plan(
     cell = space.cells.cell
     return ScenePlan(
         space=space,
-        outlines=OutlineArrays(*outlines.arguments),
+        outlines=outlines.arguments,
         radii=outlines.radii,
         groups=groups,
         group=np.array(slots, dtype=np.int64),

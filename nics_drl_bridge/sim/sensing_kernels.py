@@ -177,7 +177,7 @@ def scan_together(
         state.ranges, state.pose, chosen, state.bodies, first, scene.walls, view.sensor,
         scans.lookup,
     )  # fmt: skip
-    if view.grid[0].size > 0:
+    if view.grid.squares.size > 0:
         scan_kernels.add_map(
             state.ranges, state.pose, chosen, view.sensor, view.grid, view.exact, scans.lookup
         )
@@ -235,7 +235,7 @@ def _scan_alone(
         scan_kernels.scan_worlds(
             out, spot, scans.none, seen, -1, scene.walls, view.sensor, scans.lookup
         )
-        if view.grid[0].size > 0:
+        if view.grid.squares.size > 0:
             scan_kernels.add_map(
                 out, spot, scans.none, view.sensor, view.grid, view.exact, scans.lookup
             )

@@ -6,12 +6,15 @@ command history, K obstacles, W walls, B beams, L lanes, R periods of the past.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
+from nics_drl_bridge.lidar.map_kernels import GridArrays
+from nics_drl_bridge.lidar.scan_kernels import ScanLanes
 from nics_drl_bridge.robot.kernels import Terms
 
 Array = NDArray[np.float64]
@@ -84,8 +87,8 @@ class Surroundings(NamedTuple):
 class LidarView(NamedTuple):
     """The lidar."""
 
-    sensor: Any  # see `lidar.scanner.Scanner.arguments`
-    grid: Any  # the static map as scanned, see `lidar.maps.GridMap.arrays`
+    sensor: LidarArrays  # the lidar and its table
+    grid: GridArrays  # the static map as scanned
     exact: bool  # True if the map is scanned exactly
     mount: Array  # (3,) pose of the lidar on the robot
     limits: Array  # (2,) least and greatest range [m]
@@ -155,7 +158,7 @@ class Scans(NamedTuple):
     part: NDArray[np.float32]  # (1, 1, B) scan of a slice
     drive: Array  # (3,) twist of one robot
     none: Integers  # (1,) index of the only world of one robot
-    lookup: Any  # see `lidar.scanner.Scanner.room`
+    lookup: ScanLanes  # of the lidar
 
 
 class Scratch(NamedTuple):

@@ -136,7 +136,7 @@ def test_a_layout_is_given_by_name_number_or_fields():
     own = layout_of(30, spec)
     assert (own.sectors, own.range_max, own.viewpoint) == (30, 3.0, (0.1, 0.0))
     plan = plan_of(spec, own)
-    assert plan.count.min() >= 1
+    assert plan.hits.min() >= 1
     assert plan.shift.tolist() == [0.0, 0.0]
 
 
@@ -223,6 +223,6 @@ def test_a_header_that_describes_no_lidar_is_refused(beams, changes):
 def test_a_lidar_with_a_blind_side_fills_the_sectors_that_it_sees():
     spec = load_lidar("sick_tim571")
     plan = plan_of(spec, LAYOUTS["front"])
-    assert plan.count.min() >= 1
+    assert plan.hits.min() >= 1
     with pytest.raises(ConfigError, match="looks from -135 to 135 deg"):
         plan_of(spec, LAYOUTS["around"])

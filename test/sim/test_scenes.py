@@ -12,8 +12,9 @@ from scipy import ndimage
 from shapely import affinity
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.lidar.shapes import HEADING, SHAPE, Circle
-from nics_drl_bridge.lidar.shapes import RADIUS as BODY_RADIUS
+from nics_drl_bridge.lidar.exact_kernels import HEADING, SHAPE
+from nics_drl_bridge.lidar.exact_kernels import RADIUS as BODY_RADIUS
+from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.sim.scenes import SceneSampler, sample_scene, scaled
 from nics_drl_bridge.sim.world import World, load_world
 

@@ -15,16 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.extras.mujoco.machines import Machine, Physics
+from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.maps import GridMap
-from nics_drl_bridge.lidar.shapes import (
-    RADIUS,
-    SHAPE,
-    Circle,
-    Rectangle,
-    Segment,
-    Shape,
-    convex_hull,
-)
+from nics_drl_bridge.lidar.shapes import Circle, Rectangle, Segment, Shape, convex_hull
 
 Array = NDArray[np.float64]
 

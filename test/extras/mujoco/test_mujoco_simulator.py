@@ -14,7 +14,7 @@ from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.extras.mujoco.machines import Physics
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator, divide
 from nics_drl_bridge.generator import SimulatorModel, builtin_model
-from nics_drl_bridge.lidar.shapes import X, Y
+from nics_drl_bridge.lidar.exact_kernels import X, Y
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World, load_world
