@@ -164,8 +164,8 @@ class Scanner:
         """
         poses, bodies, walls = self._scene(poses, bodies, walls)
         out = self._result(len(poses), out)
-        if not (out.flags.c_contiguous or out.strides[1] == out.itemsize):
-            out[:] = self.scan(poses, bodies, walls)  # the kernels need contiguous beams
+        if not out.flags.c_contiguous:
+            out[:] = self.scan(poses, bodies, walls)
             return out
         worlds, lanes = np.arange(len(poses)), scan_kernels.scan_lanes()
         scan_kernels.scan_worlds(

@@ -18,6 +18,7 @@ def benchmark(monkeypatch):
     return env_scaling
 
 
+@pytest.mark.campaign
 def test_the_curves_are_lists_under_their_names_and_are_drawn(tmp_path):
     picture = tmp_path / "scaling.png"
     _, found = asked(SCRIPT, *FEW, "--picture", str(picture))
@@ -28,10 +29,12 @@ def test_the_curves_are_lists_under_their_names_and_are_drawn(tmp_path):
     assert picture.stat().st_size > 1000
 
 
+@pytest.mark.campaign
 def test_robots_that_each_look_at_each_other_miss_the_bar_of_robots():
     assert any(line.startswith("robots: 64 cost ") for line in fails(SCRIPT, "quadratic", *FEW))
 
 
+@pytest.mark.campaign
 def test_worlds_that_are_stepped_one_by_one_miss_the_bar_of_worlds():
     assert any(line.startswith("worlds: 16384 cost ") for line in fails(SCRIPT, "slow", *FEW))
 

@@ -26,6 +26,7 @@ def peers(benchmark):
     return sys.modules["measuring.peers"]
 
 
+@pytest.mark.campaign
 def test_the_throughput_is_told_with_the_ratio_at_equal_work_first():
     _, found = asked(SCRIPT, *FEW)
     assert list(found)[:2] == ["times_as_fast_at_equal_work", "times_as_fast_with_ten_scans"]
@@ -39,18 +40,21 @@ def test_the_throughput_is_told_with_the_ratio_at_equal_work_first():
     assert not [line for line in found["failures"] if not line.startswith("share_of_")]
 
 
+@pytest.mark.campaign
 def test_robots_that_stand_still_are_no_throughput():
     missed = fails(SCRIPT, "standing", *FEW)
     assert any(line.startswith("motion of our env 'one'") for line in missed)
     assert any(line.startswith("scans of our env 'estimator'") for line in missed)
 
 
+@pytest.mark.campaign
 def test_a_lidar_of_a_few_beams_is_no_throughput():
     missed = fails(SCRIPT, "blind", *FEW)
     assert any(line.startswith("scans of our env 'one'") for line in missed)
     assert not any(line.startswith("motion") for line in missed)
 
 
+@pytest.mark.campaign
 def test_an_env_that_is_ten_times_slower_misses_the_bars_of_speed():
     missed = fails(SCRIPT, "slow", *FEW)
     for bar in ("share_of_write_limit", "share_of_cartpole"):
@@ -180,6 +184,7 @@ def fake_peer(peers, monkeypatch, folder) -> None:
     monkeypatch.setattr(peers, "clean", lambda: {**os.environ, "PYTHONPATH": str(folder)})
 
 
+@pytest.mark.campaign
 def test_the_readings_of_a_peer_come_from_one_process_and_its_own_steps(
     peers, monkeypatch, tmp_path
 ):

@@ -18,6 +18,7 @@ def result() -> dict:
     return found
 
 
+@pytest.mark.campaign
 def test_the_estimate_is_off_by_a_small_share_of_what_odometry_is(result):
     assert result["ekf_rmse_m"] <= 0.2 * result["raw_rmse_m"]
     for each in result["robots"].values():
@@ -25,12 +26,14 @@ def test_the_estimate_is_off_by_a_small_share_of_what_odometry_is(result):
         assert each["way_m"] > 3.0
 
 
+@pytest.mark.campaign
 def test_the_estimate_is_off_by_as_much_as_it_claims(result):
     low, high = result["nees_95_band"]
     assert low < result["nees_mean"] < high
     assert result["drives"] == 33
 
 
+@pytest.mark.campaign
 def test_after_a_clock_jump_too(result):
     jumps = result["clock_jump"]
     assert jumps["drives"] == 33
@@ -38,12 +41,14 @@ def test_after_a_clock_jump_too(result):
     assert jumps["nees_p99"] < 16.27
 
 
+@pytest.mark.campaign
 def test_every_random_step_leaves_the_covariance_positive_definite(result):
     assert result["random_steps"] == 3_000
     assert result["finite_and_positive_definite"] is True
     assert result["cycle_us"] > 0.0
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("control", "bar"),
     [

@@ -21,6 +21,7 @@ def result_of(script: str, *options: str) -> dict:
     return json.loads(done.stdout)
 
 
+@pytest.mark.campaign
 def test_no_random_command_at_any_interval_leaves_the_envelope():
     code, result = asked("gate_envelope.py", "--steps", "6000")
     assert (code, result["failures"]) == (0, [])
@@ -28,6 +29,7 @@ def test_no_random_command_at_any_interval_leaves_the_envelope():
     assert result["in_motion_with_random_limits"] > 0
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("control", "bar"),
     [("no_limits", "violations, bar 0"), ("nan", "violations"), ("standing", "in motion at 0 of")],
@@ -47,6 +49,7 @@ def best_of_three(fault):
     return result[fault]
 
 
+@pytest.mark.campaign
 @pytest.mark.ros
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(
@@ -64,6 +67,7 @@ def test_a_fault_around_a_real_gate_leads_to_zero_in_time(fault, limit_s):
     assert 0.0 < result["max_s"] <= limit_s
 
 
+@pytest.mark.campaign
 @pytest.mark.ros
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
@@ -77,6 +81,7 @@ def test_a_gate_that_does_not_stop_the_robot_is_noticed(control, bar):
     assert missed[0].startswith(bar)
 
 
+@pytest.mark.campaign
 @pytest.mark.ros
 @pytest.mark.timeout(300)
 def test_a_gate_that_stopped_many_times_ends_at_once_and_keeps_the_first_stop():
@@ -115,12 +120,14 @@ def test_a_rule_that_is_taken_out_is_missed_by_a_test(monkeypatch):
 ONE_RULE = ("--tests", "test/gate/test_arming.py", "--rule", "arming/one_publisher")
 
 
+@pytest.mark.campaign
 @pytest.mark.timeout(300)
 def test_a_rule_that_a_test_misses_is_found():
     code, result = asked("gate_rules.py", *ONE_RULE)
     assert (code, result["failures"], result["looked_at"]) == (0, [], 1)
 
 
+@pytest.mark.campaign
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     ("control", "bar"),

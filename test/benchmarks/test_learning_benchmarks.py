@@ -18,17 +18,20 @@ no_torch = pytest.mark.skipif(find_spec("stable_baselines3") is None, reason="ne
 BASELINES = ("--robot", "differential", "--policy", "dynamic_window", "--episodes", "20")
 
 
+@pytest.mark.campaign
 def test_a_baseline_reaches_its_goals():
     code, told = asked("baselines.py", *BASELINES)
     assert (code, told["failures"]) == (0, [])
     assert told["circles/differential/dynamic_window"]["success"]["value"] >= 0.7
 
 
+@pytest.mark.campaign
 def test_a_baseline_that_stands_still_misses_its_floor():
     missed = fails("baselines.py", "standing", *BASELINES)
     assert any("dynamic_window: 0% success" in line for line in missed)
 
 
+@pytest.mark.campaign
 @no_torch
 def test_a_net_that_has_not_learnt_misses_the_success():
     missed = fails("training.py", "untrained", "--episodes", "20")
@@ -45,6 +48,7 @@ def test_a_figure_of_training_that_is_no_number_misses_its_bar(monkeypatch, name
     assert len(training.missed("differential", good | {name: float("nan")})) == 1
 
 
+@pytest.mark.campaign
 @pytest.mark.ros
 @over_ros
 @pytest.mark.parametrize("control", ["standing", "lying"])
@@ -54,6 +58,7 @@ def test_a_picture_of_robots_that_never_arrive_fails(tmp_path, control):
     assert sum("0% of the goals were truly reached" in line for line in missed) == 3
 
 
+@pytest.mark.campaign
 @pytest.mark.ros
 @over_ros
 def test_the_picture_is_of_goals_that_were_truly_reached(tmp_path):
@@ -63,6 +68,7 @@ def test_the_picture_is_of_goals_that_were_truly_reached(tmp_path):
     assert (tmp_path / "fig7_differential.png").is_file()
 
 
+@pytest.mark.campaign
 @pytest.mark.ros
 @over_ros
 @no_torch
@@ -71,6 +77,7 @@ def test_a_policy_file_that_is_cut_short_does_not_drive():
     assert any("policy_node sent no command" in line for line in missed)
 
 
+@pytest.mark.campaign
 @pytest.mark.ros
 @over_ros
 @no_torch

@@ -51,6 +51,7 @@ def monkeypatch_module():
         yield patch
 
 
+@pytest.mark.campaign
 def test_table2_is_below_a_third_of_the_nearest_rows_errors_in_every_scene():
     _, result = asked("table2_lidar.py", "--scans", "512", "--repeats", "2")
     assert not missed_but(result, "as fast as exact")
@@ -66,6 +67,7 @@ def test_table2_is_below_a_third_of_the_nearest_rows_errors_in_every_scene():
     assert result["write_limit_scans_per_s"] > 0.0
 
 
+@pytest.mark.campaign
 def test_table3_shows_that_half_the_distances_cost_a_plain_look_up_more_than_half_the_rotations():
     code, result = asked("table3_density.py", "--scans", "256")
     assert (code, result["failures"]) == (0, [])
@@ -78,6 +80,7 @@ def test_table3_shows_that_half_the_distances_cost_a_plain_look_up_more_than_hal
     assert plain["50x240"] > 1.3 > plain["100x120"]
 
 
+@pytest.mark.campaign
 def test_complexity_names_a_cost_for_every_number_of_vertices():
     options = ("--most", "16", "--scans", "32", "--repeats", "2")
     _, result = asked("lidar_complexity.py", *options, "--distances", "10", "--rotations", "8")
@@ -89,6 +92,7 @@ def test_complexity_names_a_cost_for_every_number_of_vertices():
     assert set(result["few"]) >= {"circle", "segment", "3 corners"}
 
 
+@pytest.mark.campaign
 def test_peers_are_null_with_a_reason_where_they_cant_be_installed(tmp_path):
     options = ("--scans", "32", "--scenes", "1", "--repeats", "2")
     nowhere = {"PIP_NO_INDEX": "1", "PIP_CONFIG_FILE": os.devnull}
@@ -112,16 +116,19 @@ def test_peers_are_null_with_a_reason_where_they_cant_be_installed(tmp_path):
 WITHOUT_PEERS = ("--scans", "64", "--scenes", "4", "--repeats", "2", "--without-peers")
 
 
+@pytest.mark.campaign
 def test_a_scan_that_is_turned_by_one_beam_is_not_the_same_scan():
     missed = fails("lidar_peers.py", "shifted", *WITHOUT_PEERS)
     assert any(line.startswith("rmse_m of baked: ") for line in missed)
 
 
+@pytest.mark.campaign
 def test_a_scanner_that_is_ten_times_slower_misses_its_bar():
     missed = fails("lidar_peers.py", "slow", *WITHOUT_PEERS)
     assert any(line.startswith("share_of_write_limit: ") for line in missed)
 
 
+@pytest.mark.campaign
 @pytest.mark.timeout(400)
 def test_a_scan_that_is_not_that_of_a_step_does_not_agree_with_it():
     ready = [next(CACHE.glob(f"{name}-py3.{sys.version_info[1]}/.ready"), None) for name in PEERS]
@@ -158,6 +165,7 @@ def test_a_figure_of_the_peers_beyond_its_bar_is_missed(scenes, changes, named):
     assert missed.startswith(named)
 
 
+@pytest.mark.campaign
 def test_the_point_clouds_of_scan_mode_baked_and_mujoco_lie_on_each_other(tmp_path):
     pytest.importorskip("mujoco")
     out = tmp_path / "clouds.png"
@@ -215,6 +223,7 @@ def polar(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.hypot(poses[..., 0], poses[..., 1]), np.arctan2(poses[..., 1], poses[..., 0])
 
 
+@pytest.mark.campaign
 def test_sensor_models_are_compared_with_none_in_one_run():
     _, result = asked(
         "lidar_sensor_models.py", "--scans", "64", "--repeats", "2", "--distances", "10",
@@ -231,6 +240,7 @@ def test_sensor_models_are_compared_with_none_in_one_run():
 SMALL = ("--scans", "64", "--repeats", "2", "--distances", "10", "--rotations", "16")
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("control", "bar"), [("plain", "beams return"), ("slow", "times as long, bar")]
 )
@@ -240,6 +250,7 @@ def test_sensor_models_that_do_nothing_or_are_slow_are_found(control, bar):
     assert any(bar in line for line in fails("lidar_sensor_models.py", control, *options))
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("control", "bar"), [("coarse", "RMSE"), ("nan", "RMSE nan"), ("slow", "as fast as exact")]
 )
@@ -248,11 +259,13 @@ def test_table2_fails_by_a_coarse_broken_or_slow_look_up(control, bar):
     assert any(bar in line for line in fails("table2_lidar.py", control, *options))
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(("control", "bar"), [("plain", "bar a third"), ("nan", "nan m2")])
 def test_table3_fails_by_a_plain_or_broken_look_up(control, bar):
     assert any(bar in line for line in fails("table3_density.py", control, "--scans", "128"))
 
 
+@pytest.mark.campaign
 def test_the_cost_of_the_exact_scanner_is_not_that_of_the_look_up():
     options = ("--most", "256", "--scans", "32", "--repeats", "3")
     missed = fails(
@@ -261,12 +274,14 @@ def test_the_cost_of_the_exact_scanner_is_not_that_of_the_look_up():
     assert any("with other vertices" in line for line in missed)
 
 
+@pytest.mark.campaign
 def test_jumps_through_a_map_give_the_ranges_of_the_walk():
     _, result = asked("map_lidar.py")
     assert len(result["rows"]) == 4
     assert not missed_but(result, "the walk's speed")
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("control", "bar"), [("shifted", "RMSE"), ("slow", "the walk's speed"), ("nan", "RMSE nan")]
 )
@@ -274,6 +289,7 @@ def test_another_map_a_walk_and_a_range_that_is_none_are_found(control, bar):
     assert any(bar in line for line in fails("map_lidar.py", control))
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(("control", "bar"), [("shifted", "cloud RMSE"), ("nan", "range RMSE nan")])
 def test_a_point_cloud_from_elsewhere_is_found(control, bar, tmp_path):
     options = ("--scans", "12", "--without-slam", "--out", str(tmp_path / "clouds.png"))

@@ -22,6 +22,7 @@ pytestmark = [
 SCRIPT, SHORT = "packet_loss.py", ("--seconds", "6", "--loss", "20")
 
 
+@pytest.mark.campaign
 def test_no_command_moves_a_robot_on_old_data_when_packets_are_lost():
     code, result = asked(SCRIPT, "--seconds", "8", "--loss", "20")
     assert (code, result["failures"]) == (0, [])
@@ -30,23 +31,27 @@ def test_no_command_moves_a_robot_on_old_data_when_packets_are_lost():
     assert result["unsafe_commands"] == 0
 
 
+@pytest.mark.campaign
 def test_without_the_gate_the_robot_drives_on_old_scans():
     missed = fails(SCRIPT, "no_gate", "--seconds", "6", "--loss", "40")
     assert any("unsafe commands, bar 0" in line for line in missed)
     assert any("s old, bar 0.40 s" in line for line in missed)
 
 
+@pytest.mark.campaign
 def test_a_robot_that_stands_still_shows_nothing():
     missed = fails(SCRIPT, "standing", *SHORT)
     assert "loss_20: invalid: nothing moved" in missed
     assert any("nan s old" in line for line in missed)
 
 
+@pytest.mark.campaign
 def test_a_network_that_loses_nothing_shows_nothing():
     missed = fails(SCRIPT, "no_loss", *SHORT)
     assert any("none was lost" in line for line in missed)
 
 
+@pytest.mark.campaign
 def test_a_robot_that_is_too_slow_to_send_shows_nothing():
     missed = fails(SCRIPT, "slow_robot", *SHORT)
     assert any("invalid: the robot sent " in line for line in missed)

@@ -25,6 +25,7 @@ def parity(monkeypatch):
     return parity
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("options", [SHORT, (*SHORT, "--robots", "2", "--seed", "5")])
 def test_an_env_over_topics_is_the_env_in_process(options):
     code, result = asked(SCRIPT, *options)
@@ -34,21 +35,25 @@ def test_an_env_over_topics_is_the_env_in_process(options):
     assert result["driven_m"] > 0.2
 
 
+@pytest.mark.campaign
 def test_one_nan_among_all_observations_is_found():
     assert f"{DIFFERENT} inf: must be 0" in fails(SCRIPT, "nan", *SHORT)
 
 
+@pytest.mark.campaign
 def test_the_last_bit_of_one_number_is_found():
     (missed,) = fails(SCRIPT, "noise", *SHORT)
     assert missed.startswith(f"{DIFFERENT} ")
     assert "inf" not in missed
 
 
+@pytest.mark.campaign
 def test_an_observation_that_is_told_twice_is_late_and_different():
     missed = fails(SCRIPT, "late", *SHORT)
     assert [line.split()[0] for line in missed] == [DIFFERENT, "late_observations"]
 
 
+@pytest.mark.campaign
 def test_robots_that_stand_have_shown_nothing():
     (missed,) = fails(SCRIPT, "standing", *SHORT)
     assert missed.startswith("driven_m 0.0")

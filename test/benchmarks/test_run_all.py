@@ -120,6 +120,7 @@ child.stdout = None
 """
 
 
+@pytest.mark.campaign
 def test_a_benchmark_that_hangs_is_ended_with_all_its_children(scripts):
     (scripts / "hangs.py").write_text(HANGS + "child.wait()\n")
     (scripts / "later.py").write_text(MET)
@@ -132,6 +133,7 @@ def test_a_benchmark_that_hangs_is_ended_with_all_its_children(scripts):
     assert not alive(int((scripts / "hangs.pid").read_text()))
 
 
+@pytest.mark.campaign
 def test_what_a_benchmark_leaves_behind_is_ended_and_counted(scripts):
     (scripts / "leaves.py").write_text(
         HANGS + MET + "os._exit(0)\n".replace("os._", "sys.stdout.flush(); os._")
@@ -149,6 +151,7 @@ def test_numbers_that_json_does_not_know_are_null(scripts):
     assert "NaN" not in (scripts / "results.json").read_text()
 
 
+@pytest.mark.campaign
 def test_some_are_run_again_and_the_others_keep_commit_and_load(scripts):
     for name in ("first", "second"):
         (scripts / f"{name}.py").write_text(MET)
@@ -160,6 +163,7 @@ def test_some_are_run_again_and_the_others_keep_commit_and_load(scripts):
     assert found["runs"]["second"]["result"] == {"figure": 9.5}
 
 
+@pytest.mark.campaign
 def test_results_of_scripts_that_are_gone_go(scripts):
     for name in ("first", "second"):
         (scripts / f"{name}.py").write_text(MET)
@@ -202,6 +206,7 @@ def test_results_of_another_machine_are_not_mixed_with_those_of_this_one(scripts
     assert after == found
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_ends_its_children_and_keeps_what_was_measured(scripts, number):
     (scripts / "a_good_one.py").write_text(MET)

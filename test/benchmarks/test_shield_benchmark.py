@@ -12,6 +12,7 @@ from .runs import BENCHMARKS, asked, fails
 SHORT = ("--in-process", "--episodes", "18")
 
 
+@pytest.mark.campaign
 @pytest.mark.timeout(300)
 def test_no_adversary_makes_a_shielded_robot_touch_anything():
     code, result = asked("shield.py", *SHORT)
@@ -22,6 +23,7 @@ def test_no_adversary_makes_a_shielded_robot_touch_anything():
     assert result["goals_reached"] > 0
 
 
+@pytest.mark.campaign
 @pytest.mark.ros
 @pytest.mark.timeout(600)
 def test_over_dds_and_in_real_time_nothing_is_touched():
@@ -38,11 +40,13 @@ def test_over_dds_and_in_real_time_nothing_is_touched():
     assert [line for line in result["failures"] if not line.startswith(busy)] == []
 
 
+@pytest.mark.campaign
 @pytest.mark.timeout(300)
 def test_without_the_shield_there_are_contacts():
     assert any(line.startswith("contacts of") for line in fails("shield.py", "no_shield", *SHORT))
 
 
+@pytest.mark.campaign
 @pytest.mark.timeout(300)
 def test_robots_that_stand_measure_nothing():
     missed = fails("shield.py", "standing", *SHORT)
@@ -50,6 +54,7 @@ def test_robots_that_stand_measure_nothing():
     assert any(line.startswith("contacts without") for line in missed)
 
 
+@pytest.mark.campaign
 @pytest.mark.timeout(300)
 def test_a_shield_that_thinks_the_robot_stops_at_once_touches_something():
     missed = fails("shield.py", "no_braking_distance", *SHORT)

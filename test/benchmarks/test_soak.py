@@ -12,6 +12,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.timeout(300)]
 SCRIPT = "soak.py"
 
 
+@pytest.mark.campaign
 def test_the_whole_stack_drives_and_begins_episodes_and_keeps_its_files_and_threads():
     code, result = asked(SCRIPT, "--minutes", "0.2", "--warm-up", "0.1")
     assert result["resets"] > 0
@@ -25,11 +26,13 @@ def test_the_whole_stack_drives_and_begins_episodes_and_keeps_its_files_and_thre
     assert code == bool(result["failures"])
 
 
+@pytest.mark.campaign
 def test_a_robot_that_never_moves_has_shown_nothing():
     missed = fails(SCRIPT, "standing", "--minutes", "0.05", "--warm-up", "0.0")
     assert any(line.startswith("driven_m 0.0: must be 0.1 at least") for line in missed)
 
 
+@pytest.mark.campaign
 def test_a_file_that_each_episode_leaves_open_is_found():
     missed = fails(SCRIPT, "leak", "--minutes", "0.2", "--warm-up", "0.0")
     assert any(line.startswith("fds_growth ") for line in missed)

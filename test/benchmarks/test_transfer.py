@@ -65,6 +65,7 @@ def test_rates_are_the_success_of_each_world(transfer):
 ONE = ("--episodes", "1", "--robots", "differential")
 
 
+@pytest.mark.campaign
 @pytest.mark.ros
 @pytest.mark.skipif(not ready, reason="needs ROS 2, MuJoCo and the shipped policies")
 def test_it_prints_one_json_object_with_all_worlds():
@@ -76,6 +77,7 @@ def test_it_prints_one_json_object_with_all_worlds():
     assert code == bool(told["failures"])
 
 
+@pytest.mark.campaign
 @pytest.mark.ros
 @pytest.mark.skipif(not ready, reason="needs ROS 2, MuJoCo and the shipped policies")
 @pytest.mark.parametrize(

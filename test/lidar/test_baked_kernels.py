@@ -14,7 +14,6 @@ def test_climbing_along_a_hull_ends_at_its_silhouette_from_wherever_it_begins(ma
     rng = np.random.default_rng(corners)
     hull = convex_hull(make(rng, corners).outline)
     twice = np.concatenate([hull, hull])
-    flat = twice.ravel()
     count, radius = len(hull), np.hypot(*hull.T).max()
     for _ in range(100):
         distance = radius * (1.0 + 10.0 ** rng.uniform(-6.0, 1.0))
@@ -25,9 +24,8 @@ def test_climbing_along_a_hull_ends_at_its_silhouette_from_wherever_it_begins(ma
         across = twice[skip : skip + count] @ [sin, cos]
         angles = np.arctan2(across, along)
         for side, edge in ((1.0, angles.min()), (-1.0, angles.max())):
-            x, y = kernels.outermost(
-                flat, skip, count, first, min(stride, count - 1), distance**2, cos, sin, side
-            )
+            seen = kernels.Seen(distance**2, cos, sin)
+            x, y = kernels.outermost(twice, skip, count, first, min(stride, count - 1), seen, side)
             assert np.arctan2(y, x) == pytest.approx(edge, abs=1e-9)
 
 

@@ -5,12 +5,13 @@ import pytest
 import shapely
 
 from nics_drl_bridge.lidar import map_kernels
+from nics_drl_bridge.lidar.exact_kernels import Beams, LidarPose
 from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
+from nics_drl_bridge.lidar.scan_kernels import scan_lanes
 
 BEAMS = 37
 EDGE = 1e-6  # beams that pass a corner this closely [m] may go either way
-ROOM = tuple(np.zeros(10_000, kind) for kind in (np.float64, np.float32, np.int32))
-KERNELS = {"exact": map_kernels.exact_map_into, "baked": map_kernels.map_into}
+KERNELS = ("exact", "baked")
 
 
 def directions(beams=BEAMS):
@@ -24,8 +25,9 @@ def scan(kernel, grid, pose, range_max=100.0, rays=None, before=np.inf):
     out = np.full(len(rays), before, np.float32)
     c, s = np.cos(pose[2]), np.sin(pose[2])
     arrays = grid if isinstance(grid, tuple) else grid.arrays
-    beams = np.array([-np.pi, 2.0 * np.pi / len(rays), 1.0])
-    KERNELS[kernel](out, rays, beams, *pose[:2], c, s, range_max, arrays, ROOM)
+    beams = Beams(rays, -np.pi, 2.0 * np.pi / len(rays), True)
+    lidar = LidarPose(*map(float, pose[:2]), c, s)
+    map_kernels.map_into(out, beams, lidar, range_max, arrays, kernel == "exact", scan_lanes())
     return out
 
 

@@ -7,8 +7,8 @@ from robots import lidar
 
 from nics_drl_bridge.errors import ConfigError, ModelError
 from nics_drl_bridge.lidar.bake import bake
-from nics_drl_bridge.lidar.baked_kernels import LANES
 from nics_drl_bridge.lidar.maps import GridMap
+from nics_drl_bridge.lidar.scan_kernels import LANES
 from nics_drl_bridge.lidar.scanner import RENDERERS, Scanner, make_scanner
 from nics_drl_bridge.lidar.shapes import SQUARE, STRIP, Circle, Polygon, Rectangle
 from nics_drl_bridge.lidar.table import Density

@@ -22,7 +22,7 @@ spec = LidarSpec(
 )
 shapes = Circle(radius=0.15), Rectangle(size=(0.6, 0.06))
 table = bake(spec, shapes)
-rows, page = table.lookup[3], mmap.PAGESIZE
+rows, page = table.rows, mmap.PAGESIZE
 pages = -(-rows.nbytes // page)
 room = mmap.mmap(-1, (pages + 2) * page)
 begin = ctypes.addressof(ctypes.c_char.from_buffer(room))
@@ -32,7 +32,7 @@ at = page if side == "before" else (pages + 1) * page - rows.nbytes
 guarded = np.frombuffer(room, np.float32, rows.size, at)
 guarded[:] = rows
 scanner = Scanner(spec, replace(table, rows=guarded), "baked")
-assert scanner.table.lookup[3] is guarded
+assert scanner.arguments.table.rows is guarded
 rng = np.random.default_rng(0)
 for shape in shapes:
     away = shape.radius + rng.uniform(0.0, 1.0, 20_000) ** 3 * 3.0
