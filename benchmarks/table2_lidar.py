@@ -32,7 +32,7 @@ PAPER = {  # scan mode [1/s], baked [1/s], RMSE [m], RMSE of the area [m^2]
     "strip": (4.16, 3.24e2, 1.05e-1, 9.86e-3),
     "mixture": (5.70, 3.39e2, 9.06e-2, 7.20e-3),
 }
-SHARE, RMSE_M, PART, FASTER = 0.1, 0.03, 1.0 / 3.0, 2.0
+SHARE, RMSE_M, PART, FASTER = 0.08, 0.03, 1.0 / 3.0, 2.0
 """Bars: share of the write limit, which depends on the machine and is only told; RMSE; part of the
 nearest row's; and times the exact scanner's speed in the same run."""
 COARSE = Density(distances=3, rotations=8)

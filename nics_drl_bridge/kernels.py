@@ -22,8 +22,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any, overload
 
+from llvmlite import binding as llvm
 from numba.core import event
-from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, compile_result
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
@@ -86,6 +89,59 @@ def kernel(
     return compiled if function is None else compiled(function)
 
 
+class _InnerLibrary(JITCodeLibrary):  # type: ignore[misc]
+    """Code that only kernels call: it is optimised, and made machine code, as a part of theirs."""
+
+    @property
+    def codegen(self) -> Any:
+        """Keeps no environments, as nothing runs."""
+        return self
+
+    def set_env(self, name: str, env: Any) -> None:
+        """Does nothing, see `_Kernel.add_overload`."""
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Null."""
+        self._ensure_finalized()
+        return 0
+
+    def serialize_using_object_code(self) -> Any:
+        """There is bitcode only."""
+        return self.serialize_using_bitcode()
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+class _InnerCacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        (name, _, bitcode), fndesc, env, signature, *_, reload_init, envs = payload
+        for function in reload_init or ():
+            function()
+        library = _InnerLibrary(target_context.codegen(), name)
+        library._final_module = llvm.parse_bitcode(bitcode)
+        library._finalize_final_module()
+        return compile_result(
+            typing_context=target_context.typing_context, target_context=target_context,
+            entry_point=target_context.get_executable(library, fndesc, env), signature=signature,
+            library=library, fndesc=fndesc, environment=env, objectmode=False, lifted=(),
+            reload_init=reload_init, referenced_envs=envs,
+        )  # fmt: skip
+
+
+class _Compiler(Compiler):  # type: ignore[misc]
+    def define_pipelines(self) -> Any:
+        """Gives what only kernels call a library of its own kind."""
+        state = self.state
+        if state.flags.no_cpython_wrapper:
+            state.library = _InnerLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        return super().define_pipelines()
+
+
 class _Kernel(CPUDispatcher):  # type: ignore[misc]
     """numba's dispatcher, which makes a function callable from Python only when Python calls it.
 
@@ -94,8 +150,8 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
     """
 
     def __init__(self, function: Callable[..., Any], targetoptions: dict[str, Any]) -> None:
-        super().__init__(function, targetoptions=targetoptions)
-        self._cache, self._inner_cache = _Cache(function), _Cache(function, ".inner")
+        super().__init__(function, targetoptions=targetoptions, pipeline_class=_Compiler)
+        self._cache, self._inner_cache = _Cache(function), _InnerCache(function, ".inner")
         self._inner, self._inner_only = False, set[tuple[Any, ...]]()
 
     @property
@@ -127,6 +183,8 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
         """Takes what was compiled; Python does not see what only kernels can call."""
         if not self._inner:
             super().add_overload(cres)
+            for env in cres._find_referenced_environments():
+                cres.library.codegen.set_env(env.env_name, env)
             return
         args = tuple(cres.signature.args)
         self.overloads[args] = cres
@@ -149,6 +207,10 @@ class _Cache(FunctionCache):  # type: ignore[misc]
     def is_warm(self) -> bool:
         """Something usable is on disk."""
         return bool(self._cache_file._load_index())
+
+
+class _InnerCache(_Cache):
+    _impl_class = _InnerCacheImpl
 
 
 @cache
