@@ -1,9 +1,8 @@
-"""`nics warmup`: compiles the kernels ahead, on all cores."""
+"""`nics warmup`: compiles the kernels ahead, on two cores."""
 
 from __future__ import annotations
 
 import json
-import os
 import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -19,13 +18,14 @@ ROBOT, WORLD = "differential", "arena"
 def warmup(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Compiles what training, driving and generating need, on all cores, once on a machine."""
+    """Compiles what generating, training and driving need, on two cores, once on a machine."""
     with one_sentence():
-        begin = time.monotonic()
+        begin, done = time.monotonic(), list[tuple[int, float]]()
         typer.echo("compiling the kernels, once on this machine: about a minute", err=True)
         # Fresh processes: what a fork shares with its parent's threads may be locked for ever.
-        with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
-            done = list(pool.map(_compiled_by, PARTS))
+        with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+            for stage in STAGES:
+                done += pool.map(_compiled_by, stage)
         count, cpu_s = sum(each[0] for each in done), sum(each[1] for each in done)
         took = time.monotonic() - begin
         if as_json:
@@ -39,12 +39,40 @@ def _compiled_by(part: str) -> tuple[int, float]:
     from nics_drl_bridge.kernels import COMPILING
 
     COMPILING.quiet = True
+    count, cpu_s = COMPILING.count, COMPILING.cpu_s
     PARTS[part]()
-    return COMPILING.count, COMPILING.cpu_s
+    return COMPILING.count - count, COMPILING.cpu_s - cpu_s
+
+
+def _model() -> None:
+    """Fits the kinematics of a drive and bakes a lidar table."""
+    from nics_drl_bridge.generator import builtin_model
+
+    builtin_model(ROBOT)
+
+
+def _reset() -> None:
+    """Draws scenes and scans them."""
+    from nics_drl_bridge.generator import builtin_model
+    from nics_drl_bridge.sim.simulator import FastSimulator
+    from nics_drl_bridge.sim.world import load_world
+
+    FastSimulator(builtin_model(ROBOT), load_world(WORLD), 2, 1).reset(range(2))
+
+
+def _step() -> None:
+    """Moves everything for a period."""
+    import numpy as np
+
+    from nics_drl_bridge.generator import builtin_model
+    from nics_drl_bridge.sim.simulator import FastSimulator
+    from nics_drl_bridge.sim.world import load_world
+
+    FastSimulator(builtin_model(ROBOT), load_world(WORLD), 2, 1).step(np.zeros((2, 1, 2)))
 
 
 def _train() -> None:
-    """A few steps of a vector env, which are the kernels of a simulator, too."""
+    """Observes and rewards many worlds at once."""
     from nics_drl_bridge.env.vector_env import BridgeVectorEnv
     from nics_drl_bridge.generator import builtin_model
 
@@ -55,31 +83,19 @@ def _train() -> None:
 
 
 def _drive() -> None:
-    """A few steps by the estimator, the planner and the shield."""
+    """Estimates, plans and shields."""
     from nics_drl_bridge.env.bridge_env import BridgeEnv
+    from nics_drl_bridge.gate import shield
     from nics_drl_bridge.policy.policies import open_policy
 
-    env = BridgeEnv(model=ROBOT, world=WORLD)
+    env = BridgeEnv(model=ROBOT, world=WORLD, estimator=True)
     policy, _ = open_policy("dynamic_window", env.model)
     observation, _ = env.reset(seed=0)
     env.step(policy.act(observation))
     env.close()
+    shield.rehearse()
 
 
-def _generate() -> None:
-    """A model from a short drive of the textbook robot, with its lidar table."""
-    import numpy as np
-
-    from nics_drl_bridge.generator import generate
-    from nics_drl_bridge.lidar.spec import load_lidar
-    from nics_drl_bridge.recording.textbook import record
-    from nics_drl_bridge.robot.spec import load_robot
-    from nics_drl_bridge.sim.world import load_world
-
-    robot = load_robot(ROBOT)
-    recording = record(robot, np.random.default_rng(0))
-    generate(recording, robot, load_lidar("paper"), load_world(WORLD).shapes, assume=True)
-
-
-PARTS = {"train": _train, "generate": _generate, "drive": _drive}
-"""Longest first; they share few kernels."""
+PARTS = {each.__name__[1:]: each for each in (_model, _reset, _step, _train, _drive)}
+STAGES = ("model",), ("step", "reset"), ("train", "drive")
+"""Parts that are compiled side by side; each stage needs what those before it compiled."""
