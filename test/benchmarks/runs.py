@@ -34,9 +34,9 @@ def controls_of(script: str) -> list[str]:
     return []
 
 
-def fails(script: str, control: str, *options: str) -> list[str]:
+def fails(script: str, control: str, *options: str, timeout_s: float = 280.0) -> list[str]:
     """The bars that a benchmark misses under a control, which has to be at least one."""
-    code, result = asked(script, "--control", control, *options)
+    code, result = asked(script, "--control", control, *options, timeout_s=timeout_s)
     assert (code, bool(result["failures"])) == (1, True), result
     missed: list[str] = result["failures"]
     return missed
