@@ -129,6 +129,7 @@ setup(
         f"{PACKAGE}.commands": [f"bag = {PACKAGE}.extras.bags.command:bag"],
         f"{PACKAGE}.engines": [f"ray = {PACKAGE}.extras.ray.engine:learner"],
         f"{PACKAGE}.nodes": [f"mujoco_node = {PACKAGE}.extras.mujoco.node:main"],
+        f"{PACKAGE}.sensors": [f"lidar = {PACKAGE}.lidar.further_lidar:FurtherLidar"],
         f"{PACKAGE}.salvage": [f"bag = {PACKAGE}.extras.bags.salvage:salvaged"],
     },
 )

@@ -5,8 +5,14 @@ A group is `nics_drl_bridge.GROUP`; `docs/extensions.md` says what each expects.
 
 from __future__ import annotations
 
+import hashlib
+import sys
 from functools import cache
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from traceback import extract_tb
 from typing import Any
 
 from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
@@ -53,3 +59,48 @@ def missing(module: str) -> str:
     if library in INSTALL:
         return f"needs the module {module!r}; pip install '{PACKAGE}[{INSTALL[library]}]'."
     return f"needs the module {module!r}; install it."
+
+
+def module_at(place: str, what: str) -> Any:
+    """A module by its name, or by the path of its file; a file that has changed is loaded anew.
+
+    Raises ConfigError: it is missing, or fails to run as Python; names what needs it and the line.
+    """
+    if place.endswith(".py"):
+        return _load(Path(place), what)
+    try:
+        return import_module(place)
+    except (ImportError, TypeError, ValueError) as error:
+        reason = f"can't be imported ({error}); give path/to/file.py:ClassName."
+        raise ConfigError(f"{what} {place!r}: {reason}") from None
+
+
+def _load(path: Path, what: str) -> Any:
+    if not path.is_file():
+        raise ConfigError(f"{what} {str(path)!r}: no such file; give path/to/file.py:ClassName.")
+    digest = hashlib.sha256(str(path.resolve()).encode() + path.read_bytes()).hexdigest()[:16]
+    name = f"{PACKAGE}_{what}_{digest}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ConfigError(f"{what} {str(path)!r}: can't be imported; it must be a Python file.")
+    module = sys.modules[name] = module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except BaseException as error:
+        del sys.modules[name]
+        if not isinstance(error, Exception):
+            raise
+        raise ConfigError(_unfit(path, what, error)) from error
+    return module
+
+
+def _unfit(path: Path, what: str, error: Exception) -> str:
+    """Error message for a user's file that can't be imported, with the line."""
+    frames = extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if Path(frame.filename) == path.absolute()]
+    line = error.lineno if isinstance(error, SyntaxError) else (lines or [None])[-1]
+    place = f"{path}, line {line}" if line else str(path)
+    reason = " ".join(str(error).split())
+    return f"{what} {place}: can't be imported ({type(error).__name__}: {reason}); mend the file."

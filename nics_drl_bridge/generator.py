@@ -26,6 +26,7 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.report import fit_report, why_useless
 from nics_drl_bridge.lidar.bake import bake
+from nics_drl_bridge.lidar.sensor import AnySensor, Sensor, check_sensors
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import TABLE_FILES, LidarTable
@@ -61,6 +62,7 @@ class SimulatorModel:
     control_period: float = CONTROL_PERIOD_S  # between commands; a whole number of `kinematics.dt`
     report: str = ""  # how the model was made, as readable text
     latency: Latency = field(default_factory=Latency)  # of scan and odometry, where it was shown
+    sensors: tuple[Sensor, ...] = ()  # that the robot has beside its lidar
 
     def __post_init__(self) -> None:
         robot, kinematics = self.robot, self.kinematics
@@ -73,6 +75,7 @@ class SimulatorModel:
                     f"the kinematics {known} {given}, the robot {robot.name!r} needs {needed}; "
                     "generate the model anew."
                 )
+        check_sensors(self.sensors, (self.lidar.frame,))
         substeps = self.control_period / self.kinematics.dt
         if not 0.5 < substeps < np.inf or abs(substeps - round(substeps)) > 1e-6:
             raise ModelError(
@@ -101,6 +104,8 @@ class SimulatorModel:
         }
         if self.latency.measured:
             data["latency"] = self.latency.model_dump(mode="json")
+        if self.sensors:
+            data["sensors"] = [sensor.model_dump(mode="json") for sensor in self.sensors]
         return dump_yaml(data)
 
     @property
@@ -120,6 +125,7 @@ class _File(Schema):
     lidar: LidarSpec
     noise: Noise
     latency: Latency = Field(default_factory=Latency)
+    sensors: tuple[AnySensor, ...] = ()
 
 
 def generate(
@@ -132,6 +138,7 @@ def generate(
     assume: bool = False,
     strict: bool = False,
     anyway: bool = False,
+    sensors: Sequence[Sensor] = (),
 ) -> tuple[SimulatorModel, Identified]:
     """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
 
@@ -145,6 +152,7 @@ def generate(
         assume: fill in from the textbook what the drive did not show, marked as assumed.
         strict: refuse a drive that did not excite every input on its own.
         anyway: accept predictions of unseen data hardly better than those of a standing robot.
+        sensors: that the robot has beside its lidar.
 
     Raises:
         RecordingError: the recording can't be used for this robot.
@@ -160,6 +168,7 @@ def generate(
         robot, identified.model, identified.calibration, lidar, table,
         identified.noise,
         report=fit_report(recording.source, robot, identified), latency=recording.latency,
+        sensors=tuple(sensors),
     )  # fmt: skip
     return model, identified
 
@@ -233,7 +242,7 @@ def load_model(folder: str | Path) -> SimulatorModel:
     try:
         return SimulatorModel(
             file.robot, file.kinematics.model(), file.calibration, file.lidar, table, file.noise,
-            file.control_period, report, file.latency,
+            file.control_period, report, file.latency, file.sensors,
         )  # fmt: skip
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from None

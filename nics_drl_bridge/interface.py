@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Protocol, TypedDict, runtime_checkable
 
 import numpy as np
@@ -28,6 +28,9 @@ class RobotView:
     stamp_s: float
     scan_age_s: float
     odom_age_s: float
+    # Name of a further sensor -> (..., S) its reading, see `lidar.sensor`; and the greatest age.
+    sensed: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    sensed_age_s: float = 0.0
 
 
 def stacked(views: Sequence[RobotView]) -> RobotView:
@@ -39,6 +42,8 @@ def stacked(views: Sequence[RobotView]) -> RobotView:
         max(view.stamp_s for view in views),
         max(view.scan_age_s for view in views),
         max(view.odom_age_s for view in views),
+        {name: np.stack([view.sensed[name] for view in views]) for name in views[0].sensed},
+        max(view.sensed_age_s for view in views),
     )
 
 
@@ -126,6 +131,10 @@ class Simulator(Protocol):
     @property
     def data(self) -> RobotStates:
         """The current states; a step may overwrite the same arrays."""
+
+    @property
+    def readings(self) -> Mapping[str, NDArray[np.float32]]:
+        """Name of a further sensor -> (1, M, S) its readings."""
 
     def reset(self, seeds: ArrayLike, *, starts: ArrayLike | None = None) -> Any:
         """Begins the episode of a seed (1,), at poses (1, M, 3) if they are given."""

@@ -79,6 +79,10 @@ def generate(
     topic: TopicOption = None,
     world: WorldOption = "arena",
     lidar: Annotated[str, Option(help="A shipped lidar (paper) or a YAML file.")] = "paper",
+    sensor: Annotated[
+        list[Path] | None,
+        Option(help="YAML file of a further sensor, docs/sensors.md; repeatable."),
+    ] = None,
     order: Annotated[int, Option(min=1, max=4, help="Order of the Taylor model.")] = 2,
     alpha: Annotated[
         str, Option(help="Pruning threshold of Eq. 2, 0 to 1, or auto for the knee.")
@@ -107,6 +111,7 @@ def generate(
         from nics_drl_bridge.generator import check_place, save_model
         from nics_drl_bridge.generator import generate as generate_model
         from nics_drl_bridge.identify.fit import parse_alpha
+        from nics_drl_bridge.lidar.sensor import load_sensor
         from nics_drl_bridge.lidar.spec import load_lidar
         from nics_drl_bridge.recording.readers import read_recording
         from nics_drl_bridge.recording.topic_roles import topic_roles
@@ -114,13 +119,14 @@ def generate(
         from nics_drl_bridge.sim.world import load_world
 
         check_place(out)
-        spec, sensor, threshold = load_robot(robot), load_lidar(lidar), parse_alpha(alpha)
+        spec, first, threshold = load_robot(robot), load_lidar(lidar), parse_alpha(alpha)
+        further = tuple(load_sensor(file) for file in sensor or ())
         shapes = load_world(world).shapes
         with intact(recording, salvage) as whole:
             drive = read_recording(whole, spec, topic_roles(topics, topic or ()))
         drive = replace(drive, source=str(recording))
         model, identified = generate_model(
-            drive, spec, sensor, shapes, order, threshold, assume_textbook, strict, anyway
+            drive, spec, first, shapes, order, threshold, assume_textbook, strict, anyway, further
         )
         save_model(model, out)
         if pictures:
@@ -144,5 +150,6 @@ def urdf(
         opened = open_model(model)
         file = out or Path(f"{opened.robot.name}.urdf")
         lidar = opened.lidar
-        write_text(file, urdf_of(opened.robot, lidar.mount, lidar.frame))
+        further = {each.frame: each.mount for each in opened.sensors}
+        write_text(file, urdf_of(opened.robot, lidar.mount, lidar.frame, further=further))
         typer.echo(f"{file}: the URDF of {opened.robot.name}")

@@ -186,7 +186,12 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if self._rehearsed:
             return
         free = np.full((1, self.robots, self.model.lidar.beams), np.inf, np.float32)
-        view = RobotView(episodes.starts.copy(), 0.0 * episodes.starts, free, 0.0, 0.0, 0.0)
+        sensed = {
+            sensor.name: np.full((1, self.robots, sensor.size), np.nan, np.float32)
+            for sensor in self.model.sensors
+        }
+        starts = episodes.starts
+        view = RobotView(starts.copy(), 0.0 * starts, free, 0.0, 0.0, 0.0, sensed)
         memory = self.task.reset(episodes)
         self.task.step_into(np.empty(self._shape, np.float32), view, view, memory)
         self._rehearsed = True
@@ -266,6 +271,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         return RobotView(
             view.pose.reshape(lead), view.twist.reshape(lead), view.ranges.reshape(lead),
             view.stamp_s, view.scan_age_s, view.odom_age_s,
+            {name: reading.reshape(lead) for name, reading in view.sensed.items()},
+            view.sensed_age_s,
         )  # fmt: skip
 
     def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
@@ -282,6 +289,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         }
         info["pose"] = self._row(view.pose[0]).copy()
         info["scan_age_s"], info["odom_age_s"] = view.scan_age_s, view.odom_age_s
+        if view.sensed:
+            info["sensed_age_s"] = view.sensed_age_s
         info.update(facts)
         return info
 

@@ -40,6 +40,7 @@ class Navigation(Task):
     | B + 1, B + 2 | cosine, sine of the bearing of the goal | -1 | 1 | - |
     | B + 3, B + 4 | estimated velocity forward, left | -1000 | 1000 | m/s |
     | B + 5 | estimated turn rate | -1000 | 1000 | rad/s |
+    | B + 6 on | shares of the further `sensors`, if there are any | 0 | 1 | - |
 
     ## Action Space
 
@@ -62,6 +63,7 @@ class Navigation(Task):
     """
 
     keeps_last_scan: ClassVar[bool] = False
+    observes_sensors: ClassVar[bool] = True
     shown: ClassVar[tuple[str, ...]] = ("goal",)
 
     goal_radius: float = 0.3
@@ -83,7 +85,7 @@ class Navigation(Task):
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
         """The observation (..., B + 6) of a view, for goals (..., 2) in `map`."""
-        out = np.empty((*view.pose.shape[:-1], self.scan_parts + 6), np.float32)
+        out = np.empty((*view.pose.shape[:-1], *self.observation_space.shape), np.float32)
         self._see(out, view.pose, view, memory)
         return out
 
@@ -122,12 +124,17 @@ class Navigation(Task):
         approach = np.empty(lead)
         reached, touched = np.empty(lead, np.bool_), np.empty(lead, np.bool_)
         progress = GoalProgress(approach.reshape(-1), reached.reshape(-1), touched.reshape(-1))
+        own = out
+        if self.sensors:
+            own = np.empty((*lead, self.scan_parts + 6), np.float32)
         kernels.navigate(
-            out.reshape(-1, out.shape[-1]), progress, before.reshape(-1, 3),
+            own.reshape(-1, own.shape[-1]), progress, before.reshape(-1, 3),
             view.pose.reshape(-1, 3), view.twist.reshape(-1, 3),
             view.ranges.reshape(-1, view.ranges.shape[-1]), memory["goal"].reshape(-1, 2),
             self.scale, self.goal_radius,
         )  # fmt: skip
+        if self.sensors:
+            np.concatenate([own, self.sensor_shares(view)], axis=-1, out=out)
         return approach, NavigationVerdict(reached, touched)
 
     def _terms(self, approach: Array, verdict: NavigationVerdict) -> dict[str, Array]:

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
-from importlib.util import module_from_spec, spec_from_file_location
 from inspect import Parameter, signature
-from pathlib import Path
-from traceback import extract_tb
 from typing import Any
 
 import gymnasium
 import numpy as np
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, nearest
-from nics_drl_bridge.files import sha256
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import layout_of
+from nics_drl_bridge.lidar.sensor import Sensor
 
 TASKS = {
     "navigation": "nics_drl_bridge.env.navigation:Navigation",
@@ -34,7 +31,7 @@ def make_task(
 
     The task is the name of a shipped one (`navigation`), `path/to/file.py:ClassName`, a class, or a
     Task. Options are further arguments of the class; `scan` may also be a number of sectors, the
-    name of a layout or its fields, see `sectors.layout_of`.
+    name of a layout or its fields, see `sectors.layout_of`; `sensors` are names.
 
     Raises:
         ConfigError: no such task, an unknown argument, or a Task for another robot.
@@ -46,11 +43,24 @@ def make_task(
     _check_options(found, options)
     if "scan" in options:
         options["scan"] = layout_of(options["scan"], model.lidar)
+    if "sensors" in options:
+        options["sensors"] = tuple(_sensor(name, model) for name in options["sensors"])
     try:
         return found(model.robot, model.lidar, **options)
     except TypeError as error:
         reason = str(error).removeprefix(f"{found.__name__}.__init__() ")
         raise ConfigError(f"task {found.__name__}, task_options {options}: {reason}.") from None
+
+
+def _sensor(name: Any, model: SimulatorModel) -> Sensor:
+    """Returns a sensor of a model, by its name or as it was there."""
+    known = {sensor.name: sensor for sensor in model.sensors}
+    given = name.name if isinstance(name, Sensor) else str(name)
+    if given not in known:
+        raise ConfigError(
+            f"task option sensors: the model has no sensor {given!r}; {nearest(given, known)}"
+        )
+    return known[given]
 
 
 def _check_options(found: type[Task], options: dict[str, Any]) -> None:
@@ -102,7 +112,7 @@ def _class_of(name: str) -> type[Task]:
             hint = nearest(name, TASKS)
             raise ConfigError(f"unknown task {name!r}; {hint} Or give path/to/file.py:ClassName.")
         return _class_of(TASKS[name])
-    module = _load(Path(path)) if path.endswith(".py") else _import(path)
+    module = extensions.module_at(path, "task")
     found = getattr(module, attribute, None)
     if not (isinstance(found, type) and issubclass(found, Task)):
         classes = [each for each in vars(module).values() if isinstance(each, type)]
@@ -110,50 +120,6 @@ def _class_of(name: str) -> type[Task]:
         tasks = [each.__name__ for each in own if issubclass(each, Task)]
         raise ConfigError(f"task {name!r}: {path} has no such Task; {nearest(attribute, tasks)}")
     return found
-
-
-def _import(name: str) -> Any:
-    try:
-        return import_module(name)
-    except (ImportError, TypeError, ValueError) as error:
-        reason = f"can't be imported ({error}); give path/to/file.py:ClassName."
-        raise ConfigError(f"task {name!r}: {reason}") from None
-
-
-def _load(path: Path) -> Any:
-    """Loads the module of a file, again only if the file has changed.
-
-    Raises:
-        ConfigError: the file is missing, or fails to run as Python; names the line.
-    """
-    if not path.is_file():
-        raise ConfigError(f"task {str(path)!r}: no such file; give path/to/file.py:ClassName.")
-    digest = sha256(str(path.resolve()).encode() + path.read_bytes())[:16]
-    name = f"nics_drl_bridge_task_{digest}"
-    if name in sys.modules:
-        return sys.modules[name]
-    spec = spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise ConfigError(f"task {str(path)!r}: can't be imported; it must be a Python file.")
-    module = sys.modules[name] = module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except BaseException as error:
-        del sys.modules[name]
-        if not isinstance(error, Exception):
-            raise
-        raise ConfigError(_unfit(path, error)) from error
-    return module
-
-
-def _unfit(path: Path, error: Exception) -> str:
-    """Error message for a user's file that can't be imported, with the line."""
-    frames = extract_tb(error.__traceback__)
-    lines = [frame.lineno for frame in frames if Path(frame.filename) == path.absolute()]
-    line = error.lineno if isinstance(error, SyntaxError) else (lines or [None])[-1]
-    place = f"{path}, line {line}" if line else str(path)
-    reason = " ".join(str(error).split())
-    return f"task {place}: can't be imported ({type(error).__name__}: {reason}); mend the file."
 
 
 NAVIGATION = "NicsBridge/Navigation-v0"

@@ -100,7 +100,8 @@ class SimBackend:
         data, now, row = self.simulator.data, self._now_ns, self._row
         odom, twist, ranges = data.odom[row].copy(), data.twist[row].copy(), data.ranges[row].copy()
         if not self._middlewares:
-            return RobotView(odom, twist, ranges, now * 1e-9, 0.0, 0.0)
+            sensed = {name: each[row].copy() for name, each in self.simulator.readings.items()}
+            return RobotView(odom, twist, ranges, now * 1e-9, 0.0, 0.0, sensed)
         views = [self._estimated(robot) for robot in range(len(self._middlewares))]
         return views[0] if len(views) == 1 else stacked(views)
 
@@ -108,6 +109,8 @@ class SimBackend:
         data, now, middleware = self.simulator.data, self._now_ns, self._middlewares[robot]
         middleware.odometry(now, now, data.odom[0, robot].copy(), data.twist[0, robot].copy())
         middleware.scan(now, now, data.ranges[0, robot].copy())
+        for name, readings in self.simulator.readings.items():
+            middleware.sense(name, now, now, readings[0, robot].copy())
         return middleware.view(now)
 
     def halt(self) -> None:

@@ -17,6 +17,7 @@ from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, plan_of
+from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -91,6 +92,8 @@ class Task(ABC):
         lidar: gives the scan.
         actions: `continuous` (Box) or `discrete` (the paper's drives, see `DRIVES`).
         contact_margin: a return this close to the footprint counts as a contact [m].
+        sensors: further sensors of the robot whose shares end each observation; a task that does
+            not observe them (`observes_sensors`) refuses them, but finds all of them in its views.
         scan: sectors that observations contain instead of the lidar's beams, so that they mean the
             same for any lidar; None keeps the beams. Contact is always judged from the beams.
         keeps_last_scan: True if `reward`, `update` or `step_into` use `before.ranges`; otherwise
@@ -99,6 +102,7 @@ class Task(ABC):
     """
 
     keeps_last_scan: ClassVar[bool] = True
+    observes_sensors: ClassVar[bool] = False
     shown: ClassVar[tuple[str, ...]] = ()
 
     robot: RobotSpec
@@ -106,11 +110,15 @@ class Task(ABC):
     actions: Actions = "continuous"
     contact_margin: float = 0.02
     scan: ScanLayout | None = None
+    sensors: tuple[Sensor, ...] = ()
 
     def __post_init__(self) -> None:
         if self.actions not in ("continuous", "discrete"):
             known = nearest(str(self.actions), ("continuous", "discrete"))
             raise ConfigError(f"task option actions={self.actions!r}: no such actions; {known}")
+        if self.sensors and not self.observes_sensors:
+            name = type(self).__name__
+            raise ConfigError(f"task option sensors: {name} observes no further sensors.")
         _ = self.plan  # a lidar that can't fill the layout is refused here
 
     @property
@@ -185,12 +193,12 @@ class Task(ABC):
     # Building blocks of tasks.
 
     def box(self, low: ArrayLike, high: ArrayLike) -> gymnasium.spaces.Box:
-        """Returns the space of a scan in shares (P parts) followed by parts with these limits."""
-        parts = self.scan_parts
+        """Space of a scan in shares (P), parts with these limits, and shares of `sensors` (Q)."""
+        parts, further = self.scan_parts, self.sensor_parts
         low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
         return gymnasium.spaces.Box(
-            np.concatenate([np.zeros(parts, np.float32), low]),
-            np.concatenate([np.ones(parts, np.float32), high]),
+            np.concatenate([np.zeros(parts, np.float32), low, np.zeros(further, np.float32)]),
+            np.concatenate([np.ones(parts, np.float32), high, np.ones(further, np.float32)]),
             dtype=np.float32,
         )
 
@@ -210,6 +218,16 @@ class Task(ABC):
         kernels.looks(shares, touched, rows, self.scale)
         lead = ranges.shape[:-1]
         return shares.reshape(*lead, parts), touched.reshape(lead)
+
+    def sensor_shares(self, view: RobotView) -> Observation:
+        """Returns the shares (..., Q) of `sensors`, in their order."""
+        shares = [sensor.shares(view.sensed[sensor.name]) for sensor in self.sensors]
+        return np.concatenate(shares, axis=-1)
+
+    @property
+    def sensor_parts(self) -> int:
+        """Q, the number of parts of an observation from `sensors`."""
+        return sum(sensor.parts for sensor in self.sensors)
 
     @property
     def scan_parts(self) -> int:

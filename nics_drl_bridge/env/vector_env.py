@@ -191,7 +191,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def _view(self, rows: Rows) -> RobotView:
         """View of the robots (n, M) of some worlds, with poses by odometry."""
         data = self.simulator.data
-        return RobotView(data.odom[rows], data.twist[rows], data.ranges[rows], 0.0, 0.0, 0.0)
+        sensed = {name: each[rows] for name, each in self.simulator.readings.items()}
+        scans = data.ranges[rows]
+        return RobotView(data.odom[rows], data.twist[rows], scans, 0.0, 0.0, 0.0, sensed)
 
     def step(
         self, actions: NDArray[Any]

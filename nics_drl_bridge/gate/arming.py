@@ -31,6 +31,15 @@ def _fresh(topic: str, config: GateConfig, state: GateState, request: Arm, now: 
     return "" if fresh else f"{topic} has not been fresh for {config.settle_s} s"
 
 
+def _sensors(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
+    """All further sensors are fresh."""
+    both = zip(config.sensors, state.sensors, strict=True)
+    for name, sensor in both:
+        if not stops.gap_free(sensor.arrivals, now, config.settle_s, config.scan_age_s):
+            return f"{name} has not been fresh for {config.settle_s} s"
+    return ""
+
+
 def _rate(topic: str, config: GateConfig, state: GateState, request: Arm, now: float) -> str:
     """Judges a rate: by stamps too few and too many data are wrong, by arrival only too few."""
     arrivals, _, declared = _topic(config, state, topic)
@@ -106,6 +115,7 @@ CHECKS: tuple[tuple[str, Check], ...] = (
     ("e_stop_released", _e_stop),
     ("scan_fresh", partial(_fresh, SCAN)),
     ("scan_rate", partial(_rate, SCAN)),
+    ("sensors_fresh", _sensors),
     ("odom_fresh", partial(_fresh, ODOM)),
     ("odom_rate", partial(_rate, ODOM)),
     ("clocks_agree", _clocks),

@@ -19,6 +19,7 @@ from nics_drl_bridge.gate.inputs import Arm, Input, Reset, Tick
 from nics_drl_bridge.gate.intake import take
 from nics_drl_bridge.gate.shield import shield
 from nics_drl_bridge.gate.state import Cause, Decision, GateConfig, GateState, Motion, replace
+from nics_drl_bridge.gate.stops import settled
 
 Array = NDArray[np.float64]
 
@@ -66,10 +67,11 @@ def _serve(
         failed = arming.failures(config, state, given, now)
         if failed:
             return state, "; ".join(failed), False
-        scans, odometries = stops.settled(state.scans), stops.settled(state.odometries)
+        sensors = tuple(replace(each, arrivals=settled(each.arrivals)) for each in state.sensors)
         state = replace(
-            state, armed=True, scans=scans, odometries=odometries, seen=(), frozen="", push=None
-        )
+            state, armed=True, scans=settled(state.scans), odometries=settled(state.odometries),
+            sensors=sensors, seen=(), frozen="", push=None,
+        )  # fmt: skip
         return state, "armed", True
     if isinstance(given, Reset):
         # The latch is cleared, unless the emergency stop is still pressed.
@@ -140,6 +142,7 @@ STOPS: tuple[Rule, ...] = (
     Rule(frozen.scan_frozen, latches=True),
     Rule(frozen.no_motion, latches=True),
     Rule(stops.scan_silent),
+    Rule(stops.sensor_silent),
     Rule(stops.odom_silent),
     Rule(stops.command_malformed),
     Rule(stops.command_missing),

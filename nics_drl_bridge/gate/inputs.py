@@ -29,6 +29,15 @@ class Odometry:
 
 
 @dataclass(frozen=True)
+class Reading:
+    """A reading of a further sensor arrived."""
+
+    stamp_ns: int  # of its header
+    name: str
+    points: Array  # (Q, 2) where it shows something in `base_link` [m]
+
+
+@dataclass(frozen=True)
 class Estimate:
     """An estimate of the middleware arrived."""
 
@@ -73,4 +82,4 @@ class Tick:
     """The gate's own clock ticked: the only input at which a motion is published."""
 
 
-Input = Scan | Odometry | Estimate | Command | EStop | Press | Arm | Reset | Tick
+Input = Scan | Odometry | Reading | Estimate | Command | EStop | Press | Arm | Reset | Tick

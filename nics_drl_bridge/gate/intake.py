@@ -8,9 +8,18 @@ from typing import Any
 import numpy as np
 
 from nics_drl_bridge.gate import frozen, shield, stops
-from nics_drl_bridge.gate.inputs import Command, Estimate, EStop, Input, Odometry, Press, Scan
+from nics_drl_bridge.gate.inputs import (
+    Command,
+    Estimate,
+    EStop,
+    Input,
+    Odometry,
+    Press,
+    Reading,
+    Scan,
+)
 from nics_drl_bridge.gate.limits import greatest, implausible
-from nics_drl_bridge.gate.state import EStopState, GateConfig, GateState, replace
+from nics_drl_bridge.gate.state import EStopState, GateConfig, GateState, SensorState, replace
 from nics_drl_bridge.geometry import between
 from nics_drl_bridge.interface import S_PER_NS
 
@@ -37,6 +46,13 @@ def scan_malformed(config: GateConfig, scan: Scan) -> str:
     if not last_off <= ANGLE_TOLERANCE:
         return "scan: its angles are not those of the declared lidar"
     return "scan: every range is NaN" if np.isnan(scan.ranges).all() else ""
+
+
+def reading_malformed(config: GateConfig, reading: Reading) -> str:
+    """The reading is of an unknown sensor, or not finite."""
+    if reading.name not in config.sensors:
+        return f"{reading.name}: there is no such sensor"
+    return "" if np.isfinite(reading.points).all() else f"{reading.name}: NaN or inf"
 
 
 def odom_malformed(config: GateConfig, odometry: Odometry) -> str:
@@ -69,6 +85,7 @@ def command_implausible(config: GateConfig, command: Command) -> str:
 REFUSALS: tuple[tuple[type, Callable[[GateConfig, Any], str]], ...] = (
     (Scan, scan_malformed),
     (Odometry, odom_malformed),
+    (Reading, reading_malformed),
     (Estimate, estimate_malformed),
     (Command, command_not_finite),
     (Command, command_implausible),
@@ -87,6 +104,8 @@ def take(config: GateConfig, state: GateState, given: Input, now: float) -> tupl
         return _take_scan(config, state, given, now)
     if isinstance(given, Odometry):
         return _take_odometry(config, state, given, now)
+    if isinstance(given, Reading):
+        return _take_reading(config, state, given, now)
     if isinstance(given, Estimate):
         state = replace(state, estimate=given, estimate_s=now)
     elif isinstance(given, Command):
@@ -148,6 +167,22 @@ def _take_odometry(
         return replace(state, odometry=odometry, leap=leap, push=None, seen=()), f"odom: {leap}"
     restless = state.restless_s if frozen.stands_still(config, odometry.twist) else now
     return replace(state, odometries=arrivals, odometry=odometry, restless_s=restless), ""
+
+
+def _take_reading(
+    config: GateConfig, state: GateState, reading: Reading, now: float
+) -> tuple[GateState, str]:
+    place = config.sensors.index(reading.name)
+    before, after = state.sensors[:place], state.sensors[place + 1 :]
+    arrivals, fault = stops.arrived(
+        config, state.sensors[place].arrivals, reading.stamp_ns, now, config.scan_age_s, state.armed
+    )
+    points = state.sensors[place].points if fault else reading.points
+    state = replace(state, sensors=(*before, SensorState(arrivals, points), *after))
+    if fault:
+        jumped = reading.name if fault == "jumped" else ""
+        return replace(state, jumped=jumped), f"{reading.name}: its stamp {fault}"
+    return state, ""
 
 
 def _leap(config: GateConfig, state: GateState, odometry: Odometry, now: float) -> str:

@@ -175,9 +175,12 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
     given, points = config.shield, state.obstacles
     if given is None or points is None:
         return True
+    # What further sensors show counts as standing.
+    seen_further = [np.pad(sensor.points, ((0, 0), (0, 1))) for sensor in state.sensors]
+    points = np.concatenate([points, *seen_further])
     room = given.footprint_radius + given.margin
     odometry = np.zeros(3) if state.odometry is None else state.odometry.twist
-    old = max(0.0, age(state.scans, now))
+    old = max(0.0, age(state.scans, now), *(age(s.arrivals, now) for s in state.sensors))
     # Commands that the scan does not show yet: since it was taken, or within the latency before.
     since, ends = now - old - given.latency_s, [time for time, _ in state.recent[1:]]
     past = [one[1] for one, end in zip(state.recent, [*ends, now], strict=False) if end >= since]

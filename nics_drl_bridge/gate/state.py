@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -81,6 +81,7 @@ class GateConfig:
     stuck_s: float = 1.0  # time without motion while commanded that causes a stop
     odom_std: tuple[float, float] = (0.0, 0.0)  # of odometry's twist [m/s, rad/s]
     shield: ShieldConfig | None = None
+    sensors: tuple[str, ...] = ()  # further ones, which must be as fresh as the scan
 
 
 @dataclass(frozen=True)
@@ -164,6 +165,14 @@ class EStopState:
 
 
 @dataclass(frozen=True)
+class SensorState:
+    """Known state of a further sensor."""
+
+    arrivals: Arrivals = Arrivals()  # of its accepted readings
+    points: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (Q, 2) of the newest
+
+
+@dataclass(frozen=True)
 class GateState:
     """Memory of the gate. It starts disarmed."""
 
@@ -181,6 +190,7 @@ class GateState:
     odometries: Arrivals = Arrivals()
     jumped: str = ""  # the topic whose stamps have just jumped, or run ahead
     leap: str = ""  # what is wrong with the newest odometry pose
+    sensors: tuple[SensorState, ...] = ()  # in the order of the configuration
     scan: Scan | None = None  # the newest accepted one, as in the next three
     odometry: Odometry | None = None
     estimate: Estimate | None = None
@@ -206,7 +216,8 @@ class GateState:
 def begin(config: GateConfig) -> GateState:
     """Returns the state of a gate that has no data yet."""
     size = len(config.fields)
-    return GateState(value=np.zeros(size), slope=np.zeros(size))
+    sensors = tuple(SensorState() for _ in config.sensors)
+    return GateState(value=np.zeros(size), slope=np.zeros(size), sensors=sensors)
 
 
 @dataclass(frozen=True)

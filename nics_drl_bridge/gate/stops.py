@@ -108,6 +108,15 @@ def scan_silent(config: GateConfig, state: GateState, now: float) -> Cause | Non
     return _silence("scan_silent", SCAN, state.scans, now, config.scan_age_s)
 
 
+def sensor_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """The newest reading of a further sensor is too old: it has stopped."""
+    for name, sensor in zip(config.sensors, state.sensors, strict=True):
+        cause = _silence("sensor_silent", name, sensor.arrivals, now, config.scan_age_s)
+        if cause is not None:
+            return cause
+    return None
+
+
 def odom_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The newest odometry is too old: it has stopped."""
     return _silence("odom_silent", ODOM, state.odometries, now, config.odom_age_s)

@@ -141,3 +141,12 @@ def slice_poses(out, pose, twist, sweep, direction):  # type: ignore[no-untyped-
             later = count - 1 - g if direction > AT_ONCE else g
             ago = sweep * (later + 0.5) / count
         slice_pose(out[g], pose, twist, ago)
+
+
+@kernel(allocates=True)
+def distort_worlds(ranges, chosen, limits, faults, seeds, steps):  # type: ignore[no-untyped-def]
+    """Applies the same faults to the scans (N, M, B) of some worlds (n,), see `distort`."""
+    robots = ranges.shape[1]
+    for n in chosen:
+        for m in range(robots):
+            distort(ranges[n, m], limits, faults, seeds[n], steps[n] * robots + m)

@@ -111,6 +111,7 @@ class Middleware:
 
     def __init__(self, model: SimulatorModel) -> None:
         self._beams, self._width = model.lidar.beams, len(model.robot.command)
+        self._sizes = {sensor.name: sensor.size for sensor in model.sensors}
         self.estimator = Estimator(model)
         self._timeline = Timeline(self.estimator)
         self._trail = Trail(self.estimator.unseen.walk)
@@ -180,6 +181,17 @@ class Middleware:
             return False
         self._stamps.accept(stamp_ns, arrival_ns)
         return True
+
+    def sense(
+        self, name: str, stamp_ns: int, arrival_ns: int, reading: NDArray[np.float32]
+    ) -> bool:
+        """Takes a reading (S,) of a further sensor; True if it was used. The newest is kept."""
+        fault = self._stamps.fault(stamp_ns, arrival_ns)
+        if reading.shape != (self._sizes[name],):
+            fault = f"shape {reading.shape}, not ({self._sizes[name]},)"
+        if fault:
+            return self.cache.reject(f"{name}: {fault}")
+        return self.cache.put(name, stamp_ns, arrival_ns, reading)
 
     def odometry(self, stamp_ns: int, arrival_ns: int, pose: ArrayLike, twist: ArrayLike) -> bool:
         """Takes an odometry: pose (3,) in `odom`, body twist (3,); True if it was accepted.
@@ -286,12 +298,20 @@ class Middleware:
     def view(self, now_ns: int) -> RobotView:
         """Returns the view of the robot at a time; NaN ranges before the first scan."""
         scan, newest_ns = self.cache.newest.get(SCAN), self.newest_ns
+        sensed = {
+            name: self.cache.newest[name].value
+            if name in self.cache.newest
+            else np.full(size, np.nan, np.float32)
+            for name, size in self._sizes.items()
+        }
         return RobotView(
             *self.estimator.at(now_ns),
             ranges=np.full(self._beams, np.nan, np.float32) if scan is None else scan.value,
             stamp_s=(now_ns if newest_ns is None else newest_ns) * S_PER_NS,
             scan_age_s=self.cache.age_s(SCAN, now_ns),
             odom_age_s=self.cache.age_s(ODOM, now_ns),
+            sensed=sensed,
+            sensed_age_s=max((self.cache.age_s(name, now_ns) for name in sensed), default=0.0),
         )
 
     def health(self, arrival_ns: int) -> Health:

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -20,6 +21,7 @@ from nics_drl_bridge.interface import NS_PER_S, Backend, BackendFacts, RobotView
 from nics_drl_bridge.lidar.spec import from_device
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
+from nics_drl_bridge.nodes.conversions import sensor_from_ros, sensor_type
 from nics_drl_bridge.nodes.device_parameters import default_namespaces
 from nics_drl_bridge.nodes.executor import HANDED_OVER
 from nics_drl_bridge.nodes.link import EpisodeServices, Link, halted_after_an_error
@@ -147,14 +149,19 @@ class DdsBackend:
         domain_id: int | None = None,
     ) -> None:
         self._robot, self._lidar = model.robot, model.lidar
+        self._sensors = {sensor.name: sensor for sensor in model.sensors}
         self._middleware = Middleware(model)
         self._period_ns = round(model.control_period * NS_PER_S)
-        self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *((TRUTH,) if truth else ()))
+        further = (*self._sensors, *((TRUTH,) if truth else ()))
+        self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *further)
         self._now_ns, self._mail = 0, _Mailbox(self._topics, _worker(self._middleware))
         self._known: BackendFacts = {}
         self._link = Link(namespace, domain_id)
         for topic in self._topics:
-            kind, put = LaserScan if topic == SCAN else Odometry, _putter(self._mail, topic)
+            kind = LaserScan if topic == SCAN else Odometry
+            if topic in self._sensors:
+                kind = sensor_type(self._sensors[topic])
+            put = _putter(self._mail, topic)
             self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
         self._episodes = EpisodeServices(self._link, simulator, model, world)
         self._link.begin()
@@ -229,6 +236,10 @@ class DdsBackend:
         message, arrival = messages[SCAN]
         ranges = from_device(_read(SCAN, wire.ranges_of, message), self._lidar)
         self._middleware.scan(now, arrival, ranges)
+        for name, sensor in self._sensors.items():
+            message, arrival = messages[name]
+            reading = _read(name, partial(sensor_from_ros, sensor), message)
+            self._middleware.sense(name, now, arrival, reading)
         facts = {"stamp_ns": now, **data_facts(self._middleware, time.monotonic_ns())}
         if TRUTH in self._topics:
             facts["true_pose"] = _read(TRUTH, wire.odometry_of, messages[TRUTH][0])[0]

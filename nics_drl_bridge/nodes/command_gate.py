@@ -31,9 +31,10 @@ from nics_drl_bridge.gate.limits import PERIOD_S, Limits, load_limits
 from nics_drl_bridge.gate.state import Decision, GateConfig, ShieldConfig, begin
 from nics_drl_bridge.gate.stopping import doubtful, require_possible, shield_config
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
 from nics_drl_bridge.nodes import qos, runner, wire
-from nics_drl_bridge.nodes.conversions import is_rotation
+from nics_drl_bridge.nodes.conversions import is_rotation, sensor_from_ros, sensor_type
 from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import declare
@@ -72,6 +73,7 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
         range_min=lidar.range_min,
         range_max=lidar.range_max,
         scan_rate=lidar.rate,
+        sensors=tuple(sensor.name for sensor in model.sensors),
         simulated=bool(node.get_parameter("use_sim_time").value),
         odom_std=model.noise.odometry,
         shield=_declare_shield(node, model, limits, file),
@@ -142,9 +144,15 @@ def _declare_shield(
 
 
 def scan(lidar: LidarSpec, content: bytes) -> inputs.Scan:
-    """Reads a serialised LaserScan; raises `wire.UNREADABLE`, as the next four."""
+    """Reads a serialised LaserScan; raises `wire.UNREADABLE`, as the next five."""
     ranges = from_device(wire.ranges_of(content), lidar)
     return inputs.Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
+
+
+def reading(sensor: Sensor, content: bytes) -> inputs.Reading:
+    """Reads a serialised message of a further sensor."""
+    points = sensor.points(sensor_from_ros(sensor, content))
+    return inputs.Reading(wire.stamp_of(content), sensor.name, points)
 
 
 def odometry(content: bytes) -> inputs.Odometry:
@@ -205,6 +213,7 @@ class CommandGate(QosWatch):
         super().__init__("command_gate", context=context)
         model, logger = runner.declare_model(self), self.get_logger()
         self._lidar, self._config = model.lidar, declare_gate(self, model)
+        self._sensors = model.sensors
         self._state = begin(self._config)
         self._log = GateLog(self._config, declare_black_box(self), model.robot.name, logger)
         if not self._config.e_stop_required:
@@ -227,13 +236,17 @@ class CommandGate(QosWatch):
             logger.warning(refused)
 
     def _listen(self) -> None:
-        for kind, topic, read, profile in (
+        readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (
             (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),
             (Odometry, "odom", odometry, qos.SENSOR),
             (Odometry, "odometry/filtered", estimate, qos.SENSOR),
             (TwistStamped, "cmd_vel_raw", command, qos.COMMAND),
             (Bool, "e_stop", e_stop, qos.EVERY_COMMAND),
-        ):
+        )
+        for each in self._sensors:
+            further = (sensor_type(each), each.name, partial(reading, each), qos.SENSOR)
+            readers = (*readers, further)
+        for kind, topic, read, profile in readers:
             taker = partial(self._take, topic, read)
             self.create_subscription(kind, topic, taker, profile, raw=True)
         runner.serve(self, "~/arm", self._arm)

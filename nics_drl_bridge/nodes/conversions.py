@@ -23,10 +23,13 @@ from geometry_msgs.msg import (
 )
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, JointState, LaserScan
 
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.lidar.sectors import Reader, reader_beside
+from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, from_device, to_device
 from nics_drl_bridge.recording.messages import POSITION_UNITS
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -198,6 +201,35 @@ def message_type(kind: str) -> Any | None:
         return getattr(import_module(f"{parts[0]}.{parts[1]}"), parts[2], None)
     except ImportError:
         return None
+
+
+def sensor_type(sensor: Sensor) -> Any:
+    """Returns the class of a further sensor's message. Raises ConfigError if it is missing."""
+    kind = message_type(sensor.message)
+    if kind is None:
+        raise ConfigError(
+            f"sensor {sensor.name!r}: the message {sensor.message} is not installed; install its "
+            "package with your ROS 2 distribution."
+        )
+    return kind
+
+
+def sensor_to_ros(sensor: Sensor, reading: NDArray[np.float32], time_ns: int, frame: str) -> Any:
+    """Returns a reading (S,) of a further sensor as its message."""
+    message = sensor_type(sensor)()
+    message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
+    sensor.write(message, reading)
+    return message
+
+
+def sensor_from_ros(sensor: Sensor, content: bytes) -> NDArray[np.float32]:
+    """Returns the reading (S,) of a serialised message. Raises ValueError if it is none."""
+    kind = sensor_type(sensor)
+    try:
+        message = deserialize_message(content, kind)
+    except Exception as error:  # noqa: BLE001  (rclpy's is of no public class)
+        raise ValueError(f"is no {sensor.message} ({error})") from None
+    return sensor.read(message)
 
 
 def message_texts(kind: str) -> dict[str, str]:

@@ -54,6 +54,7 @@ class Frames(NamedTuple):
     odom: str
     base: str
     laser: str
+    prefix: str  # of all but the map
 
 
 def declare_device(node: Node, laser_frame: str) -> None:
@@ -177,8 +178,9 @@ def default_namespaces(robots: int) -> tuple[str, ...]:
 def frames(node: Node, namespace: str) -> Frames:
     """Returns the frames of a robot; those of a fleet begin with its namespace, except the map."""
     prefix = str(node.get_parameter("frame_prefix").value) + (f"{namespace}/" if namespace else "")
-    world, *own = (str(node.get_parameter(f"{each}_frame").value) for each in Frames._fields)
-    return Frames(world, *(prefix + name for name in own))
+    world, *own = (str(node.get_parameter(f"{each}_frame").value) for each in Frames._fields[:-1])
+    odom, base, laser = (prefix + name for name in own)
+    return Frames(world, odom, base, laser, prefix)
 
 
 def _check_episode(parameters: list[Parameter]) -> SetParametersResult:

@@ -22,8 +22,10 @@ from sensor_msgs.msg import JointState, LaserScan
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import to_device
 from nics_drl_bridge.nodes import conversions, qos, wire
+from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
 from nics_drl_bridge.nodes.device_parameters import DeviceTiming, Frames
 from nics_drl_bridge.nodes.qos import owner
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -39,7 +41,7 @@ QUIET_S = 5.0
 
 
 class RobotPort:
-    """Publishes `scan`, `odom`, `joint_states` and `ground_truth` of one robot.
+    """Publishes `scan`, `odom`, further sensors, `joint_states`, `ground_truth` of one robot.
 
     The last two cost nothing without subscribers. The namespace is empty or ends with a slash.
     """
@@ -52,6 +54,10 @@ class RobotPort:
         self._scans = node.create_publisher(LaserScan, f"{namespace}scan", quality)
         self._odoms = node.create_publisher(Odometry, f"{namespace}odom", quality)
         self._truths = node.create_publisher(Odometry, f"{namespace}ground_truth", quality)
+        self._sensors = [
+            (each, node.create_publisher(sensor_type(each), f"{namespace}{each.name}", quality))
+            for each in model.sensors
+        ]
         self._joints = node.create_publisher(JointState, f"{namespace}joint_states", quality)
         free = np.full(model.lidar.beams, np.inf, np.float32)
         scan = conversions.scan_to_ros(model.lidar, free, 0, frames.laser)
@@ -69,10 +75,15 @@ class RobotPort:
         if node.get_parameter("publish_map_to_odom").value:
             self._moving.append(transform_message(frames.map, frames.odom))
 
-    def mount(self) -> TransformStamped:
-        """Returns the transform base_link -> laser."""
-        message = transform_message(self.frames.base, self.frames.laser)
-        return fill(message, self._model.lidar.mount, Time())
+    def mounts(self) -> list[TransformStamped]:
+        """Returns the transforms base_link -> laser, and to each further sensor."""
+        mounted = [(self.frames.laser, self._model.lidar.mount)]
+        mounted += [(self._frame_of(sensor), sensor.mount) for sensor, _ in self._sensors]
+        base = self.frames.base
+        return [fill(transform_message(base, each), place, Time()) for each, place in mounted]
+
+    def _frame_of(self, sensor: Sensor) -> str:
+        return self.frames.prefix + sensor.frame
 
     def moving(self, now: Time, sensed: Sensed) -> list[TransformStamped]:
         """Returns the transforms odom -> base_link, and map -> odom if requested."""
@@ -95,10 +106,14 @@ class RobotPort:
             self._truths.publish(self._truth.write(now_ns, sensed.pose, sensed.true_twist))
 
     def publish_scan(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
-        """Publishes the robot's scan, stamped with the time of beam 0."""
+        """Publishes the scan, stamped with the time of beam 0, and readings of further sensors."""
         ranges = to_device(sensed.ranges, self._model.lidar)
         message = self._scan.write(now_ns - self._sweep_ns, ranges)
         outbox.send(self._scans, message, now_ns, self._time.scan_late_ns)
+        for sensor, publisher in self._sensors:
+            reading = sensed.readings[sensor.name]
+            late_ns, frame = self._time.scan_late_ns, self._frame_of(sensor)
+            outbox.send(publisher, sensor_to_ros(sensor, reading, now_ns, frame), now_ns, late_ns)
 
 
 def planar_message(parent: str, child: str) -> Odometry:

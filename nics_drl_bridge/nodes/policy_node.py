@@ -132,7 +132,8 @@ class PolicyNode(ManagedNode):
         if self.state != ACTIVE:
             return
         newest = self._topics.middleware.cache.newest
-        if SCAN not in newest or ODOM not in newest:
+        needed = (SCAN, ODOM, *(sensor.name for sensor in self._task.sensors))
+        if not newest.keys() >= set(needed):
             return
         scan_ns, begin_s = newest[SCAN].stamp_ns, time.monotonic()
         if newest[ODOM].stamp_ns < scan_ns or scan_ns <= self._acted_ns:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from nics_drl_bridge.errors import BridgeError, ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.lidar.sectors import Reader
+from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
 from nics_drl_bridge.middleware.ekf import ANYWHERE
 from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
@@ -46,9 +48,10 @@ def declare_sensors(node: Node) -> None:
 class RobotTopics:
     """Subscribes to a robot's topics and keeps the middleware up to date.
 
-    These are `scan`, `odom` and `cmd_vel`, and, as the node's parameters `pose_type` and `use_imu`
-    request, `pose` and `imu`. `declare_sensors` has to be called before, for these parameters and
-    whether `cmd_vel` is stamped. A reader in another thread than the spinning one holds `lock`.
+    These are `scan`, `odom`, `cmd_vel` and those of the model's further sensors, and, as the node's
+    parameters `pose_type` and `use_imu` request, `pose` and `imu`. `declare_sensors` has to be
+    called before, for these parameters and whether `cmd_vel` is stamped. A reader in another thread
+    than the spinning one holds `lock`.
     Data are used at their own stamps; a command, which has none, at the stamp of the newest datum
     before it. The first odometry fixes `map`, unless there is a pose sensor: then the first pose
     does.
@@ -81,7 +84,10 @@ class RobotTopics:
         stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
         command = (TwistStamped, self._take_stamped) if stamped else (Twist, self._take_command)
         self._subscribe(CMD_VEL, *command, qos.COMMAND)
-        sensors = {SCAN: (LaserScan, self._take_scan), ODOM: (Odometry, self._take_odometry)}
+        sensors: dict[str, tuple[Any, Callable[[Any], None]]] = {
+            SCAN: (LaserScan, self._take_scan),
+            ODOM: (Odometry, self._take_odometry),
+        }
         pose_type = str(node.get_parameter("pose_type").value)
         self._posed = pose_type != NO_POSE
         if self._posed:
@@ -93,6 +99,9 @@ class RobotTopics:
             sensors[POSE] = (POSE_TYPES[pose_type], self._take_pose)
         if node.get_parameter("use_imu").value:
             sensors[IMU] = (Imu, self._take_imu)
+        for sensor in model.sensors:
+            take_reading = partial(self._take_reading, sensor)
+            sensors[sensor.name] = (conversions.sensor_type(sensor), take_reading)
         for topic, (kind, take) in sensors.items():
             self._subscribe(topic, kind, take, qos.SENSOR)
         self.expected = tuple(sensors)
@@ -199,6 +208,15 @@ class RobotTopics:
             self.middleware.cache.reject(f"{IMU}: no angular velocity")
             return
         self.middleware.imu(stamp, self.now_ns(), *measured)
+
+    def _take_reading(self, sensor: Sensor, message: Any) -> None:
+        stamp = conversions.stamp_from_ros(message.header.stamp)
+        try:
+            reading = sensor.read(message)
+        except ValueError as error:
+            self.middleware.cache.reject(f"{sensor.name}: {error}")
+            return
+        self.middleware.sense(sensor.name, stamp, self.now_ns(), reading)
 
     def _take_stamped(self, message: TwistStamped) -> None:
         self._take_command(message.twist)

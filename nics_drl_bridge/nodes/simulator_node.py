@@ -86,7 +86,7 @@ class DeviceNode(QosWatch):
             self._inlets.append(
                 CommandInlet(self, space, model.robot, commands, take, self._too_old)
             )
-        self._transforms.publish_fixed([port.mount() for port in self._ports])
+        self._transforms.publish_fixed([each for port in self._ports for each in port.mounts()])
         runner.serve(self, "~/reset", self._reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
         runner.serve(self, "~/repeat", self._repeat)

@@ -21,6 +21,7 @@ from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import ScanLayout
+from nics_drl_bridge.lidar.sensor import AnySensor
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -41,7 +42,7 @@ class TaskEntry(Schema):
     """The task of a policy."""
 
     name: str = Field(min_length=1)  # as in `env.registry.TASKS`, or the name of a user's class
-    options: dict[str, Any]  # all of its options except `scan`
+    options: dict[str, Any]  # all of its options except `scan` and `sensors`
     sha256: str = Field(pattern="^[0-9a-f]{64}$")  # over name, options and observation
 
 
@@ -77,6 +78,7 @@ class Contract(Schema):
     robot: RobotSpec
     lidar: LidarSpec
     scan: ScanLayout | None  # sectors of its observations; None: the beams of exactly this lidar
+    sensors: tuple[AnySensor, ...] = ()  # further ones that it observes
     task: TaskEntry
     observation: ObservationEntry
     actions: Literal["continuous", "discrete"]
@@ -107,7 +109,7 @@ def contract_of(
     Raises ConfigError if an entry has a wrong type.
     """
     entry, observation = task_entry(task), observation_entry(task)
-    data = {
+    data: dict[str, Any] = {
         "format": FORMAT,
         "robot": task.robot.model_dump(mode="json"),
         "lidar": task.lidar.model_dump(mode="json"),
@@ -124,6 +126,8 @@ def contract_of(
             for name, rows in golden.items()
         },
     }
+    if task.sensors:
+        data["sensors"] = [sensor.model_dump(mode="json") for sensor in task.sensors]
     data["checksums"] = checksums(data)
     validate(data, Contract, "policy")
     return json.dumps(data, allow_nan=False)
@@ -137,7 +141,7 @@ def task_entry(task: Task) -> dict[str, Any]:
     options = {
         field.name: getattr(task, field.name)
         for field in dataclasses.fields(task)
-        if field.init and field.name not in ("robot", "lidar", "scan")
+        if field.init and field.name not in ("robot", "lidar", "scan", "sensors")
     }
     return {"name": name, "options": options}
 

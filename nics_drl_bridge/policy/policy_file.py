@@ -82,9 +82,12 @@ class PolicyFile:
 
     @cached_property
     def task_options(self) -> dict[str, Any]:
-        """Arguments of the policy's task: its options and its scan."""
+        """Arguments of the policy's task: its options, scan and sensors."""
         scan = self.contract.scan
-        return {**self.contract.task.options, **({} if scan is None else {"scan": scan})}
+        options = {**self.contract.task.options, **({} if scan is None else {"scan": scan})}
+        if self.contract.sensors:
+            options["sensors"] = self.contract.sensors
+        return options
 
     def make_task(self, model: SimulatorModel, kind: str | type[Task] | None = None) -> Task:
         """Makes the policy's task for a robot that it fits.
@@ -109,6 +112,7 @@ class PolicyFile:
         """
         if model is not None:
             self._check_robot(model.robot, model.lidar)
+            self._check_sensors(model)
             period = self.contract.control_period
             if abs(period - model.control_period) > PERIOD_TOLERANCE:
                 self._refuse("control_period", period, model.control_period)
@@ -129,6 +133,15 @@ class PolicyFile:
             except ConfigError as error:
                 raise PolicyError(str(self.path), "scan", str(error)) from None
         self._compare(ours, theirs)
+
+    def _check_sensors(self, model: SimulatorModel) -> None:
+        """The further sensors that the policy observes are those of the model."""
+        theirs = {sensor.name: sensor for sensor in model.sensors}
+        for k, sensor in enumerate(self.contract.sensors):
+            if sensor.name not in theirs:
+                self._refuse(f"sensors.{k}.name", sensor.name, sorted(theirs))
+            found = theirs[sensor.name].model_dump(mode="json")
+            self._compare({f"sensors.{k}": sensor.model_dump(mode="json")}, {f"sensors.{k}": found})
 
     def _check_task(self, task: Task) -> None:
         theirs = {

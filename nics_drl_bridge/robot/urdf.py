@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from xml.etree import ElementTree
 
 from nics_drl_bridge.robot.kinds import Wheel, drawing
@@ -16,7 +17,11 @@ BODY_HEIGHT = 0.04
 
 
 def urdf_of(
-    spec: RobotSpec, mount: Place = (0.0, 0.0, 0.0), laser: str = "laser", base: str = "base_link"
+    spec: RobotSpec,
+    mount: Place = (0.0, 0.0, 0.0),
+    laser: str = "laser",
+    base: str = "base_link",
+    further: Mapping[str, Place] | None = None,
 ) -> str:
     """Returns the text of a robot's URDF.
 
@@ -24,7 +29,8 @@ def urdf_of(
     `laser` is at its mount, at the height of `base_link`, since the package's world is flat.
     Moving joints have the names of the state variables in `joint_states`. A robot without
     textbook kinematics has no wheels here, since its spec does not contain their positions.
-    The lidar's frame is `laser`, its mount x [m], y [m], heading [rad] in the frame `base`.
+    The lidar's frame is `laser`, its mount x [m], y [m], heading [rad] in the frame `base`, as are
+    those of the `further` sensors by frame.
     """
     robot = Element("robot", name=spec.name)
     for name, colour in COLOURS.items():
@@ -40,8 +46,11 @@ def urdf_of(
         _visual(link, "body", (*body, BODY_HEIGHT), (looks.centre[0], 0.0, looks.centre[1]))
         for wheel in looks.wheels:
             _wheel(robot, base, wheel)
-    _visual(_add(robot, "link", name=laser), "laser", (0.02, 0.03), (0.0, 0.0, 0.07))
-    _joint(robot, "laser_mount", "fixed", (base, laser), (*mount[:2], 0.0), yaw=mount[2])
+    joints = {laser: "laser_mount"}
+    for frame, (x, y, yaw) in {laser: mount, **(further or {})}.items():
+        _visual(_add(robot, "link", name=frame), "laser", (0.02, 0.03), (0.0, 0.0, 0.07))
+        joint = joints.get(frame, f"{frame}_mount")
+        _joint(robot, joint, "fixed", (base, frame), (x, y, 0.0), yaw=yaw)
     ElementTree.indent(robot)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(robot, encoding="unicode")}\n'
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +33,7 @@ class Sensed:
     pose: Array  # (3,) true pose in `map`
     before: Array  # (3,) true pose one step earlier
     period: float  # length of a step [s]
+    readings: Mapping[str, NDArray[np.float32]]  # name -> (S,) of each further sensor
 
     @property
     def true_twist(self) -> Array:
@@ -98,6 +100,7 @@ class DeviceWorld:
             data.odom[0, robot], self._covariance[robot], data.twist[0, robot],
             data.state[0, robot], data.ranges[0, robot], data.pose[0, robot], self._before[robot],
             self._period,
+            {name: each[0, robot] for name, each in self._simulator.readings.items()},
         )  # fmt: skip
 
 
@@ -191,4 +194,5 @@ class DrivenSimulator:
             self.fast.packed[0], driven.twist[None], self.wheels[None], driven.wheels[None],
             driven.counted[None],
         )  # fmt: skip
+        self.fast.sense(np.zeros(1, np.int64))
         self.wheels = driven.wheels.copy()

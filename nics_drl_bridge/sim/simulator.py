@@ -15,6 +15,7 @@ from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.lidar.bake import with_shapes
 from nics_drl_bridge.lidar.exact_kernels import SHAPE
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
+from nics_drl_bridge.lidar.sensor import Readings, Render, SensedWorlds
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -145,6 +146,7 @@ class FastSimulator:
         goals: (N, M, 2) of the episodes [m].
         parts: the worlds that each thread steps.
         sampler: draws the scenes.
+        readings: name of a further sensor -> (N, M, S) its readings, see `lidar.sensor`.
         drawn: name -> draws of the randomisation for the running episodes, (N, M) per robot or
             (N,) per scene; empty without randomisation.
     """
@@ -196,6 +198,10 @@ class FastSimulator:
         self._scanner = Scanner(model.lidar, table, renderer, world.grid)
         self._sizes = Sizes(worlds, robots, self.sampler.count, delay, longest_age)
         self.data = allocate(model, self._sizes)
+        self.readings: dict[str, Readings] = {
+            sensor.name: np.full((worlds, robots, sensor.size), np.nan, np.float32)
+            for sensor in model.sensors
+        }
         self.parts = split(worlds, threads)
         self._boxes = {
             part.start: CommandBox(model.kinematics, model.robot, tell) for part in self.parts
@@ -210,8 +216,22 @@ class FastSimulator:
         return {part.start: step_kernels.pack(part_of(*of, part)) for part in self.parts}
 
     def __getstate__(self) -> dict[str, Any]:
-        """Returns the state without `packed`, which a copy rebuilds."""
-        return {name: value for name, value in vars(self).items() if name != "packed"}
+        """Returns the state without what a copy rebuilds."""
+        rebuilt = ("packed", "_renders")
+        return {name: value for name, value in vars(self).items() if name not in rebuilt}
+
+    @cached_property
+    def _renders(self) -> dict[str, Render]:
+        around = SensedWorlds(
+            self.data, self._scanner.table.shapes, self.sampler.count, self.world.all_walls(),
+            self.world.grid, self._scanner.renderer,
+        )  # fmt: skip
+        return {sensor.name: sensor.renderer(around) for sensor in self.model.sensors}
+
+    def sense(self, worlds: Indices) -> None:
+        """Renders the readings of the further sensors in some worlds (n,)."""
+        for name, render in self._renders.items():
+            render(self.readings[name], worlds)
 
     def reset(
         self,
@@ -245,6 +265,7 @@ class FastSimulator:
             if len(of_part):
                 self._boxes[part.start].begin()
                 step_kernels.begin(self.packed[part.start], of_part)
+                self.sense(of_part)
         return scenes
 
     def scenes(self, seeds: ArrayLike) -> Scenes:
@@ -295,11 +316,7 @@ class FastSimulator:
         The commands are (N, M, C), in the units and the order of the RobotSpec.
         """
         checked = self._checked(slice(0, len(self.data.steps)), commands)
-        self.run_parts(
-            lambda part: step_kernels.step_worlds(
-                self.packed[part.start], checked[part], part.start
-            )
-        )
+        self.run_parts(lambda part: self._step(part, checked[part]))
 
     def run_parts(self, function: Callable[[slice], R]) -> list[R]:
         """Runs a function for each of `parts`, one thread per part; returns the results."""
@@ -310,8 +327,12 @@ class FastSimulator:
 
         The commands (n, M, C) are of these worlds; different parts may be stepped in parallel.
         """
-        checked = self._checked(part, commands)
-        step_kernels.step_worlds(self.packed[part.start], checked, part.start)
+        self._step(part, self._checked(part, commands))
+
+    def _step(self, part: slice, commands: Array) -> None:
+        step_kernels.step_worlds(self.packed[part.start], commands, part.start)
+        if self.readings:
+            self.sense(np.arange(part.start, part.stop))
 
     def _checked(self, part: slice, commands: ArrayLike) -> Array:
         """Returns commands as the kernels read them. Raises ConfigError for another shape."""

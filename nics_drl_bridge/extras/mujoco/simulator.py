@@ -196,6 +196,11 @@ class MujocoSimulator:
         return self._driven.fast.data
 
     @property
+    def readings(self) -> dict[str, NDArray[np.float32]]:
+        """Name of a further sensor -> (1, M, S) its readings."""
+        return self._driven.fast.readings
+
+    @property
     def goals(self) -> Array:
         """(1, M, 2) goals of the episode [m]."""
         return self._driven.fast.goals

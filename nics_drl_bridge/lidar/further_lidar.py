@@ -1,0 +1,97 @@
+"""A further lidar, as a `Sensor`: the second one of a robot, or the third."""
+
+from __future__ import annotations
+
+import array
+from typing import Any, Literal
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.lidar import fault_kernels, scan_kernels
+from nics_drl_bridge.lidar.scanner import make_scanner
+from nics_drl_bridge.lidar.sensor import Readings, Render, SensedWorlds, Sensor
+from nics_drl_bridge.lidar.spec import LidarSpec, from_device, to_device
+
+ANGLE_TOLERANCE = 1e-3
+"""Greatest deviation of the last beam from the declared angle [rad]."""
+
+
+class FurtherLidar(Sensor):
+    """A planar lidar; a reading is its scan (B,) [m], REP-117.
+
+    All beams are measured at once, at the end of a control period.
+    """
+
+    message = "sensor_msgs/msg/LaserScan"
+
+    kind: Literal["lidar"] = "lidar"
+    lidar: LidarSpec
+
+    @property
+    def size(self) -> int:
+        """B."""
+        return self.lidar.beams
+
+    @property
+    def frame(self) -> str:
+        """Id of the lidar's own frame."""
+        return self.lidar.frame
+
+    @property
+    def mount(self) -> tuple[float, float, float]:
+        """X [m], y [m], heading [rad] in `base_link`."""
+        return self.lidar.mount
+
+    def renderer(self, around: SensedWorlds) -> Render:
+        """Scans bodies, walls and map like the first lidar, with this one's faults."""
+        scanner = make_scanner(self.lidar, around.shapes, around.renderer, around.grid)
+        state, lidar, salt = around.state, scanner.arguments, crc32(self.name.encode())
+        limits = np.array([self.lidar.range_min, self.lidar.range_max])
+        faults = self.lidar.fault_parameters
+
+        def render(out: Readings, worlds: NDArray[np.int64]) -> None:
+            lanes = scan_kernels.scan_lanes()
+            scan_kernels.scan_worlds(
+                out, state.pose, worlds, state.bodies, around.first, around.walls, lidar, lanes
+            )
+            if scanner.grid is not None:
+                scan_kernels.add_map(
+                    out, state.pose, worlds, lidar, scanner.grid.arrays,
+                    scanner.renderer == "exact", lanes,
+                )  # fmt: skip
+            fault_kernels.distort_worlds(
+                out, worlds, limits, faults, state.seeds ^ salt, state.steps
+            )
+
+        return render
+
+    def write(self, message: Any, reading: Readings) -> None:
+        """Fills a LaserScan as the device would."""
+        for field, value in self.lidar.header._asdict().items():
+            setattr(message, field, value)
+        message.ranges = array.array("f", to_device(reading, self.lidar).tobytes())
+
+    def read(self, message: Any) -> Readings:
+        """Returns the scan (B,) of a LaserScan."""
+        header, beams = self.lidar.header, self.lidar.beams
+        off = abs(message.angle_min - header.angle_min)
+        off += abs(message.angle_increment - header.angle_increment) * (beams - 1)
+        if len(message.ranges) != beams or not off <= ANGLE_TOLERANCE:
+            raise ValueError(f"is of another lidar, with {len(message.ranges)} beams")
+        return from_device(message.ranges, self.lidar)
+
+    def shares(self, readings: Readings) -> Readings:
+        """Ranges as shares of the maximum: 1 free, 0 too close or unknown."""
+        known = np.nan_to_num(readings, nan=0.0, posinf=np.inf, neginf=0.0)
+        shares: Readings = np.clip(known / np.float32(self.lidar.range_max), 0.0, 1.0)
+        return shares.astype(np.float32)
+
+    def points(self, reading: Readings) -> NDArray[np.float64]:
+        """Ends of the beams that hit something (Q, 2); what is too close counts as at range_min."""
+        x, y, heading = self.mount
+        near = np.where(np.isneginf(reading), self.lidar.range_min, reading.astype(np.float64))
+        hit = np.isfinite(near)
+        angles, ranges = self.lidar.angles[hit] + heading, near[hit]
+        return np.stack([x + ranges * np.cos(angles), y + ranges * np.sin(angles)], axis=1)

@@ -1,0 +1,176 @@
+"""Sensor: what a robot has beside its lidar. A kind of sensor is one file with one class.
+
+The model names the sensors of a robot; everything else asks them: the simulator renders their
+readings, the nodes publish and read their messages, the middleware caches them by name, views hold
+them in `sensed`, tasks observe their `shares`, and the gate keeps clear of their `points`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PlainSerializer, PlainValidator
+
+from nics_drl_bridge import extensions
+from nics_drl_bridge.config import Schema, parse_yaml, read_text, validate
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.maps import GridMap
+from nics_drl_bridge.lidar.scanner import Renderer
+from nics_drl_bridge.lidar.shapes import Shape
+
+Array = NDArray[np.float64]
+Readings = NDArray[np.float32]
+TAKEN = ("scan", "odom", "pose", "imu", "joint_states", "ground_truth", "cmd_vel")
+"""Topics of a robot that are no sensor's."""
+
+
+class SensedState(Protocol):
+    """State of N worlds of M robots and K other bodies; the simulator changes it in place."""
+
+    @property
+    def pose(self) -> Array:
+        """(N, M, 3) true pose of `base_link` in `map`."""
+
+    @property
+    def bodies(self) -> Array:
+        """(N, K + M, 7) other bodies, then robots, columns as in `lidar.exact_kernels`."""
+
+    @property
+    def seeds(self) -> NDArray[np.int64]:
+        """(N,) of the episodes."""
+
+    @property
+    def steps(self) -> NDArray[np.int64]:
+        """(N,) control periods since the reset."""
+
+
+@dataclass(frozen=True)
+class SensedWorlds:
+    """All that a sensor can see."""
+
+    state: SensedState
+    shapes: tuple[Shape, ...]  # of the bodies, by the index in their column `SHAPE`
+    first: int  # K, the body of robot 0
+    walls: Array  # (W, 4) x1, y1, x2, y2 [m]
+    grid: GridMap | None  # the static map
+    renderer: Renderer  # of the lidar
+
+
+Render = Callable[[Readings, NDArray[np.int64]], None]
+"""Writes the readings (N, M, S) of some worlds (n,) in place, of all their robots."""
+
+
+class Sensor(Schema, ABC):
+    """A sensor of a robot beside its lidar.
+
+    A subclass is found by its `kind`, the name of an entry point of `nics_drl_bridge.sensors` or
+    `path/to/file.py:ClassName`. A reading is S numbers, float32; NaN is unknown.
+    """
+
+    message: ClassVar[str]  # type of its message, as sensor_msgs/msg/LaserScan, with a header
+
+    kind: str
+    name: str = Field(pattern="^[a-z][a-z0-9_]*$")  # also its topic, below the robot's namespace
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """S, the number of values of a reading."""
+
+    @property
+    def parts(self) -> int:
+        """P, the number of `shares`."""
+        return self.size
+
+    @property
+    def frame(self) -> str:
+        """Id of the sensor's own frame."""
+        return self.name
+
+    @property
+    @abstractmethod
+    def mount(self) -> tuple[float, float, float]:
+        """X [m], y [m], heading [rad] of the sensor in `base_link`."""
+
+    @abstractmethod
+    def renderer(self, around: SensedWorlds) -> Render:
+        """Prepares to render readings; equal seeds and steps must give equal bits in any batch."""
+
+    @abstractmethod
+    def write(self, message: Any, reading: Readings) -> None:
+        """Fills a message with a reading (S,); its header is filled in already."""
+
+    @abstractmethod
+    def read(self, message: Any) -> Readings:
+        """Returns the reading (S,) of a message. Raises ValueError if it is not of this sensor."""
+
+    @abstractmethod
+    def shares(self, readings: Readings) -> Readings:
+        """Returns the part of an observation (..., P), in [0, 1], of readings (..., S)."""
+
+    def points(self, reading: Readings) -> Array:
+        """Returns where a reading (S,) shows something in `base_link` (Q, 2) [m]; none here."""
+        return np.zeros((0, 2))
+
+
+def sensor_of(given: Sensor | Mapping[str, Any]) -> Sensor:
+    """Returns a sensor, made from its entries if it is none yet.
+
+    Raises ConfigError: an unknown kind, or wrong entries.
+    """
+    if isinstance(given, Sensor):
+        return given
+    if not isinstance(given, Mapping) or "kind" not in given:
+        raise ConfigError("a sensor needs a 'kind' and a 'name'.")
+    kind = str(given["kind"])
+    place, colon, name = kind.rpartition(":")
+    if colon:
+        found = getattr(extensions.module_at(place, "sensor"), name, None)
+    else:
+        found = extensions.load("sensors", kind)
+    if not (isinstance(found, type) and issubclass(found, Sensor)):
+        raise ConfigError(f"sensor kind {kind!r}: is no subclass of lidar.sensor.Sensor.")
+    return validate(dict(given), found, f"sensor {given.get('name')!r}")
+
+
+def load_sensor(file: Path) -> Sensor:
+    """Reads a sensor from a YAML file. Raises ConfigError for what is wrong with it."""
+    try:
+        return sensor_of(parse_yaml(read_text(file), str(file)))
+    except ConfigError as error:
+        known = str(error).startswith(str(file))
+        raise error if known else ConfigError(f"{file}: {error}") from None
+
+
+def check_sensors(sensors: tuple[Sensor, ...], frames: tuple[str, ...]) -> None:
+    """Raises ConfigError if two sensors, or one and the robot's own topics or frames, collide."""
+    names, used = list(TAKEN), list(frames)
+    for sensor in sensors:
+        if sensor.name in names or sensor.frame in used:
+            raise ConfigError(
+                f"sensor {sensor.name!r} with frame {sensor.frame!r}: another has that name or "
+                "frame already; choose others."
+            )
+        names.append(sensor.name)
+        used.append(sensor.frame)
+
+
+def _validated(given: Any) -> Sensor:
+    try:
+        return sensor_of(given)
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
+
+
+AnySensor = Annotated[
+    Sensor,
+    PlainValidator(_validated),
+    PlainSerializer(lambda sensor: sensor.model_dump(mode="json"), return_type=dict),
+]
+"""A sensor of any kind, as a field of a schema."""

@@ -1,0 +1,110 @@
+"""Further sensors over ROS 2: published, transformed, awaited, observed and guarded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from sensor_msgs.msg import LaserScan
+
+from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.errors import BackendError
+from nics_drl_bridge.generator import save_model
+from nics_drl_bridge.lidar.further_lidar import FurtherLidar
+from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.nodes import command_gate, conversions, qos
+from nics_drl_bridge.sim.world import load_world
+
+pytestmark = pytest.mark.ros
+TASK = {"sensors": ["rear_scan"]}
+
+
+@pytest.fixture(scope="module")
+def two_lidars(model, tmp_path_factory):
+    """A car with a lidar at its back, and the folder of its model."""
+    changes = {"beams": 91, "angle_min": -1.0, "angle_max": 1.0, "noise_std": 0.01}
+    changes |= {"name": "rear", "mount": (-0.1, 0.0, np.pi), "frame": "rear_laser"}
+    spec = LidarSpec.model_validate(model.lidar.model_dump() | changes)
+    made = replace(model, sensors=(FurtherLidar(name="rear_scan", lidar=spec),))
+    folder = tmp_path_factory.mktemp("model") / "two"
+    save_model(made, folder)
+    env = BridgeEnv(model=made, world="arena", task_options=TASK, estimator=True)
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    return made, str(folder)
+
+
+@pytest.fixture(scope="module")
+def simulator(launch, module_domain_id, two_lidars):
+    process = launch("simulator_node", module_domain_id, model=two_lidars[1], mode="lockstep")
+    yield module_domain_id
+    process.check()
+
+
+def test_an_env_over_dds_sees_both_lidars_as_the_one_in_process(simulator, two_lidars):
+    model = two_lidars[0]
+    here = BridgeEnv(model=model, world="arena", task_options=TASK, estimator=True)
+    there = BridgeEnv(
+        model=model, world="arena", task_options=TASK, backend="dds",
+        backend_options={"domain_id": simulator},
+    )  # fmt: skip
+    try:
+        for seed in (1, 2):
+            one, _ = here.reset(seed=seed)
+            other, _ = there.reset(seed=seed)
+            assert np.array_equal(one, other)
+            for _ in range(10):
+                action = here.action_space.sample()
+                one, *rest = here.step(action)
+                other, *_, info = there.step(action)
+                assert np.array_equal(one, other)
+                assert info["rear_scan_stamp_ns"] == info["scan_stamp_ns"]
+                if rest[1]:
+                    break
+        assert one[-91:].min() < 1.0
+    finally:
+        here.close()
+        there.close()
+
+
+def test_its_scan_and_its_place_are_published(simulator, meet, two_lidars):
+    peer = meet(simulator)
+    scans = peer.listen(LaserScan, "rear_scan", qos.SENSOR)
+    env = BridgeEnv(
+        model=two_lidars[0], world="arena", backend="dds", backend_options={"domain_id": simulator}
+    )
+    try:
+        env.reset(seed=0)
+        peer.until(lambda: scans, "a scan from the back")
+    finally:
+        env.close()
+    assert scans[-1].header.frame_id == "rear_laser"
+    sensor = two_lidars[0].sensors[0]
+    assert sensor.read(scans[-1]).shape == (91,)
+
+
+def test_a_simulator_without_the_sensor_is_of_another_model(launch, domain_id, model, two_lidars):
+    launch("simulator_node", domain_id, mode="lockstep")
+    with pytest.raises(BackendError, match="rear_scan"):
+        BridgeEnv(
+            model=two_lidars[0], world=load_world("arena"), backend="dds",
+            backend_options={"domain_id": domain_id, "timeout_s": 5.0},
+        )  # fmt: skip
+
+
+def test_the_gate_reads_where_a_sensor_shows_something(two_lidars):
+    sensor = two_lidars[0].sensors[0]
+    reading = np.full(91, np.inf, np.float32)
+    reading[45] = 0.5
+    message = conversions.sensor_to_ros(sensor, reading, 7_000_000_000, "rear_laser")
+    from rclpy.serialization import serialize_message
+
+    given = command_gate.reading(sensor, serialize_message(message))
+    assert (given.stamp_ns, given.name) == (7_000_000_000, "rear_scan")
+    assert given.points == pytest.approx(np.array([[-0.6, 0.0]]), abs=1e-5)
+    with pytest.raises(ValueError, match="LaserScan"):
+        command_gate.reading(sensor, b"\x00\x01\x00\x00nothing")
