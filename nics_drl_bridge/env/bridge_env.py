@@ -22,6 +22,7 @@ from nics_drl_bridge.env.task import Episodes, Memory, Task, still, team_space
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend, RobotView, Start
+from nics_drl_bridge.lidar.sensor import unread
 from nics_drl_bridge.random_kernels import episode_seed
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
@@ -186,10 +187,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if self._rehearsed:
             return
         free = np.full((1, self.robots, self.model.lidar.beams), np.inf, np.float32)
-        sensed = {
-            sensor.name: np.full((1, self.robots, sensor.size), np.nan, np.float32)
-            for sensor in self.model.sensors
-        }
+        sensed = unread(self.model.sensors, 1, self.robots)
         starts = episodes.starts
         view = RobotView(starts.copy(), 0.0 * starts, free, 0.0, 0.0, 0.0, sensed)
         memory = self.task.reset(episodes)

@@ -29,7 +29,7 @@ class Odometry:
 
 
 @dataclass(frozen=True)
-class Reading:
+class SensorReading:
     """A reading of a further sensor arrived."""
 
     stamp_ns: int  # of its header
@@ -82,4 +82,4 @@ class Tick:
     """The gate's own clock ticked: the only input at which a motion is published."""
 
 
-Input = Scan | Odometry | Reading | Estimate | Command | EStop | Press | Arm | Reset | Tick
+Input = Scan | Odometry | SensorReading | Estimate | Command | EStop | Press | Arm | Reset | Tick

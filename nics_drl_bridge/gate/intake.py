@@ -15,8 +15,8 @@ from nics_drl_bridge.gate.inputs import (
     Input,
     Odometry,
     Press,
-    Reading,
     Scan,
+    SensorReading,
 )
 from nics_drl_bridge.gate.limits import greatest, implausible
 from nics_drl_bridge.gate.state import EStopState, GateConfig, GateState, SensorState, replace
@@ -48,7 +48,7 @@ def scan_malformed(config: GateConfig, scan: Scan) -> str:
     return "scan: every range is NaN" if np.isnan(scan.ranges).all() else ""
 
 
-def reading_malformed(config: GateConfig, reading: Reading) -> str:
+def reading_malformed(config: GateConfig, reading: SensorReading) -> str:
     """The reading is of an unknown sensor, or not finite."""
     if reading.name not in config.sensors:
         return f"{reading.name}: there is no such sensor"
@@ -85,7 +85,7 @@ def command_implausible(config: GateConfig, command: Command) -> str:
 REFUSALS: tuple[tuple[type, Callable[[GateConfig, Any], str]], ...] = (
     (Scan, scan_malformed),
     (Odometry, odom_malformed),
-    (Reading, reading_malformed),
+    (SensorReading, reading_malformed),
     (Estimate, estimate_malformed),
     (Command, command_not_finite),
     (Command, command_implausible),
@@ -104,7 +104,7 @@ def take(config: GateConfig, state: GateState, given: Input, now: float) -> tupl
         return _take_scan(config, state, given, now)
     if isinstance(given, Odometry):
         return _take_odometry(config, state, given, now)
-    if isinstance(given, Reading):
+    if isinstance(given, SensorReading):
         return _take_reading(config, state, given, now)
     if isinstance(given, Estimate):
         state = replace(state, estimate=given, estimate_s=now)
@@ -170,7 +170,7 @@ def _take_odometry(
 
 
 def _take_reading(
-    config: GateConfig, state: GateState, reading: Reading, now: float
+    config: GateConfig, state: GateState, reading: SensorReading, now: float
 ) -> tuple[GateState, str]:
     place = config.sensors.index(reading.name)
     before, after = state.sensors[:place], state.sensors[place + 1 :]

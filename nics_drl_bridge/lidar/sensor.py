@@ -8,7 +8,7 @@ them in `sensed`, tasks observe their `shares`, and the gate keeps clear of thei
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Protocol
@@ -146,6 +146,11 @@ def load_sensor(file: Path) -> Sensor:
     except ConfigError as error:
         known = str(error).startswith(str(file))
         raise error if known else ConfigError(f"{file}: {error}") from None
+
+
+def unread(sensors: Sequence[Sensor], *lead: int) -> dict[str, Readings]:
+    """Returns unknown readings (*lead, S) by the sensors' names."""
+    return {each.name: np.full((*lead, each.size), np.nan, np.float32) for each in sensors}
 
 
 def check_sensors(sensors: tuple[Sensor, ...], frames: tuple[str, ...]) -> None:

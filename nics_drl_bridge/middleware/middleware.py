@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, RobotView
+from nics_drl_bridge.lidar.sensor import unread
 from nics_drl_bridge.middleware.ekf import LEAST_POSE_STD, LEAST_TWIST_STD, START_STD, Estimator
 from nics_drl_bridge.middleware.measurement import (
     CMD_VEL,
@@ -111,7 +112,7 @@ class Middleware:
 
     def __init__(self, model: SimulatorModel) -> None:
         self._beams, self._width = model.lidar.beams, len(model.robot.command)
-        self._sizes = {sensor.name: sensor.size for sensor in model.sensors}
+        self._sensors = model.sensors
         self.estimator = Estimator(model)
         self._timeline = Timeline(self.estimator)
         self._trail = Trail(self.estimator.unseen.walk)
@@ -187,8 +188,9 @@ class Middleware:
     ) -> bool:
         """Takes a reading (S,) of a further sensor; True if it was used. The newest is kept."""
         fault = self._stamps.fault(stamp_ns, arrival_ns)
-        if reading.shape != (self._sizes[name],):
-            fault = f"shape {reading.shape}, not ({self._sizes[name]},)"
+        size = next(sensor.size for sensor in self._sensors if sensor.name == name)
+        if reading.shape != (size,):
+            fault = f"shape {reading.shape}, not ({size},)"
         if fault:
             return self.cache.reject(f"{name}: {fault}")
         return self.cache.put(name, stamp_ns, arrival_ns, reading)
@@ -298,11 +300,9 @@ class Middleware:
     def view(self, now_ns: int) -> RobotView:
         """Returns the view of the robot at a time; NaN ranges before the first scan."""
         scan, newest_ns = self.cache.newest.get(SCAN), self.newest_ns
-        sensed = {
-            name: self.cache.newest[name].value
-            if name in self.cache.newest
-            else np.full(size, np.nan, np.float32)
-            for name, size in self._sizes.items()
+        sensed = unread(self._sensors)
+        sensed |= {
+            name: self.cache.newest[name].value for name in sensed if name in self.cache.newest
         }
         return RobotView(
             *self.estimator.at(now_ns),

@@ -149,10 +149,10 @@ def scan(lidar: LidarSpec, content: bytes) -> inputs.Scan:
     return inputs.Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
 
 
-def reading(sensor: Sensor, content: bytes) -> inputs.Reading:
+def reading(sensor: Sensor, content: bytes) -> inputs.SensorReading:
     """Reads a serialised message of a further sensor."""
     points = sensor.points(sensor_from_ros(sensor, content))
-    return inputs.Reading(wire.stamp_of(content), sensor.name, points)
+    return inputs.SensorReading(wire.stamp_of(content), sensor.name, points)
 
 
 def odometry(content: bytes) -> inputs.Odometry:

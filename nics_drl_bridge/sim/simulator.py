@@ -15,7 +15,7 @@ from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.lidar.bake import with_shapes
 from nics_drl_bridge.lidar.exact_kernels import SHAPE
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
-from nics_drl_bridge.lidar.sensor import Readings, Render, SensedWorlds
+from nics_drl_bridge.lidar.sensor import Render, SensedWorlds, unread
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -198,10 +198,7 @@ class FastSimulator:
         self._scanner = Scanner(model.lidar, table, renderer, world.grid)
         self._sizes = Sizes(worlds, robots, self.sampler.count, delay, longest_age)
         self.data = allocate(model, self._sizes)
-        self.readings: dict[str, Readings] = {
-            sensor.name: np.full((worlds, robots, sensor.size), np.nan, np.float32)
-            for sensor in model.sensors
-        }
+        self.readings = unread(model.sensors, worlds, robots)
         self.parts = split(worlds, threads)
         self._boxes = {
             part.start: CommandBox(model.kinematics, model.robot, tell) for part in self.parts

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nics_drl_bridge.gate.inputs import Reading
+from nics_drl_bridge.gate.inputs import SensorReading
 
 from .rig import Rig, config
 from .test_shield import CAR, FAR
@@ -22,7 +22,7 @@ class Backed(Rig):
     def send(self, without: str = ""):
         super().send(without)
         if "rear" not in without:
-            self.give(Reading(self.stamp, "rear", np.array([[-self.behind, 0.0]])))
+            self.give(SensorReading(self.stamp, "rear", np.array([[-self.behind, 0.0]])))
 
 
 def test_it_has_to_be_fresh_before_the_gate_is_armed():
@@ -54,7 +54,7 @@ def test_what_it_shows_behind_keeps_the_robot_from_backing_into_it():
 
 def test_its_jump_in_time_latches():
     rig = Backed(wish=(0.5, 0.0, 0.0)).drive()
-    rig.give(Reading(rig.stamp - 10**10, "rear", np.zeros((0, 2))))
+    rig.give(SensorReading(rig.stamp - 10**10, "rear", np.zeros((0, 2))))
     assert (rig.rule, rig.decision.cause.topic) == ("stamps_jumped", "rear")
     rig.run(1.0)
     assert rig.state.latched is not None
@@ -67,4 +67,4 @@ def test_its_jump_in_time_latches():
 def test_what_is_malformed_is_refused(name, points, reason):
     rig = Backed()
     rig.run(0.2)
-    assert reason in rig.give(Reading(rig.stamp + 1, name, np.array(points))).refused
+    assert reason in rig.give(SensorReading(rig.stamp + 1, name, np.array(points))).refused
