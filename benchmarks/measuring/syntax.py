@@ -185,7 +185,7 @@ def _functions(modules: list[Module], places: Places) -> dict[str, int]:
     worst = {"max_arguments": 0, "max_body": 0}
     for module in modules:
         for function in functions(module):
-            commands = ".commands." in module.name
+            commands = ".commands." in module.name or module.name.endswith(".command")
             for figure, size in (
                 ("max_arguments", 0 if commands else arguments(function)),
                 ("max_body", body(function)),

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
@@ -12,6 +14,14 @@ from nics_drl_bridge.lidar.exact_kernels import Beams
 
 EDGE = 1e-6
 """Ranges at an edge are taken this far inside it, as a share of the whole width."""
+
+
+class Incidence(NamedTuple):
+    """Of P rays: range to the nearest edge [m], cosine of the incidence there, and scratch."""
+
+    nearest: NDArray[np.float32]
+    cosines: NDArray[np.float32]
+    before: NDArray[np.float32]
 
 
 @kernel(allocates=True)
@@ -137,7 +147,7 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
 @kernel
 def _circle(scan, beams, x, radius):  # type: ignore[no-untyped-def]
     """Cosines on a circle straight ahead, whose normal is the direction from its centre."""
-    nearest, cosines, _ = scan
+    nearest, cosines = scan.nearest, scan.cosines
     exact_kernels.circle(nearest, beams, x, 0.0, radius, np.inf)
     for i in range(nearest.shape[0]):
         if nearest[i] < np.inf:
@@ -148,7 +158,7 @@ def _circle(scan, beams, x, radius):  # type: ignore[no-untyped-def]
 @kernel
 def _segment(scan, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
     """Cosines on a segment where it is nearest: the distance of its line over the range."""
-    nearest, cosines, before = scan
+    nearest, cosines, before = scan.nearest, scan.cosines, scan.before
     for i in range(nearest.shape[0]):
         before[i] = nearest[i]
     exact_kernels.segment(nearest, beams, x1, y1, x2, y2)
@@ -165,16 +175,16 @@ def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[n
     directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
     beams, count = Beams(directions, angles[0], step, False), len(angles)
     nearest, before = np.full(count, np.inf, np.float32), np.empty(count, np.float32)
-    scan = (nearest, np.zeros(count, np.float32), before)
+    scan = Incidence(nearest, np.zeros(count, np.float32), before)
     if corners.shape[0] == 0:
         _circle(scan, beams, distance, radius)
-        return scan[1]
+        return scan.cosines
     ax, ay = exact_kernels.turned(distance, 0.0, c, s, corners[corners.shape[0] - 1])
     for v in range(corners.shape[0]):
         bx, by = exact_kernels.turned(distance, 0.0, c, s, corners[v])
         _segment(scan, beams, ax, ay, bx, by)
         ax, ay = bx, by
-    return scan[1]
+    return scan.cosines
 
 
 @kernel(allocates=True)
