@@ -178,8 +178,9 @@ KINDS: dict[str, type] = {
     for kind in (
         inputs.Scan, inputs.SensorReading, inputs.Odometry, inputs.Estimate, inputs.Command,
         inputs.EStop, inputs.Press, inputs.Arm, inputs.Reset, inputs.Tick, limits.Limits,
-        state.ShieldConfig, state.GateConfig, state.Cause, state.Arrivals, state.Sameness, state.Push,
-        state.View, state.EStopState, state.SensorState, state.GateState, state.Decision,
+        state.ShieldConfig, state.GateConfig, state.Cause, state.Arrivals, state.Sameness,
+        state.Push, state.View, state.EStopState, state.SensorState, state.GateState,
+        state.Decision,
     )
 }  # fmt: skip
 
