@@ -16,15 +16,10 @@ EDGE = 1e-6
 
 @kernel(allocates=True)
 def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[no-untyped-def]
-    """Computes the outermost directions of a shape straight ahead, and their corners.
+    """Writes the right and left edge [rad] of a shape straight ahead, and the corners there.
 
-    Args:
-        hull: (V, 2) corners of its convex hull [m]; unused for a circle.
-        radius: of a circle [m], 0 for another shape.
-        distances: (D,) of its origin [m].
-        turns: (T,) rotations of the shape [rad].
-        edges: (T, D, 2) result: right and left edge [rad].
-        hints: (T, D, 2) result: index of the corner at each.
+    Both results are (T, D, 2), for rotations (T,) [rad] and distances (D,) [m] of its origin. The
+    convex hull is (V, 2) [m], unused for a circle; `radius` [m] is 0 for any other shape.
     """
     for t in range(turns.shape[0]):
         c, s = math.cos(turns[t]), math.sin(turns[t])
@@ -66,16 +61,10 @@ def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untype
 
 @kernel(allocates=True)
 def row(fine, beams, corners, radius, distance, cos, sin, edge):  # type: ignore[no-untyped-def]
-    """Ranges (P,) of a shape straight ahead, continued beyond its edges.
+    """Writes ranges (P,) [m] of a shape straight ahead, continued beyond its edges (2,) [rad].
 
-    Args:
-        fine: (P,) result [m].
-        beams: of the P points.
-        corners: (V, 2) of its outline, none for a circle [m].
-        radius: of a circle [m].
-        distance: of its origin [m].
-        cos, sin: of its rotation.
-        edge: (2,) right and left edge [rad].
+    The outline has corners (V, 2) [m], none for a circle of a radius [m]; its origin is at a
+    distance [m], and it is turned by (cos, sin).
     """
     fine[:] = np.inf
     if corners.shape[0] == 0:
@@ -107,18 +96,11 @@ def into_phases(rows, fine, width, phases):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
-    """Computes all rows of one rotation.
+    """Writes the rows of one rotation [rad] into the table's ranges (R,) float32 [m].
 
-    Args:
-        rows: (R,) float32 result: the table's ranges [m].
-        layout: (3, D) index in `rows` of the begin of each row, its first beam relative to the
-            bearing, and its width in beams.
-        shape: corners and radius, see `row`.
-        distances: (D,) [m].
-        turn: rotation [rad].
-        edges: (D, 2) [rad].
-        step: angle between beams [rad].
-        phases: points per beam.
+    The layout (3, D) is the begin of the row of each distance, its first beam relative to the
+    bearing, and its width in beams. `shape` are corners and radius, see `row`; edges are (D, 2),
+    beams a `step` apart [rad], with so many phases (points) each.
     """
     c, s = math.cos(turn), math.sin(turn)
     corners, radius = shape
@@ -179,13 +161,9 @@ def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[n
 
 @kernel(allocates=True)
 def cosines_of_turn(cosines, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
-    """Computes the cosine of the incidence at every point of the rows of one rotation.
+    """Writes the cosine (R,) of the incidence at every point of one rotation, see `rows_of_turn`.
 
     Beyond the edges of the shape it is that at the edge, as for the ranges.
-
-    Args:
-        cosines: (R,) float32 result, laid out as the ranges.
-        layout, shape, distances, turn, edges, step, phases: see `rows_of_turn`.
     """
     c, s = math.cos(turn), math.sin(turn)
     corners, radius = shape
