@@ -171,11 +171,8 @@ def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None
     """Makes a policy by name.
 
     The name is a key of `POLICIES`, a shipped policy file, or the path of a policy file, which is
-    checked against the task and the model of the robot.
-
-    Raises:
-        ConfigError: an unknown name; suggests the nearest.
-        PolicyError: the file can't be used, or does not fit; names the field.
+    checked against the task and the model of the robot. Raises ConfigError for an unknown name,
+    PolicyError, with the field, if the file can't be used or does not fit.
     """
     if not is_policy_file(name):
         return POLICIES[name](task)

@@ -91,20 +91,12 @@ def export_policy(
     normaliser: Normaliser | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> PolicyFile:
-    """Writes a trained model as a policy file, and loads it as a robot would.
+    """Writes a trained model (see `actor_of`) as a policy file, and loads it as a robot would.
 
-    Args:
-        model: see `actor_of`.
-        task: the task that it was trained on.
-        simulator_model: the model that it was trained in.
-        path: of the file, `*.onnx`.
-        normaliser: mean (O,), standard deviation (O,) and limit of the normalised observations;
-            None if the model has its own.
-        provenance: command, seed and so on, as strings and numbers.
-
-    Raises:
-        ConfigError: the model can't be exported.
-        PolicyError: the file does not reproduce the model's outputs.
+    Task and simulator model are those of its training. The normaliser is the mean (O,), standard
+    deviation (O,) and limit of the normalised observations; None if the model has its own. The
+    provenance is command, seed and so on, as strings and numbers. Raises ConfigError if the model
+    can't be exported, PolicyError if the file does not reproduce its outputs.
     """
     file = Path(path)
     if file.suffix != SUFFIX:
@@ -112,9 +104,8 @@ def export_policy(
     deployed = Deployed(actor_of(model), task, normaliser).eval().cpu()
     graph = _graph(deployed, task)
     golden = _golden(deployed, graph, task, str(file))
-    text = contract_of(
-        task, simulator_model, golden, onnx_graph.graph_hash(graph), provenance or {}
-    )
+    sha256 = onnx_graph.graph_hash(graph)
+    text = contract_of(task, simulator_model, golden, sha256, provenance or {})
     onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
     data = onnx_graph.sealed(graph.SerializeToString(deterministic=True))
     policy = policy_of(data, file)
