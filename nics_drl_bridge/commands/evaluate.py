@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -94,27 +95,19 @@ def evaluate(
         elif hardware:
             from nics_drl_bridge.commands.vehicle import VehicleOrder
 
-            _hardware(
-                VehicleOrder(
-                    policies[0],
-                    out,
-                    model,
-                    world,
-                    episodes or 1,
-                    seed,
-                    start,
-                    place,
-                    namespace,
-                    pose_type,
-                    arm,
-                ),
-                yes,
-            )
+            trip = VehicleOrder(
+                policies[0], out, model, world, episodes or 1, seed, start, place, namespace,
+                pose_type, arm,
+            )  # fmt: skip
+            _hardware(trip, yes)
         else:
             from nics_drl_bridge.commands.episodes import EvaluationOrder
+            from nics_drl_bridge.commands.episodes import evaluate as drive
 
             chosen = {"places": tuple(dict.fromkeys(places))} if places else {}
-            _evaluate(EvaluationOrder(policies, out, model, world, episodes or 20, seed, **chosen))
+            order = EvaluationOrder(policies, out, model, world, episodes or 20, seed, **chosen)
+            with progress_bar() as tell:
+                _print_evaluated(drive(order, partial(typer.echo, err=True), tell), out)
 
 
 def _point(text: str | None) -> tuple[float, float] | None:
@@ -127,13 +120,6 @@ def _point(text: str | None) -> tuple[float, float] | None:
     except ValueError:
         pass
     raise ConfigError(f"--goal {text!r}: must be X,Y in metres, as 2.5,-1.")
-
-
-def _evaluate(order: Any) -> None:
-    from nics_drl_bridge.commands.episodes import evaluate
-
-    with progress_bar() as tell:
-        _print_evaluated(evaluate(order, lambda line: typer.echo(line, err=True), tell), order.out)
 
 
 def _shadow(
@@ -154,24 +140,18 @@ def _shadow(
         place, differences = out / f"shadow_{Path(policy).stem}", made.differences()
         write_bytes(place.with_suffix(".png"), shadow_picture(made))
         data = {
-            "bag": str(bag),
-            "policy": policy,
-            "model": name,
-            "goal": goal,
-            "ahead_s": None if goal else ahead,
-            "compared": len(made.time),
-            "skipped": dict(made.skipped),
-            "commands": differences,
-        }
+            "bag": str(bag), "policy": policy, "model": name, "goal": goal,
+            "ahead_s": None if goal else ahead, "compared": len(made.time),
+            "skipped": dict(made.skipped), "commands": differences,
+        }  # fmt: skip
         write_text(place.with_suffix(".json"), json.dumps(data) + "\n")
         for (command, figures), unit in zip(differences.items(), made.units, strict=True):
             *amounts, opposite = figures.values()
             cells = (f"{value:.3g}" for value in amounts)
             rows.append((policy, command, unit, *cells, f"{100 * opposite:.1f} %"))
+        compared = f"{policy}: compared at {len(made.time)} times"
         left_out = ", ".join(f"{count} {why}" for why, count in made.skipped.items() if count)
-        lines.append(
-            f"{policy}: compared at {len(made.time)} times; left out: {left_out or 'none'}"
-        )
+        lines.append(f"{compared}; left out: {left_out or 'none'}")
     heads = (
         "policy", "command", "unit", "mean", "mean size", *(f"{q} %" for q in PERCENTILES),
         "greatest", "opposite sign",
@@ -188,7 +168,7 @@ def _hardware(order: Any, yes: bool) -> None:
             typer.prompt("Enter when ready", default="", show_default=False)
 
     with needs_ros("nics evaluate --hardware"):
-        made = drive_vehicle(order, lambda line: typer.echo(line, err=True), ask)
+        made = drive_vehicle(order, partial(typer.echo, err=True), ask)
     _print_evaluated([made], order.out)
 
 
