@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import astuple, dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -45,6 +45,7 @@ START_S, ARRIVE_S = 60.0, 40.0  # time that a node may take to start, and the ro
 FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05
 """Limits of the demo's gate: time from zero to the maximum command, and to its maximum rate."""
 PANELS = 9  # maximum number of episodes that are drawn
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -99,26 +100,20 @@ def run(plan: DemoPlan, say: Say) -> str:
         raise ConfigError(f"the demo {MISSING_ROS.format(module='rclpy')}")
     took: dict[str, float] = {}
 
-    @contextmanager
-    def part(name: str) -> Iterator[None]:
+    def timed(name: str, part: Callable[..., R], *arguments: Any) -> R:
         begin = time.perf_counter()
-        yield
+        result = part(plan, *arguments, say)
         took[name] = time.perf_counter() - begin
         say(f"  {name} took {took[name]:.0f} s")
+        return result
 
-    with part("generating"):
-        model, identified = _generate(plan, say)
-    with part("learning"):
-        learned = learn(plan, model, say)
-    with part("evaluating"):
-        summary = _evaluate(plan, model, learned.policy, say)
-    with part("driving in process"):
-        here = _drive(FAST, f"driving {plan.episodes} episodes", plan, learned.policy, say)
-    with part("driving over DDS"):
-        there = _drive(DDS, f"driving the same {plan.episodes} episodes", plan, learned.policy, say)
-    with part("deploying"):
-        arrived = (episode.seed for episode in there if episode.result == "success")
-        live = _deploy(plan, model, learned.policy, next(arrived, 0), say)
+    model, identified = timed("generating", _generate)
+    learned = timed("learning", learn, model)
+    summary = timed("evaluating", _evaluate, model, learned.policy)
+    here = timed("driving in process", _drive, FAST, learned.policy)
+    there = timed("driving over DDS", _drive, DDS, learned.policy)
+    arrived = (episode.seed for episode in there if episode.result == "success")
+    live = timed("deploying", _deploy, model, learned.policy, next(arrived, 0))
     results = DemoResults(model, identified, learned, summary, here, there, live, took)
     file = plan.out / "report.html"
     write_text(file, report(plan, results))
@@ -214,12 +209,14 @@ def _evaluate(plan: DemoPlan, model: SimulatorModel, name: str, say: Say) -> Sum
     return summary
 
 
-def _drive(place: str, what: str, plan: DemoPlan, policy: str, say: Say) -> list[Episode]:
+def _drive(plan: DemoPlan, place: str, policy: str, say: Say) -> list[Episode]:
     """Drives the plan's episodes in one of `episodes.PLACES` and reports each."""
-    say(f"{what} {'in process' if place == FAST else 'over DDS in lock-step'}")
+    where = "in process" if place == FAST else "over DDS in lock-step"
+    say(f"driving {'' if place == FAST else 'the same '}{plan.episodes} episodes {where}")
+    seeds, logs = range(plan.episodes), plan.out / "logs" / place
     return drive_in(
         place,
-        Trial(policy, str(plan.model), plan.world, range(plan.episodes), plan.out / "logs" / place),
+        Trial(policy, str(plan.model), plan.world, seeds, logs),
         lambda e: say(f"  seed {e.seed}: {e.result}, {e.steps} steps, {e.length:.2f} m"),
         say,
     )

@@ -23,16 +23,14 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import MOST_WIDE, Density, LidarTable, padding
 
 Array = NDArray[np.float64]
-TOUCHING = 1e-6
-"""Excess of the nearest grid distance over the radius, as a share of the radius."""
+TOUCHING = 1e-6  # excess of the nearest grid distance over the radius, as a share of the radius
 COARSE = np.radians(2.0)
 """Shapes are evaluated between grid rotations in steps of at most half of this [rad]."""
 MOST_NUMBERS = 2**31 - 2**20
 FIRST_BEAM = -(2**15)  # least first beam of a row, relative to the bearing
 MISS = 0.02
 """An edge that two corners would miss by more than this [beams] is found by climbing the hull."""
-Progress = Callable[[int, int], None]
-"""Called with the number of rotations done and their total."""
+Progress = Callable[[int, int], None]  # called with the number of rotations done and their total
 
 
 @dataclass(frozen=True)

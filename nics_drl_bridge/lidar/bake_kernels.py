@@ -10,8 +10,7 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
 from nics_drl_bridge.lidar.exact_kernels import Beams
 
-EDGE = 1e-6
-"""Ranges at an edge are taken this far inside it, as a share of the whole width."""
+EDGE = 1e-6  # ranges at an edge are taken this far inside it, as a share of the whole width
 
 
 @kernel(allocates=True)
@@ -116,47 +115,35 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
         into_phases(rows[start : start + points], fine, width, phases)
 
 
-@kernel
-def _circle(scan, beams, x, radius):  # type: ignore[no-untyped-def]
-    """Cosines on a circle straight ahead, whose normal is the direction from its centre."""
-    nearest, cosines, _ = scan
-    exact_kernels.circle(nearest, beams, x, 0.0, radius, np.inf)
-    for i in range(nearest.shape[0]):
-        if nearest[i] < np.inf:
-            cosine = abs((nearest[i] - beams.directions[i, 0] * x) / radius)
-            cosines[i] = min(cosine, 1.0)
-
-
-@kernel
-def _segment(scan, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
-    """Cosines on a segment where it is nearest: the distance of its line over the range."""
-    nearest, cosines, before = scan
-    for i in range(nearest.shape[0]):
-        before[i] = nearest[i]
-    exact_kernels.segment(nearest, beams, x1, y1, x2, y2)
-    ex, ey = x2 - x1, y2 - y1
-    away = np.float32(abs(x1 * ey - y1 * ex) / math.sqrt(ex * ex + ey * ey))
-    for i in range(nearest.shape[0]):
-        if nearest[i] < before[i]:
-            cosines[i] = min(away / nearest[i], np.float32(1.0))
-
-
 @kernel(allocates=True)
 def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[no-untyped-def]
-    """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it."""
+    """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it.
+
+    The normal of a circle is the direction from its centre; the cosine on a segment, where it is
+    nearest, is the distance of its line over the range.
+    """
     directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
     beams, count = Beams(directions, angles[0], step, False), len(angles)
-    nearest, before = np.full(count, np.inf, np.float32), np.empty(count, np.float32)
-    scan = (nearest, np.zeros(count, np.float32), before)
+    nearest, cosines = np.full(count, np.inf, np.float32), np.zeros(count, np.float32)
     if corners.shape[0] == 0:
-        _circle(scan, beams, distance, radius)
-        return scan[1]
+        exact_kernels.circle(nearest, beams, distance, 0.0, radius, np.inf)
+        for i in range(count):
+            if nearest[i] < np.inf:
+                cosine = abs((nearest[i] - directions[i, 0] * distance) / radius)
+                cosines[i] = min(cosine, 1.0)
+        return cosines
     ax, ay = exact_kernels.turned(distance, 0.0, c, s, corners[corners.shape[0] - 1])
     for v in range(corners.shape[0]):
         bx, by = exact_kernels.turned(distance, 0.0, c, s, corners[v])
-        _segment(scan, beams, ax, ay, bx, by)
+        before = nearest.copy()
+        exact_kernels.segment(nearest, beams, ax, ay, bx, by)
+        ex, ey = bx - ax, by - ay
+        away = np.float32(abs(ax * ey - ay * ex) / math.sqrt(ex * ex + ey * ey))
+        for i in range(count):
+            if nearest[i] < before[i]:
+                cosines[i] = min(away / nearest[i], np.float32(1.0))
         ax, ay = bx, by
-    return scan[1]
+    return cosines
 
 
 @kernel(allocates=True)

@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 from nics_drl_bridge.kernels import kernel
 
 TWO_PI = 2.0 * math.pi
-ROUNDING = 1e-6
-"""Beams this near to an edge, in beams, are candidates; the exact test decides."""
+ROUNDING = 1e-6  # beams this near to an edge, in beams, are candidates; the exact test decides
 HALF_PI = 0.5 * math.pi
-TINY = 1e-300
-"""Avoids NaN for the angle of a zero vector."""
+TINY = 1e-300  # avoids NaN for the angle of a zero vector
 ATAN = (
     0.9999999996145, -0.3333332366563, 0.1999959585417, -0.1427904841688, 0.1105378475317,
     -0.0879611755717, 0.0671011398839, -0.0442736682632, 0.0222034549106, -0.0071661648959,

@@ -19,8 +19,7 @@ from nics_drl_bridge.config import Schema, load_yaml
 Ranges = NDArray[np.float32]
 Function = Callable[[Ranges, NDArray[np.float64]], Ranges]
 """Ranges (P,) [m] and angles of incidence (P,) [rad] to the ranges that the device reports."""
-NEAREST = 1e-3
-"""A surface nearer than this is as bright as one at this range [m]."""
+NEAREST = 1e-3  # a surface nearer than this is as bright as one at this range [m]
 
 
 class IncidenceDropout(Schema):

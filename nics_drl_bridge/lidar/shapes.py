@@ -20,8 +20,7 @@ MOST_CORNERS = 16_384
 MOST_SHAPES = 1_000  # in one file, or in one group of obstacles
 SMALLEST, LARGEST = 1e-6, 1e4
 """Extent of a shape [m]: anything smaller is invisible, anything larger does not fit in a world."""
-SAME_PLACE = 1e-9
-"""Corners within this distance, as a share of the shape's radius, coincide."""
+SAME_PLACE = 1e-9  # corners within this distance, as a share of the shape's radius, coincide
 FARTHEST = 1e8  # greatest coordinate in a map [m], enough for UTM
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 Heading = Annotated[float, Field(ge=-1000.0, le=1000.0)]

@@ -30,8 +30,7 @@ TABLE_FILES = (ABOUT_FILE, *(f"{name}.npy" for name in ARRAYS))
 POINT_ANGLE = 0.01
 """Greatest default angle between the points of a row, as far as `MOST_PHASES` allows [rad]."""
 MOST_PHASES = 8
-MOST_WIDE = 0xFFFF
-"""Greatest number of beams in a row."""
+MOST_WIDE = 0xFFFF  # greatest number of beams in a row
 
 
 class Density(Schema):

@@ -22,8 +22,7 @@ from nics_drl_bridge.seeds import checked_seeds
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-Act = Callable[[NDArray[np.float32]], NDArray[Any]]
-"""Actions (N, C) for observations (N, O)."""
+Act = Callable[[NDArray[np.float32]], NDArray[Any]]  # actions (N, C) for observations (N, O)
 
 FIRST_SEED = 1_000_000  # first seed of an evaluation, far from the seeds of any training
 DRIFT_M = 0.1  # a robot stops where it believes its goal is; odometry may have drifted by this much
