@@ -102,8 +102,6 @@ class SimulatorModel:
 
 
 class _File(Schema):
-    """The keys of `model.yaml`."""
-
     format: str
     control_period: float = Field(gt=0.0)
     robot: RobotSpec

@@ -65,10 +65,8 @@ def bake(
     cells = np.concatenate([np.zeros((0, 6), np.int64), *(g.cell.reshape(-1, 6) for g in grids)])
     sizes = cells[:, 1] * density.phases
     if sizes.sum() > MOST_NUMBERS:
-        raise ConfigError(
-            f"a lidar table of {len(cells)} cells with {spec.beams} beams is too large; lower "
-            "`distances`, `rotations` or `phases`."
-        )
+        size = f"a lidar table of {len(cells)} cells with {spec.beams} beams"
+        raise ConfigError(f"{size} is too large; lower `distances`, `rotations` or `phases`.")
     first = np.cumsum([0, *(len(g.turns) * density.distances for g in grids)])
     about = [(g.distances[-1], len(g.turns), f) for g, f in zip(grids, first, strict=False)]
     table = LidarTable(
@@ -122,10 +120,8 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
             far_off[:, 0] = True  # near contact, the rim of a cell does not bound its interior
             cell[..., 2 + 2 * side : 4 + 2 * side] = np.where(far_off[..., None], climb, two)
     if cell[..., 1].max() > MOST_WIDE or cell[..., 0].min() < FIRST_BEAM:
-        raise ConfigError(
-            f"{describe(shape)} covers too many beams to be baked, as they are "
-            f"{spec.angle_increment:.2g} rad apart; scan with the renderer `exact`."
-        )
+        apart = f"{spec.angle_increment:.2g} rad apart; scan with the renderer `exact`."
+        raise ConfigError(f"{describe(shape)} covers too many beams to be baked: they are {apart}")
     return Grid(distances, np.arange(count) * unit, edges[parts // 2 :: parts], cell)
 
 
@@ -234,10 +230,10 @@ def apply_model(
     ends = table.start + table.widths * phases
     if callable(model):
         for begin, end in zip(table.start, ends, strict=True):
-            part, cosine = (
+            row, cosine = (
                 a[begin:end].reshape(phases, -1).T.ravel() for a in (table.rows, cosines)
             )
-            changed = model(part, np.arccos(cosine.astype(np.float64)))
+            changed = model(row, np.arccos(cosine.astype(np.float64)))
             table.rows[begin:end] = np.asarray(changed, np.float32).reshape(-1, phases).T.ravel()
         return table
     bounds = np.append(table.grid[:, 2].astype(np.int64), len(ends))

@@ -20,6 +20,7 @@ from scipy import ndimage
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.shapes import Coordinate, Heading
 
@@ -63,11 +64,8 @@ class GridMap:
 
     def world_to_cell(self, points: ArrayLike) -> NDArray[np.int64]:
         """Returns row and column (..., 2) of points (..., 2) x, y [m]; may be outside the map."""
-        x, y, heading = self.origin
-        d = np.asarray(points, dtype=np.float64) - (x, y)
-        c, s = np.cos(heading), np.sin(heading)
-        place = np.stack([c * d[..., 1] - s * d[..., 0], c * d[..., 0] + s * d[..., 1]], axis=-1)
-        return np.floor(place / self.resolution).astype(np.int64)
+        place = rotate(np.asarray(points, dtype=np.float64) - self.origin[:2], -self.origin[2])
+        return np.floor(place[..., ::-1] / self.resolution).astype(np.int64)
 
     def cell_to_world(self, cells: ArrayLike) -> NDArray[np.float64]:
         """Returns the centres (..., 2) x, y [m] of cells (..., 2) row, column."""

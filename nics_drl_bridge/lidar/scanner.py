@@ -60,21 +60,16 @@ class Scanner:
         if self.renderer == "exact" or not table.shapes:
             return
         if not table.has_rows:
-            raise ModelError(
-                f"the lidar table has no rows to look up with the renderer {self.renderer!r}; scan "
-                "with `exact`, or bake one."
-            )
+            reason = f"has no rows to look up with the renderer {self.renderer!r}"
+            raise ModelError(f"the lidar table {reason}; scan with `exact`, or bake one.")
+        bake_one = f"; bake one for the lidar {spec.name!r}."
         if not math.isclose(table.beam_angle, spec.angle_increment, rel_tol=1e-9):
-            raise ModelError(
-                f"the lidar table is for beams that are {table.beam_angle:.6g} rad apart, those of "
-                f"the lidar {spec.name!r} are {spec.angle_increment:.6g} rad; bake one for it."
-            )
+            apart = f"{table.beam_angle:.6g} rad apart, not {spec.angle_increment:.6g} rad"
+            raise ModelError(f"the lidar table is for beams that are {apart}{bake_one}")
         reach = float((table.grid[:, 0] - table.outlines.radii).min())
         if reach < spec.range_max * (1.0 - 1e-9):
-            raise ModelError(
-                f"the lidar table reaches {reach:g} m, the lidar {spec.name!r} {spec.range_max:g} "
-                "m; bake one for it."
-            )
+            reaches = f"reaches {reach:g} m, not {spec.range_max:g} m"
+            raise ModelError(f"the lidar table {reaches}{bake_one}")
 
     @cached_property
     def arguments(self) -> LidarArrays:
@@ -166,9 +161,8 @@ class Scanner:
             bodies = bodies[None]
         walls = np.atleast_2d(np.asarray(walls if np.size(walls) else NO_WALLS, dtype=np.float64))
         if poses.shape[1:] != (3,) or bodies.shape != (len(poses), bodies.shape[1], BODY):
-            raise ConfigError(
-                f"poses {poses.shape} and bodies {bodies.shape} must be (N, 3) and (N, K, {BODY})."
-            )
+            given = f"poses {poses.shape} and bodies {bodies.shape}"
+            raise ConfigError(f"{given} must be (N, 3) and (N, K, {BODY}).")
         if walls.shape != (len(walls), 4):
             raise ConfigError(f"walls {walls.shape} must be (W, 4).")
         index, known = bodies[..., SHAPE], len(self.table.shapes)

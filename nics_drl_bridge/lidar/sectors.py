@@ -152,15 +152,13 @@ def _beams_of(away: Array, half: float) -> tuple[int, int]:
 def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
     apart = lidar.angle_increment if lidar.beams > 1 else np.inf
     if apart > COARSEST_RAD:
-        raise ConfigError(
-            f"the beams of the lidar {lidar.name!r} are {np.degrees(apart):.3g} deg apart, a scan "
-            f"layout needs at most {np.degrees(COARSEST_RAD):.3g}; use a finer lidar."
-        )
+        found, most = np.degrees([apart, COARSEST_RAD])
+        reason = f"are {found:.3g} deg apart, a scan layout needs at most {most:.3g}"
+        raise ConfigError(f"the beams of the lidar {lidar.name!r} {reason}; use a finer lidar.")
     if lidar.range_max < layout.range_max * (1.0 - RANGE_TOLERANCE):
-        raise ConfigError(
-            f"range_max of the lidar {lidar.name!r} is {lidar.range_max:g} m, the scan layout "
-            f"needs {layout.range_max:g} m; use a lidar that sees farther, or another layout."
-        )
+        needed = f"{layout.range_max:g} m; use a lidar that sees farther, or another layout."
+        seen = f"range_max of the lidar {lidar.name!r} is {lidar.range_max:g} m"
+        raise ConfigError(f"{seen}, the scan layout needs {needed}")
     steps = max(layout.sectors, int(np.ceil((layout.angle_max - layout.angle_min) / apart)))
     wanted = np.linspace(layout.angle_min, layout.angle_max, steps + 1)
     ordered = np.sort(np.mod(angles, 2.0 * np.pi))
@@ -169,11 +167,10 @@ def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
     after = np.searchsorted(ordered, place).clip(1, len(ordered) - 1)
     gap = np.minimum(place - ordered[after - 1], ordered[after] - place)
     if (gap > apart + BORDER_RAD).any():
-        begin, end = np.degrees([angles[0], angles[-1]])
+        limits = np.degrees([angles[0], angles[-1], layout.angle_min, layout.angle_max])
         raise ConfigError(
-            f"the lidar {lidar.name!r} looks from {begin:.4g} to {end:.4g} deg in base_link, the "
-            f"scan layout needs {np.degrees(layout.angle_min):.4g} to "
-            f"{np.degrees(layout.angle_max):.4g}; use a wider lidar, or another layout."
+            "the lidar {!r} looks from {:.4g} to {:.4g} deg in base_link, the scan layout needs "
+            "{:.4g} to {:.4g}; use a wider lidar, or another layout.".format(lidar.name, *limits)
         )
 
 
@@ -200,10 +197,9 @@ def reader_of(header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool
     if upside_down:
         begin, step = -begin, -step
     if not (np.isfinite([begin, step]).all() and step != 0.0 and beams > 1):
-        raise ConfigError(
-            f"LaserScan of {beams} beams, angle_min {header.angle_min:g}, angle_increment "
-            f"{header.angle_increment:g}: describes no lidar; mend the driver's parameters."
-        )
+        angles = f"angle_min {header.angle_min:g}, angle_increment {header.angle_increment:g}"
+        reason = "describes no lidar; mend the driver's parameters."
+        raise ConfigError(f"LaserScan of {beams} beams, {angles}: {reason}")
     backwards = step < 0.0
     if backwards:
         begin, step = begin + step * (beams - 1), -step

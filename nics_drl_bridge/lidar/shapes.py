@@ -257,10 +257,9 @@ class Outlines:
         try:
             return self.shapes.index(shape)
         except ValueError:
-            raise ModelError(
-                f"the shape {describe(shape)} is not in the lidar table, which holds "
-                f"{', '.join(map(describe, self.shapes)) or 'none'}; bake it as well."
-            ) from None
+            held = ", ".join(map(describe, self.shapes)) or "none"
+            reason = f"is not in the lidar table, which holds {held}; bake it as well."
+            raise ModelError(f"the shape {describe(shape)} {reason}") from None
 
 
 def describe(shape: Shape) -> str:

@@ -193,9 +193,10 @@ class LidarTable:
             raise ModelError(f"{path}: is no JSON ({error}); generate the model anew.") from None
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise ModelError(f"{path}: its format is not {FORMAT!r}; generate the model anew.")
-        about = dict(validate(data, TableAbout, str(path)))
-        del about["format"]
-        table = cls(**about, **{name: _mapped(folder / f"{name}.npy") for name in ARRAYS})
+        parts: dict[str, Any] = dict(validate(data, TableAbout, str(path)))
+        parts |= {name: _mapped(folder / f"{name}.npy") for name in ARRAYS}
+        del parts["format"]
+        table = cls(**parts)
         try:
             table._check()
         except (ArithmeticError, IndexError, ValueError) as error:

@@ -213,8 +213,8 @@ def _drive_once(env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]) -> tup
         reward += np.where(running, gain, 0.0)
         steps += running
         ended = running & (terminated | truncated)
-        flags = (_robots(info, name) for name in ("collision", "true_collision"))
-        touched = np.logical_or(*(each.any(axis=1) for each in flags))
+        touched = _robots(info, "collision").any(axis=1)
+        touched = touched | _robots(info, "true_collision").any(axis=1)
         collision |= ended & touched
         arrived = _robots(info, "is_success").all(axis=1)
         if arrived.any() and "goal" in info:
@@ -289,7 +289,8 @@ def summarise(outcomes: Outcomes, control_period: float) -> Summary:
     count, arrived = len(outcomes.seeds), outcomes.success
     flags = arrived, outcomes.collision, outcomes.time_out
     length, time = outcomes.length[arrived], outcomes.steps[arrived] * control_period
-    return Summary(count, *(rate(int(one.sum()), count) for one in flags), mean(length), mean(time))
+    shares = (rate(int(one.sum()), count) for one in flags)
+    return Summary(count, *shares, *map(mean, (length, time)))
 
 
 @dataclass(frozen=True)

@@ -65,8 +65,6 @@ class Shadow:
 
 @dataclass
 class _Moment:
-    """A time at which the policy would act."""
-
     receive_ns: int
     stamp_ns: int
     view: RobotView
@@ -144,7 +142,6 @@ def _hold(moments: list[_Moment], held: tuple[int, Array] | None) -> None:
 
 
 def _goals(moments: list[_Moment], goal: ArrayLike | None, ahead_s: float) -> Array:
-    """(T, 2) goal of each moment."""
     if goal is not None:
         return np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
     times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS

@@ -133,10 +133,8 @@ def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
         raise ConfigError(f"{path}: does not say of which training it is; train anew.")
     for key, value in new["settings"].items():
         if (then := old["settings"].get(key)) != value:
-            raise ConfigError(
-                f"{path}: was trained with {key} {then!r}, not {value!r}; resume it with the same "
-                "settings, or train anew in another folder."
-            )
+            reason = f"was trained with {key} {then!r}, not {value!r}"
+            raise ConfigError(f"{path}: {reason}; resume it so, or train anew in another folder.")
     if old["seed"] != new["seed"]:
         raise ConfigError(f"{path}: is of seed {old['seed']}, not {new['seed']}; name that one.")
 

@@ -220,9 +220,11 @@ class Companion(BaseCallback):
         self._told = now
         taken = max(now - self._begin, 1e-9)
         successes = self.model.ep_success_buffer
-        rates = (float(np.mean(r)) if r else np.nan for r in (successes, self._collisions))
+        success, collision = (
+            float(np.mean(r)) if r else np.nan for r in (successes, self._collisions)
+        )
         progress = Progress(
-            self._seed, self.num_timesteps, self._total, *rates,
+            self._seed, self.num_timesteps, self._total, success, collision,
             (self.num_timesteps - self._first) / taken,
             (self._env.stepping_s - self._busy) / taken,
         )  # fmt: skip

@@ -78,9 +78,8 @@ def actor_of(model: Any) -> torch.nn.Module:
         return torch.nn.Sequential(*parts)
     if isinstance(policy, torch.nn.Module):
         return policy
-    raise ConfigError(
-        f"a {type(model).__name__} can't be exported; give a PPO, A2C or SAC, or a torch module."
-    )
+    known = "give a PPO, A2C or SAC, or a torch module."
+    raise ConfigError(f"a {type(model).__name__} can't be exported; {known}")
 
 
 def export_policy(
@@ -134,7 +133,6 @@ def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str
 
 
 def _graph(deployed: Deployed, task: Task) -> Any:
-    """Exports a module as a ModelProto."""
     example = torch.zeros(1, task.observation_space.shape[0])
     names, buffer = [onnx_graph.ACTION, onnx_graph.COMMAND], io.BytesIO()
     with warnings.catch_warnings():
