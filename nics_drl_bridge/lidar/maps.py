@@ -1,7 +1,4 @@
-"""GridMap: a static map of square cells, with the queries of lidar and simulator.
-
-Static maps from files, as Nav2's map_server reads them.
-"""
+"""Static maps of square cells, also from files as Nav2's map_server reads them."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -110,13 +107,12 @@ class GridMap:
         return np.asarray(labels == labels[row, column])
 
 
-__all__ = ["FREE", "NO_MAP", "OCCUPIED", "UNKNOWN", "GridMap", "MapFile", "load_map"]
-
 MAX_CELLS = 64_000_000
 MAX_BYTES = 4 * MAX_CELLS + 2**20  # of an image file; larger files are not opened
 FORMATS = {"PPM": (".pgm", ".pnm", ".ppm", ".pbm"), "PNG": (".png",), "BMP": (".bmp",)}
 LUMA = np.array([0.212656, 0.715158, 0.072186])
 """Luma weights of red, green, blue (Rec. 709), as used by ImageMagick for Nav2."""
+Mode = Literal["trinary", "scale", "raw"]
 
 
 class MapFile(Schema):
@@ -132,14 +128,13 @@ class MapFile(Schema):
     negate: bool  # 0 or 1; True if white is occupied, rather than black
     occupied_thresh: float = Field(ge=0.0, le=1.0)  # from this darkness on pixels are occupied
     free_thresh: float = Field(ge=0.0, le=1.0)  # up to this darkness they are free
-    mode: Literal["trinary", "scale", "raw"] = "trinary"
+    mode: Mode = "trinary"
 
     @field_validator("mode", mode="before")
     @classmethod
     def _known(cls, mode: object) -> object:
-        known = ("trinary", "scale", "raw")
-        if isinstance(mode, str) and mode not in known:
-            raise ValueError(f"unknown mode; {nearest(mode, known)}")
+        if isinstance(mode, str) and mode not in get_args(Mode):
+            raise ValueError(f"unknown mode; {nearest(mode, get_args(Mode))}")
         return mode
 
     @model_validator(mode="after")
@@ -156,10 +151,8 @@ def load_map(
 
     Cells equal those of Nav2's map_server: pixels exactly on a threshold are occupied or free,
     colours count by their brightness (Rec. 709) in 256 steps, and pixels that are not opaque are
-    unknown unless the mode is `raw`. (Older releases of Nav2 average red, green, blue, and alpha
-    into the darkness, and leave pixels exactly on a threshold unknown; grey maps without alpha
-    differ in the latter only.) Raises ConfigError if the YAML file or the image is missing, invalid
-    or too large.
+    unknown unless the mode is `raw`. Raises ConfigError if the YAML file or the image is missing,
+    invalid or too large.
     """
     path = find_config(name, "maps")
     file = load_yaml(path, MapFile)
