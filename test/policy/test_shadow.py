@@ -91,8 +91,8 @@ def test_another_policy_differs(recorded):
 
 def test_without_a_goal_it_is_where_the_robot_was_later(recorded):
     _, bag, _ = recorded
-    made = shadow(bag, builtin_model("ackermann"), "dynamic_window", {}, ahead_s=2.0)
-    ahead = round(2.0 / PERIOD)
+    made = shadow(bag, builtin_model("ackermann"), "dynamic_window", {}, ahead_s=1.0)
+    ahead = round(1.0 / PERIOD)
     assert made.goal[0] == pytest.approx(made.pose[ahead, :2], abs=1e-6)
 
 
