@@ -37,9 +37,7 @@ def evaluate(
         list[str] | None,
         Option("--in", help="fast, dds or mujoco_dds; several times; all by default."),
     ] = None,
-    episodes: Annotated[
-        int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")
-    ] = None,
+    episodes: Annotated[int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the first episode.")] = 1_000_000,
     out: Annotated[Path, Option(help="Folder for everything that is written.")] = Path(
         "runs/evaluate"
@@ -55,28 +53,18 @@ def evaluate(
         float,
         Option(help="For --shadow without --goal: the goal is where it was so much later."),
     ] = 4.0,
-    backend: Annotated[
-        str | None, Option(help="dds, with --hardware.", metavar="dds")
-    ] = None,
+    backend: Annotated[str | None, Option(help="dds, with --hardware.", metavar="dds")] = None,
     hardware: Annotated[
         bool, Option("--hardware", help="Drive the vehicle, through command_gate.")
     ] = False,
     start: Annotated[
         str, Option(help="For --hardware: wait until it stands there, or take the present.")
     ] = "wait",
-    goal: Annotated[
-        str | None, Option(metavar="X,Y", help="In map [m]; else that of the world.")
-    ] = None,
+    goal: Annotated[str | None, Option(metavar="X,Y", help="In map [m]; else the world's.")] = None,
     namespace: Annotated[str, Option(help="For --hardware: of the vehicle's topics.")] = "",
-    pose_type: Annotated[
-        str, Option(help="For --hardware: type of `pose`, a pose sensor in map.")
-    ] = "none",
-    yes: Annotated[
-        bool, Option("--yes", help="For --hardware: ask nothing before an episode.")
-    ] = False,
-    arm: Annotated[
-        bool, Option("--arm", help="For --hardware: arm command_gate before an episode.")
-    ] = False,
+    pose_type: Annotated[str, Option(help="For --hardware: type of `pose`, in map.")] = "none",
+    yes: Annotated[bool, Option("--yes", help="For --hardware: ask no questions.")] = False,
+    arm: Annotated[bool, Option("--arm", help="For --hardware: arm command_gate.")] = False,
 ) -> None:  # fmt: skip
     """Drives policies through the same episodes in several worlds, and compares."""
     with one_sentence():

@@ -70,14 +70,10 @@ def bake(
     first = np.cumsum([0, *(len(g.turns) * density.distances for g in grids)])
     about = [(g.distances[-1], len(g.turns), f) for g, f in zip(grids, first, strict=False)]
     table = LidarTable(
-        shapes,
-        density,
-        spec.angle_increment,
-        np.array(about, dtype=np.float64).reshape(-1, 3),
-        (np.cumsum(sizes) - sizes).astype(np.int32),
-        cells.astype(np.int16),
+        shapes, density, spec.angle_increment, np.array(about, dtype=np.float64).reshape(-1, 3),
+        (np.cumsum(sizes) - sizes).astype(np.int32), cells.astype(np.int16),
         np.zeros(int(sizes.sum()) + padding(spec.angle_increment), np.float32),
-    )
+    )  # fmt: skip
     _fill(bake_kernels.rows_of_turn, table.rows, table, grids, progress)
     model = spec.sensor_model if sensor_model is None else sensor_model
     return apply_model(table, grids, model) if callable(model) or model else table

@@ -79,12 +79,9 @@ class Scanner:
         return LidarArrays(
             np.array(spec.mount),
             Beams(directions, spec.angle_min, spec.angle_increment, spec.full_circle),
-            spec.range_min,
-            spec.range_max,
-            self._looked_up(),
-            table.outlines.arguments,
+            spec.range_min, spec.range_max, self._looked_up(), table.outlines.arguments,
             table.arrays,
-        )
+        )  # fmt: skip
 
     def _looked_up(self) -> Array:
         """(H, 2) squares of the distances between which a shape is looked up [m^2]."""

@@ -20,12 +20,7 @@ from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.geometry import wrap_angle
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.shapes import LARGEST, Place
-from nics_drl_bridge.lidar.spec import (
-    FULL_CIRCLE_TOLERANCE,
-    LidarSpec,
-    ScanHeader,
-    check_angles,
-)
+from nics_drl_bridge.lidar.spec import FULL_CIRCLE_TOLERANCE, LidarSpec, ScanHeader, check_angles
 
 Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
@@ -122,16 +117,10 @@ def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
     left_open = 2.0 * np.pi - (lidar.angles[-1] - lidar.angles[0])
     closed = left_open <= max(COARSEST_RAD, lidar.angle_increment)
     return SectorPlan(
-        first,
-        count,
-        np.stack([np.cos(angles), np.sin(angles)], axis=1),
-        np.array([x - layout.viewpoint[0], y - layout.viewpoint[1]]),
-        float(layout.angle_min),
-        float(layout.width),
-        float(lidar.range_min),
-        float(lidar.range_max),
-        bool(closed),
-    )
+        first, count, np.stack([np.cos(angles), np.sin(angles)], axis=1),
+        np.array([x - layout.viewpoint[0], y - layout.viewpoint[1]]), float(layout.angle_min),
+        float(layout.width), float(lidar.range_min), float(lidar.range_max), bool(closed),
+    )  # fmt: skip
 
 
 def _beams_of(away: Array, half: float) -> tuple[int, int]:

@@ -237,15 +237,13 @@ class Outlines:
         orders = [rotational_order(o, h) for o, h in zip(outlines, hulls, strict=True)]
         twice = [np.concatenate([hull, hull]) for hull in hulls]
         nothing = np.zeros((0, 2))
+        radii = np.array([shape.radius for shape in shapes], dtype=np.float64)
         return cls(
             tuple(shapes),
-            np.concatenate([nothing, *outlines]),
-            np.cumsum([0, *map(len, outlines)]),
-            np.concatenate([nothing, *twice]),
-            np.cumsum([0, *map(len, twice)]),
-            np.array([shape.radius for shape in shapes], dtype=np.float64),
-            np.array(orders, dtype=np.int64),
-        )
+            np.concatenate([nothing, *outlines]), np.cumsum([0, *map(len, outlines)]),
+            np.concatenate([nothing, *twice]), np.cumsum([0, *map(len, twice)]),
+            radii, np.array(orders, dtype=np.int64),
+        )  # fmt: skip
 
     @property
     def arguments(self) -> OutlineArrays:

@@ -71,8 +71,8 @@ def check_serves(settings: TrainingSettings, env: TrainVecEnv) -> None:
         raise ConfigError("algorithm 'sac' needs continuous actions; use 'ppo'.")
     size = settings.ppo.rollout * env.num_envs
     if settings.algorithm == "ppo" and settings.ppo.batch > size:
-        reason = f"is more than a rollout's {size}; lower it, or raise ppo.rollout or worlds."
-        raise ConfigError(f"ppo.batch {settings.ppo.batch}: {reason}")
+        batch = f"ppo.batch {settings.ppo.batch}: is more than the {size} transitions of a rollout"
+        raise ConfigError(f"{batch}; lower it, or raise ppo.rollout or worlds.")
 
 
 def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
