@@ -37,7 +37,7 @@ GREATEST_SEED = 2**32 - 1
 """Largest seed of numpy's global generator, from which Stable-Baselines3 draws."""
 LOG_EVERY = {"ppo": 1, "sac": 1000}
 """Roll-outs (PPO) or episodes (SAC) between two entries of TensorBoard."""
-Tell = Callable[[checkpoints.Progress], None]
+Tell = checkpoints.Tell
 
 
 @dataclass(frozen=True)
@@ -78,9 +78,7 @@ def train(
     algorithm.set_logger(configure(str(folder), ["tensorboard"]))
     busy = env.stepping_s
     save = partial(checkpoints.save_checkpoint, path, algorithm, env, about)
-    companion = checkpoints.Companion(
-        env, seed, settings.steps, settings.checkpoint_every, save, tell
-    )
+    companion = checkpoints.Companion(env, seed, settings, save, tell)
     left = settings.steps - algorithm.num_timesteps
     if left > 0:
         every = LOG_EVERY[settings.algorithm]

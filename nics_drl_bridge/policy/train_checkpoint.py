@@ -29,6 +29,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_sealed, sealed, write_bytes
 from nics_drl_bridge.policy.train_algorithms import RECENT
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
+from nics_drl_bridge.policy.training_settings import TrainingSettings
 
 FORMAT = "nics_drl_bridge/checkpoint/2"
 MOST_BYTES = 4 * 2**30  # maximum size of a file, which contains all of SAC's buffer
@@ -176,25 +177,23 @@ class Progress:
     env_share: float  # share of the wall time that went to the simulator
 
 
+Save = Callable[[], None]
+Tell = Callable[[Progress], None]
+
+
 class Companion(BaseCallback):
-    """Callback that monitors each step and roll-out of a training of `total` environment steps.
+    """Callback that monitors each step and roll-out of a training.
 
     It calls `tell` with the progress, and `save` about every `checkpoint_every` environment steps,
     between two roll-outs only.
     """
 
     def __init__(
-        self,
-        env: TrainVecEnv,
-        seed: int,
-        total: int,
-        checkpoint_every: int,
-        save: Callable[[], None],
-        tell: Callable[[Progress], None],
+        self, env: TrainVecEnv, seed: int, settings: TrainingSettings, save: Save, tell: Tell
     ) -> None:
         super().__init__()
-        self._env, self._seed, self._total = env, seed, total
-        self._every, self._save, self._tell = checkpoint_every, save, tell
+        self._env, self._seed, self._save, self._tell = env, seed, save, tell
+        self._total, self._every = settings.steps, settings.checkpoint_every
         self._collisions: deque[bool] = deque(maxlen=RECENT)
 
     def _on_training_start(self) -> None:
