@@ -35,43 +35,62 @@ def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-d
     A return stays within the limits, range_min and range_max [m]. `counter` is that of the scan:
     for equal seed and counter the result is bit-identical in any batch.
     """
-    std, proportional, step = faults[NOISE_STD], faults[NOISE_PROPORTIONAL], faults[QUANTISATION]
-    close, share, far = faults[TOO_CLOSE], faults[DROPOUT], faults[DROPOUT_FAR]
-    noisy, lossy = std > 0.0 or proportional > 0.0, share > 0.0 or far > 0.0
-    if not (noisy or lossy or step > 0.0 or close != AS_MINUS_INF):
-        return
+    if faults[TOO_CLOSE] != AS_MINUS_INF:
+        _too_close(ranges, limits, faults[TOO_CLOSE], seed, counter)
+    if faults[NOISE_STD] > 0.0 or faults[NOISE_PROPORTIONAL] > 0.0:
+        _noise(ranges, limits, faults[NOISE_STD], faults[NOISE_PROPORTIONAL], seed, counter)
+    if faults[QUANTISATION] > 0.0:
+        _quantise(ranges, limits, faults[QUANTISATION])
+    if faults[DROPOUT] > 0.0 or faults[DROPOUT_FAR] > 0.0:
+        _drop(ranges, limits, faults[DROPOUT], faults[DROPOUT_FAR], seed, counter)
+
+
+@kernel(allocates=True)
+def _too_close(ranges, limits, behaviour, seed, counter):  # type: ignore[no-untyped-def]
+    count = ranges.shape[0]
+    for i in range(count):
+        if ranges[i] != -np.inf:
+            continue
+        if behaviour == AS_RANGE_MIN:
+            ranges[i] = limits[0]
+        elif behaviour == AS_NO_RETURN:
+            ranges[i] = np.inf
+        else:
+            draw = random.uniform(seed, random.GHOST_STREAM, counter * count + i)
+            ranges[i] = limits[0] + draw * (limits[1] - limits[0])
+
+
+@kernel(allocates=True)
+def _noise(ranges, limits, std, proportional, seed, counter):  # type: ignore[no-untyped-def]
+    count = ranges.shape[0]
+    for i in range(count):
+        if np.isfinite(ranges[i]):
+            draw = random.normal(seed, random.RANGE_STREAM, counter * count + i)
+            noisy = ranges[i] + (std + proportional * ranges[i]) * draw
+            ranges[i] = min(max(noisy, limits[0]), limits[1])
+
+
+@kernel(allocates=True)
+def _quantise(ranges, limits, step):  # type: ignore[no-untyped-def]
     for i in range(ranges.shape[0]):
-        value, draw = ranges[i], counter * ranges.shape[0] + i
-        if close != AS_MINUS_INF and value == -np.inf:
-            value = np.float32(_replaced(close, limits, seed, draw))
-        if noisy and np.isfinite(value):
-            error = (std + proportional * value) * random.normal(seed, random.RANGE_STREAM, draw)
-            value = np.float32(min(max(value + error, limits[0]), limits[1]))
-        if step > 0.0 and np.isfinite(value):
-            value = np.float32(_quantised(value, limits, step))
-        if lossy and value < np.inf:
-            reach = max(value, 0.0) / limits[1]
-            lost = random.uniform(seed, random.DROPOUT_STREAM, draw) < share + far * reach * reach
-            value = np.float32(np.inf) if lost else value
-        ranges[i] = value
+        if np.isfinite(ranges[i]):
+            value = math.floor(ranges[i] / step + 0.5) * step
+            if value > limits[1] + ROUNDING:
+                value -= step
+            elif value < limits[0] - ROUNDING:
+                value += step
+            ranges[i] = value
 
 
 @kernel(allocates=True)
-def _replaced(behaviour, limits, seed, draw):  # type: ignore[no-untyped-def]
-    """Report for a return that is too close."""
-    if behaviour == AS_RANGE_MIN:
-        return limits[0]
-    if behaviour == AS_NO_RETURN:
-        return np.inf
-    return limits[0] + random.uniform(seed, random.GHOST_STREAM, draw) * (limits[1] - limits[0])
-
-
-@kernel(allocates=True)
-def _quantised(value, limits, step):  # type: ignore[no-untyped-def]
-    rounded = math.floor(value / step + 0.5) * step
-    if rounded > limits[1] + ROUNDING:
-        return rounded - step
-    return rounded + step if rounded < limits[0] - ROUNDING else rounded
+def _drop(ranges, limits, share, far, seed, counter):  # type: ignore[no-untyped-def]
+    count = ranges.shape[0]
+    for i in range(count):
+        if ranges[i] < np.inf:
+            reach = max(ranges[i], 0.0) / limits[1]
+            draw = random.uniform(seed, random.DROPOUT_STREAM, counter * count + i)
+            if draw < share + far * reach * reach:
+                ranges[i] = np.inf
 
 
 @kernel(allocates=True)
