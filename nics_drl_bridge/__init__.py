@@ -30,21 +30,10 @@ except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"
 
 __all__ = [
-    "FastSimulator",
-    "__version__",
-    "generate",
-    "load_model",
-    "load_policy",
-    "load_recording",
-    "load_robot",
-    "load_world",
-    "make",
-    "make_vec",
-    "open_model",
-    "read_recording",
-    "save_model",
+    "FastSimulator", "__version__", "generate", "load_model", "load_policy", "load_recording",
+    "load_robot", "load_world", "make", "make_vec", "open_model", "read_recording", "save_model",
     "save_recording",
-]
+]  # fmt: skip
 
 _HOMES = {
     "FastSimulator": "sim.simulator",

@@ -41,11 +41,7 @@ SchemaT = TypeVar("SchemaT", bound=BaseModel)
 
 
 def validate(data: dict[str, Any], schema: type[SchemaT], source: str) -> SchemaT:
-    """Checks the content of a file against a schema.
-
-    Raises:
-        ConfigError: the first error, with file, key, value and fix.
-    """
+    """Checks a file's content against a schema. Raises ConfigError with key, value and fix."""
     try:
         found = schema.model_validate(data)
     except ValidationError as error:
@@ -71,8 +67,7 @@ def _coerced_to_numbers(given: Any, found: Any, place: str = "") -> Iterator[tup
 
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 """Errors of pydantic about an unknown key, of a model and of a dataclass."""
-_SHORT = reprlib.Repr()
-"""Shortens a wrong value: one made of YAML aliases may not fit into memory in full."""
+_SHORT = reprlib.Repr()  # a value made of YAML aliases may not fit into memory in full
 _SHORT.maxstring = _SHORT.maxother = 80
 
 
@@ -125,11 +120,8 @@ def _annotations_of(model: Any) -> dict[Any, Any]:
 def _inner_models(annotation: Any) -> list[type]:
     if _annotations_of(annotation):
         return [annotation]
-    return [
-        model
-        for argument in getattr(annotation, "__args__", ())
-        for model in _inner_models(argument)
-    ]
+    arguments = getattr(annotation, "__args__", ())
+    return [model for argument in arguments for model in _inner_models(argument)]
 
 
 def no_device(path: Path) -> Path:
@@ -167,35 +159,27 @@ def load_yaml(path: str | Path, schema: type[SchemaT]) -> SchemaT:
 def share_folder() -> Path:
     """The folder that contains `config` and `launch`: the checkout, or `share/nics_drl_bridge`."""
     checkout, *others = Path(__file__).resolve().parents[1:]
-    if (checkout / "config" / "robots").is_dir():
-        return checkout
-    for parent in others:
-        installed = parent / "share" / PACKAGE
-        if (installed / "config").is_dir():
-            return installed
-    raise ConfigError(
-        "the package's config folder was not found; install the package with pip or colcon."
-    )
+    for folder in (checkout, *(parent / "share" / PACKAGE for parent in others)):
+        if (folder / "config" / "robots").is_dir():
+            return folder
+    raise ConfigError("the package's config folder was not found; install it with pip or colcon.")
 
 
 def find_config(name: str | Path, kind: str) -> Path:
     """Finds a configuration: `arena` for `config/KIND/arena.yaml`, or the path of a YAML file.
 
-    Raises:
-        ConfigError: no such configuration; names the nearest valid one.
+    Raises ConfigError if there is none of this name; suggests the nearest.
     """
     name = str(name)
     if name.endswith((".yaml", ".yml")):
         return Path(name)
     folder = share_folder() / "config" / kind
     path = folder / f"{name}.yaml"
-    if not path.is_file():
-        known = [file.stem for file in folder.glob("*.yaml")]
-        raise ConfigError(
-            f"unknown {kind.removesuffix('s')} {name!r}; {nearest(name, known)} "
-            "(or give the path of a YAML file)."
-        )
-    return path
+    if path.is_file():
+        return path
+    hint = nearest(name, (file.stem for file in folder.glob("*.yaml")))
+    unknown = f"unknown {kind.removesuffix('s')} {name!r}"
+    raise ConfigError(f"{unknown}; {hint} (or give the path of a YAML file).")
 
 
 class _PythonEvents(yaml.reader.Reader, yaml.scanner.Scanner, yaml.parser.Parser):
@@ -275,50 +259,41 @@ class _Dumper(yaml.SafeDumper):
     """Dumper that quotes text that either `_Loader` or YAML 1.1 would take for a number."""
 
 
+_TAG = "tag:yaml.org,2002:"
+_FLOAT = re.compile(
+    r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+)
 _Loader.yaml_implicit_resolvers = {
-    first: [
-        (tag, pattern) for tag, pattern in resolvers if tag.rsplit(":", 1)[-1] in ("null", "merge")
-    ]
-    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    first: [(tag, pattern) for tag, pattern in some if tag in (f"{_TAG}null", f"{_TAG}merge")]
+    for first, some in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")
-)
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:int", re.compile(r"^[-+]?(?:0|[1-9][0-9]*)$"), list("-+0123456789")
-)
-for _kind in (_Loader, _Dumper):
-    _kind.add_implicit_resolver(
-        "tag:yaml.org,2002:float",
-        re.compile(
-            r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
-            r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
-        ),
-        list("-+0123456789."),
-    )
+for _kind, _type, _pattern, _first in (
+    (_Loader, "bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), "tTfF"),
+    (_Loader, "int", re.compile(r"^[-+]?(?:0|[1-9][0-9]*)$"), "-+0123456789"),
+    (_Loader, "float", _FLOAT, "-+0123456789."),
+    (_Dumper, "float", _FLOAT, "-+0123456789."),
+):
+    _kind.add_implicit_resolver(_TAG + _type, _pattern, list(_first))
 
 
 def parse_yaml(text: str, source: str) -> dict[str, Any]:
     """Reads a YAML mapping; the source is the file's name.
 
-    Raises:
-        ConfigError: not YAML, a duplicate key, an empty file, no mapping at the top level, or more
-            than `MAX_BYTES`, `MAX_DEPTH` and `MAX_VALUES` allow.
+    Raises ConfigError if it is no YAML, has a duplicate key or no mapping at the top level, is
+    empty, or is more than `MAX_BYTES`, `MAX_DEPTH` and `MAX_VALUES` allow.
     """
     if len(text) > MAX_BYTES:
         reason = f"is larger than {MAX_BYTES // 2**20} MB; give a configuration instead."
         raise ConfigError(f"{source}: {reason}")
     try:
         data = _Loader(text).get_single_data()
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
+    except (yaml.YAMLError, ValueError) as error:
+        mark = getattr(error, "problem_mark", None)
         last = text.rstrip().count("\n")  # a mark may lie beyond the end
         line = f", line {min(mark.line, last) + 1}" if mark else ""
-        problem = shortened(error.problem or "not YAML", _LONGEST_PROBLEM)
-        raise ConfigError(f"{source}{line}: {problem}.") from None
-    except (yaml.YAMLError, ValueError) as error:
-        problem = shortened(" ".join(str(error).split()), _LONGEST_PROBLEM)
-        raise ConfigError(f"{source}: {problem}.") from None
+        problem = getattr(error, "problem", None) or " ".join(str(error).split())
+        raise ConfigError(f"{source}{line}: {shortened(problem, _LONGEST_PROBLEM)}.") from None
     if data is None:
         raise ConfigError(f"{source}: the file is empty; it must hold `key: value` lines.")
     if not isinstance(data, dict):

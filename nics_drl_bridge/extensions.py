@@ -20,12 +20,9 @@ from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
 PACKAGE = "nics_drl_bridge"
 ROS = ("rclpy", "_msgs", "std_srvs", "builtin_interfaces")
 INSTALL = {
-    "mcap": "bags",
-    "mujoco": "mujoco",
-    "ray": "train,distributed",
-    "rosbags": "bags",
+    "mcap": "bags", "mujoco": "mujoco", "ray": "train,distributed", "rosbags": "bags",
     "torch": "train",
-}
+}  # fmt: skip
 """Libraries, and the extra of this package that brings each."""
 
 

@@ -66,9 +66,8 @@ def check_folder(path: str | Path, marker: str) -> Path:
     if path.exists() and not path.is_dir():
         raise ConfigError(f"{path}: is a file, not a folder; give the name of a folder.")
     if path.is_dir() and any(path.iterdir()) and not (path / marker).exists():
-        raise ConfigError(
-            f"{path}: holds other files and no {marker!r}; give a new folder, or empty this one."
-        )
+        fix = "give a new folder, or empty this one."
+        raise ConfigError(f"{path}: holds other files and no {marker!r}; {fix}")
     check_above(path)
     return path
 
@@ -211,19 +210,15 @@ def check_sums(folder: Path, names: Sequence[str], editable: str = "") -> None:
         if line in listed or (free and not any(one.endswith(line[64:]) for one in listed)):
             continue
         own = f"if you changed it yourself, remove its line from {SUMS}, otherwise " if free else ""
-        raise ModelError(
-            f"{folder / name}: does not match its checksum in {SUMS}; {own}generate the model anew."
-        )
+        reason = f"does not match its checksum in {SUMS}; {own}generate the model anew."
+        raise ModelError(f"{folder / name}: {reason}")
     for line in listed:
         if line not in expected.values():
-            raise ModelError(
-                f"{folder / SUMS}: the line {line.decode(errors='replace')!r} is of no file of a "
-                "model; remove it."
-            )
+            reason = f"line {line.decode(errors='replace')!r} is of no file of a model; remove it."
+            raise ModelError(f"{folder / SUMS}: the {reason}")
 
 
 def _line_of(folder: Path, name: str) -> bytes:
-    """The line of a file in `SHA256SUMS`."""
     with _opened(folder / name) as file:
         return f"{_sha256_of(file, MOST_BYTES)}  {name}\n".encode()
 

@@ -38,11 +38,7 @@ from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
 
 FORMAT = "nics_drl_bridge/simulator_model/4"
 MODEL_FILE, TABLE_FOLDER, REPORT_FILE = "model.yaml", "lidar_table", "report.txt"
-MODEL_FILES = (
-    MODEL_FILE,
-    REPORT_FILE,
-    *(f"{TABLE_FOLDER}/{name}" for name in (SUMS, *TABLE_FILES)),
-)
+MODEL_FILES = (MODEL_FILE, REPORT_FILE, *(f"{TABLE_FOLDER}/{n}" for n in (SUMS, *TABLE_FILES)))
 """The files of a model, in addition to its manifest."""
 CONTROL_PERIOD_S = 0.1
 DEFAULT_LIDAR = "paper"
@@ -54,7 +50,7 @@ class SimulatorModel:
     """All that a fast simulator needs to know about a robot."""
 
     robot: RobotSpec
-    kinematics: TaylorModel  # the fitted, pruned Taylor model
+    kinematics: TaylorModel  # fitted and pruned
     calibration: Calibration  # clock offset, latency, sensor frames, noise of the recording
     lidar: LidarSpec
     table: LidarTable  # baked ranges of the obstacles' shapes and of the robot itself
@@ -71,17 +67,13 @@ class SimulatorModel:
             ("give the rates", kinematics.dofs, robot.dof_names),
         ):
             if given != needed:
-                raise ModelError(
-                    f"the kinematics {known} {given}, the robot {robot.name!r} needs {needed}; "
-                    "generate the model anew."
-                )
+                reason = f"the robot {robot.name!r} needs {needed}; generate the model anew."
+                raise ModelError(f"the kinematics {known} {given}, {reason}")
         check_sensors(self.sensors, (self.lidar.frame,))
-        substeps = self.control_period / self.kinematics.dt
-        if not 0.5 < substeps < np.inf or abs(substeps - round(substeps)) > 1e-6:
-            raise ModelError(
-                f"control_period {self.control_period} s is no multiple of the model's step "
-                f"{self.kinematics.dt} s; change one of them."
-            )
+        period, dt = self.control_period, kinematics.dt
+        if not 0.5 < period / dt < np.inf or abs(period / dt - round(period / dt)) > 1e-6:
+            reason = f"is no multiple of the model's step {dt} s; change one of them."
+            raise ModelError(f"control_period {period} s {reason}")
 
     @property
     def timing(self) -> tuple[float, int, int]:
@@ -115,8 +107,6 @@ class SimulatorModel:
 
 
 class _File(Schema):
-    """The keys of `model.yaml`."""
-
     format: str
     control_period: float = Field(gt=0.0)
     robot: RobotSpec
@@ -142,31 +132,20 @@ def generate(
 ) -> tuple[SimulatorModel, Identified]:
     """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
 
-    Args:
-        recording: a drive of the robot.
-        robot: defines state and command.
-        lidar: the sensor to simulate.
-        shapes: of the obstacles to bake; the robot's own footprint is added.
-        order: of the Taylor model.
-        alpha: pruning threshold of Eq. 2, or `auto`.
-        assume: fill in from the textbook what the drive did not show, marked as assumed.
-        strict: refuse a drive that did not excite every input on its own.
-        anyway: accept predictions of unseen data hardly better than those of a standing robot.
-        sensors: that the robot has beside its lidar.
-
-    Raises:
-        RecordingError: the recording can't be used for this robot.
-        FitError: the drive does not contain enough to fit a model, or the model is useless.
+    The shapes of obstacles are baked, and the robot's own footprint. `order` is that of the Taylor
+    model, `alpha` the pruning threshold of Eq. 2. `assume` fills in from the textbook what the
+    drive did not show, marked as assumed; `strict` refuses a drive that did not excite every input
+    on its own; `anyway` accepts predictions of unseen data hardly better than those of a standing
+    robot; `sensors` are what the robot has beside its lidar. Raises RecordingError if the recording
+    can't be used for this robot, FitError if it does not contain enough to fit a model, or the
+    model is useless.
     """
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
-    reason = why_useless(identified, robot, order)
-    if reason and not anyway:
+    if (reason := why_useless(identified, robot, order)) and not anyway:
         raise FitError(reason)
-    shapes = (*shapes, footprint_shape(robot))
-    table = bake(lidar, shapes)
     model = SimulatorModel(
-        robot, identified.model, identified.calibration, lidar, table,
-        identified.noise,
+        robot, identified.model, identified.calibration, lidar,
+        bake(lidar, (*shapes, footprint_shape(robot))), identified.noise,
         report=fit_report(recording.source, robot, identified), latency=recording.latency,
         sensors=tuple(sensors),
     )  # fmt: skip

@@ -140,3 +140,10 @@ def by_plane_geometry(spec: LidarSpec, scene: Scene) -> tuple[np.ndarray, np.nda
     ranges[ranges > spec.range_max] = np.inf
     ranges[ranges < spec.range_min] = -np.inf
     return ranges, clear
+
+
+def scan_skewed(render, poses: np.ndarray) -> np.ndarray:
+    """A scan (B,) by `render` in G equal groups of beams, each from its pose (G, 3)."""
+    scans = [render(pose) for pose in poses]
+    edges = np.arange(len(poses) + 1) * len(scans[0]) // len(poses)
+    return np.concatenate([scans[g][edges[g] : edges[g + 1]] for g in range(len(poses))])

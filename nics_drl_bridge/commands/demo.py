@@ -12,9 +12,7 @@ from nics_drl_bridge.commands.console import WorldOption, one_sentence
 
 
 def demo(
-    recording: Annotated[
-        Path | None, Option(help="A drive; by default one of the textbook robot.")
-    ] = None,
+    recording: Annotated[Path | None, Option(help="A drive; by default a textbook one.")] = None,
     out: Annotated[Path, Option(help="Folder for everything the demo writes.")] = Path("runs/demo"),
     robot: Annotated[
         str | None,
@@ -29,9 +27,7 @@ def demo(
         str | None,
         Option(help="Train none; drive with a policy file, a shipped one or a baseline."),
     ] = None,
-    train_steps: Annotated[
-        int | None, Option(min=1, help="Environment steps of the training.")
-    ] = None,
+    train_steps: Annotated[int | None, Option(min=1, help="Environment steps to train.")] = None,
 ) -> None:
     """Goes the whole road once: generate, train, evaluate, drive over DDS, deploy, report."""
     with one_sentence():

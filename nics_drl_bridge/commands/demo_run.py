@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import astuple, dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,15 +21,8 @@ from nics_drl_bridge.files import write_text
 from nics_drl_bridge.generator import SimulatorModel, generate, save_model
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.lidar.spec import load_lidar
-from nics_drl_bridge.policy.evaluation import (
-    FIRST_SEED,
-    Episode,
-    Summary,
-    deviation,
-    drive_worlds,
-    successes,
-    summarise,
-)
+from nics_drl_bridge.policy import evaluation
+from nics_drl_bridge.policy.evaluation import FIRST_SEED, Episode, Summary, deviation, successes
 from nics_drl_bridge.policy.policies import open_policy, shipped_policies
 from nics_drl_bridge.policy.training_settings import TrainingSettings, load_training
 from nics_drl_bridge.recording import textbook
@@ -51,8 +44,8 @@ LINES = 10  # number of progress reports of a training
 START_S, ARRIVE_S = 60.0, 40.0  # time that a node may take to start, and the robot to arrive
 FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05
 """Limits of the demo's gate: time from zero to the maximum command, and to its maximum rate."""
-IN_PROCESS, OVER_DDS = LABELS[FAST], LABELS[DDS]
 PANELS = 9  # maximum number of episodes that are drawn
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -72,11 +65,6 @@ class DemoPlan:
         """Folder of the generated simulator."""
         return self.out / "model"
 
-    @property
-    def policy_file(self) -> Path:
-        """Path of the trained policy."""
-        return self.out / "policy.onnx"
-
 
 @dataclass(frozen=True)
 class Learned:
@@ -85,14 +73,6 @@ class Learned:
     policy: str
     how: str
     curve: Sequence[Point] = ()
-
-
-@dataclass(frozen=True)
-class Live:
-    """A drive of the deployed nodes, with its path; `arrived` is True if it reached the goal."""
-
-    arrived: bool
-    path: Episode
 
 
 @dataclass(frozen=True)
@@ -105,45 +85,35 @@ class DemoResults:
     summary: Summary  # of the policy's many episodes in the fast simulator
     here: Sequence[Episode]
     there: Sequence[Episode]
-    live: Live
+    live: Episode  # of the deployed nodes
     took: dict[str, float]  # part of the demo -> wall time [s]
 
 
 def run(plan: DemoPlan, say: Say) -> str:
     """Generates a simulator, trains a policy in it, drives it over DDS, and writes the report.
 
-    Every process that this starts has ended when it returns or raises.
-
-    Returns:
-        The last line of the demo: successes in process and over DDS, and the path of the report.
-
-    Raises:
-        BridgeError: a bad recording or name, or a node that does not start.
+    Every process that this starts has ended when it returns or raises. Returns the last line of the
+    demo: successes in process and over DDS, and the path of the report. Raises BridgeError for a
+    bad recording or name, or a node that does not start.
     """
     if find_spec("rclpy") is None:
         raise ConfigError(f"the demo {MISSING_ROS.format(module='rclpy')}")
     took: dict[str, float] = {}
 
-    @contextmanager
-    def part(name: str) -> Iterator[None]:
+    def timed(name: str, part: Callable[..., R], *arguments: Any) -> R:
         begin = time.perf_counter()
-        yield
+        result = part(plan, *arguments, say)
         took[name] = time.perf_counter() - begin
         say(f"  {name} took {took[name]:.0f} s")
+        return result
 
-    with part("generating"):
-        model, identified = _generate(plan, say)
-    with part("learning"):
-        learned = learn(plan, model, say)
-    with part("evaluating"):
-        summary = _evaluate(plan, model, learned.policy, say)
-    with part("driving in process"):
-        here = _drive(FAST, f"driving {plan.episodes} episodes", plan, learned.policy, say)
-    with part("driving over DDS"):
-        there = _drive(DDS, f"driving the same {plan.episodes} episodes", plan, learned.policy, say)
-    with part("deploying"):
-        arrived = (episode.seed for episode in there if episode.result == "success")
-        live = _deploy(plan, model, learned.policy, next(arrived, 0), say)
+    model, identified = timed("generating", _generate)
+    learned = timed("learning", learn, model)
+    summary = timed("evaluating", _evaluate, model, learned.policy)
+    here = timed("driving in process", _drive, FAST, learned.policy)
+    there = timed("driving over DDS", _drive, DDS, learned.policy)
+    arrived = (episode.seed for episode in there if episode.result == "success")
+    live = timed("deploying", _deploy, model, learned.policy, next(arrived, 0))
     results = DemoResults(model, identified, learned, summary, here, there, live, took)
     file = plan.out / "report.html"
     write_text(file, report(plan, results))
@@ -190,12 +160,8 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
 def settings_of(plan: DemoPlan) -> TrainingSettings:
     """Settings of the demo's training, in the plan's simulator and world."""
     chosen = load_training("demo")
-    changes = {
-        "robot": str(plan.model),
-        "worlds": {plan.world: chosen.num_envs},
-        "steps": plan.train_steps or chosen.steps,
-    }
-    return chosen.model_copy(update=changes)
+    worlds, steps = {plan.world: chosen.num_envs}, plan.train_steps or chosen.steps
+    return chosen.model_copy(update={"robot": str(plan.model), "worlds": worlds, "steps": steps})
 
 
 def _trained(plan: DemoPlan, say: Say) -> Learned:
@@ -214,22 +180,20 @@ def _trained(plan: DemoPlan, say: Say) -> Learned:
             )
 
     trained = train(settings, TRAINING_SEED, plan.out / "training", tell)
-    result = SeedResult(TRAINING_SEED, trained, {})
-    export(settings, result, f"nics demo --robot {plan.robot}", plan.policy_file)
+    result, file = SeedResult(TRAINING_SEED, trained, {}), plan.out / "policy.onnx"
+    export(settings, result, f"nics demo --robot {plan.robot}", file)
     steps = f"{trained.steps:,} steps, {trained.stepping_s:.0f} s of {trained.wall_s:.0f} s"
     how = f"PPO learned it from nothing in the generated simulator: {steps} in the simulator."
-    return Learned(str(plan.policy_file), how, curve)
+    return Learned(str(file), how, curve)
 
 
 def _ready_made(model: SimulatorModel) -> str:
     """The shipped policy of the robot if it fits, else a baseline."""
     name = model.robot.name
     if name in shipped_policies() and find_spec("onnxruntime") and find_spec("onnx"):
-        try:
+        with suppress(PolicyError):
             open_policy(name, model)
-        except PolicyError:
-            return BASELINE
-        return name
+            return name
     return BASELINE
 
 
@@ -238,26 +202,27 @@ def _evaluate(plan: DemoPlan, model: SimulatorModel, name: str, say: Say) -> Sum
     say(f"evaluating {name} in {MANY} unseen episodes, all at once")
     policy, task = open_policy(name, model)
     env = BridgeVectorEnv(MANY, model, plan.world, task)
-    outcomes = drive_worlds(env, policy.act, range(FIRST_SEED, FIRST_SEED + MANY))
-    summary = summarise(outcomes, model.control_period)
-    rates = (summary.success, summary.collision, summary.time_out)
-    named = zip(("success", "collision", "time-out"), rates, strict=True)
-    say("  " + ", ".join(f"{word} {100 * rate.value:.1f} %" for word, rate in named))
+    outcomes = evaluation.drive_worlds(env, policy.act, range(FIRST_SEED, FIRST_SEED + MANY))
+    summary = evaluation.summarise(outcomes, model.control_period)
+    rates = (f"{name} {100 * share.value:.1f} %" for name, share in summary.shares.items())
+    say(f"  {', '.join(rates)}")
     return summary
 
 
-def _drive(place: str, what: str, plan: DemoPlan, policy: str, say: Say) -> list[Episode]:
+def _drive(plan: DemoPlan, place: str, policy: str, say: Say) -> list[Episode]:
     """Drives the plan's episodes in one of `episodes.PLACES` and reports each."""
-    say(f"{what} {'in process' if place == FAST else 'over DDS in lock-step'}")
+    where = "in process" if place == FAST else "over DDS in lock-step"
+    say(f"driving {'' if place == FAST else 'the same '}{plan.episodes} episodes {where}")
+    seeds, logs = range(plan.episodes), plan.out / "logs" / place
     return drive_in(
         place,
-        Trial(policy, str(plan.model), plan.world, range(plan.episodes), plan.out / "logs" / place),
+        Trial(policy, str(plan.model), plan.world, seeds, logs),
         lambda e: say(f"  seed {e.seed}: {e.result}, {e.steps} steps, {e.length:.2f} m"),
         say,
     )
 
 
-def _deploy(plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: Say) -> Live:
+def _deploy(plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: Say) -> Episode:
     """Runs the nodes of a robot in real time, each in its own process, in the scene of a seed.
 
     Raises BackendError if a node does not start, or ends.
@@ -283,7 +248,7 @@ def _deploy(plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: 
     arrived, path = _watched(nodes, plan.out / "logs" / "realtime", goal, near, say)
     say(f"  the deployed nodes {'reached' if arrived else 'did not reach'} the goal of seed {seed}")
     result = "success" if arrived else "time-out"
-    return Live(arrived, Episode(seed, result, path, path, scene.goals[0], scene.bodies, 0.0))
+    return Episode(seed, result, path, path, scene.goals[0], scene.bodies, 0.0)
 
 
 def _watched(
@@ -300,10 +265,8 @@ def _watched(
             processes.append(stack.enter_context(NodeProcess(node, logs, parameters, domain_id)))
             if node == "simulator_node" and not witness.sees(START_S):
                 processes[0].check()
-                raise BackendError(
-                    f"{node} publishes nothing after {START_S:g} s; look at its log, "
-                    f"{processes[0].log}."
-                )
+                reason = f"publishes nothing after {START_S:g} s; look at its log"
+                raise BackendError(f"{node} {reason}, {processes[0].log}.")
         refused = witness.arms("command_gate", START_S)
         for process in processes:
             process.check()
@@ -346,13 +309,11 @@ def report(plan: DemoPlan, results: DemoResults) -> str:
 
 def _model(plan: DemoPlan, results: DemoResults) -> list[Block]:
     calibrated = calibration_pictures(results.model.robot, results.identified)
+    caption = "What each further term is worth; circles mark how many are kept."
     return [
         f"Generated from {plan.recording or 'a textbook drive'}.",
         Code(results.model.report),
-        Picture(
-            accuracy(results.identified),
-            "What each further term is worth; circles mark how many are kept.",
-        ),
+        Picture(accuracy(results.identified), caption),
         *(Picture(picture, CAPTIONS[name]) for name, picture in calibrated.items()),
     ]
 
@@ -363,10 +324,9 @@ def _policy(plan: DemoPlan, results: DemoResults) -> list[Block]:
         caption = "Success and collisions while it explores; all episodes are new ones."
         blocks.append(Picture(training_curve(results.learned.curve), caption))
     summary = results.summary
-    shares = (summary.success, summary.collision, summary.time_out)
     rows = [
         (name, *(f"{100 * value:.1f} %" for value in astuple(share)))
-        for name, share in zip(("success", "collision", "time-out"), shares, strict=True)
+        for name, share in summary.shares.items()
     ]
     for name, amount in (("path [m]", summary.length), ("time [s]", summary.time)):
         rows.append((name, *(f"{value:.2f}" for value in astuple(amount))))
@@ -379,33 +339,35 @@ def _policy(plan: DemoPlan, results: DemoResults) -> list[Block]:
 
 def _episodes(plan: DemoPlan, results: DemoResults) -> list[Block]:
     here, there = results.here, results.there
+    both, each = (LABELS[FAST], LABELS[DDS]), ("steps", "path [m]")
+    head = ("seed", both[0], *each, both[1], *each, "deviation [m]")
     rows = [
-        (
-            str(a.seed), a.result, f"{a.steps}", f"{a.length:.2f}", b.result, f"{b.steps}",
-            f"{b.length:.2f}", f"{deviation(a, b):.1g}",
-        )
+        (f"{a.seed}", *_cells(a), *_cells(b), f"{deviation(a, b):.1g}")
         for a, b in zip(here, there, strict=True)
-    ]  # fmt: skip
-    head = ("seed", IN_PROCESS, "steps", "path [m]", OVER_DDS, "steps", "path [m]", "deviation [m]")
-    runs = {IN_PROCESS: here[:PANELS], OVER_DDS: there[:PANELS]}
-    both = trajectories(runs, load_world(plan.world), results.model.robot.footprint_radius)
+    ]
+    runs = {both[0]: here[:PANELS], both[1]: there[:PANELS]}
+    drawn = trajectories(runs, load_world(plan.world), results.model.robot.footprint_radius)
     return [
         f"{successes(here)} of {len(here)} episodes reached the goal in process, "
         f"{successes(there)} of {len(there)} over DDS in lock-step. Deviation is the "
         "greatest distance between the two true paths at the same step.",
         Table(head, rows),
-        Picture(both, "Blue: in process. Red, dashed: over DDS."),
+        Picture(drawn, "Blue: in process. Red, dashed: over DDS."),
     ]
+
+
+def _cells(episode: Episode) -> tuple[str, str, str]:
+    return episode.result, f"{episode.steps}", f"{episode.length:.2f}"
 
 
 def _deployed(plan: DemoPlan, results: DemoResults) -> list[Block]:
     live = results.live
-    beside = [episode for episode in results.here if episode.seed == live.path.seed]
-    runs = {IN_PROCESS: beside, "deployed": [live.path]}
+    beside = [episode for episode in results.here if episode.seed == live.seed]
+    runs = {LABELS[FAST]: beside, "deployed": [live]}
     drawn = trajectories(runs, load_world(plan.world), results.model.robot.footprint_radius)
     return [
         "simulator_node in real time, middleware_node, policy_node and command_gate ran as "
         "processes of their own; nobody stepped them. The robot "
-        f"{'reached' if live.arrived else 'did not reach'} its goal.",
+        f"{'reached' if live.result == 'success' else 'did not reach'} its goal.",
         Picture(drawn, "The true path of the deployed robot beside the lock-step one."),
     ]

@@ -20,9 +20,7 @@ DEFAULT = "ackermann"
 
 
 def doctor(
-    bag: Annotated[
-        Path | None, Argument(help="A bag to look at; the live robot when left out.")
-    ] = None,
+    bag: Annotated[Path | None, Argument(help="A bag to look at; else the live robot.")] = None,
     model: Annotated[
         str | None,
         Option(
@@ -32,9 +30,7 @@ def doctor(
     ] = None,
     policy: Annotated[str | None, Option(help="What it must fit instead: a policy file.")] = None,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
-    duration: Annotated[
-        float, Option(min=1.0, help="How long to listen to a live robot [s].")
-    ] = 5.0,
+    duration: Annotated[float, Option(min=1.0, help="How long to listen to a robot [s].")] = 5.0,
     as_json: Annotated[bool, Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Tells what of a robot or a bag does not fit a model or a policy; it sends nothing."""

@@ -9,7 +9,9 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +22,11 @@ from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, nearest
 from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.policy.evaluation import (
-    FIRST_SEED,
-    ConfidenceInterval,
-    Episode,
-    Tally,
-    drive_all,
-    tallies,
-)
+from nics_drl_bridge.policy.evaluation import FIRST_SEED, Episode, Tally, drive_all, tallies
 from nics_drl_bridge.policy.policies import Policy, is_policy_file, open_policy
 from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.seeds import checked_seeds
-from nics_drl_bridge.sim.world import load_world
+from nics_drl_bridge.sim.world import World, load_world
 
 FAST, DDS, MUJOCO, VEHICLE = "fast", "dds", "mujoco_dds", "vehicle"
 NODES = {DDS: "simulator_node", MUJOCO: "mujoco_node"}
@@ -75,13 +70,12 @@ def drive_in(
             return drive_all(env, policy, trial.seeds, on_episode)
     from nics_drl_bridge.nodes.processes import Witness
 
-    with _node(NODES[place], trial, say) as options, Witness(options["domain_id"]) as witness:
+    name = NODES[place]
+    with _node(name, trial, say) as options, Witness(options["domain_id"]) as witness:
         env, policy = env_of(trial.policy, model, trial.world, "dds", backend_options=options)
         with closing(env):
-            return drive_all(
-                env, policy, trial.seeds, on_episode,
-                lambda: witness.touched(NODES[place], START_S),
-            )  # fmt: skip
+            touched = partial(witness.touched, name, START_S)
+            return drive_all(env, policy, trial.seeds, on_episode, touched)
 
 
 def env_of(
@@ -105,10 +99,9 @@ def _node(name: str, trial: Trial, say: Say) -> Iterator[dict[str, Any]]:
     parameters = {"model": trial.model, "world": trial.world, "mode": "lockstep"}
     with NodeProcess(name, trial.logs, parameters, domain_id) as process:
         say(f"started {name} as process {process.pid} in ROS domain {domain_id}")
+        options = {"domain_id": domain_id, "simulator": name, "timeout_s": START_S}
         try:
-            yield {
-                "truth": True, "domain_id": domain_id, "simulator": name, "timeout_s": START_S,
-            }  # fmt: skip
+            yield {"truth": True, **options}
         except BackendError:
             process.check()  # if the node has ended, its own error is more useful
             raise
@@ -163,15 +156,11 @@ class Evaluated:
 
 
 def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
-    """Drives every policy through the same episodes in every place, and writes the results.
+    """Drives every policy through the same episodes in every place.
 
-    `tell` is called with what is being driven, the number of episodes done, and the total.
-
-    Returns:
-        The results of each policy; `evaluation.json` and a picture per policy are in `order.out`.
-
-    Raises:
-        BridgeError: a bad name or file, or a node that does not start.
+    `tell` is called with what is being driven, the number of episodes done, and the total. Returns
+    the results of each policy; `evaluation.json` and a picture per policy are in `order.out`.
+    Raises BridgeError for a bad name or file, or a node that does not start.
     """
     name, seeds = _model_name(order), order.seeds
     model, world = open_model(name), load_world(order.world)
@@ -189,13 +178,24 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
 
             trial = Trial(policy, name, order.world, seeds, order.out / "logs")
             runs[place] = drive_in(place, trial, on_episode, say)
-        made = Evaluated(policy, runs, tallies(runs, model.control_period))
-        evaluated.append(made)
-        shown = {LABELS[place]: some[:PANELS] for place, some in runs.items()}
-        picture = trajectories(shown, world, model.robot.footprint_radius)
-        write_bytes(picture_of(order.out, policy), picture)
+        evaluated.append(judged(policy, runs, model, world, order.out, PANELS))
     write_evaluation(order.out, name, model, order.world, order.seed, evaluated)
     return evaluated
+
+
+def judged(
+    policy: str,
+    runs: Mapping[str, Sequence[Episode]],
+    model: SimulatorModel,
+    world: World,
+    out: Path,
+    panels: int | None = None,
+) -> Evaluated:
+    """Judges the runs of a policy by place, and draws their first episodes into a folder."""
+    shown = {LABELS[place]: some[:panels] for place, some in runs.items()}
+    picture = trajectories(shown, world, model.robot.footprint_radius)
+    write_bytes(out / f"trajectories_{Path(policy).stem}.png", picture)
+    return Evaluated(policy, runs, tallies(runs, model.control_period))
 
 
 def _model_name(order: EvaluationOrder) -> str:
@@ -211,68 +211,41 @@ def _model_name(order: EvaluationOrder) -> str:
     return next(iter(robots.values()))
 
 
-def picture_of(out: Path, policy: str) -> Path:
-    """Path of the picture of a policy."""
-    return out / f"trajectories_{Path(policy).stem}.png"
-
-
 def write_evaluation(
-    out: Path,
-    name: str,
-    model: SimulatorModel,
-    world: str,
-    seed: int,
-    evaluated: Sequence[Evaluated],
+    out: Path, name: str, model: SimulatorModel, world: str, seed: int, evaluated: list[Evaluated]
 ) -> None:
     """Writes `evaluation.json`; the name is that of the model, the seed of the first episode."""
-    data = {
-        "model": name,
-        "model_fingerprint": model.fingerprint,
-        "robot": model.robot.name,
-        "world": world,
-        "seed": seed,
-        "policies": {
-            one.policy: {
-                place: {
-                    **one.tallies[place].figures(),
-                    "each": [episode.plain() for episode in one.runs[place]],
-                }
-                for place in one.runs
-            }
-            for one in evaluated
-        },
+    policies = {
+        one.policy: {
+            place: {**one.tallies[place].figures(), "each": [episode.plain() for episode in some]}
+            for place, some in one.runs.items()
+        }
+        for one in evaluated
     }
+    data = {
+        "model": name, "model_fingerprint": model.fingerprint, "robot": model.robot.name,
+        "world": world, "seed": seed, "policies": policies,
+    }  # fmt: skip
     write_text(out / "evaluation.json", json.dumps(data) + "\n")
 
 
 def rows_of(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
     """Rows of the table with the columns `HEADS`, as text."""
     return [
-        (one.policy, LABELS[place], *_cells(tally))
+        (
+            one.policy, LABELS[place], _percent(tally.success.value),
+            f"{100 * tally.success.low:.0f} to {100 * tally.success.high:.0f} %",
+            *(_percent(rate.value) for rate in (tally.believed, tally.collision, tally.time_out)),
+            *("-" if isnan(of.value) else f"{of.value:.2f}" for of in (tally.length, tally.time)),
+            _percent(tally.same), f"{tally.deviation.value:.2g}", f"{tally.greatest_deviation:.2g}",
+        )
         for one in evaluated
         for place, tally in one.tallies.items()
-    ]
-
-
-def _cells(tally: Tally) -> tuple[str, ...]:
-    return (
-        _percent(tally.success.value),
-        f"{100 * tally.success.low:.0f} to {100 * tally.success.high:.0f} %",
-        *(_percent(one.value) for one in (tally.believed, tally.collision, tally.time_out)),
-        _figure(tally.length),
-        _figure(tally.time),
-        _percent(tally.same),
-        f"{tally.deviation.value:.2g}",
-        f"{tally.greatest_deviation:.2g}",
-    )
+    ]  # fmt: skip
 
 
 def _percent(share: float) -> str:
     return f"{100 * share:.4g} %"
-
-
-def _figure(estimate: ConfidenceInterval) -> str:
-    return "-" if estimate.value != estimate.value else f"{estimate.value:.2f}"
 
 
 def line_of(one: Evaluated) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,9 +37,7 @@ def evaluate(
         list[str] | None,
         Option("--in", help="fast, dds or mujoco_dds; several times; all by default."),
     ] = None,
-    episodes: Annotated[
-        int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")
-    ] = None,
+    episodes: Annotated[int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the first episode.")] = 1_000_000,
     out: Annotated[Path, Option(help="Folder for everything that is written.")] = Path(
         "runs/evaluate"
@@ -54,28 +53,18 @@ def evaluate(
         float,
         Option(help="For --shadow without --goal: the goal is where it was so much later."),
     ] = 4.0,
-    backend: Annotated[
-        str | None, Option(help="dds, with --hardware.", metavar="dds")
-    ] = None,
+    backend: Annotated[str | None, Option(help="dds, with --hardware.", metavar="dds")] = None,
     hardware: Annotated[
         bool, Option("--hardware", help="Drive the vehicle, through command_gate.")
     ] = False,
     start: Annotated[
         str, Option(help="For --hardware: wait until it stands there, or take the present.")
     ] = "wait",
-    goal: Annotated[
-        str | None, Option(metavar="X,Y", help="In map [m]; else that of the world.")
-    ] = None,
+    goal: Annotated[str | None, Option(metavar="X,Y", help="In map [m]; else the world's.")] = None,
     namespace: Annotated[str, Option(help="For --hardware: of the vehicle's topics.")] = "",
-    pose_type: Annotated[
-        str, Option(help="For --hardware: type of `pose`, a pose sensor in map.")
-    ] = "none",
-    yes: Annotated[
-        bool, Option("--yes", help="For --hardware: ask nothing before an episode.")
-    ] = False,
-    arm: Annotated[
-        bool, Option("--arm", help="For --hardware: arm command_gate before an episode.")
-    ] = False,
+    pose_type: Annotated[str, Option(help="For --hardware: type of `pose`, in map.")] = "none",
+    yes: Annotated[bool, Option("--yes", help="For --hardware: ask no questions.")] = False,
+    arm: Annotated[bool, Option("--arm", help="For --hardware: arm command_gate.")] = False,
 ) -> None:  # fmt: skip
     """Drives policies through the same episodes in several worlds, and compares."""
     with one_sentence():
@@ -94,27 +83,19 @@ def evaluate(
         elif hardware:
             from nics_drl_bridge.commands.vehicle import VehicleOrder
 
-            _hardware(
-                VehicleOrder(
-                    policies[0],
-                    out,
-                    model,
-                    world,
-                    episodes or 1,
-                    seed,
-                    start,
-                    place,
-                    namespace,
-                    pose_type,
-                    arm,
-                ),
-                yes,
-            )
+            trip = VehicleOrder(
+                policies[0], out, model, world, episodes or 1, seed, start, place, namespace,
+                pose_type, arm,
+            )  # fmt: skip
+            _hardware(trip, yes)
         else:
             from nics_drl_bridge.commands.episodes import EvaluationOrder
+            from nics_drl_bridge.commands.episodes import evaluate as drive
 
             chosen = {"places": tuple(dict.fromkeys(places))} if places else {}
-            _evaluate(EvaluationOrder(policies, out, model, world, episodes or 20, seed, **chosen))
+            order = EvaluationOrder(policies, out, model, world, episodes or 20, seed, **chosen)
+            with progress_bar() as tell:
+                _print_evaluated(drive(order, partial(typer.echo, err=True), tell), out)
 
 
 def _point(text: str | None) -> tuple[float, float] | None:
@@ -127,13 +108,6 @@ def _point(text: str | None) -> tuple[float, float] | None:
     except ValueError:
         pass
     raise ConfigError(f"--goal {text!r}: must be X,Y in metres, as 2.5,-1.")
-
-
-def _evaluate(order: Any) -> None:
-    from nics_drl_bridge.commands.episodes import evaluate
-
-    with progress_bar() as tell:
-        _print_evaluated(evaluate(order, lambda line: typer.echo(line, err=True), tell), order.out)
 
 
 def _shadow(
@@ -154,24 +128,18 @@ def _shadow(
         place, differences = out / f"shadow_{Path(policy).stem}", made.differences()
         write_bytes(place.with_suffix(".png"), shadow_picture(made))
         data = {
-            "bag": str(bag),
-            "policy": policy,
-            "model": name,
-            "goal": goal,
-            "ahead_s": None if goal else ahead,
-            "compared": len(made.time),
-            "skipped": dict(made.skipped),
-            "commands": differences,
-        }
+            "bag": str(bag), "policy": policy, "model": name, "goal": goal,
+            "ahead_s": None if goal else ahead, "compared": len(made.time),
+            "skipped": dict(made.skipped), "commands": differences,
+        }  # fmt: skip
         write_text(place.with_suffix(".json"), json.dumps(data) + "\n")
         for (command, figures), unit in zip(differences.items(), made.units, strict=True):
             *amounts, opposite = figures.values()
             cells = (f"{value:.3g}" for value in amounts)
             rows.append((policy, command, unit, *cells, f"{100 * opposite:.1f} %"))
+        compared = f"{policy}: compared at {len(made.time)} times"
         left_out = ", ".join(f"{count} {why}" for why, count in made.skipped.items() if count)
-        lines.append(
-            f"{policy}: compared at {len(made.time)} times; left out: {left_out or 'none'}"
-        )
+        lines.append(f"{compared}; left out: {left_out or 'none'}")
     heads = (
         "policy", "command", "unit", "mean", "mean size", *(f"{q} %" for q in PERCENTILES),
         "greatest", "opposite sign",
@@ -188,7 +156,7 @@ def _hardware(order: Any, yes: bool) -> None:
             typer.prompt("Enter when ready", default="", show_default=False)
 
     with needs_ros("nics evaluate --hardware"):
-        made = drive_vehicle(order, lambda line: typer.echo(line, err=True), ask)
+        made = drive_vehicle(order, partial(typer.echo, err=True), ask)
     _print_evaluated([made], order.out)
 
 

@@ -23,16 +23,12 @@ from nics_drl_bridge.commands.console import (
 def record(
     out: Annotated[Path, Option(help="An .npz file, or the folder of a rosbag2, to write.")],
     robot: RobotOption = "ackermann",
-    bound: Annotated[
-        float, Option(help="Radius of the circle around the start to keep within [m].")
-    ] = 2.0,
+    bound: Annotated[float, Option(help="Radius around the start to keep within [m].")] = 2.0,
     duration: Annotated[float, Option(help="Of the drive [s].")] = 60.0,
     speed: Annotated[float, Option(help="Share of the greatest speeds to use.")] = 1.0,
     seed: Annotated[int, Option(help="Of the pattern.")] = 0,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
-    remap: Annotated[
-        list[str] | None, Option(help="A topic's other name, as in odom:=/wheel_odometry.")
-    ] = None,
+    remap: Annotated[list[str] | None, Option(help="A topic's other name: odom:=/wheels.")] = None,
     topics: Annotated[
         Path | None, Option(help="YAML file that names the joints of state and wheels.")
     ] = None,
@@ -40,9 +36,7 @@ def record(
     use_sim_time: Annotated[
         bool, Option("--use-sim-time", help="Take the time from /clock.")
     ] = False,
-    preview: Annotated[
-        bool, Option("--preview", help="Show what the drive will be, and stop.")
-    ] = False,
+    preview: Annotated[bool, Option("--preview", help="Show the drive's plan, and stop.")] = False,
     yes: Annotated[bool, Option("--yes", help="Do not ask before the robot moves.")] = False,
 ) -> None:
     """Drives a robot over ROS 2 so that it shows its whole motion, and records it."""
@@ -102,9 +96,7 @@ def generate(
             "--anyway", help="Write the model even if its predictions of unseen data are of no use."
         ),
     ] = False,
-    pictures: Annotated[
-        bool, Option(help="Draw the fit into the folder pictures of the model.")
-    ] = False,
+    pictures: Annotated[bool, Option(help="Draw the fit into the model's pictures/.")] = False,
 ) -> None:
     """Generates a simulator from a recording and writes it as a folder."""
     with one_sentence():

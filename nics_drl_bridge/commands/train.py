@@ -143,7 +143,6 @@ def info(
 
 
 def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
-    """Name and text of each printed line."""
     lidar, scan, seen = facts["lidar"], facts["scan"], facts["observation"]
     commands = [
         f"{c['name']} {c['min']:g} to {c['max']:g} {c['unit']}" for c in facts["robot"]["command"]

@@ -6,25 +6,14 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from nics_drl_bridge.commands.episodes import (
-    FAST,
-    LABELS,
-    VEHICLE,
-    Evaluated,
-    Say,
-    env_of,
-    picture_of,
-    robot_of,
-    write_evaluation,
-)
+from nics_drl_bridge.commands import episodes as evaluation
+from nics_drl_bridge.commands.episodes import FAST, VEHICLE, Evaluated, Say, env_of
 from nics_drl_bridge.errors import BackendError
-from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.policy.evaluation import Episode, drive, tallies
+from nics_drl_bridge.policy.evaluation import Episode, drive
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.report.doctor import examine
 from nics_drl_bridge.report.doctor_facts import expected_of
-from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world import load_world
 
@@ -56,15 +45,11 @@ def drive_vehicle(order: VehicleOrder, say: Say, ask: Say) -> Evaluated:
     Commands go to `cmd_vel_raw`, so that only an armed `command_gate` lets them pass. Afterwards
     the fast simulator drives the same episodes from the vehicle's actual starting poses. `ask` is
     called before each episode with where to place the vehicle, and returns when it may begin.
-
-    Returns:
-        The episodes of both; `evaluation.json` and a picture are in `order.out`.
-
-    Raises:
-        BackendError: the vehicle does not fit its model, or does not answer.
-        BridgeError: a bad name or file.
+    Returns the episodes of both; `evaluation.json` and a picture are in `order.out`. Raises
+    BackendError if the vehicle does not fit its model, or does not answer, another BridgeError for
+    a bad name or file.
     """
-    name = order.model or robot_of(order.policy)
+    name = order.model or evaluation.robot_of(order.policy)
     model, world = open_model(name), load_world(order.world)
     open_policy(order.policy, model)  # a misfit is an error before anything moves
     _examine(order, model, say)
@@ -76,11 +61,8 @@ def drive_vehicle(order: VehicleOrder, say: Say, ask: Say) -> Evaluated:
             for one in episodes
         ]
     runs = {VEHICLE: episodes, FAST: again}
-    made = Evaluated(order.policy, runs, tallies(runs, model.control_period))
-    shown = {LABELS[place]: some for place, some in runs.items()}
-    picture = trajectories(shown, world, model.robot.footprint_radius)
-    write_bytes(picture_of(order.out, order.policy), picture)
-    write_evaluation(order.out, name, model, order.world, order.seed, [made])
+    made = evaluation.judged(order.policy, runs, model, world, order.out)
+    evaluation.write_evaluation(order.out, name, model, order.world, order.seed, [made])
     return made
 
 

@@ -3,38 +3,22 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
 from nics_drl_bridge.lidar.exact_kernels import Beams
 
-EDGE = 1e-6
-"""Ranges at an edge are taken this far inside it, as a share of the whole width."""
-
-
-class Incidence(NamedTuple):
-    """Of P rays: range to the nearest edge [m], cosine of the incidence there, and scratch."""
-
-    nearest: NDArray[np.float32]
-    cosines: NDArray[np.float32]
-    before: NDArray[np.float32]
+EDGE = 1e-6  # ranges at an edge are taken this far inside it, as a share of the whole width
 
 
 @kernel(allocates=True)
 def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[no-untyped-def]
-    """Computes the outermost directions of a shape straight ahead, and their corners.
+    """Writes the right and left edge [rad] of a shape straight ahead, and the corners there.
 
-    Args:
-        hull: (V, 2) corners of its convex hull [m]; unused for a circle.
-        radius: of a circle [m], 0 for another shape.
-        distances: (D,) of its origin [m].
-        turns: (T,) rotations of the shape [rad].
-        edges: (T, D, 2) result: right and left edge [rad].
-        hints: (T, D, 2) result: index of the corner at each.
+    Both results are (T, D, 2), for rotations (T,) [rad] and distances (D,) [m] of its origin. The
+    convex hull is (V, 2) [m], unused for a circle; `radius` [m] is 0 for any other shape.
     """
     for t in range(turns.shape[0]):
         c, s = math.cos(turns[t]), math.sin(turns[t])
@@ -76,16 +60,10 @@ def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untype
 
 @kernel(allocates=True)
 def row(fine, beams, corners, radius, distance, cos, sin, edge):  # type: ignore[no-untyped-def]
-    """Ranges (P,) of a shape straight ahead, continued beyond its edges.
+    """Writes ranges (P,) [m] of a shape straight ahead, continued beyond its edges (2,) [rad].
 
-    Args:
-        fine: (P,) result [m].
-        beams: of the P points.
-        corners: (V, 2) of its outline, none for a circle [m].
-        radius: of a circle [m].
-        distance: of its origin [m].
-        cos, sin: of its rotation.
-        edge: (2,) right and left edge [rad].
+    The outline has corners (V, 2) [m], none for a circle of a radius [m]; its origin is at a
+    distance [m], and it is turned by (cos, sin).
     """
     fine[:] = np.inf
     if corners.shape[0] == 0:
@@ -117,18 +95,11 @@ def into_phases(rows, fine, width, phases):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
-    """Computes all rows of one rotation.
+    """Writes the rows of one rotation [rad] into the table's ranges (R,) float32 [m].
 
-    Args:
-        rows: (R,) float32 result: the table's ranges [m].
-        layout: (3, D) index in `rows` of the begin of each row, its first beam relative to the
-            bearing, and its width in beams.
-        shape: corners and radius, see `row`.
-        distances: (D,) [m].
-        turn: rotation [rad].
-        edges: (D, 2) [rad].
-        step: angle between beams [rad].
-        phases: points per beam.
+    The layout (3, D) is the begin of the row of each distance, its first beam relative to the
+    bearing, and its width in beams. `shape` are corners and radius, see `row`; edges are (D, 2),
+    beams a `step` apart [rad], with so many phases (points) each.
     """
     c, s = math.cos(turn), math.sin(turn)
     corners, radius = shape
@@ -144,58 +115,42 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
         into_phases(rows[start : start + points], fine, width, phases)
 
 
-@kernel
-def _circle(scan, beams, x, radius):  # type: ignore[no-untyped-def]
-    """Cosines on a circle straight ahead, whose normal is the direction from its centre."""
-    nearest, cosines = scan.nearest, scan.cosines
-    exact_kernels.circle(nearest, beams, x, 0.0, radius, np.inf)
-    for i in range(nearest.shape[0]):
-        if nearest[i] < np.inf:
-            cosine = abs((nearest[i] - beams.directions[i, 0] * x) / radius)
-            cosines[i] = min(cosine, 1.0)
-
-
-@kernel
-def _segment(scan, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
-    """Cosines on a segment where it is nearest: the distance of its line over the range."""
-    nearest, cosines, before = scan.nearest, scan.cosines, scan.before
-    for i in range(nearest.shape[0]):
-        before[i] = nearest[i]
-    exact_kernels.segment(nearest, beams, x1, y1, x2, y2)
-    ex, ey = x2 - x1, y2 - y1
-    away = np.float32(abs(x1 * ey - y1 * ex) / math.sqrt(ex * ex + ey * ey))
-    for i in range(nearest.shape[0]):
-        if nearest[i] < before[i]:
-            cosines[i] = min(away / nearest[i], np.float32(1.0))
-
-
 @kernel(allocates=True)
 def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[no-untyped-def]
-    """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it."""
+    """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it.
+
+    The normal of a circle is the direction from its centre; the cosine on a segment, where it is
+    nearest, is the distance of its line over the range.
+    """
     directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
     beams, count = Beams(directions, angles[0], step, False), len(angles)
-    nearest, before = np.full(count, np.inf, np.float32), np.empty(count, np.float32)
-    scan = Incidence(nearest, np.zeros(count, np.float32), before)
+    nearest, cosines = np.full(count, np.inf, np.float32), np.zeros(count, np.float32)
     if corners.shape[0] == 0:
-        _circle(scan, beams, distance, radius)
-        return scan.cosines
+        exact_kernels.circle(nearest, beams, distance, 0.0, radius, np.inf)
+        for i in range(count):
+            if nearest[i] < np.inf:
+                cosine = abs((nearest[i] - directions[i, 0] * distance) / radius)
+                cosines[i] = min(cosine, 1.0)
+        return cosines
     ax, ay = exact_kernels.turned(distance, 0.0, c, s, corners[corners.shape[0] - 1])
     for v in range(corners.shape[0]):
         bx, by = exact_kernels.turned(distance, 0.0, c, s, corners[v])
-        _segment(scan, beams, ax, ay, bx, by)
+        before = nearest.copy()
+        exact_kernels.segment(nearest, beams, ax, ay, bx, by)
+        ex, ey = bx - ax, by - ay
+        away = np.float32(abs(ax * ey - ay * ex) / math.sqrt(ex * ex + ey * ey))
+        for i in range(count):
+            if nearest[i] < before[i]:
+                cosines[i] = min(away / nearest[i], np.float32(1.0))
         ax, ay = bx, by
-    return scan.cosines
+    return cosines
 
 
 @kernel(allocates=True)
 def cosines_of_turn(cosines, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
-    """Computes the cosine of the incidence at every point of the rows of one rotation.
+    """Writes the cosine (R,) of the incidence at every point of one rotation, see `rows_of_turn`.
 
     Beyond the edges of the shape it is that at the edge, as for the ranges.
-
-    Args:
-        cosines: (R,) float32 result, laid out as the ranges.
-        layout, shape, distances, turn, edges, step, phases: see `rows_of_turn`.
     """
     c, s = math.cos(turn), math.sin(turn)
     corners, radius = shape

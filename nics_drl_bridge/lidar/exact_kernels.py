@@ -16,41 +16,25 @@ from numpy.typing import NDArray
 from nics_drl_bridge.kernels import kernel
 
 TWO_PI = 2.0 * math.pi
-ROUNDING = 1e-6
-"""Beams this near to an edge, in beams, are candidates; the exact test decides."""
+ROUNDING = 1e-6  # beams this near to an edge, in beams, are candidates; the exact test decides
 HALF_PI = 0.5 * math.pi
-TINY = 1e-300
-"""Avoids NaN for the angle of a zero vector."""
+TINY = 1e-300  # avoids NaN for the angle of a zero vector
 ATAN = (
-    0.9999999996145,
-    -0.3333332366563,
-    0.1999959585417,
-    -0.1427904841688,
-    0.1105378475317,
-    -0.0879611755717,
-    0.0671011398839,
-    -0.0442736682632,
-    0.0222034549106,
-    -0.0071661648959,
+    0.9999999996145, -0.3333332366563, 0.1999959585417, -0.1427904841688, 0.1105378475317,
+    -0.0879611755717, 0.0671011398839, -0.0442736682632, 0.0222034549106, -0.0071661648959,
     0.0010844927512,
-)
+)  # fmt: skip
 X, Y, HEADING, COS, SIN, RADIUS, SHAPE = range(7)
 """Columns of a placed body; the radius of an absent one is 0, `SHAPE` is an index."""
 
 
 class Beams(NamedTuple):
-    """Directions of the beams in the frame of the lidar.
+    """Directions of the beams in the frame of the lidar."""
 
-    Attributes:
-        directions: (B, 2) cosine and sine.
-        first, step: angle of beam 0, and between beams [rad].
-        closed: True for a full circle.
-    """
-
-    directions: NDArray[np.float64]
-    first: float
-    step: float
-    closed: bool
+    directions: NDArray[np.float64]  # (B, 2) cosine and sine
+    first: float  # angle of beam 0 [rad]
+    step: float  # between beams [rad]
+    closed: bool  # True for a full circle
 
 
 class LidarPose(NamedTuple):
@@ -63,15 +47,10 @@ class LidarPose(NamedTuple):
 
 
 class OutlineArrays(NamedTuple):
-    """Outlines of all shapes, see `shapes.Outlines`.
+    """Outlines of all shapes, see `shapes.Outlines`."""
 
-    Attributes:
-        corners: (sum V, 2) of all outlines [m].
-        first: (H + 1,) first corner of each outline; a circle has none.
-    """
-
-    corners: NDArray[np.float64]
-    first: NDArray[np.int64]
+    corners: NDArray[np.float64]  # (sum V, 2) of all outlines [m]
+    first: NDArray[np.int64]  # (H + 1,) first corner of each outline; a circle has none
 
 
 @kernel(inline=True)
@@ -238,10 +217,8 @@ def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
 def walls_into(out, beams, lidar, walls, range_max):  # type: ignore[no-untyped-def]
     """Fuses straight walls (W, 4), given in the world, into a scan from a `LidarPose`.
 
-    Only beams that can meet the part of a wall within `range_max` are computed.
-
-    Returns:
-        Number of walls within range.
+    Only beams that can meet the part of a wall within `range_max` are computed. Returns the number
+    of walls within range.
     """
     near, c, s = 0, lidar.c, lidar.s
     for w in range(walls.shape[0]):

@@ -25,20 +25,15 @@ AS_MINUS_INF, AS_RANGE_MIN, AS_NO_RETURN, AS_GHOST = range(4)
 # Values of the column SKEW.
 CLOCKWISE, AT_ONCE, COUNTER_CLOCKWISE = -1, 0, 1
 
-ROUNDING = 1e-9
-"""Rounding error of a multiple of the quantisation step [m]."""
+ROUNDING = 1e-9  # rounding error of a multiple of the quantisation step [m]
 
 
 @kernel(allocates=True)
 def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-def]
-    """Applies the faults of the device to one exact scan.
+    """Applies faults (P,) of the device to one exact scan (B,) float32, REP-117, in place [m].
 
-    Args:
-        ranges: (B,) float32, REP-117, in place [m].
-        limits: range_min and range_max [m]; a return stays within them.
-        faults: (P,) see the columns above.
-        seed: of the random draws.
-        counter: of the scan; for equal seed and counter the result is bit-identical in any batch.
+    A return stays within the limits, range_min and range_max [m]. `counter` is that of the scan:
+    for equal seed and counter the result is bit-identical in any batch.
     """
     if faults[TOO_CLOSE] != AS_MINUS_INF:
         _too_close(ranges, limits, faults[TOO_CLOSE], seed, counter)
@@ -100,13 +95,9 @@ def _drop(ranges, limits, share, far, seed, counter):  # type: ignore[no-untyped
 
 @kernel(allocates=True)
 def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
-    """Computes the pose `ago` seconds earlier at a constant body twist, along the exact arc.
+    """Writes the pose (3,) `ago` seconds before a pose, along the exact arc of a body twist (3,).
 
-    Args:
-        out: (3,) result; its heading is not wrapped.
-        pose: (3,) x [m], y [m], heading [rad].
-        twist: (3,) vx [m/s], vy [m/s], wz [rad/s].
-        ago: [s].
+    The heading is not wrapped.
     """
     turn = -twist[2] * ago
     half = 0.5 * turn
@@ -121,18 +112,12 @@ def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def slice_poses(out, pose, twist, sweep, direction):  # type: ignore[no-untyped-def]
-    """Computes the poses of the robot at which G equal groups of beams were measured.
+    """Writes the poses (G, 3) of the robot at which G equal groups of beams were measured.
 
     Group g consists of the beams from `g * B // G` to `(g + 1) * B // G`; its pose is that of the
-    middle of its interval. The sweep ends at `pose`: the newest beam is the last one, or beam 0
-    for a device that turns clockwise.
-
-    Args:
-        out: (G, 3) result; headings are not wrapped.
-        pose: (3,) at the end of the sweep.
-        twist: (3,) body twist during the sweep.
-        sweep: duration from the first beam to the last [s].
-        direction: a value of the column SKEW.
+    middle of its interval, its heading not wrapped. The sweep, of a duration from the first beam to
+    the last [s], ends at `pose`: the newest beam is the last one, or beam 0 for a device that turns
+    clockwise. `direction` is a value of the column SKEW, `twist` (3,) that of the body meanwhile.
     """
     count = out.shape[0]
     for g in range(count):

@@ -15,12 +15,10 @@ RINGS, PLACES, BANDS, SEED = 13, 256, 8, 0
 which the errors are sorted; rings and bands grow geometrically. Last, the seed."""
 TOUCHING = 1e-3
 """Outer distance of the nearest ring from the shape's circle, as a share of the lidar's range."""
-OUTLIER = 0.3
-"""Greatest allowed error of any beam [m]."""
+OUTLIER = 0.3  # greatest allowed error of any beam [m]
 DEVIATIONS = 2.0
 """Safety margin on the measured squared error, in standard deviations: rare beams dominate it."""
-SLANT = np.radians(1.5)
-"""Greatest angle between line of sight and an edge in the search for outliers [rad]."""
+SLANT = np.radians(1.5)  # between line of sight and edge at most, in the search for outliers [rad]
 NARROWEST = 0.1
 """Least width of an interval of distances that is looked up, as a share of the lidar's range:
 narrower ones have too few samples."""
@@ -28,13 +26,9 @@ NO_WALLS = np.zeros((0, 4))
 
 
 def lookup_distances(
-    exact: LidarArrays,
-    baked: LidarArrays,
-    shape: int,
-    radius: float,
-    greatest: float,
+    exact: LidarArrays, baked: LidarArrays, shape: int, radius: float, greatest: float
 ) -> tuple[float, float]:
-    """Finds the distances between which looking up a shape has an RMSE of at most `greatest`.
+    """Finds the distances between which looking up a shape has an RMSE of at most `greatest` [m].
 
     This is required in each ring of distances between them and in each band of ranges over all
     these rings, and no beam may be off by more than `OUTLIER`: long thin shapes err when near and
@@ -42,16 +36,9 @@ def lookup_distances(
     would hide. Only beams with a return both in the look-up and in the exact scan count: the beams
     that hit follow from the silhouette, which is exact. Placements are the same for all shapes.
 
-    Args:
-        exact: `Scanner.arguments` of that renderer.
-        baked: `Scanner.arguments` of the renderer `baked`.
-        shape: its index in the table.
-        radius: of the shape [m].
-        greatest: RMSE [m].
-
-    Returns:
-        Least and greatest distance from the lidar to the shape's origin [m]; both inf if it may not
-        be looked up.
+    `exact` and `baked` are `Scanner.arguments` of these renderers, the shape is an index in the
+    table with its radius [m]. Returns the least and the greatest distance from the lidar to the
+    shape's origin [m]; both inf if it may not be looked up.
     """
     low, high, (corners, first) = exact.range_min, exact.range_max, exact.outlines
     outline = corners[first[shape] : first[shape + 1]]
@@ -88,10 +75,7 @@ def _widest(rings: Array, squares: Array, counts: Array, greatest: Array) -> tup
 def _small(squares: Array, counts: Array, greatest: float) -> bool:
     """True if the RMSE is small in each ring and in each band, with a margin for chance.
 
-    Args:
-        squares: (R, P, B) sums of squared errors of R rings, P places in each and B bands.
-        counts: (R, P, B) numbers of beams.
-        greatest: RMSE [m].
+    The sums of squared errors, and the counts of beams, are of rings, places, bands (R, P, B).
     """
     rings = squares.sum(axis=2), counts.sum(axis=2)
     bands = squares.reshape(-1, BANDS).T, counts.reshape(-1, BANDS).T
@@ -109,9 +93,8 @@ def _scans(bodies: Array, exact: LidarArrays, baked: LidarArrays) -> tuple[Array
     mount, directions = exact.mount, exact.beams.directions
     robots = np.tile([-mount[0], -mount[1], 0.0], (PLACES, 1, 1))  # the lidar is at the origin
     scans = np.empty((2, PLACES, 1, len(directions)), np.float32)
+    worlds, lanes = np.arange(PLACES), scan_kernels.scan_lanes()
     for ranges, sensor in zip(scans, (exact, baked), strict=True):
-        worlds = np.arange(PLACES)
-        lanes = scan_kernels.scan_lanes()
         scan_kernels.scan_worlds(ranges, robots, worlds, bodies, -1, NO_WALLS, sensor, lanes)
     one, other = scans[:, :, 0].astype(np.float64)
     return one, other

@@ -28,25 +28,20 @@ COLUMN, ROW, ASIDE, ABOVE, QUADRANT, SIDE = (np.uintp(k * LANES) for k in range(
 """Where the quantities of a lane begin: direction, its inverses, place in the cell of the lidar and
 distance [cells]; column and row relative to the lidar, index increments of one column and one row,
 the quadrant's bit shift, and the side of the free square."""
-LONGEST = 255
-"""Side of the largest square that fits in a byte [cells]."""
-PARALLEL = np.float32(1e-12)
-"""Least component of a direction: its inverse stays finite."""
-SLACK = 1.0 + 1e-6
-"""A return at exactly range_max must not be lost to rounding; `finish` decides."""
+LONGEST = 255  # side of the largest square that fits in a byte [cells]
+PARALLEL = np.float32(1e-12)  # least component of a direction: its inverse stays finite
+SLACK = 1.0 + 1e-6  # a return at exactly range_max must not be lost to rounding; `finish` decides
 
 
 class GridArrays(NamedTuple):
     """A static map for the kernels; without cells where there is none.
 
-    Attributes:
-        squares: (rows + 2, columns + 2) of each cell one byte per quadrant, 0 in cells that stop a
-            beam and in the border of one cell around the map.
-        frame: (5,) x, y [m], cosine, sine of its origin in the world, resolution [m].
+    Of each cell the squares have one byte per quadrant, 0 in cells that stop a beam and in the
+    border of one cell around the map.
     """
 
-    squares: NDArray[np.uint32]
-    frame: NDArray[np.float64]
+    squares: NDArray[np.uint32]  # (rows + 2, columns + 2)
+    frame: NDArray[np.float64]  # (5,) x, y [m], cosine, sine of its origin, resolution [m]
 
 
 @kernel(allocates=True)
@@ -128,15 +123,9 @@ def walk(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
 
 @kernel
 def map_into(out, beams, lidar, range_max, grid, exact, lanes):  # type: ignore[no-untyped-def]
-    """Fuses a map into a scan (B,) float32 from a `LidarPose`, by walking or by jumping.
+    """Fuses a map (`GridArrays`) into a scan (B,) float32 [m] from a `LidarPose`.
 
-    Args:
-        out: (B,) ranges [m]; each becomes the lesser of itself and the range to the map.
-        beams: their directions.
-        lidar: its pose.
-        range_max: end of the search [m].
-        grid: `GridArrays`.
-        exact: True to walk.
+    It walks if `exact`, else jumps, and searches up to `range_max` [m].
     """
     squares, frame = grid.squares, grid.frame
     if squares.size == 0:

@@ -1,7 +1,4 @@
-"""GridMap: a static map of square cells, with the queries of lidar and simulator.
-
-Static maps from files, as Nav2's map_server reads them.
-"""
+"""Static maps of square cells, also from files as Nav2's map_server reads them."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +17,7 @@ from scipy import ndimage
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.shapes import Coordinate, Heading
 
@@ -32,21 +30,16 @@ NO_MAP = map_kernels.GridArrays(np.zeros((0, 0), np.uint32), np.zeros(0))
 class GridMap:
     """A static map. Cells are solid squares or free; everything outside is free.
 
-    Attributes:
-        cells: (rows, columns) int8 as in `nav_msgs/OccupancyGrid`: 0 free, 100 occupied, -1
-            unknown, else probability of occupancy [%]. Row 0 has the lowest y of the map and is the
-            last row of its image.
-        resolution: side of a cell [m].
-        origin: x [m], y [m], heading [rad] of the outer corner of cell (0, 0) in the world.
-        unknown_stops: whether cells that are neither free nor occupied stop a beam.
-        occupied_from: least value of occupied cells; 100 as in Nav2's static layer.
+    Cells are as in `nav_msgs/OccupancyGrid`: 0 free, 100 occupied, -1 unknown, else probability of
+    occupancy [%]. Row 0 has the lowest y of the map and is the last row of its image. The origin is
+    x [m], y [m], heading [rad] of the outer corner of cell (0, 0) in the world.
     """
 
-    cells: NDArray[np.int8]
-    resolution: float
+    cells: NDArray[np.int8]  # (rows, columns)
+    resolution: float  # side of a cell [m]
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    unknown_stops: bool = False
-    occupied_from: int = OCCUPIED
+    unknown_stops: bool = False  # True: cells that are neither free nor occupied stop a beam
+    occupied_from: int = OCCUPIED  # least value of occupied cells; 100 as in Nav2's static layer
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
@@ -68,11 +61,8 @@ class GridMap:
 
     def world_to_cell(self, points: ArrayLike) -> NDArray[np.int64]:
         """Returns row and column (..., 2) of points (..., 2) x, y [m]; may be outside the map."""
-        x, y, heading = self.origin
-        d = np.asarray(points, dtype=np.float64) - (x, y)
-        c, s = np.cos(heading), np.sin(heading)
-        place = np.stack([c * d[..., 1] - s * d[..., 0], c * d[..., 0] + s * d[..., 1]], axis=-1)
-        return np.floor(place / self.resolution).astype(np.int64)
+        place = rotate(np.asarray(points, dtype=np.float64) - self.origin[:2], -self.origin[2])
+        return np.floor(place[..., ::-1] / self.resolution).astype(np.int64)
 
     def cell_to_world(self, cells: ArrayLike) -> NDArray[np.float64]:
         """Returns the centres (..., 2) x, y [m] of cells (..., 2) row, column."""
@@ -103,16 +93,10 @@ class GridMap:
         return np.asarray(steps * (self.resolution / 2.0), dtype=np.float32)
 
     def reachable(self, start: ArrayLike, radius: float) -> NDArray[np.bool_]:
-        """Finds the cells whose centres a disc can reach from a start through free cells.
+        """Finds the cells (rows, columns) that a disc [m] can reach from a start (2,) [m].
 
-        It moves between the centres of neighbouring cells (four each) and stays in the map.
-
-        Args:
-            start: (2,) x, y [m].
-            radius: of the disc [m].
-
-        Returns:
-            (rows, columns), all False if the disc does not fit at the cell of the start.
+        It moves between the centres of neighbouring free cells (four each) and stays in the map;
+        all are False if it does not fit at the cell of the start.
         """
         fits = self.free & (self.distance_field > radius)
         row, column = self.world_to_cell(start)
@@ -123,44 +107,34 @@ class GridMap:
         return np.asarray(labels == labels[row, column])
 
 
-__all__ = ["FREE", "NO_MAP", "OCCUPIED", "UNKNOWN", "GridMap", "MapFile", "load_map"]
-
 MAX_CELLS = 64_000_000
-MAX_BYTES = 4 * MAX_CELLS + 2**20
-"""Greatest size of an image file; larger files are not opened."""
+MAX_BYTES = 4 * MAX_CELLS + 2**20  # of an image file; larger files are not opened
 FORMATS = {"PPM": (".pgm", ".pnm", ".ppm", ".pbm"), "PNG": (".png",), "BMP": (".bmp",)}
 LUMA = np.array([0.212656, 0.715158, 0.072186])
 """Luma weights of red, green, blue (Rec. 709), as used by ImageMagick for Nav2."""
+Mode = Literal["trinary", "scale", "raw"]
 
 
 class MapFile(Schema):
     """The keys of a map's YAML file, those of Nav2's map_server.
 
-    Attributes:
-        image: its path, absolute or relative to the folder of the YAML file.
-        resolution: side of a pixel [m].
-        origin: x [m], y [m], heading [rad] of the lower left corner of the image in the world.
-        negate: 0 or 1; whether white is occupied, rather than black.
-        occupied_thresh: pixels of at least this darkness, from 0 to 1, are occupied.
-        free_thresh: pixels of at most this darkness are free.
-        mode: `trinary`: free, occupied, else unknown. `scale`: pixels between the thresholds
-            become 0 to 100 %. `raw`: pixels from 0 to 100 are the percentage itself.
+    Mode `trinary`: pixels are free, occupied, else unknown. `scale`: pixels between the thresholds
+    become 0 to 100 %. `raw`: pixels from 0 to 100 are the percentage itself.
     """
 
-    image: str = Field(min_length=1)
-    resolution: float = Field(ge=1e-4, le=100.0)
-    origin: tuple[Coordinate, Coordinate, Heading]
-    negate: bool
-    occupied_thresh: float = Field(ge=0.0, le=1.0)
-    free_thresh: float = Field(ge=0.0, le=1.0)
-    mode: Literal["trinary", "scale", "raw"] = "trinary"
+    image: str = Field(min_length=1)  # path, absolute or relative to the folder of the YAML file
+    resolution: float = Field(ge=1e-4, le=100.0)  # side of a pixel [m]
+    origin: tuple[Coordinate, Coordinate, Heading]  # of the image's lower left corner
+    negate: bool  # 0 or 1; True if white is occupied, rather than black
+    occupied_thresh: float = Field(ge=0.0, le=1.0)  # from this darkness on pixels are occupied
+    free_thresh: float = Field(ge=0.0, le=1.0)  # up to this darkness they are free
+    mode: Mode = "trinary"
 
     @field_validator("mode", mode="before")
     @classmethod
     def _known(cls, mode: object) -> object:
-        known = ("trinary", "scale", "raw")
-        if isinstance(mode, str) and mode not in known:
-            raise ValueError(f"unknown mode; {nearest(mode, known)}")
+        if isinstance(mode, str) and mode not in get_args(Mode):
+            raise ValueError(f"unknown mode; {nearest(mode, get_args(Mode))}")
         return mode
 
     @model_validator(mode="after")
@@ -177,20 +151,8 @@ def load_map(
 
     Cells equal those of Nav2's map_server: pixels exactly on a threshold are occupied or free,
     colours count by their brightness (Rec. 709) in 256 steps, and pixels that are not opaque are
-    unknown unless the mode is `raw`. (Older releases of Nav2 average red, green, blue, and alpha
-    into the darkness, and leave pixels exactly on a threshold unknown; grey maps without alpha
-    differ in the latter only.)
-
-    Args:
-        name: of the map, or path.
-        unknown_stops: see GridMap.
-        occupied_from: see GridMap.
-
-    Returns:
-        The map.
-
-    Raises:
-        ConfigError: the YAML file or the image is missing, invalid or too large.
+    unknown unless the mode is `raw`. Raises ConfigError if the YAML file or the image is missing,
+    invalid or too large.
     """
     path = find_config(name, "maps")
     file = load_yaml(path, MapFile)
@@ -202,13 +164,7 @@ def load_map(
 def cells_of(
     grey: NDArray[np.uint8], opaque: NDArray[np.bool_] | None, file: MapFile
 ) -> NDArray[np.int8]:
-    """Returns the cells of an image (rows, columns), in the image's order of rows.
-
-    Args:
-        grey: brightness of each pixel.
-        opaque: True for opaque pixels; None if the image has no alpha channel.
-        file: thresholds and mode.
-    """
+    """Cells of an image (rows, columns) from its brightness and opacity, in its order of rows."""
     if file.mode == "raw":
         return np.where(grey <= OCCUPIED, grey, UNKNOWN).astype(np.int8)
     # In float32, as in Nav2: 0.6 and the pixel 102 are equal there.
@@ -229,45 +185,32 @@ def cells_of(
 def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
     """Reads brightness (rows, columns) of an image and, if it has an alpha channel, its opacity.
 
-    Args:
-        path: of a PGM (binary or plain, 8 or 16 bit), PNG or BMP file.
-        source: name of the YAML file, for error messages.
-
-    Raises:
-        ConfigError: it is missing, not such an image, damaged or too large.
+    It is a PGM (binary or plain, 8 or 16 bit), PNG or BMP file, which `source` names in its YAML.
+    Raises ConfigError if it is missing, not such an image, damaged or too large.
     """
     if not path.is_file():
         raise ConfigError(f"{source}: key 'image': there is no file {str(path)!r}; {_near(path)}")
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ConfigError(_too_large(path, "too many"))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # MAX_CELLS is less
+            if path.stat().st_size > MAX_BYTES:
+                raise Image.DecompressionBombError
             with Image.open(path, formats=tuple(FORMATS)) as image:
-                _check_size(image.size, path)
+                if image.width * image.height > MAX_CELLS:
+                    raise Image.DecompressionBombError
                 return _pixels(image)
     except Image.DecompressionBombError:
-        raise ConfigError(_too_large(path, "too many")) from None
+        reason = f"has too many pixels, a map may have {MAX_CELLS}; cut or coarsen it."
+        raise ConfigError(f"{path}: {reason}") from None
     except (EOFError, IndexError, OSError, OverflowError, SyntaxError, ValueError, struct.error):
-        raise ConfigError(
-            f"{path}: is no whole PGM, PNG or BMP image; save the map anew in one of them."
-        ) from None
+        reason = "is no whole PGM, PNG or BMP image; save the map anew in one of them."
+        raise ConfigError(f"{path}: {reason}") from None
 
 
 def _near(path: Path) -> str:
-    endings = tuple(ending for some in FORMATS.values() for ending in some)
-    folder = path.parent
+    endings, folder = sum(FORMATS.values(), ()), path.parent
     known = [file.name for file in folder.glob("*") if file.name.lower().endswith(endings)]
     return nearest(path.name, known) if known else f"there are no images in {str(folder)!r}."
-
-
-def _too_large(path: Path, cells: str) -> str:
-    return f"{path}: has {cells} pixels, and a map may have {MAX_CELLS}; cut or coarsen it."
-
-
-def _check_size(size: tuple[int, int], path: Path) -> None:
-    if size[0] * size[1] > MAX_CELLS:
-        raise ConfigError(_too_large(path, str(size[0] * size[1])))
 
 
 def _pixels(image: Image.Image) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:

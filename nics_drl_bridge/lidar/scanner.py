@@ -39,47 +39,37 @@ points are inaccurate [rad]."""
 class Scanner:
     """A lidar with its table, ready to scan.
 
-    Attributes:
-        spec: the lidar.
-        table: of the shapes that may occur.
-        renderer: `baked` looks up every shape; `exact` computes every ray; `auto` looks up, except
-            shapes larger than the range, in whose circle the lidar nearly always is, shapes with
-            an error of more than `GREATEST_ERROR` (any shape that is very near; long thin ones and
-            deep notches farther away, or anywhere), and beams wider than `WIDEST_BEAMS`. All
-            renderers compute straight walls, and a body in whose circle the lidar is.
-        grid: a static map of every world, if any.
+    The renderer `baked` looks up every shape; `exact` computes every ray; `auto` looks up, except
+    shapes larger than the range, in whose circle the lidar nearly always is, shapes with an error
+    of more than `GREATEST_ERROR` (any shape that is very near; long thin ones and deep notches
+    farther away, or anywhere), and beams wider than `WIDEST_BEAMS`. All renderers compute straight
+    walls, and a body in whose circle the lidar is.
     """
 
     spec: LidarSpec
-    table: LidarTable
+    table: LidarTable  # of the shapes that may occur
     renderer: Renderer = "auto"
-    grid: GridMap | None = None
+    grid: GridMap | None = None  # a static map of every world
 
     def __post_init__(self) -> None:
         """Raises ConfigError for an unknown renderer, ModelError for another lidar's table."""
         table, spec = self.table, self.spec
         if self.renderer not in RENDERERS:
-            raise ConfigError(
-                f"unknown renderer {self.renderer!r}; {nearest(str(self.renderer), RENDERERS)}"
-            )
+            known = nearest(str(self.renderer), RENDERERS)
+            raise ConfigError(f"unknown renderer {self.renderer!r}; {known}")
         if self.renderer == "exact" or not table.shapes:
             return
         if not table.has_rows:
-            raise ModelError(
-                f"the lidar table has no rows to look up with the renderer {self.renderer!r}; scan "
-                "with `exact`, or bake one."
-            )
+            reason = f"has no rows to look up with the renderer {self.renderer!r}"
+            raise ModelError(f"the lidar table {reason}; scan with `exact`, or bake one.")
+        bake_one = f"; bake one for the lidar {spec.name!r}."
         if not math.isclose(table.beam_angle, spec.angle_increment, rel_tol=1e-9):
-            raise ModelError(
-                f"the lidar table is for beams that are {table.beam_angle:.6g} rad apart, those of "
-                f"the lidar {spec.name!r} are {spec.angle_increment:.6g} rad; bake one for it."
-            )
+            apart = f"{table.beam_angle:.6g} rad apart, not {spec.angle_increment:.6g} rad"
+            raise ModelError(f"the lidar table is for beams that are {apart}{bake_one}")
         reach = float((table.grid[:, 0] - table.outlines.radii).min())
         if reach < spec.range_max * (1.0 - 1e-9):
-            raise ModelError(
-                f"the lidar table reaches {reach:g} m, the lidar {spec.name!r} {spec.range_max:g} "
-                "m; bake one for it."
-            )
+            reaches = f"reaches {reach:g} m, not {spec.range_max:g} m"
+            raise ModelError(f"the lidar table {reaches}{bake_one}")
 
     @cached_property
     def arguments(self) -> LidarArrays:
@@ -89,12 +79,9 @@ class Scanner:
         return LidarArrays(
             np.array(spec.mount),
             Beams(directions, spec.angle_min, spec.angle_increment, spec.full_circle),
-            spec.range_min,
-            spec.range_max,
-            self._looked_up(),
-            table.outlines.arguments,
+            spec.range_min, spec.range_max, self._looked_up(), table.outlines.arguments,
             table.arrays,
-        )
+        )  # fmt: skip
 
     def _looked_up(self) -> Array:
         """(H, 2) squares of the distances between which a shape is looked up [m^2]."""
@@ -124,21 +111,10 @@ class Scanner:
     def place(self, shapes: Sequence[Shape], poses: ArrayLike) -> NDArray[np.float64]:
         """Returns bodies (..., K, 7) of K shapes at poses (..., K, 3): x, y [m], heading [rad].
 
-        Raises:
-            ModelError: a shape is not in the table.
+        Raises ModelError if a shape is not in the table.
         """
-        poses = np.asarray(poses, dtype=np.float64)
         index = [self.table.outlines.index_of(shape) for shape in shapes]
         return place(poses, self.table.outlines.radii[index], index)
-
-    def _require_known(self, index: NDArray[np.float64]) -> None:
-        """Raises ModelError if the kernels would read beyond the table."""
-        known = len(self.table.shapes)
-        if index.size and not (index.min() >= 0 and index.max() < known):
-            raise ModelError(
-                f"a body is of a shape that is none of the {known} in the lidar table; make "
-                "bodies by `place` of the scanner that scans them."
-            )
 
     def scan(
         self,
@@ -147,23 +123,17 @@ class Scanner:
         walls: ArrayLike = NO_WALLS,
         out: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
-        """Scans from several robots, each in a separate world.
+        """Scans (N, B) [m], REP-117, from poses (N, 3) of robots, each in a separate world.
 
-        Args:
-            poses: (N, 3) of `base_link` in the world.
-            bodies: (N, K, 7) from `place`.
-            walls: (W, 4) x1, y1, x2, y2 [m], the same in every world.
-            out: (N, B) result array, a new one by default.
-
-        Returns:
-            (N, B) ranges [m]: `inf` no return, `-inf` too close (REP-117).
-
-        Raises:
-            ConfigError: an array has a wrong shape.
-            ModelError: a body is of a shape that is not in the table.
+        The bodies (N, K, 7) are from `place`; walls (W, 4) x1, y1, x2, y2 [m] are the same in every
+        world; the ranges are written to `out` if it is given. Raises ConfigError for an array of a
+        wrong shape, ModelError for a body of a shape that is not in the table.
         """
         poses, bodies, walls = self._scene(poses, bodies, walls)
-        out = self._result(len(poses), out)
+        shape = (len(poses), self.spec.beams)
+        out = np.empty(shape, np.float32) if out is None else out
+        if out.shape != shape or out.dtype != np.float32:
+            raise ConfigError(f"out is {out.shape} {out.dtype}; it must be {shape} float32.")
         if not out.flags.c_contiguous:
             out[:] = self.scan(poses, bodies, walls)
             return out
@@ -188,21 +158,17 @@ class Scanner:
             bodies = bodies[None]
         walls = np.atleast_2d(np.asarray(walls if np.size(walls) else NO_WALLS, dtype=np.float64))
         if poses.shape[1:] != (3,) or bodies.shape != (len(poses), bodies.shape[1], BODY):
-            raise ConfigError(
-                f"poses {poses.shape} and bodies {bodies.shape} must be (N, 3) and (N, K, {BODY})."
-            )
+            given = f"poses {poses.shape} and bodies {bodies.shape}"
+            raise ConfigError(f"{given} must be (N, 3) and (N, K, {BODY}).")
         if walls.shape != (len(walls), 4):
             raise ConfigError(f"walls {walls.shape} must be (W, 4).")
-        self._require_known(bodies[..., SHAPE])
+        index, known = bodies[..., SHAPE], len(self.table.shapes)
+        if index.size and not (index.min() >= 0 and index.max() < known):
+            raise ModelError(  # the kernels would read beyond the table
+                f"a body is of a shape that is none of the {known} in the lidar table; make "
+                "bodies by `place` of the scanner that scans them."
+            )
         return poses, bodies, walls
-
-    def _result(self, scans: int, out: NDArray[np.float32] | None) -> NDArray[np.float32]:
-        """Returns the result array (N, B). Raises ConfigError if `out` does not fit."""
-        shape = (scans, self.spec.beams)
-        out = np.empty(shape, np.float32) if out is None else out
-        if out.shape != shape or out.dtype != np.float32:
-            raise ConfigError(f"out is {out.shape} {out.dtype}; it must be {shape} float32.")
-        return out
 
 
 def make_scanner(
@@ -213,8 +179,7 @@ def make_scanner(
 ) -> Scanner:
     """Returns a scanner with a table for the shapes, baked now if needed, and a static map.
 
-    Raises:
-        ConfigError: the renderer is unknown, or the table would be too large.
+    Raises ConfigError if the renderer is unknown, or the table would be too large.
     """
     table = LidarTable.without_rows(spec, shapes) if renderer == "exact" else bake(spec, shapes)
     return Scanner(spec, table, renderer, grid)

@@ -17,27 +17,17 @@ TURN = 2.0 * math.pi
 
 
 class SectorPlan(NamedTuple):
-    """Assignment of the beams of one lidar to the sectors of one layout.
+    """Assignment of the beams of one lidar to the sectors of one layout."""
 
-    Attributes:
-        first, hits: (S,) first beam of each sector, and number of its beams; they continue with
-            beam 0 after the last.
-        directions: (B, 2) of the beams in `base_link`.
-        shift: (2,) of the lidar from the viewpoint [m]; if zero, sectors are filled by beam.
-        angle_min, width: begin of sector 0, and width of the sectors [rad].
-        range_min, range_max: of the lidar [m].
-        closed: True if the last beam and the first are neighbours.
-    """
-
-    first: NDArray[np.int32]
-    hits: NDArray[np.int32]
-    directions: NDArray[np.float64]
-    shift: NDArray[np.float64]
-    angle_min: float
-    width: float
-    range_min: float
+    first: NDArray[np.int32]  # (S,) first beam of each sector
+    hits: NDArray[np.int32]  # (S,) number of its beams, which continue with beam 0 after the last
+    directions: NDArray[np.float64]  # (B, 2) of the beams in `base_link`
+    shift: NDArray[np.float64]  # (2,) of the lidar from the viewpoint [m]; zero: filled by beam
+    angle_min: float  # begin of sector 0 [rad]
+    width: float  # of the sectors [rad]
+    range_min: float  # of the lidar [m]
     range_max: float
-    closed: bool
+    closed: bool  # True if the last beam and the first are neighbours
 
     def resample(self, ranges: NDArray[np.float32]) -> NDArray[np.float32]:
         """Resamples scans (..., B) to the nearest return (..., S) in each sector [m], REP-117.

@@ -20,7 +20,7 @@ from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.geometry import wrap_angle
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.shapes import LARGEST, Place
-from nics_drl_bridge.lidar.spec import FULL_CIRCLE_TOLERANCE, LidarSpec, ScanHeader
+from nics_drl_bridge.lidar.spec import FULL_CIRCLE_TOLERANCE, LidarSpec, ScanHeader, check_angles
 
 Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
@@ -38,27 +38,17 @@ class ScanLayout(Schema):
 
     Sector 0 begins at `angle_min`, the others follow counter-clockwise. The angles are those of
     `base_link`, seen from the viewpoint.
-
-    Attributes:
-        sectors: S.
-        angle_min: begin of the first sector [rad].
-        angle_max: end of the last sector [rad].
-        range_max: farther returns count as none [m].
-        viewpoint: x, y in `base_link` [m].
     """
 
-    sectors: int = Field(ge=4, le=1440)
-    angle_min: float = -np.pi
-    angle_max: float = np.pi
-    range_max: float = Field(ge=1e-3, le=LARGEST)
-    viewpoint: tuple[Place, Place] = (0.0, 0.0)
+    sectors: int = Field(ge=4, le=1440)  # S
+    angle_min: float = -np.pi  # begin of the first sector [rad]
+    angle_max: float = np.pi  # end of the last sector [rad]
+    range_max: float = Field(ge=1e-3, le=LARGEST)  # farther returns count as none [m]
+    viewpoint: tuple[Place, Place] = (0.0, 0.0)  # x, y in `base_link` [m]
 
     @model_validator(mode="after")
     def _consistent(self) -> ScanLayout:
-        if not 0.0 < self.angle_max - self.angle_min <= 2.0 * np.pi + FULL_CIRCLE_TOLERANCE:
-            raise ValueError("angle_max must exceed angle_min by at most a full circle, in radians")
-        if max(-self.angle_min, self.angle_max) > 2.0 * np.pi + FULL_CIRCLE_TOLERANCE:
-            raise ValueError("angle_min and angle_max must lie within -2 pi and 2 pi")
+        check_angles(self.angle_min, self.angle_max)
         return self
 
     @property
@@ -82,37 +72,27 @@ LAYOUTS = {
 def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
     """Returns the layout for a user's setting.
 
-    Args:
-        given: None, a ScanLayout, the name of one of `LAYOUTS`, its fields, or a number of sectors
-            over the lidar's field of view, seen from its mount.
-        lidar: used with a number of sectors.
-
-    Raises:
-        ConfigError: none of these.
+    It is None, a ScanLayout, the name of one of `LAYOUTS`, its fields, or a number of sectors over
+    the lidar's field of view, seen from its mount. Raises ConfigError for anything else.
     """
     if given is None or isinstance(given, ScanLayout):
         return given
+    option = f"task option scan={given!r}"
     if isinstance(given, str):
         if given not in LAYOUTS:
-            raise ConfigError(
-                f"task option scan={given!r}: no such layout; {nearest(given, LAYOUTS)}"
-            )
+            raise ConfigError(f"{option}: no such layout; {nearest(given, LAYOUTS)}")
         return LAYOUTS[given]
-    if isinstance(given, Mapping):
-        return validate(dict(given), ScanLayout, "task option scan")
     if isinstance(given, int | np.integer) and not isinstance(given, bool):
         x, y, heading = lidar.mount
         middle = 0.5 * (lidar.angle_min + lidar.angle_max)
         begin = lidar.angle_min + float(wrap_angle(middle + heading)) - middle
         span = lidar.angle_max - lidar.angle_min
         fields = {"angle_min": begin, "angle_max": begin + span, "range_max": lidar.range_max}
-        return validate(
-            {"sectors": int(given), "viewpoint": (x, y), **fields}, ScanLayout, "task option scan"
-        )
-    raise ConfigError(
-        f"task option scan={given!r}: must be a number of sectors, a mapping, or one of "
-        f"{', '.join(map(repr, LAYOUTS))}."
-    )
+        given = {"sectors": int(given), "viewpoint": (x, y), **fields}
+    if not isinstance(given, Mapping):
+        known = ", ".join(map(repr, LAYOUTS))
+        raise ConfigError(f"{option}: must be a number of sectors, a mapping, or one of {known}.")
+    return validate(dict(given), ScanLayout, "task option scan")
 
 
 NO_PLAN = SectorPlan(
@@ -125,9 +105,8 @@ NO_PLAN = SectorPlan(
 def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
     """Returns the plan by which a lidar fills a layout.
 
-    Raises:
-        ConfigError: the lidar does not cover every sector, its range is too short, or its beams
-            are more than `COARSEST_RAD` apart.
+    Raises ConfigError if the lidar does not cover every sector, its range is too short, or its
+    beams are more than `COARSEST_RAD` apart.
     """
     x, y, heading = lidar.mount
     angles = lidar.angles + heading
@@ -138,24 +117,16 @@ def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
     left_open = 2.0 * np.pi - (lidar.angles[-1] - lidar.angles[0])
     closed = left_open <= max(COARSEST_RAD, lidar.angle_increment)
     return SectorPlan(
-        first,
-        count,
-        np.stack([np.cos(angles), np.sin(angles)], axis=1),
-        np.array([x - layout.viewpoint[0], y - layout.viewpoint[1]]),
-        float(layout.angle_min),
-        float(layout.width),
-        float(lidar.range_min),
-        float(lidar.range_max),
-        bool(closed),
-    )
+        first, count, np.stack([np.cos(angles), np.sin(angles)], axis=1),
+        np.array([x - layout.viewpoint[0], y - layout.viewpoint[1]]), float(layout.angle_min),
+        float(layout.width), float(lidar.range_min), float(lidar.range_max), bool(closed),
+    )  # fmt: skip
 
 
 def _beams_of(away: Array, half: float) -> tuple[int, int]:
     """First beam and number of beams within `half` of a direction, or the adjacent beams if none.
 
-    Args:
-        away: (B,) angle of each beam from the middle of the sector [rad], wrapped.
-        half: half the width of the sector [rad].
+    `away` (B,) is the angle of each beam from that direction, wrapped [rad].
     """
     inside = np.abs(away) <= half
     if not inside.any():
@@ -170,15 +141,13 @@ def _beams_of(away: Array, half: float) -> tuple[int, int]:
 def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
     apart = lidar.angle_increment if lidar.beams > 1 else np.inf
     if apart > COARSEST_RAD:
-        raise ConfigError(
-            f"the beams of the lidar {lidar.name!r} are {np.degrees(apart):.3g} deg apart, a scan "
-            f"layout needs at most {np.degrees(COARSEST_RAD):.3g}; use a finer lidar."
-        )
+        found, most = np.degrees([apart, COARSEST_RAD])
+        reason = f"are {found:.3g} deg apart, a scan layout needs at most {most:.3g}"
+        raise ConfigError(f"the beams of the lidar {lidar.name!r} {reason}; use a finer lidar.")
     if lidar.range_max < layout.range_max * (1.0 - RANGE_TOLERANCE):
-        raise ConfigError(
-            f"range_max of the lidar {lidar.name!r} is {lidar.range_max:g} m, the scan layout "
-            f"needs {layout.range_max:g} m; use a lidar that sees farther, or another layout."
-        )
+        needed = f"{layout.range_max:g} m; use a lidar that sees farther, or another layout."
+        seen = f"range_max of the lidar {lidar.name!r} is {lidar.range_max:g} m"
+        raise ConfigError(f"{seen}, the scan layout needs {needed}")
     steps = max(layout.sectors, int(np.ceil((layout.angle_max - layout.angle_min) / apart)))
     wanted = np.linspace(layout.angle_min, layout.angle_max, steps + 1)
     ordered = np.sort(np.mod(angles, 2.0 * np.pi))
@@ -187,25 +156,19 @@ def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
     after = np.searchsorted(ordered, place).clip(1, len(ordered) - 1)
     gap = np.minimum(place - ordered[after - 1], ordered[after] - place)
     if (gap > apart + BORDER_RAD).any():
-        begin, end = np.degrees([angles[0], angles[-1]])
+        limits = np.degrees([angles[0], angles[-1], layout.angle_min, layout.angle_max])
         raise ConfigError(
-            f"the lidar {lidar.name!r} looks from {begin:.4g} to {end:.4g} deg in base_link, the "
-            f"scan layout needs {np.degrees(layout.angle_min):.4g} to "
-            f"{np.degrees(layout.angle_max):.4g}; use a wider lidar, or another layout."
+            "the lidar {!r} looks from {:.4g} to {:.4g} deg in base_link, the scan layout needs "
+            "{:.4g} to {:.4g}; use a wider lidar, or another layout.".format(lidar.name, *limits)
         )
 
 
 @dataclass(frozen=True)
 class Reader:
-    """Converts the ranges of a device to the beam order of a LidarSpec.
+    """Converts the ranges of a device to the beam order of a LidarSpec."""
 
-    Attributes:
-        lidar: the device.
-        backwards: whether its beams are in clockwise order.
-    """
-
-    lidar: LidarSpec
-    backwards: bool
+    lidar: LidarSpec  # the device
+    backwards: bool  # True if its beams are in clockwise order
 
     def ordered(self, values: Ranges) -> Ranges:
         """Returns ranges (..., B) in counter-clockwise order."""
@@ -213,25 +176,19 @@ class Reader:
 
 
 def reader_of(header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool = False) -> Reader:
-    """Returns the reader for scans with a given header.
+    """Returns the reader for scans of B beams with the header of a LaserScan.
 
-    Args:
-        header: of a LaserScan. A negative `angle_increment` means clockwise beams.
-        beams: B.
-        like: provides the properties that headers lack: mount, frame, the value for no return.
-        upside_down: whether the device is mounted with its z axis down, so that it turns clockwise.
-
-    Raises:
-        ConfigError: the header does not describe a lidar.
+    A negative `angle_increment` means clockwise beams, and so does a device that is mounted with
+    its z axis down. `like` provides what headers lack: mount, frame, the value for no return.
+    Raises ConfigError if the header describes no lidar.
     """
     begin, step = header.angle_min, header.angle_increment
     if upside_down:
         begin, step = -begin, -step
     if not (np.isfinite([begin, step]).all() and step != 0.0 and beams > 1):
-        raise ConfigError(
-            f"LaserScan of {beams} beams, angle_min {header.angle_min:g}, angle_increment "
-            f"{header.angle_increment:g}: describes no lidar; mend the driver's parameters."
-        )
+        angles = f"angle_min {header.angle_min:g}, angle_increment {header.angle_increment:g}"
+        reason = "describes no lidar; mend the driver's parameters."
+        raise ConfigError(f"LaserScan of {beams} beams, {angles}: {reason}")
     backwards = step < 0.0
     if backwards:
         begin, step = begin + step * (beams - 1), -step

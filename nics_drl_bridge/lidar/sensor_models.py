@@ -19,19 +19,14 @@ from nics_drl_bridge.config import Schema, load_yaml
 Ranges = NDArray[np.float32]
 Function = Callable[[Ranges, NDArray[np.float64]], Ranges]
 """Ranges (P,) [m] and angles of incidence (P,) [rad] to the ranges that the device reports."""
-NEAREST = 1e-3
-"""A surface nearer than this is as bright as one at this range [m]."""
+NEAREST = 1e-3  # a surface nearer than this is as bright as one at this range [m]
 
 
 class IncidenceDropout(Schema):
-    """Loses returns at oblique incidence, as from polished metal.
-
-    Attributes:
-        greatest_incidence: between the ray and the normal of the surface [rad].
-    """
+    """Loses returns at oblique incidence, as from polished metal."""
 
     kind: Literal["incidence_dropout"] = "incidence_dropout"
-    greatest_incidence: float
+    greatest_incidence: float  # between the ray and the normal of the surface [rad]
 
     @field_validator("greatest_incidence")
     @classmethod
@@ -56,21 +51,16 @@ class Intensity(Schema):
 
     This is the laser range equation for a diffuse surface that is wider than the beam, in clear
     air: Jelalian, Laser Radar Systems (1992); in this form Hoefle and Pfeifer, Correction of laser
-    scanning intensity data (2007), with the exponent 1 of Lambert's law.
-
-    Attributes:
-        gain: intensity of a white surface at normal incidence at 1 m [the device's unit].
-        reflectivity: of walls, static maps and shapes without their own: 1 is a white diffuse
-            surface, a retroreflector has more.
-        exponent: of the cosine; 0 for no effect of the angle, more than 1 for glossy surfaces.
-        threshold: weaker returns are lost [the device's unit].
+    scanning intensity data (2007), with the exponent 1 of Lambert's law. A reflectivity of 1 is
+    that of a white diffuse surface, a retroreflector has more; the exponent is 0 for no effect of
+    the angle, and more than 1 for glossy surfaces.
     """
 
     kind: Literal["intensity"] = "intensity"
-    gain: float = Field(default=1.0, gt=0.0)
-    reflectivity: float = Field(default=0.5, gt=0.0)
-    exponent: float = Field(default=1.0, ge=0.0, le=100.0)
-    threshold: float = Field(default=0.0, ge=0.0)
+    gain: float = Field(default=1.0, gt=0.0)  # white, at normal incidence, at 1 m [device's unit]
+    reflectivity: float = Field(default=0.5, gt=0.0)  # of walls, maps, shapes without their own
+    exponent: float = Field(default=1.0, ge=0.0, le=100.0)  # of the cosine
+    threshold: float = Field(default=0.0, ge=0.0)  # weaker returns are lost [the device's unit]
 
     def __str__(self) -> str:
         """In a few words."""
@@ -87,10 +77,8 @@ class Intensity(Schema):
     ) -> NDArray[np.bool_]:
         """True for the points (P,) whose return is below the threshold.
 
-        Args:
-            ranges: (P,) [m].
-            incidence: (P,) between the ray and the normal of the surface [rad].
-            reflectivity: of the surface, None for that of the model.
+        The incidence is between the ray and the normal of the surface [rad]; a reflectivity of None
+        is that of the model.
         """
         light = self.gain * self.reflectance(np.cos(incidence), reflectivity)
         return np.asarray(light / np.square(np.maximum(ranges, NEAREST)) < self.threshold)

@@ -17,16 +17,11 @@ from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN, Outline
 
 Array = NDArray[np.float64]
 MOST_CORNERS = 16_384
-MOST_SHAPES = 1_000
-"""Greatest number of shapes in one file, or in one group of obstacles."""
+MOST_SHAPES = 1_000  # in one file, or in one group of obstacles
 SMALLEST, LARGEST = 1e-6, 1e4
 """Extent of a shape [m]: anything smaller is invisible, anything larger does not fit in a world."""
-SAME_PLACE = 1e-9
-"""Corners within this distance, as a share of the shape's radius, coincide."""
-
-
-FARTHEST = 1e8
-"""Greatest coordinate in a map [m], enough for UTM."""
+SAME_PLACE = 1e-9  # corners within this distance, as a share of the shape's radius, coincide
+FARTHEST = 1e8  # greatest coordinate in a map [m], enough for UTM
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 Heading = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Place = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
@@ -36,23 +31,32 @@ Size = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 class Surface(Schema):
     """Properties of a shape's surface, common to all shapes.
 
-    Attributes:
-        reflectivity: of its surface, for a sensor model of intensity: 1 is a white diffuse
-            one, a retroreflector has more; by default that of the lidar's sensor model.
+    The reflectivity is for a sensor model of intensity: 1 is that of a white diffuse surface, a
+    retroreflector has more; by default it is that of the lidar's sensor model.
     """
 
     reflectivity: float | None = Field(default=None, gt=0.0, le=1e6)
 
 
-class Circle(Surface):
-    """A disc around its own origin.
+class Outlined(Surface):
+    """A shape with corners."""
 
-    Attributes:
-        radius: [m].
-    """
+    @property
+    def outline(self) -> Array:
+        """(V, 2) corners, counter-clockwise [m]."""
+        raise NotImplementedError
+
+    @property
+    def radius(self) -> float:
+        """Of the circle around the origin that holds the shape [m]."""
+        return _reach(self.outline)
+
+
+class Circle(Surface):
+    """A disc around its own origin."""
 
     kind: Literal["circle"] = "circle"
-    radius: Size
+    radius: Size  # [m]
 
     @property
     def outline(self) -> Array:
@@ -60,15 +64,11 @@ class Circle(Surface):
         return np.zeros((0, 2))
 
 
-class Rectangle(Surface):
-    """A rectangle centred at its own origin, along its own axes.
-
-    Attributes:
-        size: length along x and width along y [m].
-    """
+class Rectangle(Outlined):
+    """A rectangle centred at its own origin, along its own axes."""
 
     kind: Literal["rectangle"] = "rectangle"
-    size: tuple[Size, Size]
+    size: tuple[Size, Size]  # length along x and width along y [m]
 
     @field_validator("size", mode="before")
     @classmethod
@@ -83,17 +83,11 @@ class Rectangle(Surface):
         x, y = self.size[0] / 2.0, self.size[1] / 2.0
         return np.array([(x, y), (-x, y), (-x, -y), (x, -y)])
 
-    @property
-    def radius(self) -> float:
-        """Of the circle around the origin that holds the shape [m]."""
-        return _reach(self.outline)
 
-
-class Polygon(Surface):
+class Polygon(Outlined):
     """An outline of straight edges, convex or concave; the last corner is joined to the first.
 
-    Attributes:
-        points: corners in the shape's own frame, in either orientation [m].
+    The points are in the shape's own frame, in either orientation [m].
     """
 
     kind: Literal["polygon"] = "polygon"
@@ -116,21 +110,12 @@ class Polygon(Surface):
         twice_area = np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)
         return corners if twice_area >= 0.0 else np.ascontiguousarray(corners[::-1])
 
-    @property
-    def radius(self) -> float:
-        """Of the circle around the origin that holds the shape [m]."""
-        return _reach(self.outline)
 
-
-class Segment(Surface):
-    """A straight wall without thickness.
-
-    Attributes:
-        ends: its two ends in the shape's own frame [m].
-    """
+class Segment(Outlined):
+    """A straight wall without thickness."""
 
     kind: Literal["segment"] = "segment"
-    ends: tuple[tuple[Place, Place], tuple[Place, Place]]
+    ends: tuple[tuple[Place, Place], tuple[Place, Place]]  # in the shape's own frame [m]
 
     @model_validator(mode="after")
     def _extended(self) -> Segment:
@@ -144,11 +129,6 @@ class Segment(Surface):
     def outline(self) -> Array:
         """(2, 2) ends [m]."""
         return np.array(self.ends, dtype=np.float64)
-
-    @property
-    def radius(self) -> float:
-        """Of the circle around the origin that holds the shape [m]."""
-        return _reach(self.outline)
 
 
 Shape = Annotated[Circle | Rectangle | Polygon | Segment, Field(discriminator="kind")]
@@ -168,8 +148,7 @@ def load_shapes(path: str | Path) -> tuple[Shape, ...]:
 SQUARE = Rectangle(size=(0.3, 0.3))
 STRIP = Rectangle(size=(0.6, 0.06))
 
-BODY = 7
-"""Number of columns of a placed body."""
+BODY = 7  # number of columns of a placed body
 
 
 def _reach(outline: Array) -> float:
@@ -177,15 +156,10 @@ def _reach(outline: Array) -> float:
 
 
 def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
-    """Places shapes in a world.
+    """Places shapes in a world as bodies (..., 7), see `BODY`.
 
-    Args:
-        poses: (..., 3) x, y [m], heading [rad] of each shape's own frame.
-        radii: (...) of each shape [m]; 0 for an absent one.
-        shapes: (...) index of each shape.
-
-    Returns:
-        (..., 7) bodies, see `BODY`.
+    Each has a pose (..., 3) of its own frame, a radius (...) [m], 0 if it is absent, and the index
+    (...) of its shape.
     """
     poses = np.asarray(poses, dtype=np.float64)
     bodies = np.empty((*poses.shape[:-1], BODY))
@@ -243,24 +217,17 @@ def rotational_order(outline: Array, hull: Array) -> int:
 class Outlines:
     """A set of shapes as flat arrays.
 
-    Attributes:
-        shapes: the H shapes.
-        corners: (sum V, 2) corners of all outlines, one after the other [m].
-        corner: (H + 1,) index in `corners` of each outline's first corner; a circle has none.
-        hulls: corners of all convex hulls, each stored twice, so that an index may run past its
-            end; a circle has its centre.
-        hull: (H + 1,) index in `hulls` of each hull's first corner.
-        radii: (H,) [m].
-        orders: (H,) rotational order.
+    Convex hulls are stored twice, so that an index may run past the end; that of a circle is its
+    centre.
     """
 
-    shapes: tuple[Shape, ...]
-    corners: Array
-    corner: NDArray[np.int64]
-    hulls: Array
-    hull: NDArray[np.int64]
-    radii: Array
-    orders: NDArray[np.int64]
+    shapes: tuple[Shape, ...]  # H
+    corners: Array  # (sum V, 2) of all outlines, one after the other [m]
+    corner: NDArray[np.int64]  # (H + 1,) first corner of each outline; a circle has none
+    hulls: Array  # (sum 2 V, 2) corners of all convex hulls [m]
+    hull: NDArray[np.int64]  # (H + 1,) first corner of each hull
+    radii: Array  # (H,) [m]
+    orders: NDArray[np.int64]  # (H,) rotational order
 
     @classmethod
     def of(cls, shapes: Sequence[Shape]) -> Outlines:
@@ -270,20 +237,13 @@ class Outlines:
         orders = [rotational_order(o, h) for o, h in zip(outlines, hulls, strict=True)]
         twice = [np.concatenate([hull, hull]) for hull in hulls]
         nothing = np.zeros((0, 2))
+        radii = np.array([shape.radius for shape in shapes], dtype=np.float64)
         return cls(
             tuple(shapes),
-            np.concatenate([nothing, *outlines]),
-            np.cumsum([0, *map(len, outlines)]),
-            np.concatenate([nothing, *twice]),
-            np.cumsum([0, *map(len, twice)]),
-            np.array([shape.radius for shape in shapes], dtype=np.float64),
-            np.array(orders, dtype=np.int64),
-        )
-
-    @property
-    def concave(self) -> NDArray[np.bool_]:
-        """(H,) True for outlines with corners that are not on their hull."""
-        return np.asarray(np.diff(self.corner) > np.diff(self.hull) // 2)
+            np.concatenate([nothing, *outlines]), np.cumsum([0, *map(len, outlines)]),
+            np.concatenate([nothing, *twice]), np.cumsum([0, *map(len, twice)]),
+            radii, np.array(orders, dtype=np.int64),
+        )  # fmt: skip
 
     @property
     def arguments(self) -> OutlineArrays:
@@ -295,23 +255,19 @@ class Outlines:
         try:
             return self.shapes.index(shape)
         except ValueError:
-            raise ModelError(
-                f"the shape {describe(shape)} is not in the lidar table, which holds "
-                f"{', '.join(map(describe, self.shapes)) or 'none'}; bake it as well."
-            ) from None
+            held = ", ".join(map(describe, self.shapes)) or "none"
+            reason = f"is not in the lidar table, which holds {held}; bake it as well."
+            raise ModelError(f"the shape {describe(shape)} {reason}") from None
 
 
 def describe(shape: Shape) -> str:
     """Describes a shape in a few words."""
-    surface = "" if shape.reflectivity is None else f", reflectivity {shape.reflectivity:g}"
-    return f"{_outline_in_words(shape)}{surface}"
-
-
-def _outline_in_words(shape: Shape) -> str:
     if isinstance(shape, Circle):
-        return f"circle of radius {shape.radius:g} m"
-    if isinstance(shape, Rectangle):
-        return f"rectangle of {shape.size[0]:g} x {shape.size[1]:g} m"
-    if isinstance(shape, Segment):
-        return f"segment of {np.hypot(*np.subtract(*shape.ends)):.3g} m"
-    return f"polygon of {len(shape.points)} corners, radius {shape.radius:.3g} m"
+        words = f"circle of radius {shape.radius:g} m"
+    elif isinstance(shape, Rectangle):
+        words = f"rectangle of {shape.size[0]:g} x {shape.size[1]:g} m"
+    elif isinstance(shape, Segment):
+        words = f"segment of {np.hypot(*np.subtract(*shape.ends)):.3g} m"
+    else:
+        words = f"polygon of {len(shape.points)} corners, radius {shape.radius:.3g} m"
+    return words if shape.reflectivity is None else f"{words}, reflectivity {shape.reflectivity:g}"

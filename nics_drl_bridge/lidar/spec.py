@@ -28,26 +28,23 @@ NoReturn = Literal["inf", "zero", "nan", "range_max"]
 
 
 class ScanHeader(NamedTuple):
-    """The fields of a LaserScan that follow from the lidar, with their names in the message.
+    """The fields of a LaserScan that follow from the lidar, with their names in the message."""
 
-    Attributes:
-        angle_min: of the first beam [rad].
-        angle_max: of the last beam, also for a full circle [rad].
-        angle_increment: between neighbouring beams [rad].
-        time_increment: between neighbouring beams [s]; 0 if all are measured at once,
-            negative if the device turns clockwise.
-        scan_time: between scans [s].
-        range_min: nearest return [m].
-        range_max: farthest return [m].
-    """
+    angle_min: float  # of the first beam [rad]
+    angle_max: float  # of the last beam, also for a full circle [rad]
+    angle_increment: float  # between neighbouring beams [rad]
+    time_increment: float  # the same [s]; 0 if all are measured at once, negative if clockwise
+    scan_time: float  # between scans [s]
+    range_min: float  # nearest return [m]
+    range_max: float  # farthest return [m]
 
-    angle_min: float
-    angle_max: float
-    angle_increment: float
-    time_increment: float
-    scan_time: float
-    range_min: float
-    range_max: float
+
+def check_angles(angle_min: float, angle_max: float) -> None:
+    """Raises ValueError unless the limits span at most a full circle within two turns."""
+    if not 0.0 < angle_max - angle_min <= 2.0 * np.pi + FULL_CIRCLE_TOLERANCE:
+        raise ValueError("angle_max must exceed angle_min by at most a full circle, in radians")
+    if max(-angle_min, angle_max) > 2.0 * np.pi + FULL_CIRCLE_TOLERANCE:
+        raise ValueError("angle_min and angle_max must lie within -2 pi and 2 pi")
 
 
 class LidarSpec(Schema):
@@ -56,46 +53,27 @@ class LidarSpec(Schema):
     Beam 0 points at `angle_min`, the others follow counter-clockwise. When the limits span a
     full circle the last beam stops one increment short of it, so that no direction is
     measured twice.
-
-    Attributes:
-        name: the name users refer to it by.
-        beams: B.
-        angle_min: of the first beam, in the frame of the lidar [rad].
-        angle_max: of the last beam, or of the end of the circle [rad].
-        range_min: nearer returns are reported as `-inf` [m].
-        range_max: farther returns are reported as `inf` [m].
-        rate: scans per second [Hz].
-        mount: x [m], y [m], heading [rad] of `laser` in `base_link`.
-        noise_std: standard deviation of a range [m].
-        frame: id of the lidar's own frame.
-        no_return: the device's value for no return: `inf` (REP-117), `zero`, `nan` or
-            `range_max`. In the package it is `inf`; see `lidar.rep117`.
-        faults: further faults of the device's ranges.
-        sensor_model: effects of the surfaces on its returns, baked into its tables.
     """
 
     name: str = "lidar"
-    beams: int = Field(ge=1, le=100_000)
-    angle_min: float
-    angle_max: float
-    range_min: float = Field(ge=0.0)
-    range_max: float = Field(ge=1e-3, le=LARGEST)
-    rate: float = Field(ge=1e-3, le=1e5)
-    mount: tuple[Place, Place, Heading] = (0.0, 0.0, 0.0)
-    noise_std: float = Field(default=0.0, ge=0.0, le=LARGEST)
-    frame: str = Field(default="laser", min_length=1)
-    no_return: NoReturn = "inf"
-    faults: LidarFaults = LidarFaults()
-    sensor_model: SensorModels = ()
+    beams: int = Field(ge=1, le=100_000)  # B
+    angle_min: float  # of the first beam, in the frame of the lidar [rad]
+    angle_max: float  # of the last beam, or of the end of the circle [rad]
+    range_min: float = Field(ge=0.0)  # nearer returns are reported as `-inf` [m]
+    range_max: float = Field(ge=1e-3, le=LARGEST)  # farther returns are reported as `inf` [m]
+    rate: float = Field(ge=1e-3, le=1e5)  # scans per second [Hz]
+    mount: tuple[Place, Place, Heading] = (0.0, 0.0, 0.0)  # of `laser` in `base_link`
+    noise_std: float = Field(default=0.0, ge=0.0, le=LARGEST)  # of a range [m]
+    frame: str = Field(default="laser", min_length=1)  # id of the lidar's own frame
+    no_return: NoReturn = "inf"  # the device's value for it; in the package it is `inf`
+    faults: LidarFaults = LidarFaults()  # further faults of the device's ranges
+    sensor_model: SensorModels = ()  # effects of surfaces on its returns, baked into its tables
 
     @model_validator(mode="after")
     def _consistent(self) -> LidarSpec:
         if not self.range_min < self.range_max:
             raise ValueError("range_min must be less than range_max")
-        if not 0.0 < self.angle_max - self.angle_min <= 2.0 * np.pi + FULL_CIRCLE_TOLERANCE:
-            raise ValueError("angle_max must exceed angle_min by at most a full circle, in radians")
-        if max(-self.angle_min, self.angle_max) > 2.0 * np.pi + FULL_CIRCLE_TOLERANCE:
-            raise ValueError("angle_min and angle_max must lie within -2 pi and 2 pi")
+        check_angles(self.angle_min, self.angle_max)
         if self.faults.quantisation > self.range_max - self.range_min:
             raise ValueError("faults.quantisation must be less than range_max - range_min")
         if self.no_return == "zero" and self.range_min == 0.0:
@@ -142,14 +120,11 @@ class LidarSpec(Schema):
     def header(self) -> ScanHeader:
         """The fields of a LaserScan except stamp, frame and ranges."""
         return ScanHeader(
-            angle_min=float(self.angles[0]),
-            angle_max=float(self.angles[-1]),
-            angle_increment=self.angle_increment,
+            angle_min=float(self.angles[0]), angle_max=float(self.angles[-1]),
+            angle_increment=self.angle_increment, scan_time=self.scan_time,
             time_increment=self.beam_time * SKEW[self.faults.skew],
-            scan_time=self.scan_time,
-            range_min=self.range_min,
-            range_max=self.range_max,
-        )
+            range_min=self.range_min, range_max=self.range_max,
+        )  # fmt: skip
 
     @property
     def fault_parameters(self) -> NDArray[np.float64]:

@@ -17,13 +17,7 @@ from pydantic import Field, field_validator
 
 from nics_drl_bridge.config import Schema, read_text, validate
 from nics_drl_bridge.errors import ModelError
-from nics_drl_bridge.files import (
-    MOST_BYTES,
-    check_sums,
-    whole_folder,
-    write_sums,
-    write_text,
-)
+from nics_drl_bridge.files import MOST_BYTES, check_sums, whole_folder, write_sums, write_text
 from nics_drl_bridge.lidar.baked_kernels import TABLE_SHAPE, TableArrays
 from nics_drl_bridge.lidar.sensor_models import SensorModel, SensorModels
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape
@@ -36,23 +30,15 @@ TABLE_FILES = (ABOUT_FILE, *(f"{name}.npy" for name in ARRAYS))
 POINT_ANGLE = 0.01
 """Greatest default angle between the points of a row, as far as `MOST_PHASES` allows [rad]."""
 MOST_PHASES = 8
-MOST_WIDE = 0xFFFF
-"""Greatest number of beams in a row."""
+MOST_WIDE = 0xFFFF  # greatest number of beams in a row
 
 
 class Density(Schema):
-    """Sampling density of a table.
+    """Sampling density of a table; a shape with rotational symmetry is baked for one period."""
 
-    Attributes:
-        distances: number of grid distances, from the shape's own radius to out of range.
-        rotations: number of grid rotations in a full turn; a shape with rotational symmetry is
-            baked for one period only.
-        phases: points per beam, 1, 2, 4 or 8; see `for_beams`.
-    """
-
-    distances: int = Field(default=100, ge=3, le=10_000)
-    rotations: int = Field(default=240, ge=1, le=100_000)
-    phases: int = 1
+    distances: int = Field(default=100, ge=3, le=10_000)  # from the shape's radius to out of range
+    rotations: int = Field(default=240, ge=1, le=100_000)  # in a full turn
+    phases: int = 1  # points per beam, 1, 2, 4 or 8; see `for_beams`
 
     @classmethod
     def for_beams(cls, beam_angle: float) -> Density:
@@ -94,29 +80,20 @@ class LidarTable:
     shape can cover up to the next cells, once for each phase: the points of one phase are one beam
     apart, so that those for the beams of a scan are contiguous.
 
-    Attributes:
-        shapes: the H shapes.
-        density: of the grid.
-        beam_angle: angle between the beams that it was baked for [rad].
-        grid: (H, 3) greatest grid distance [m], grid rotations in one period of the shape's
-            rotational symmetry, first cell.
-        start: (cells,) int32 index in `rows` of the begin of each row.
-        cell: (cells, 6) int16 first beam of the row relative to the bearing; its width in beams
-            (unsigned, see `widths`); a corner of the hull that can be the right edge within the
-            cell; the only other such corner, or the same one, or, if there are more, minus the
-            initial stride for climbing; the same two for the left edge.
-        rows: (R,) float32 ranges [m], padded by what one look-up can read.
-        sensor_model: named models that were baked in.
+    The columns of a cell are the first beam of its row, relative to the bearing; its width in beams
+    (unsigned, see `widths`); a corner of the hull that can be the right edge within the cell; the
+    only other such corner, or the same one, or, if there are more, minus the initial stride for
+    climbing; the same two for the left edge.
     """
 
-    shapes: tuple[Shape, ...]
+    shapes: tuple[Shape, ...]  # H
     density: Density
-    beam_angle: float
-    grid: NDArray[np.float64]
-    start: NDArray[np.int32]
-    cell: NDArray[np.int16]
-    rows: NDArray[np.float32]
-    sensor_model: tuple[SensorModel, ...] = ()
+    beam_angle: float  # between the beams that it was baked for [rad]
+    grid: NDArray[np.float64]  # (H, 3) greatest distance [m], rotations in a period, first cell
+    start: NDArray[np.int32]  # (cells,) begin of each row in `rows`
+    cell: NDArray[np.int16]  # (cells, 6) see above
+    rows: NDArray[np.float32]  # (R,) ranges [m], padded by what one look-up can read
+    sensor_model: tuple[SensorModel, ...] = ()  # named models that were baked in
 
     @classmethod
     def without_rows(cls, spec: LidarSpec, shapes: Sequence[Shape]) -> LidarTable:
@@ -124,16 +101,8 @@ class LidarTable:
         shapes = tuple(dict.fromkeys(shapes))
         grid = np.ones((len(shapes), 3))
         grid[:, 0] = [spec.range_max + 2.0 * shape.radius for shape in shapes]
-        return cls(
-            shapes,
-            Density(),
-            spec.angle_increment,
-            grid,
-            np.zeros(0, np.int32),
-            np.zeros((0, 6), np.int16),
-            np.zeros(0, np.float32),
-            spec.sensor_model,
-        )
+        none = np.zeros(0, np.int32), np.zeros((0, 6), np.int16), np.zeros(0, np.float32)
+        return cls(shapes, Density(), spec.angle_increment, grid, *none, spec.sensor_model)
 
     @property
     def has_rows(self) -> bool:
@@ -184,13 +153,8 @@ class LidarTable:
 
     @property
     def _about(self) -> str:
-        about = TableAbout(
-            format=FORMAT,
-            shapes=self.shapes,
-            density=self.density,
-            beam_angle=self.beam_angle,
-            sensor_model=self.sensor_model,
-        )
+        kept = {name: getattr(self, name) for name in TableAbout.model_fields if name != "format"}
+        about = TableAbout(format=FORMAT, **kept)
         return about.model_dump_json(indent=1, exclude_none=True) + "\n"
 
     @cached_property
@@ -201,17 +165,10 @@ class LidarTable:
             digest.update(array.data)
         return digest.hexdigest()
 
-    def cells_of_shapes(self) -> list[tuple[int, int]]:
-        """Returns the first cell of each shape (H,), and the one after its last."""
-        counts = (self.grid[:, 1] * self.density.distances).astype(np.int64)
-        ends = np.cumsum(counts)
-        return list(zip((ends - counts).tolist(), ends.tolist(), strict=True))
-
     def save(self, folder: str | Path) -> None:
         """Writes the table as a folder of `.npy` files, completely or not at all.
 
-        Raises:
-            ConfigError: the folder contains something else.
+        Raises ConfigError if the folder contains something else.
         """
         with whole_folder(folder, ABOUT_FILE) as temporary:
             write_text(temporary / ABOUT_FILE, self._about)
@@ -223,12 +180,8 @@ class LidarTable:
     def load(cls, folder: str | Path, checked: bool = False) -> LidarTable:
         """Memory-maps a table that `save` wrote; processes share the memory.
 
-        Args:
-            folder: of the table.
-            checked: True if the caller has compared its files with their checksums.
-
-        Raises:
-            ConfigError, ModelError: a file is missing, damaged or of another format.
+        `checked` is True if the caller has compared its files with their checksums. Raises
+        ConfigError, ModelError if a file is missing, damaged or of another format.
         """
         folder = Path(folder)
         if not checked:
@@ -240,17 +193,15 @@ class LidarTable:
             raise ModelError(f"{path}: is no JSON ({error}); generate the model anew.") from None
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise ModelError(f"{path}: its format is not {FORMAT!r}; generate the model anew.")
-        about = validate(data, TableAbout, str(path))
-        arrays = {name: _mapped(folder / f"{name}.npy") for name in ARRAYS}
-        table = cls(
-            about.shapes, about.density, about.beam_angle, **arrays, sensor_model=about.sensor_model
-        )
+        parts: dict[str, Any] = dict(validate(data, TableAbout, str(path)))
+        parts |= {name: _mapped(folder / f"{name}.npy") for name in ARRAYS}
+        del parts["format"]
+        table = cls(**parts)
         try:
             table._check()
         except (ArithmeticError, IndexError, ValueError) as error:
-            raise ModelError(
-                f"{folder}: is no lidar table ({error}); generate the model anew."
-            ) from None
+            reason = f"is no lidar table ({error}); generate the model anew."
+            raise ModelError(f"{folder}: {reason}") from None
         return table
 
     def _check(self) -> None:
@@ -275,10 +226,7 @@ class LidarTable:
         last = len(self.rows) - padding(self.beam_angle)
         if cells and (self.start.min() < 0 or widths.min() < 1 or ends.max() > last):
             raise ValueError("a row lies outside of the table")
-        self._check_corners(counts.astype(np.int64))
-
-    def _check_corners(self, counts: NDArray[np.int64]) -> None:
-        corners = np.repeat(np.diff(self.outlines.hull) // 2, counts)[:, None]
+        corners = np.repeat(np.diff(self.outlines.hull) // 2, counts.astype(np.int64))[:, None]
         hint, other = self.cell[:, 2::2], self.cell[:, 3::2]
         if (hint < 0).any() or (hint >= corners).any() or (np.abs(other) >= corners).any():
             raise ValueError("a cell names a corner that its shape has not")

@@ -242,11 +242,8 @@ def _check_agreement(contract: Contract, source: str) -> None:
     if contract.task.sha256 != _task_hash(contract.task.model_dump(), seen):
         raise PolicyError(source, "task.sha256", "does not belong to the task and observation.")
     commands = len(contract.robot.command)
-    sizes = {
-        "observations": observation.size,
-        "commands": commands,
-        "actions": 1 if contract.actions == "discrete" else commands,
-    }
+    actions = 1 if contract.actions == "discrete" else commands
+    sizes = {"observations": observation.size, "commands": commands, "actions": actions}
     for name, size in sizes.items():
         try:
             rows = contract.golden.rows(name)

@@ -22,8 +22,7 @@ from nics_drl_bridge.seeds import checked_seeds
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-Act = Callable[[NDArray[np.float32]], NDArray[Any]]
-"""Actions (N, C) for observations (N, O)."""
+Act = Callable[[NDArray[np.float32]], NDArray[Any]]  # actions (N, C) for observations (N, O)
 
 FIRST_SEED = 1_000_000  # first seed of an evaluation, far from the seeds of any training
 DRIFT_M = 0.1  # a robot stops where it believes its goal is; odometry may have drifted by this much
@@ -191,13 +190,10 @@ def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcom
     env's `autoreset_mode` is `NextStep`, the default.
     """
     width, given = env.num_envs, checked_seeds(seeds)
-    done = []
-    for first in range(0, len(given), width):
-        # The last batch is padded with seeds that are driven but not counted.
-        chunk = np.resize(given[first : first + width], width)
-        rows = _drive_once(env, act, chunk)
-        done.append(tuple(row[: len(given) - first] for row in rows))
-    return Outcomes(given, *(np.concatenate(each) for each in zip(*done, strict=True)))
+    # The last batch is padded with seeds that are driven but not counted.
+    batches = (np.resize(given[k : k + width], width) for k in range(0, len(given), width))
+    done = zip(*(_drive_once(env, act, batch) for batch in batches), strict=True)
+    return Outcomes(given, *(np.concatenate(rows)[: len(given)] for rows in done))
 
 
 def _drive_once(env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]) -> tuple[Any, ...]:
@@ -206,8 +202,8 @@ def _drive_once(env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]) -> tup
     observation, info = env.reset(seed=list(seeds))
     where = np.reshape(info["start"], (count, -1, 3))[..., :2]
     success, collision = np.zeros((2, count), np.bool_)
-    steps, reward = np.zeros(count, np.int64), np.zeros(count)
-    length, running = np.zeros(count), np.ones(count, np.bool_)
+    steps, (length, reward) = np.zeros(count, np.int64), np.zeros((2, count))
+    running = np.ones(count, np.bool_)
     while running.any():
         observation, gain, terminated, truncated, info = env.step(act(observation))
         there = np.reshape(info["true_pose"], (count, -1, 3))[..., :2]
@@ -282,16 +278,19 @@ class Summary:
     length: ConfidenceInterval
     time: ConfidenceInterval
 
+    @property
+    def shares(self) -> dict[str, ConfidenceInterval]:
+        """The shares by the name of the result."""
+        return {"success": self.success, "collision": self.collision, "time-out": self.time_out}
+
 
 def summarise(outcomes: Outcomes, control_period: float) -> Summary:
     """Summarises episodes; `control_period` [s]."""
     count, arrived = len(outcomes.seeds), outcomes.success
-    success, collision, time_out = (
-        rate(int(flags.sum()), count)
-        for flags in (outcomes.success, outcomes.collision, outcomes.time_out)
-    )
+    flags = arrived, outcomes.collision, outcomes.time_out
     length, time = outcomes.length[arrived], outcomes.steps[arrived] * control_period
-    return Summary(count, success, collision, time_out, mean(length), mean(time))
+    shares = (rate(int(one.sum()), count) for one in flags)
+    return Summary(count, *shares, *map(mean, (length, time)))
 
 
 @dataclass(frozen=True)
@@ -323,24 +322,19 @@ def _finite(value: float) -> float | None:
 
 def tally(episodes: Sequence[Episode], first: Sequence[Episode], control_period: float) -> Tally:
     """Computes the figures of episodes, compared with the same seeds in the first world."""
-    results = np.array([episode.result for episode in episodes])
-    outcomes = Outcomes(
-        np.array([episode.seed for episode in episodes]),
-        results == "success",
-        results == "collision",
-        np.array([episode.steps for episode in episodes]),
-        np.array([episode.length for episode in episodes]),
-        np.array([episode.reward for episode in episodes]),
+    seeds, results, *figures = map(
+        np.array,
+        zip(*((e.seed, e.result, e.steps, e.length, e.reward) for e in episodes), strict=True),
     )
-    gaps = [deviation(one, other) for one, other in zip(episodes, first, strict=True)]
-    same = sum(one.result == other.result for one, other in zip(episodes, first, strict=True))
-    believed = sum(episode.believed_success for episode in episodes)
+    outcomes = Outcomes(seeds, results == "success", results == "collision", *figures)
+    pairs = list(zip(episodes, first, strict=True))
+    gaps = [deviation(one, other) for one, other in pairs]
     return Tally(
         **vars(summarise(outcomes, control_period)),
-        same=same / len(episodes),
+        same=sum(one.result == other.result for one, other in pairs) / len(pairs),
         deviation=mean(gaps),
         greatest_deviation=max(gaps),
-        believed=rate(believed, len(episodes)),
+        believed=rate(sum(episode.believed_success for episode in episodes), len(pairs)),
     )
 
 

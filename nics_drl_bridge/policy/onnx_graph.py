@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import onnx
 from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
+from onnx import TensorProto
 
 from nics_drl_bridge.errors import PolicyError
 from nics_drl_bridge.files import sha256
@@ -24,12 +25,10 @@ SEAL = "sha256"  # key of the metadata entry at the file's end: the checksum of 
 SIZE_LIMIT = 32 * 2**20
 MOST_PARTS = 50_000  # maximum number of fields of all messages; each array of weights is one part
 MOST_NESTED = 16  # maximum nesting of messages; an exported graph needs six levels
-MOST_PACKED = 2**20
-"""Maximum size of packed integers in one part, such as an array's shape [bytes]; not weights."""
+MOST_PACKED = 2**20  # maximum size of packed integers in one part, as a shape [bytes]
 MOST_NODES = 1000  # maximum number of nodes; an exported network has some dozens
 MOST_DIMENSIONS = 8  # maximum number of dimensions of an array of weights
-CONTRACT_LIMIT = 4 * 2**20
-"""Maximum size of the contract [bytes], most of which are golden observations."""
+CONTRACT_LIMIT = 4 * 2**20  # maximum size of the contract [bytes], mostly golden observations
 MOST_NUMBERS = 1_000_000  # maximum output of all nodes together for one observation
 MOST_WORK = 20_000_000
 """Maximum number of multiplications, or of numbers read and written, for one observation."""
@@ -49,12 +48,10 @@ OPERATORS = frozenset({
     "Split", "Sqrt", "Squeeze", "Sub", "Tanh", "Transpose", "Unsqueeze",
 })  # fmt: skip
 """Operators of feed-forward networks: no loops, branches, random draws or data-dependent sizes."""
-FLOATS = frozenset({onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE, onnx.TensorProto.FLOAT16})
-INTEGERS = frozenset({onnx.TensorProto.INT64, onnx.TensorProto.INT32})
-NUMBERS = FLOATS | INTEGERS | {onnx.TensorProto.BOOL}
-"""Types of arrays that are as large in memory as in the file."""
-DIVIDING = frozenset({"Div", "ReduceMean"})
-"""On integers, division by zero, or of the minimum by -1, ends the process."""
+FLOATS = frozenset({TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.FLOAT16})
+INTEGERS = frozenset({TensorProto.INT64, TensorProto.INT32})
+NUMBERS = FLOATS | INTEGERS | {TensorProto.BOOL}  # types as large in memory as in the file
+DIVIDING = frozenset({"Div", "ReduceMean"})  # of integers by zero, or minimum by -1: a crash
 OTHER_FORMATS = (
     (b"PK", "a zip archive, as Stable-Baselines3 and torch write them"),
     (b"\x80", "a pickle"),
@@ -63,11 +60,11 @@ OTHER_FORMATS = (
     (b"\x1f\x8b", "a gzip file"),
 )
 """First bytes of files that trainers write and that are never opened here."""
-_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
+_VARINT, _BYTES = 0, 2  # types of a field on the wire
+_FIXED = {1: 8, 5: 4}  # other types, and their sizes [bytes]
 _LONGEST_VARINT = 10
 Shape = tuple[int, ...]
-Fault = tuple[str, str]
-"""Faulty field, and the reason."""
+Fault = tuple[str, str]  # faulty field, and the reason
 
 
 def parse(data: bytes, source: str) -> Any:
@@ -84,11 +81,9 @@ def parse(data: bytes, source: str) -> Any:
         model = onnx.load_model_from_string(data)
         if not model.HasField("graph"):
             raise ValueError
-    except WireError as error:
-        reason = f"{error}, which no policy is; export or copy it again."
-        raise PolicyError(source, "file", reason) from None
-    except (DecodeError, ValueError, TypeError):
-        reason = "is no ONNX model, or is cut off; copy it again."
+    except (DecodeError, ValueError, TypeError) as error:
+        what = str(error) if isinstance(error, WireError) else "is no ONNX model, or is cut off"
+        reason = f"{what}, which no policy is; export or copy it again."
         raise PolicyError(source, "file", reason) from None
     metadata(model, source)
     check_graph(model, source)
@@ -156,34 +151,32 @@ def check_wire(data: bytes) -> None:
             if parts > MOST_PARTS:
                 raise WireError(f"has more than {MOST_PARTS} parts")
             key, start = _varint(view, start, end)
-            begin, start = _extent(view, start, end, key & 7)
+            size, start = _size_of(view, start, end, key & 7)
+            begin, start = start, start + size
+            if start > end:
+                raise WireError("is cut off")
             field = kind.fields_by_number.get(key >> 3)
             if field is None or key & 7 != _BYTES:
                 continue
-            # Numbers of variable length grow when they are parsed.
-            grows = field.type in (
-                field.TYPE_INT64, field.TYPE_UINT64, field.TYPE_INT32, field.TYPE_UINT32,
-                field.TYPE_ENUM,
-            )  # fmt: skip
             if field.message_type is not None:
                 ahead.append((begin, start, field.message_type, depth + 1))
-            elif grows and start - begin > MOST_PACKED:
-                raise WireError(f"has {start - begin} bytes of {field.name!r}, not weights")
+            elif size > MOST_PACKED and field.type in (
+                field.TYPE_INT64, field.TYPE_UINT64, field.TYPE_INT32, field.TYPE_UINT32,
+                field.TYPE_ENUM,
+            ):  # fmt: skip
+                # Numbers of variable length grow when they are parsed.
+                raise WireError(f"has {size} bytes of {field.name!r}, not weights")
 
 
-def _extent(view: memoryview, start: int, end: int, wire: int) -> tuple[int, int]:
-    """Start and end of the content of a field."""
-    if wire == _VARINT:
-        return start, _varint(view, start, end)[1]
+def _size_of(view: memoryview, start: int, end: int, wire: int) -> tuple[int, int]:
+    """Size of a field's content, and its start."""
     if wire == _BYTES:
-        size, start = _varint(view, start, end)
-    elif wire in (_FIXED64, _FIXED32):
-        size = 8 if wire == _FIXED64 else 4
-    else:
+        return _varint(view, start, end)
+    if wire == _VARINT:
+        return _varint(view, start, end)[1] - start, start
+    if wire not in _FIXED:
         raise WireError("is no ONNX model")
-    if start + size > end:
-        raise WireError("is cut off")
-    return start, start + size
+    return _FIXED[wire], start
 
 
 def _varint(view: memoryview, start: int, end: int) -> tuple[int, int]:
@@ -201,26 +194,26 @@ def check_graph(model: Any, source: str) -> None:
     try:
         onnx.checker.check_model(model)
     except (onnx.checker.ValidationError, ValueError) as error:
-        words = " ".join(str(error).split())[:120]
-        raise PolicyError(source, "graph", f"is no valid ONNX graph ({words}).") from None
+        reason = f"is no valid ONNX graph ({_shown(error)})."
+        raise PolicyError(source, "graph", reason) from None
+
+
+def _shown(error: Exception) -> str:
+    return " ".join(str(error).split())[:120]
 
 
 def _graph_faults(model: Any) -> Iterator[Fault]:
     graph = model.graph
     if len(graph.node) > MOST_NODES:
-        yield (
-            "graph.node",
-            f"has {len(graph.node)} operators, a policy at most {MOST_NODES}; not run.",
-        )
+        reason = f"has {len(graph.node)} operators, a policy at most {MOST_NODES}; not run."
+        yield "graph.node", reason
     for tensor in _tensors(graph):
         name = f"weights.{tensor.name}"
         if tensor.data_type not in NUMBERS or len(tensor.dims) > MOST_DIMENSIONS:
-            yield (
-                name,
-                f"is no array of numbers with at most {MOST_DIMENSIONS} dimensions; not run.",
-            )
+            reason = f"is no array of numbers with at most {MOST_DIMENSIONS} dimensions; not run."
+            yield name, reason
         location = next((entry.value for entry in tensor.external_data if entry.key), "")
-        if tensor.data_location == onnx.TensorProto.EXTERNAL or tensor.external_data:
+        if tensor.data_location == TensorProto.EXTERNAL or tensor.external_data:
             yield name, f"refers to another file ({location!r}); a policy holds its own weights."
     if len(model.functions) or len(model.training_info) or len(graph.sparse_initializer):
         yield "graph", "holds functions, training or sparse weights; remove."
@@ -280,11 +273,11 @@ def check_ends(model: Any, widths: dict[str, int | None], source: str) -> None:
             raise PolicyError(source, f"graph.{kind}", reason)
     for end in (*inputs, *model.graph.output):
         tensor, width = end.type.tensor_type, widths[end.name]
-        kind = onnx.TensorProto.INT64 if width is None else onnx.TensorProto.FLOAT
+        kind = TensorProto.INT64 if width is None else TensorProto.FLOAT
         sizes = [d.dim_value if d.HasField("dim_value") else None for d in tensor.shape.dim]
         wanted = [None] if width is None else [None, width]
         if tensor.elem_type != kind or sizes != wanted:
-            name = onnx.TensorProto.DataType.Name(tensor.elem_type)
+            name = TensorProto.DataType.Name(tensor.elem_type)
             reason = f"is {name} of shape {sizes}, where {wanted} is needed; export anew."
             raise PolicyError(source, f"graph.{end.name}", reason)
 
@@ -327,53 +320,38 @@ def _setting_faults(graph: Any) -> Iterator[Fault]:
             named = [lengths.get(name, 1) for name in node.input[1:2]]
             added += max(named + [len(a.ints) for a in node.attribute], default=0)
     if added > MOST_AXES:
-        yield (
-            "graph.node",
-            f"reshapes to {added} dimensions in all, a policy to {MOST_AXES}; not run.",
-        )
+        reason = f"reshapes to {added} dimensions in all, a policy to {MOST_AXES}; not run."
+        yield "graph.node", reason
 
 
 def _integer_faults(model: Any, source: str) -> Iterator[Fault]:
     """Integers that are divided, or that grow while shapes are inferred."""
-    inferred = _inferred(model, ROWS, source, values=False)
-    kinds = {tensor.name: tensor.data_type for tensor in inferred.initializer}
-    sizes = {}
-    for value in (*inferred.input, *inferred.value_info, *inferred.output):
-        tensor = value.type.tensor_type
-        kinds[value.name] = tensor.elem_type
-        sizes[value.name] = math.prod(d.dim_value for d in tensor.shape.dim)
+    kinds, shapes = _sizes(model, ROWS, source, values=False)
     for node in model.graph.node:
         if node.op_type in DIVIDING and kinds.get(node.input[0]) not in FLOATS:
-            reason = f"{node.op_type} of whole numbers may end the process; use float32."
-            yield "graph.node", reason
+            yield "graph.node", f"{node.op_type} of whole numbers may end the process; use float32."
         if node.op_type in ("Concat", "Gather") and kinds.get(node.output[0]) not in FLOATS:
-            size = sizes.get(node.output[0], 0)
+            size = math.prod(shapes.get(node.output[0], (0,)))
             if size > SMALL * ROWS:
-                reason = (
-                    f"{node.op_type} of {size} whole numbers is no shape and no index; not run."
-                )
-                yield "graph.node", reason
+                reason = f"of {size} whole numbers is no shape and no index; not run."
+                yield "graph.node", f"{node.op_type} {reason}"
 
 
 def _costs(model: Any, rows: int, source: str) -> tuple[int, int]:
     """Output and work of all nodes for `rows` observations."""
-    shapes = _shapes(model, rows, source)
+    _, shapes = _sizes(model, rows, source, values=True)
     numbers = work = 0
     for node in model.graph.node:
-        given, made = _known(node.input, shapes), _known(node.output, shapes)
-        if given is None or made is None:
+        try:
+            given = [shapes[name] for name in node.input if name]  # without those that are omitted
+            made = [shapes[name] for name in node.output if name]
+        except KeyError:
             reason = f"the size of what {node.op_type} gives can't be known before it runs."
-            raise PolicyError(source, "graph.node", reason)
+            raise PolicyError(source, "graph.node", reason) from None
         buffer, multiplied = _work(node, given, made)
         numbers += sum(map(math.prod, made)) + buffer
         work += sum(map(math.prod, (*given, *made))) + multiplied + buffer
     return numbers, work
-
-
-def _known(names: Any, shapes: Mapping[str, Shape]) -> list[Shape] | None:
-    """Shapes of a node's tensors, except omitted ones; None if one is unknown."""
-    found = [shapes.get(name) for name in names if name]
-    return None if None in found else [shape for shape in found if shape is not None]
 
 
 def _work(node: Any, given: list[Shape], made: list[Shape]) -> tuple[int, int]:
@@ -391,25 +369,26 @@ def _work(node: Any, given: list[Shape], made: list[Shape]) -> tuple[int, int]:
     return 0, 0
 
 
-def _shapes(model: Any, rows: int, source: str) -> dict[str, Shape]:
-    """Shape of every tensor for `rows` observations; unknown ones are missing."""
-    inferred = _inferred(model, rows, source, values=True)
-    shapes = {tensor.name: tuple(tensor.dims) for tensor in inferred.initializer}
-    for value in (*inferred.input, *inferred.value_info, *inferred.output):
-        dims = value.type.tensor_type.shape.dim
-        if value.type.tensor_type.HasField("shape") and all(d.HasField("dim_value") for d in dims):
-            shapes[value.name] = tuple(d.dim_value for d in dims)
-    return {name: shape for name, shape in shapes.items() if all(size >= 0 for size in shape)}
+def _sizes(
+    model: Any, rows: int, source: str, values: bool
+) -> tuple[dict[str, int], dict[str, Shape]]:
+    """Type and, if known, shape of every tensor for `rows` observations.
 
-
-def _inferred(model: Any, rows: int, source: str, values: bool) -> Any:
-    """A graph without weights, with types and shapes; `values`: infers from integers too."""
+    `values`: also what follows from the values of integers.
+    """
     bare = _without_weights(model, rows)
     try:
-        return onnx.shape_inference.infer_shapes(bare, strict_mode=True, data_prop=values).graph
+        graph = onnx.shape_inference.infer_shapes(bare, strict_mode=True, data_prop=values).graph
     except Exception as error:  # noqa: BLE001 - a damaged graph raises anything
-        words = " ".join(str(error).split())[:120]
-        raise PolicyError(source, "graph", f"its shapes do not fit ({words}).") from None
+        raise PolicyError(source, "graph", f"its shapes do not fit ({_shown(error)}).") from None
+    kinds = {tensor.name: tensor.data_type for tensor in graph.initializer}
+    shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer}
+    for value in (*graph.input, *graph.value_info, *graph.output):
+        tensor = value.type.tensor_type
+        kinds[value.name] = tensor.elem_type
+        if tensor.HasField("shape") and all(d.HasField("dim_value") for d in tensor.shape.dim):
+            shapes[value.name] = tuple(d.dim_value for d in tensor.shape.dim)
+    return kinds, {name: shape for name, shape in shapes.items() if min(shape, default=0) >= 0}
 
 
 def _without_weights(model: Any, rows: int) -> Any:

@@ -93,7 +93,7 @@ class DynamicWindow:
     weights: tuple[float, float, float, float] = (1.0, 0.6, 0.3, 1.5)  # see `TwistWeights`
 
     def __post_init__(self) -> None:
-        _ = self._twists
+        _ = self._search
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """See `Policy`."""
@@ -103,27 +103,24 @@ class DynamicWindow:
         chosen = np.empty(len(seen), np.int64)
         kernels.choose_all(
             chosen, np.ascontiguousarray(seen[:, :parts]), goals,
-            np.ascontiguousarray(seen[:, parts + 3 : parts + 6]),
-            self._twists, self._rays, self._ahead, kernels.TwistWeights(*self.weights),
+            np.ascontiguousarray(seen[:, parts + 3 : parts + 6]), *self._search,
         )  # fmt: skip
         return self._scaled[chosen[0] if observation.ndim == 1 else chosen]
 
     @cached_property
-    def _rays(self) -> kernels.ScanRays:
-        sight = self.task.sight
+    def _search(self) -> tuple[Array, kernels.ScanRays, kernels.LookAhead, kernels.TwistWeights]:
+        """(K, 3) body twist of each command; what is seen, how far it looks, what it weighs."""
+        robot, sight = self.task.robot, self.task.sight
+        twists = steady_twist(robot, self._commands)
         directions = np.stack([np.cos(sight.angles), np.sin(sight.angles)], axis=-1)
-        return kernels.ScanRays(directions, sight.origin, float(sight.range_max))
-
-    @cached_property
-    def _ahead(self) -> kernels.LookAhead:
-        robot = self.task.robot
+        rays = kernels.ScanRays(directions, sight.origin, float(sight.range_max))
         lags = [value for name, value in robot.parameters.items() if name.endswith("_lag")]
         lag = max(lags, default=0.0)
         share = 1.0 - math.exp(-self.period / lag) if lag > 0.0 else 1.0
-        reach = share * (self._twists.max(axis=0) - self._twists.min(axis=0)) + 1e-6
-        radius = robot.footprint_radius + self.margin
-        rest = 2.0 * self.period + lag
-        return kernels.LookAhead(reach, radius, 1.5 * self.period, self.steps, rest)
+        reach = share * (twists.max(axis=0) - twists.min(axis=0)) + 1e-6
+        radius, rest = robot.footprint_radius + self.margin, 2.0 * self.period + lag
+        ahead = kernels.LookAhead(reach, radius, 1.5 * self.period, self.steps, rest)
+        return twists, rays, ahead, kernels.TwistWeights(*self.weights)
 
     @cached_property
     def _commands(self) -> Array:
@@ -140,11 +137,6 @@ class DynamicWindow:
     def _scaled(self) -> NDArray[np.float32]:
         """(K, C) action of each command."""
         return _actions(self.task.robot, self._commands).astype(np.float32)
-
-    @cached_property
-    def _twists(self) -> Array:
-        """(K, 3) body twist of each command."""
-        return steady_twist(self.task.robot, self._commands)
 
 
 POLICIES: dict[str, Callable[[Navigation], Policy]] = {
@@ -171,11 +163,8 @@ def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None
     """Makes a policy by name.
 
     The name is a key of `POLICIES`, a shipped policy file, or the path of a policy file, which is
-    checked against the task and the model of the robot.
-
-    Raises:
-        ConfigError: an unknown name; suggests the nearest.
-        PolicyError: the file can't be used, or does not fit; names the field.
+    checked against the task and the model of the robot. Raises ConfigError for an unknown name,
+    PolicyError, with the field, if the file can't be used or does not fit.
     """
     if not is_policy_file(name):
         return POLICIES[name](task)

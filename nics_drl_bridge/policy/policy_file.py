@@ -62,11 +62,9 @@ class PolicyFile:
             reason = f"is {size}, but was given observations {given.shape}; use its own task."
             raise PolicyError(str(self.path), "observation.size", reason)
         rows = given.reshape(-1, size)
-        out = [
-            self._run_rows(rows[first : first + self._rows_at_once])
-            for first in range(0, len(rows), self._rows_at_once)
-        ] or [self._run_rows(rows)]
-        whole = out[0] if len(out) == 1 else [np.concatenate(p) for p in zip(*out, strict=True)]
+        firsts = range(0, max(len(rows), 1), self._rows_at_once)
+        out = [self._run_rows(rows[first : first + self._rows_at_once]) for first in firsts]
+        whole = [np.concatenate(parts) for parts in zip(*out, strict=True)]
         return [part[0] if given.ndim == 1 else part for part in whole]
 
     def _run_rows(self, rows: Rows) -> list[NDArray[Any]]:
@@ -113,56 +111,45 @@ class PolicyFile:
         if model is not None:
             self._check_robot(model.robot, model.lidar)
             self._check_sensors(model)
-            period = self.contract.control_period
-            if abs(period - model.control_period) > PERIOD_TOLERANCE:
-                self._refuse("control_period", period, model.control_period)
+            period = model.control_period
+            if abs(self.contract.control_period - period) > PERIOD_TOLERANCE:
+                self._compare({"control_period": period})
         if task is not None:
             self._check_robot(task.robot, task.lidar)
-            self._check_task(task)
+            self._compare({
+                "task": {"name": task_entry(task)["name"]},
+                "actions": task.actions,
+                "scan": None if task.scan is None else task.scan.model_dump(mode="json"),
+                "observation": observation_entry(task),
+            })  # fmt: skip
 
     def _check_robot(self, robot: RobotSpec, lidar: LidarSpec) -> None:
-        ours = self.contract.model_dump(mode="json", include={"robot": ROBOT, "lidar": LIDAR})
-        theirs = {
-            "robot": robot.model_dump(mode="json", include=ROBOT),
-            "lidar": lidar.model_dump(mode="json", include=LIDAR),
-        }
-        if self.contract.scan is not None:
-            del ours["lidar"], theirs["lidar"]
+        theirs = {"robot": robot.model_dump(mode="json", include=ROBOT)}
+        if self.contract.scan is None:
+            theirs["lidar"] = lidar.model_dump(mode="json", include=LIDAR)
+        else:
             try:
                 plan_of(lidar, self.contract.scan)
             except ConfigError as error:
                 raise PolicyError(str(self.path), "scan", str(error)) from None
-        self._compare(ours, theirs)
+        self._compare(theirs)
 
     def _check_sensors(self, model: SimulatorModel) -> None:
         """The further sensors that the policy observes are those of the model."""
-        theirs = {sensor.name: sensor for sensor in model.sensors}
-        for k, sensor in enumerate(self.contract.sensors):
-            if sensor.name not in theirs:
-                self._refuse(f"sensors.{k}.name", sensor.name, sorted(theirs))
-            found = theirs[sensor.name].model_dump(mode="json")
-            self._compare({f"sensors.{k}": sensor.model_dump(mode="json")}, {f"sensors.{k}": found})
+        known = {sensor.name: sensor.model_dump(mode="json") for sensor in model.sensors}
+        self._compare({"sensors": [known.get(each.name) for each in self.contract.sensors]})
 
-    def _check_task(self, task: Task) -> None:
-        theirs = {
-            "task": {"name": task_entry(task)["name"]},
-            "actions": task.actions,
-            "scan": None if task.scan is None else task.scan.model_dump(mode="json"),
-            "observation": observation_entry(task),
-        }
-        ours = self.contract.model_dump(mode="json", include=set(theirs))
-        ours["task"] = {"name": ours["task"]["name"]}
-        self._compare({name: ours[name] for name in theirs}, theirs)
-
-    def _compare(self, ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> None:
-        mine, other = dict(leaves(dict(ours))), dict(leaves(dict(theirs)))
-        for path in (*mine, *other):
-            if mine.get(path) != other.get(path):
-                self._refuse(path, mine.get(path), other.get(path))
-
-    def _refuse(self, field: str, ours: Any, theirs: Any) -> None:
-        reason = f"is {ours!r}, but the robot's is {theirs!r}; use a policy that was trained so."
-        raise PolicyError(str(self.path), field, reason)
+    def _compare(self, theirs: Mapping[str, Any]) -> None:
+        """Raises PolicyError for the first of some entries that differs from the contract's."""
+        for name, entry in theirs.items():
+            only: Any = {name: set(entry) if isinstance(entry, dict) else True}
+            ours = dict(leaves(self.contract.model_dump(mode="json", include=only)))
+            other = dict(leaves({name: entry}))
+            for path in (*ours, *other):
+                if ours.get(path) != other.get(path):
+                    reason = f"is {ours.get(path)!r}, but the robot's is {other.get(path)!r}"
+                    reason += "; use a policy that was trained so."
+                    raise PolicyError(str(self.path), path, reason)
 
 
 def find_policy(name: str) -> Path:
@@ -179,13 +166,12 @@ def load_policy(path: str | Path) -> PolicyFile:
     file = find_policy(str(path))
     source = str(file)
     try:
-        size = file.stat().st_size
+        size, limit = file.stat().st_size, onnx_graph.SIZE_LIMIT
         if not file.is_file():
             raise PolicyError(source, "file", "is no file; give the path of an .onnx file.")
-        if size > onnx_graph.SIZE_LIMIT:
-            limit = onnx_graph.SIZE_LIMIT // 2**20
-            reason = f"is {size / 2**20:.0f} MB, a policy is at most {limit} MB; not opened."
-            raise PolicyError(source, "file", reason)
+        if size > limit:
+            sizes = f"is {size / 2**20:.0f} MB, a policy is at most {limit // 2**20} MB"
+            raise PolicyError(source, "file", f"{sizes}; not opened.")
         data = file.read_bytes()
     except OSError as error:
         raise PolicyError(source, "file", f"can't be read ({error.strerror}).") from None
@@ -198,9 +184,9 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
     model = onnx_graph.parse(data, source)
     contract = read_contract(onnx_graph.metadata(model, source), source)
     commands = len(contract.robot.command)
-    discrete = contract.actions == "discrete"
-    widths = {"observation": contract.observation.size, "command": commands}
-    onnx_graph.check_ends(model, {**widths, "action": None if discrete else commands}, source)
+    action = None if contract.actions == "discrete" else commands
+    widths = {"observation": contract.observation.size, "command": commands, "action": action}
+    onnx_graph.check_ends(model, widths, source)
     if onnx_graph.graph_hash(model) != contract.graph_sha256:
         reason = "does not belong to the graph, which was changed after the export."
         raise PolicyError(source, "graph_sha256", reason)
@@ -215,16 +201,13 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
 def open_session(data: bytes, source: str) -> Any:
     """An onnxruntime session on one thread.
 
-    Raises:
-        ConfigError: onnxruntime is missing.
-        PolicyError: onnxruntime can't run the graph.
+    Raises ConfigError if onnxruntime is missing, PolicyError if it can't run the graph.
     """
     try:
         import onnxruntime
     except ImportError:
-        raise ConfigError(
-            "a policy file needs the module 'onnxruntime'; pip install 'nics_drl_bridge[deploy]'."
-        ) from None
+        fix = "pip install 'nics_drl_bridge[deploy]'."
+        raise ConfigError(f"a policy file needs the module 'onnxruntime'; {fix}") from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL

@@ -48,11 +48,9 @@ class Shadow:
         unit; and the share of opposite signs among the times at which both have a sign.
         """
         found = {}
-        for name, one, other, scale in zip(
-            self.names, self.policy.T, self.driven.T, self.scale, strict=True
-        ):
-            gap, band = one - other, DEAD_BAND * scale
-            size = np.abs(gap)
+        for c, name in enumerate(self.names):
+            one, other, band = self.policy[:, c], self.driven[:, c], DEAD_BAND * self.scale[c]
+            gap, size = one - other, np.abs(one - other)
             signed = (np.abs(one) > band) & (np.abs(other) > band)
             opposite = (one[signed] * other[signed] < 0.0).mean() if signed.any() else 0.0
             found[name] = {
@@ -67,8 +65,6 @@ class Shadow:
 
 @dataclass
 class _Moment:
-    """A time at which the policy would act."""
-
     receive_ns: int
     stamp_ns: int
     view: RobotView
@@ -91,11 +87,8 @@ def shadow(
 
     The goal (2,) [m] is in `map`, in which the first odometry is taken at face value. None uses the
     robot's position `ahead_s` later instead: the driver's intention, in hindsight. `topics` are by
-    role, see `playback.chosen`.
-
-    Raises:
-        RecordingError: the bag can't be used, or lacks scans or commands.
-        BridgeError: the policy can't be used, or does not fit.
+    role, see `playback.chosen`. Raises RecordingError if the bag can't be used, or lacks scans or
+    commands, another BridgeError if the policy can't be used, or does not fit.
     """
     if goal is None and not ahead_s > 0.0:
         raise ConfigError(f"--ahead {ahead_s:g}: must be more than 0 s.")
@@ -125,15 +118,12 @@ def _moments(
             held = message.receive_ns, row
             if moments and moments[-1].driven is None:
                 moments[-1].driven = row
-        if role not in (SCAN, ODOM):
-            continue
         newest = playback.middleware.cache.newest
-        if SCAN not in newest or ODOM not in newest:
+        if role not in (SCAN, ODOM) or SCAN not in newest or ODOM not in newest:
             continue
         scan_ns = newest[SCAN].stamp_ns
-        if newest[ODOM].stamp_ns < scan_ns or scan_ns <= acted_ns:
-            continue
-        if not pace.due(scan_ns * S_PER_NS + JITTER * model.control_period):
+        early = not pace.due(scan_ns * S_PER_NS + JITTER * model.control_period)
+        if newest[ODOM].stamp_ns < scan_ns or scan_ns <= acted_ns or early:
             continue
         pace.acted(scan_ns * S_PER_NS)
         acted_ns = scan_ns
@@ -152,7 +142,6 @@ def _hold(moments: list[_Moment], held: tuple[int, Array] | None) -> None:
 
 
 def _goals(moments: list[_Moment], goal: ArrayLike | None, ahead_s: float) -> Array:
-    """(T, 2) goal of each moment."""
     if goal is not None:
         return np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
     times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS

@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +21,9 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, shortened
 from nics_drl_bridge.files import write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
+from nics_drl_bridge.policy import train_checkpoint as checkpoints
 from nics_drl_bridge.policy.evaluation import FIRST_SEED, Outcomes, Summary, drive_worlds, summarise
 from nics_drl_bridge.policy.train_algorithms import Actor, act_of, make_algorithm, observed
-from nics_drl_bridge.policy.train_checkpoint import (
-    Companion,
-    Progress,
-    read_checkpoint,
-    resume,
-    save_checkpoint,
-)
 from nics_drl_bridge.policy.train_export import export_policy
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
@@ -42,7 +37,7 @@ GREATEST_SEED = 2**32 - 1
 """Largest seed of numpy's global generator, from which Stable-Baselines3 draws."""
 LOG_EVERY = {"ppo": 1, "sac": 1000}
 """Roll-outs (PPO) or episodes (SAC) between two entries of TensorBoard."""
-Tell = Callable[[Progress], None]
+Tell = checkpoints.Tell
 
 
 @dataclass(frozen=True)
@@ -70,7 +65,7 @@ def train(
     inconsistent, or no checkpoint fits them.
     """
     begin, path = time.perf_counter(), folder / CHECKPOINT
-    content = read_checkpoint(path) if resumed else None
+    content = checkpoints.read_checkpoint(path) if resumed else None
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
     env = make_train_env(settings)
     if content is None:
@@ -82,11 +77,8 @@ def train(
         algorithm = _again(content, about, settings, env, path)
     algorithm.set_logger(configure(str(folder), ["tensorboard"]))
     busy = env.stepping_s
-
-    def save() -> None:
-        save_checkpoint(path, algorithm, env, about)
-
-    companion = Companion(env, seed, settings.steps, settings.checkpoint_every, save, tell)
+    save = partial(checkpoints.save_checkpoint, path, algorithm, env, about)
+    companion = checkpoints.Companion(env, seed, settings, save, tell)
     left = settings.steps - algorithm.num_timesteps
     if left > 0:
         every = LOG_EVERY[settings.algorithm]
@@ -104,16 +96,14 @@ def make_train_env(
 ) -> TrainVecEnv:
     """Makes the worlds of the settings in one env; model and worlds may already be open."""
     model = model or open_model(settings.robot)
-    return TrainVecEnv(
-        *(
-            BridgeVectorEnv(
-                count, model, (scenes or {}).get(world, world), settings.task,
-                settings.task_options,
-                settings.max_episode_steps, "SameStep", randomisation=settings.randomisation,
-            )
-            for world, count in settings.worlds.items()
+    envs = (
+        BridgeVectorEnv(
+            count, model, (scenes or {}).get(world, world), settings.task, settings.task_options,
+            settings.max_episode_steps, "SameStep", randomisation=settings.randomisation,
         )
+        for world, count in settings.worlds.items()
     )  # fmt: skip
+    return TrainVecEnv(*envs)
 
 
 def _again(
@@ -128,12 +118,10 @@ def _again(
     size = int(np.prod(env.observation_space.shape))
     algorithm = make_algorithm(settings, env, about["seed"], (np.zeros(size), np.ones(size)))
     try:
-        resume(content, algorithm, env)
+        checkpoints.resume(content, algorithm, env)
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        reason = shortened(str(error), 120)
-        raise ConfigError(
-            f"{path}: does not hold what a training needs ({reason}); train anew."
-        ) from None
+        reason = f"does not hold what a training needs ({shortened(str(error), 120)})"
+        raise ConfigError(f"{path}: {reason}; train anew.") from None
     return algorithm
 
 
@@ -142,11 +130,9 @@ def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
     if not isinstance(old, dict) or not isinstance(old.get("settings"), dict) or "seed" not in old:
         raise ConfigError(f"{path}: does not say of which training it is; train anew.")
     for key, value in new["settings"].items():
-        if old["settings"].get(key) != value:
-            raise ConfigError(
-                f"{path}: was trained with {key} {old['settings'].get(key)!r}, not {value!r}; "
-                "resume it with the same settings, or train anew in another folder."
-            )
+        if (then := old["settings"].get(key)) != value:
+            reason = f"was trained with {key} {then!r}, not {value!r}"
+            raise ConfigError(f"{path}: {reason}; resume it so, or train anew in another folder.")
     if old["seed"] != new["seed"]:
         raise ConfigError(f"{path}: is of seed {old['seed']}, not {new['seed']}; name that one.")
 
@@ -210,10 +196,11 @@ def run(
         folder = order.out / f"seed_{seed}"
         begun = (folder / CHECKPOINT).is_file()
         trained = learn(settings, seed, folder, tell, order.resumed and begun)
-        summaries = {}
-        for world in settings.worlds:
-            outcomes = evaluate(trained.algorithm, settings, world, order.episodes, model)
-            summaries[world] = summarise(outcomes, model.control_period)
+        driven = {
+            world: evaluate(trained.algorithm, settings, world, order.episodes, model)
+            for world in settings.worlds
+        }
+        summaries = {w: summarise(one, model.control_period) for w, one in driven.items()}
         result = SeedResult(seed, trained, summaries)
         plain = {world: dataclasses.asdict(one) for world, one in summaries.items()}
         write_text(folder / EVALUATION, json.dumps(plain, indent=2) + "\n")
@@ -238,9 +225,8 @@ def _check(seeds: Sequence[int], out: Path, resumed: bool) -> None:
         raise ConfigError(f"seeds {list(seeds)}: give one or more, none twice.")
     begun = any((out / f"seed_{seed}" / CHECKPOINT).is_file() for seed in seeds)
     if begun and not resumed:
-        raise ConfigError(
-            f"{out}: holds checkpoints of these seeds; add --resume, or choose another --out."
-        )
+        reason = "holds checkpoints of these seeds; add --resume, or choose another --out."
+        raise ConfigError(f"{out}: {reason}")
     if resumed and not begun:
         raise ConfigError(f"{out}: holds no checkpoint of these seeds; leave out --resume.")
 
@@ -256,11 +242,7 @@ def line_of(summary: Summary) -> str:
     """Formats a summary as text, every figure with its 95 % interval."""
     rates = ", ".join(
         f"{name} {100 * share.value:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})"
-        for name, share in (
-            ("success", summary.success),
-            ("collision", summary.collision),
-            ("time-out", summary.time_out),
-        )
+        for name, share in summary.shares.items()
     )
     length, time = (
         f"{one.value:.2f} {unit} ({one.low:.2f} to {one.high:.2f})"

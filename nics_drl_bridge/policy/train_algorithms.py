@@ -65,18 +65,14 @@ def make_algorithm(
 def check_serves(settings: TrainingSettings, env: TrainVecEnv) -> None:
     """Raises ConfigError if the algorithm does not suit the task."""
     if len(env.observation_space.shape) != 1:
-        raise ConfigError(
-            f"task {settings.task!r}: shows {env.observation_space.shape}, and training "
-            "takes vectors only; train a task of one robot."
-        )
+        shown = f"task {settings.task!r}: shows {env.observation_space.shape}"
+        raise ConfigError(f"{shown}, not vectors; train a task of one robot.")
     if settings.algorithm == "sac" and not isinstance(env.action_space, gymnasium.spaces.Box):
         raise ConfigError("algorithm 'sac' needs continuous actions; use 'ppo'.")
     size = settings.ppo.rollout * env.num_envs
     if settings.algorithm == "ppo" and settings.ppo.batch > size:
-        raise ConfigError(
-            f"ppo.batch {settings.ppo.batch}: is more than the {size} transitions of a rollout; "
-            "lower it, or raise ppo.rollout or worlds."
-        )
+        batch = f"ppo.batch {settings.ppo.batch}: is more than the {size} transitions of a rollout"
+        raise ConfigError(f"{batch}; lower it, or raise ppo.rollout or worlds.")
 
 
 def act_of(algorithm: BaseAlgorithm | Actor) -> Act:

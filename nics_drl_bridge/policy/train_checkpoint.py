@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import json
-import pickle
 import time
 import zipfile
 from collections import deque
@@ -30,6 +29,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_sealed, sealed, write_bytes
 from nics_drl_bridge.policy.train_algorithms import RECENT
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
+from nics_drl_bridge.policy.training_settings import TrainingSettings
 
 FORMAT = "nics_drl_bridge/checkpoint/2"
 MOST_BYTES = 4 * 2**30  # maximum size of a file, which contains all of SAC's buffer
@@ -89,14 +89,9 @@ def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
         _check_tensors(content, size)
         found = str(content["format"])
         read = {**content, "about": json.loads(content["about"])}
-    except (
-        RuntimeError, pickle.UnpicklingError, zipfile.BadZipFile, EOFError, OSError, KeyError,
-        TypeError, ValueError, AttributeError, IndexError, RecursionError,
-    ):  # fmt: skip
-        raise ConfigError(
-            f"{path}: is no checkpoint of a training, or a damaged one; leave out --resume to "
-            "begin anew."
-        ) from None
+    except Exception:  # noqa: BLE001 - a damaged file breaks torch in any way
+        reason = "is no checkpoint of a training, or a damaged one"
+        raise ConfigError(f"{path}: {reason}; leave out --resume to begin anew.") from None
     if found != kind:
         raise ConfigError(f"{path}: is a {found!r}, not a {kind!r}; resume with the same --engine.")
     return read
@@ -182,32 +177,28 @@ class Progress:
     env_share: float  # share of the wall time that went to the simulator
 
 
+Save = Callable[[], None]
+Tell = Callable[[Progress], None]
+
+
 class Companion(BaseCallback):
-    """Callback that monitors each step and roll-out of a training of `total` environment steps.
+    """Callback that monitors each step and roll-out of a training.
 
     It calls `tell` with the progress, and `save` about every `checkpoint_every` environment steps,
     between two roll-outs only.
     """
 
     def __init__(
-        self,
-        env: TrainVecEnv,
-        seed: int,
-        total: int,
-        checkpoint_every: int,
-        save: Callable[[], None],
-        tell: Callable[[Progress], None],
+        self, env: TrainVecEnv, seed: int, settings: TrainingSettings, save: Save, tell: Tell
     ) -> None:
         super().__init__()
-        self._env, self._seed, self._total = env, seed, total
-        self._every, self._save, self._tell = checkpoint_every, save, tell
+        self._env, self._seed, self._save, self._tell = env, seed, save, tell
+        self._total, self._every = settings.steps, settings.checkpoint_every
         self._collisions: deque[bool] = deque(maxlen=RECENT)
-        self._begin = self._told = time.perf_counter()
-        self._first = self._saved = 0
-        self._busy = env.stepping_s
 
     def _on_training_start(self) -> None:
-        self._begin, self._busy = time.perf_counter(), self._env.stepping_s
+        self._begin = self._told = time.perf_counter()
+        self._busy = self._env.stepping_s
         self._first = self._saved = self.num_timesteps
 
     def _on_rollout_start(self) -> None:
@@ -228,15 +219,14 @@ class Companion(BaseCallback):
         self._told = now
         taken = max(now - self._begin, 1e-9)
         successes = self.model.ep_success_buffer
+        success, collision = (
+            float(np.mean(r)) if r else np.nan for r in (successes, self._collisions)
+        )
         progress = Progress(
-            self._seed,
-            self.num_timesteps,
-            self._total,
-            float(np.mean(successes)) if successes else np.nan,
-            float(np.mean(self._collisions)) if self._collisions else np.nan,
+            self._seed, self.num_timesteps, self._total, success, collision,
             (self.num_timesteps - self._first) / taken,
             (self._env.stepping_s - self._busy) / taken,
-        )
+        )  # fmt: skip
         self.logger.record("rollout/collision_rate", progress.collision)
         self.logger.record("time/env_share", progress.env_share)
         self._tell(progress)
@@ -263,26 +253,22 @@ def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
 
     Raises ConfigError if the snapshot is of an env with other worlds, robots, lidar or task.
     """
-    targets = env.changing
-    known = {name for name in state if not name.startswith((MEMORY, DRAWN))}
-    for name in (*sorted(known ^ set(targets)), *targets):
-        one, other = state.get(name), targets.get(name)
-        if one is None or other is None:
-            fault = "is in one of both only"
-        elif one.shape != other.shape or one.dtype != other.dtype:
-            fault = f"is of shape {one.shape}, this env's of {other.shape}"
-        else:
-            continue
-        advice = "make the env with the arguments that it had"
-        raise ConfigError(f"state of a vector env: {name!r} {fault}; {advice}.")
+    parts: dict[str, Arrays] = {"": {}, MEMORY: {}, DRAWN: {}}
+    for name, rows in state.items():
+        prefix = next((p for p in (MEMORY, DRAWN) if name.startswith(p)), "")
+        parts[prefix][name.removeprefix(prefix)] = np.array(rows)
+    targets, given = env.changing, parts[""]
+    for name in sorted(given.keys() | targets.keys()):
+        was, now = (_kind(rows.get(name)) for rows in (given, targets))
+        if was != now:
+            reason = f"{name!r} is {was}, this env's is {now}"
+            advice = "make the env with the arguments that it had"
+            raise ConfigError(f"state of a vector env: {reason}; {advice}.")
     for name, target in targets.items():
-        target[...] = state[name]  # in place: the compiled steps refer to these arrays
-    env.memory, env.simulator.drawn = (
-        {
-            name.removeprefix(prefix): np.array(rows)
-            for name, rows in state.items()
-            if name.startswith(prefix)
-        }
-        for prefix in (MEMORY, DRAWN)
-    )
+        target[...] = given[name]  # in place: the compiled steps refer to these arrays
+    env.memory, env.simulator.drawn = parts[MEMORY], parts[DRAWN]
     env.ready = bool((targets["episode"] >= 0).all())
+
+
+def _kind(rows: NDArray[Any] | None) -> str:
+    return "missing" if rows is None else f"{rows.dtype} of shape {rows.shape}"

@@ -78,9 +78,8 @@ def actor_of(model: Any) -> torch.nn.Module:
         return torch.nn.Sequential(*parts)
     if isinstance(policy, torch.nn.Module):
         return policy
-    raise ConfigError(
-        f"a {type(model).__name__} can't be exported; give a PPO, A2C or SAC, or a torch module."
-    )
+    known = "give a PPO, A2C or SAC, or a torch module."
+    raise ConfigError(f"a {type(model).__name__} can't be exported; {known}")
 
 
 def export_policy(
@@ -91,20 +90,12 @@ def export_policy(
     normaliser: Normaliser | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> PolicyFile:
-    """Writes a trained model as a policy file, and loads it as a robot would.
+    """Writes a trained model (see `actor_of`) as a policy file, and loads it as a robot would.
 
-    Args:
-        model: see `actor_of`.
-        task: the task that it was trained on.
-        simulator_model: the model that it was trained in.
-        path: of the file, `*.onnx`.
-        normaliser: mean (O,), standard deviation (O,) and limit of the normalised observations;
-            None if the model has its own.
-        provenance: command, seed and so on, as strings and numbers.
-
-    Raises:
-        ConfigError: the model can't be exported.
-        PolicyError: the file does not reproduce the model's outputs.
+    Task and simulator model are those of its training. The normaliser is the mean (O,), standard
+    deviation (O,) and limit of the normalised observations; None if the model has its own. The
+    provenance is command, seed and so on, as strings and numbers. Raises ConfigError if the model
+    can't be exported, PolicyError if the file does not reproduce its outputs.
     """
     file = Path(path)
     if file.suffix != SUFFIX:
@@ -112,9 +103,8 @@ def export_policy(
     deployed = Deployed(actor_of(model), task, normaliser).eval().cpu()
     graph = _graph(deployed, task)
     golden = _golden(deployed, graph, task, str(file))
-    text = contract_of(
-        task, simulator_model, golden, onnx_graph.graph_hash(graph), provenance or {}
-    )
+    sha256 = onnx_graph.graph_hash(graph)
+    text = contract_of(task, simulator_model, golden, sha256, provenance or {})
     onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
     data = onnx_graph.sealed(graph.SerializeToString(deterministic=True))
     policy = policy_of(data, file)
@@ -143,7 +133,6 @@ def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str
 
 
 def _graph(deployed: Deployed, task: Task) -> Any:
-    """Exports a module as a ModelProto."""
     example = torch.zeros(1, task.observation_space.shape[0])
     names, buffer = [onnx_graph.ACTION, onnx_graph.COMMAND], io.BytesIO()
     with warnings.catch_warnings():

@@ -32,16 +32,14 @@ class TrainVecEnv(VecEnv):
     def __init__(self, *envs: BridgeVectorEnv) -> None:
         for env in envs:
             if env.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP or not env.copy:
-                raise ConfigError(
-                    "Stable-Baselines3 needs BridgeVectorEnv(autoreset_mode='SameStep', copy=True)."
-                )
+                needed = "autoreset_mode='SameStep', copy=True"
+                raise ConfigError(f"Stable-Baselines3 needs BridgeVectorEnv({needed}).")
         first = envs[0]
-        for env in envs[1:]:
-            if env.single_observation_space != first.single_observation_space:
-                raise ConfigError(
-                    f"vector envs that are fed together show {first.single_observation_space} and "
-                    f"{env.single_observation_space}; give them one robot, lidar and task."
-                )
+        spaces = [env.single_observation_space for env in envs]
+        for space in spaces:
+            if space != spaces[0]:
+                shown = f"{spaces[0]} and {space}; give them one robot, lidar and task."
+                raise ConfigError(f"vector envs that are fed together show {shown}")
         self.envs = envs
         edges = np.cumsum([0, *(env.num_envs for env in envs)])
         self._rows = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
@@ -117,7 +115,6 @@ class TrainVecEnv(VecEnv):
         return [results[id(self._env_of(n))] for n in self._get_indices(indices)]
 
     def _env_of(self, n: int) -> BridgeVectorEnv:
-        """The vector env that contains world n."""
         return next(env for env, rows in zip(self.envs, self._rows, strict=True) if n < rows.stop)
 
     def env_is_wrapped(

@@ -89,10 +89,8 @@ class TrainingSettings(Schema):
             raise ValueError(f"all worlds together may have {MOST_WORLDS} copies")
         kept = self.num_envs * self.ppo.rollout if self.algorithm == "ppo" else self.sac.buffer
         if kept > MOST_KEPT:
-            raise ValueError(
-                f"{self.algorithm} would keep {kept} transitions, and may keep {MOST_KEPT}; lower "
-                "the copies of worlds, ppo.rollout or sac.buffer"
-            )
+            kept_by = f"{self.algorithm} would keep {kept} transitions, and may keep {MOST_KEPT}"
+            raise ValueError(f"{kept_by}; lower the copies of worlds, ppo.rollout or sac.buffer")
         return self
 
     @property

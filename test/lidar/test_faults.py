@@ -2,11 +2,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from lidar_scenes import scan_skewed
 from robots import direct_model, field, lidar
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.lidar import fault_kernels
-from nics_drl_bridge.lidar.faults import LidarFaults, distort, scan_skewed, slice_edges, slice_poses
+from nics_drl_bridge.lidar.faults import LidarFaults, distort, slice_poses
 from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.sim.simulator import FastSimulator
 
@@ -222,13 +223,6 @@ def test_a_device_that_turns_clockwise_has_its_newest_beam_first():
 
 def test_without_skew_all_slices_are_at_the_pose():
     assert slice_poses(POSE, TWIST, 0.1, 3, "none") == pytest.approx(np.tile(POSE, (3, 1)))
-
-
-@pytest.mark.parametrize(("beams", "slices"), [(10, 1), (10, 3), (10, 10), (720, 16)])
-def test_slices_hold_every_beam_once(beams, slices):
-    edges = slice_edges(beams, slices)
-    assert (edges[0], edges[-1]) == (0, beams)
-    assert set(np.diff(edges)) <= {beams // slices, -(-beams // slices)}
 
 
 @pytest.mark.parametrize("skew", ["counter_clockwise", "clockwise"])

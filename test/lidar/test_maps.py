@@ -179,7 +179,7 @@ def test_a_damaged_image_is_one_sentence(save, image):
 @pytest.mark.parametrize("size", [b"9000 9000", b"99999 99999"])
 def test_an_image_that_is_too_large_is_refused_before_it_is_read(save, size):
     assert maps.MAX_CELLS < 9000 * 9000
-    with pytest.raises(ConfigError, match=r"map\.pgm: has .* pixels, and a map may have 64000000"):
+    with pytest.raises(ConfigError, match=r"map\.pgm: has too many pixels, a map may have 64"):
         load_map(save(b"P5 " + size + b" 255\n"))
 
 

@@ -123,7 +123,7 @@ def test_a_car_turns_by_its_own_wheelbase(changes):
     twist = [speed, 0.0, speed * np.tan(angle) / 2.5]
     assert steady_twist(long, long.command_high) == pytest.approx(twist)
     planner = DynamicWindow(Navigation(long, lidar()))
-    assert np.abs(planner._twists).max(axis=0) == pytest.approx(np.abs(twist))
+    assert np.abs(planner._search[0]).max(axis=0) == pytest.approx(np.abs(twist))
 
 
 def test_a_car_of_unknown_wheelbase_is_refused_and_none_assumed():
