@@ -16,13 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array, rotate, wrap_angle
+from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.clocks import (
-    LONG_STEP,
-    TimingEstimate,
-    expected_states,
-    if_certain,
-)
 from nics_drl_bridge.identify.drive import Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import followed, held
 from nics_drl_bridge.identify.statistics import standard_errors
@@ -48,7 +43,9 @@ class Mounting:
     turns: bool  # True if the robot turned at all
 
 
-def mounting_of(drive: Drive, timing: TimingEstimate, speed: Array | None) -> Mounting | None:
+def mounting_of(
+    drive: Drive, timing: clocks.TimingEstimate, speed: Array | None
+) -> Mounting | None:
     """Estimates the mounting as far as the drive shows it; None if it does not.
 
     The speed (n,) along the direction of travel is expected over the intervals of the twists, up to
@@ -73,7 +70,9 @@ def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
     names = ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
     values = map(float, (mounting.rotation, *mounting.lever))
     sigmas = tuple(map(float, (mounting.rotation_sigma, *mounting.lever_sigma)))
-    rotation, x, y = (if_certain(v, s, MIN_LENGTH) for v, s in zip(values, sigmas, strict=True))
+    rotation, x, y = (
+        clocks.if_certain(v, s, MIN_LENGTH) for v, s in zip(values, sigmas, strict=True)
+    )
     learnt = {n: s for n, s in zip(names, sigmas, strict=True) if not np.isnan(s)}
     return replace(
         calibration,
@@ -132,14 +131,16 @@ def lateral_lever(motion: TwistIntervals, rotation: float, speed: Array) -> tupl
     return -float(beta[1]), float(standard_errors(chi, along - chi @ beta)[1])
 
 
-def _by_commands(timing: TimingEstimate, drive: Drive, twists: TwistIntervals) -> Mounting | None:
+def _by_commands(
+    timing: clocks.TimingEstimate, drive: Drive, twists: TwistIntervals
+) -> Mounting | None:
     """Estimates the mounting on an omnidirectional robot from its state, or else its commands.
 
     None unless the robot moved along x and y and turned.
     """
     recording, spec = drive.recording, drive.spec
     if spec.state:
-        expected = expected_states(drive, twists, timing)
+        expected = clocks.expected_states(drive, twists, timing)
         command = _as_commands(expected, drive, timing.latency)
     else:
         begin = twists.start + timing.offset - timing.latency
@@ -169,7 +170,7 @@ def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
     if stream is None:
         return states[:, np.argsort(followed(spec))]
     span = np.diff(stream.t)
-    keep = (span > 0.0) & (span < LONG_STEP * np.median(span))
+    keep = (span > 0.0) & (span < clocks.LONG_STEP * np.median(span))
     keep &= _fresh(command, stream.t[:-1] - latency)
     rates = np.diff(stream.values, axis=0)[keep] / span[keep, None]
     before = stream.values[:-1][keep]
@@ -188,10 +189,10 @@ def _fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
     """Selects the times (n,) at which the command is known: not in gaps of regular rows."""
     span = np.diff(command.t)
     usual = float(np.median(span)) if len(span) else 0.0
-    if not (span < LONG_STEP * usual).mean() > REGULAR:
+    if not (span < clocks.LONG_STEP * usual).mean() > REGULAR:
         return np.ones(len(start), dtype=np.bool_)
     row = np.searchsorted(command.t, start + 1e-9, "right") - 1
-    return np.asarray(np.append(span, 0.0)[np.clip(row, 0, None)] < LONG_STEP * usual)
+    return np.asarray(np.append(span, 0.0)[np.clip(row, 0, None)] < clocks.LONG_STEP * usual)
 
 
 Estimate = Callable[[Drive, TwistIntervals], Mounting | None]

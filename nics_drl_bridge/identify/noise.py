@@ -13,16 +13,9 @@ import numpy as np
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, find_bursts, pose_noise
-from nics_drl_bridge.identify.open_loop import (
-    Windows,
-    course_of,
-    predict,
-    relative_ends,
-    tracked_ends,
-    windows,
-)
 from nics_drl_bridge.identify.signals import white_noise
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.noise import ASSUMED_STATE_DRIFT, MEASURED, Level, Noise, assumed
@@ -98,7 +91,7 @@ def _pose_drift(
     sensor: Noise, drive: Drive, calibration: Calibration, model: TaylorModel
 ) -> tuple[Level, Level] | None:
     """Returns the drift of position and heading; None if too short or the model diverges."""
-    chosen = windows(drive, calibration, 0.0, drive.duration_s, HORIZON_S, SPACING_S)
+    chosen = open_loop.windows(drive, calibration, 0.0, drive.duration_s, HORIZON_S, SPACING_S)
     if len(chosen.start_t) < MIN_WINDOWS:
         return None
     error = geometry.between(_predicted(drive, calibration, model, chosen), chosen.end)
@@ -125,7 +118,7 @@ def drift_growth(
     """
     rows = []
     for horizon in GROWTH_S:
-        chosen = windows(drive, calibration, 0.0, drive.duration_s, horizon, SPACING_S)
+        chosen = open_loop.windows(drive, calibration, 0.0, drive.duration_s, horizon, SPACING_S)
         if len(chosen.start_t) < MIN_WINDOWS:
             break
         error = geometry.between(_predicted(drive, calibration, model, chosen), chosen.end)
@@ -135,19 +128,21 @@ def drift_growth(
 
 
 def _predicted(
-    drive: Drive, calibration: Calibration, model: TaylorModel, chosen: Windows
+    drive: Drive, calibration: Calibration, model: TaylorModel, chosen: open_loop.Windows
 ) -> Array:
     """Predicts end poses (W, 3) from the state, measured so that its drift is not counted twice."""
     state = drive.recording.state
     if state is None:
-        return predict(model, calibration, drive, chosen)
-    course = course_of(model, calibration, drive, chosen)
+        return open_loop.predict(model, calibration, drive, chosen)
+    course = open_loop.course_of(model, calibration, drive, chosen)
     x, begin = course.x.copy(), chosen.start_t + calibration.clock_offset_s
     t = begin[:, None] + model.dt * np.arange(x.shape[1])
     for i, column in enumerate(state.values.T):
         x[:, :, i] = np.interp(t, state.t, column)
     course = replace(course, x=x)
-    return tracked_ends(course.chosen, calibration, relative_ends(course, model)[0])
+    return open_loop.tracked_ends(
+        course.chosen, calibration, open_loop.relative_ends(course, model)[0]
+    )
 
 
 def _state_drift(drive: Drive, model: TaylorModel, samples: Samples) -> dict[str, Level]:

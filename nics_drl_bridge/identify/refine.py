@@ -15,18 +15,9 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.open_loop import (
-    Course,
-    Windows,
-    course_of,
-    predict,
-    relative_ends,
-    tracked_ends,
-    tracked_slopes,
-    windows,
-)
 from nics_drl_bridge.identify.statistics import clustered_errors, minimise, uncertainty
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -126,34 +117,36 @@ class Problem:
     """Prediction problem of a refinement: windows of one drive, the same for every trial model."""
 
     drive: Drive
-    chosen: tuple[Windows, ...]  # of each horizon, without those that contain a jump of the pose
-    courses: tuple[Course, ...]  # of X over them if the state was measured, else empty
+    chosen: tuple[
+        open_loop.Windows, ...
+    ]  # of each horizon, without those that contain a jump of the pose
+    courses: tuple[open_loop.Course, ...]  # of X over them if the state was measured, else empty
 
 
 def problem_of(model: TaylorModel, calibration: Calibration, drive: Drive) -> Problem | None:
     """Selects the windows of a training part to predict; None if it is too short."""
     until = drive.settings.train_until_s
-    found = (windows(drive, calibration, 0.0, until, h, SPACING_S) for h in HORIZONS_S)
+    found = (open_loop.windows(drive, calibration, 0.0, until, h, SPACING_S) for h in HORIZONS_S)
     chosen = tuple(
-        _without_outliers(w, predict(model, calibration, drive, w) - w.end)
+        _without_outliers(w, open_loop.predict(model, calibration, drive, w) - w.end)
         for w in found
         if len(w.start_t) >= MIN_WINDOWS
     )
     if not chosen:
         return None
     measured = drive.recording.state is not None
-    courses = (course_of(model, calibration, drive, w) for w in chosen if measured)
+    courses = (open_loop.course_of(model, calibration, drive, w) for w in chosen if measured)
     return Problem(drive, chosen, tuple(courses))
 
 
-def _without_outliers(chosen: Windows, error: Array) -> Windows:
+def _without_outliers(chosen: open_loop.Windows, error: Array) -> open_loop.Windows:
     """Drops windows that contain a jump of the pose, or have one at an end."""
     size = np.hypot(error[:, 0], error[:, 1])
     far = max(OUTLYING * float(np.median(size)), OUTLYING_SHARE * float(chosen.path.max()))
     inside = size <= far
     if inside.all() or inside.mean() < 1.0 - MOST_OUTLIERS or inside.sum() < MIN_WINDOWS:
         return chosen
-    return Windows(*(values[inside] for values in vars(chosen).values()))
+    return open_loop.Windows(*(values[inside] for values in vars(chosen).values()))
 
 
 def prediction_errors(problem: Problem, model: TaylorModel, calibration: Calibration) -> Array:
@@ -162,10 +155,10 @@ def prediction_errors(problem: Problem, model: TaylorModel, calibration: Calibra
     with np.errstate(all="ignore"):  # a trial step may diverge; it is then rejected
         for k, chosen in enumerate(problem.chosen):
             if problem.courses:
-                ends = relative_ends(problem.courses[k], model)[0]
-                predicted = tracked_ends(chosen, calibration, ends)
+                ends = open_loop.relative_ends(problem.courses[k], model)[0]
+                predicted = open_loop.tracked_ends(chosen, calibration, ends)
             else:
-                predicted = predict(model, calibration, problem.drive, chosen)
+                predicted = open_loop.predict(model, calibration, problem.drive, chosen)
             error = predicted - chosen.end
             error[:, 2] = HEADING_ARM_M * geometry.wrap_angle(error[:, 2])
             parts.append(error.ravel())
@@ -179,11 +172,13 @@ def prediction_slopes(
     """Returns the derivatives (n, P) of `prediction_errors` for a measured state."""
     parts = []
     for course in problem.courses:
-        ends, moved = relative_ends(course, model, free.coefficients)
-        slope = tracked_slopes(course, calibration, ends, moved)
+        ends, moved = open_loop.relative_ends(course, model, free.coefficients)
+        slope = open_loop.tracked_slopes(course, calibration, ends, moved)
         if free.turn:
             turned = [
-                tracked_ends(course.chosen, replace(calibration, rotation_rad=angle), ends)
+                open_loop.tracked_ends(
+                    course.chosen, replace(calibration, rotation_rad=angle), ends
+                )
                 for angle in calibration.rotation_rad + np.array([-TURN_RAD, TURN_RAD])
             ]
             aside = (turned[1] - turned[0])[:, :, None]

@@ -16,17 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge import geometry
+from nics_drl_bridge import files, geometry
 from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.files import (
-    MOST_BYTES,
-    check_sealed,
-    read_file,
-    sealed,
-    sha256,
-    write_bytes,
-)
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.noise import Latency
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -203,7 +195,7 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         meta["latency"] = recording.latency.model_dump(mode="json")
     buffer = io.BytesIO()
     np.savez_compressed(buffer, meta=np.array(json.dumps(meta)), **arrays)  # type: ignore[arg-type]
-    write_bytes(path, sealed(buffer.getvalue()))
+    files.write_bytes(path, files.sealed(buffer.getvalue()))
 
 
 def load_recording(path: str | Path) -> Recording:
@@ -213,7 +205,7 @@ def load_recording(path: str | Path) -> Recording:
         RecordingError: there is no such file, or it is not an `.npz`, damaged or incomplete.
     """
     try:
-        data = read_file(no_device(Path(path)))
+        data = files.read_file(no_device(Path(path)))
         arrays = _arrays(data)
         meta = json.loads(str(arrays["meta"]))
         _check_seal(data, meta["format"])
@@ -247,8 +239,8 @@ def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
     """The arrays of an `.npz` file's content. Raises ValueError if it is damaged or too large."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if sum(member.file_size for member in archive.infolist()) > MOST_BYTES:
-                raise ValueError(f"unpacked it is larger than {MOST_BYTES // 2**20} MB")
+            if sum(member.file_size for member in archive.infolist()) > files.MOST_BYTES:
+                raise ValueError(f"unpacked it is larger than {files.MOST_BYTES // 2**20} MB")
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except Exception as error:  # noqa: BLE001 - damage breaks zipfile and numpy in any way
@@ -257,6 +249,6 @@ def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
 
 def _check_seal(data: bytes, version: str) -> None:
     if version == FORMAT:
-        check_sealed(io.BytesIO(data))
-    elif version == COMMENT_FORMAT and data[-64:] != sha256(data[:-64]).encode():
+        files.check_sealed(io.BytesIO(data))
+    elif version == COMMENT_FORMAT and data[-64:] != files.sha256(data[:-64]).encode():
         raise ValueError("its checksum is missing or does not fit the rest")

@@ -12,14 +12,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.clocks import (
-    residual_by_shift,
-    response_residual,
-    speed_along,
-    state_residual,
-    wheel_means,
-)
 from nics_drl_bridge.identify.drive import Drive, pose_residual
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.noise import drift_growth, odometry_residual
@@ -135,10 +129,10 @@ def _points(axes: Axes, tracked: Sequence[Array], base: Sequence[Array]) -> None
 def wheels(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
     """Draws wheel speeds against the motion: their scale, and which wheel is the left one."""
     drive, calibration = identified.drive, identified.calibration
-    units = wheel_means(drive, calibration)
+    units = clocks.wheel_means(drive, calibration)
     if units is None or calibration.wheel_scale is None:
         return None
-    turn, along = drive.twists.twist[:, 2], speed_along(drive, calibration)
+    turn, along = drive.twists.twist[:, 2], clocks.speed_along(drive, calibration)
     rows: tuple[tuple[str, str, str, Array, Array], ...] = (
         ("wheel_scale", "mean of both wheels [unit]", "speed [m/s]", units.mean(axis=1), along),
         ("turn_scale", "right less left wheel [unit]", "yaw rate [rad/s]",
@@ -248,20 +242,22 @@ def _curve(drive: Drive, calibration: Calibration, name: str) -> ShiftCurve | No
     lags = lags if len(lags) == len(spec.state) else nominal_lags(spec)
     state, wheels, command = recording.state, recording.wheels, recording.command
     if name == "clock_offset_s" and state is not None:
-        by_state = residual_by_shift(state, pose)
+        by_state = clocks.residual_by_shift(state, pose)
         rest = [by_state(np.array([-v])) for v in value]
     elif name == "clock_offset_s":
-        by_command = response_residual(command, spec, pose)
+        by_command = clocks.response_residual(command, spec, pose)
         rest = [by_command(lags, calibration.command_latency_s - v) for v in value]
     elif state is not None:
-        by_delay = state_residual(command, state, spec)
+        by_delay = clocks.state_residual(command, state, spec)
         rest = [by_delay(np.array([v])) for v in value]
     elif recording.pose.clock == command.clock:
-        by_command = response_residual(command, spec, pose)
+        by_command = clocks.response_residual(command, spec, pose)
         rest = [by_command(lags, v) for v in value]
     elif wheels is not None:
         tick = float(np.median(np.diff(wheels.t)))
-        by_command = response_residual(command, spec, (wheels.t - tick, wheels.t, wheels.values))
+        by_command = clocks.response_residual(
+            command, spec, (wheels.t - tick, wheels.t, wheels.values)
+        )
         rest = [by_command(lags, v) for v in value]
     else:
         return None
