@@ -46,11 +46,9 @@ SPANNED = 0.9  # share of a uniform distribution between the first and last of t
 def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recording:
     """Reads a drive of a robot from a bag: its folder or its only file.
 
-    Missing roles of topics are guessed; for the clocks see `stamping.streams`.
-
-    Raises:
-        RecordingError: the bag is damaged or incomplete, a topic is missing or ambiguous, or
-            the data can't be used for this robot; one sentence with place and fix.
+    Missing roles of topics are guessed; for the clocks see `stamping.streams`. RecordingError, one
+    sentence with place and fix: the bag is damaged or incomplete, a topic is missing or ambiguous,
+    or the data can't be used for this robot.
     """
     with opened(path) as bag:
         topics = roles.assign(mapping, bag.types, bag.empty, bag.place)
@@ -59,17 +57,18 @@ def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recordin
             "pose": _pose(bag, topics.get("pose") or topics["odom"], mapping),
         }
         if "pose" in topics and "odom" in topics:
-            odometry = bag.messages(topics["odom"])
-            data["odometry"] = _table(bag, topics["odom"], odometry, twist_row)
-        if "joint_states" in topics:
+            data["odometry"] = _table(bag, topics["odom"], twist_row)
+        if topic := topics.get("joint_states"):
+            messages = ((m.receive_ns, stamp(m.content), m.content) for m in bag.messages(topic))
             joints = gather(
-                topics["joint_states"], map(_joints, bag.messages(topics["joint_states"]))
+                topic,
+                (JointMessage(ns, t, c.name, c.position, c.velocity) for ns, t, c in messages),
             )
             state = state_of(joints, spec, mapping, bag.place)
             wheels = wheels_of(joints, mapping, bag.place)
             data |= {n: d for n, d in (("state", state), ("wheels", wheels)) if d is not None}
         if "imu" in topics:
-            data["imu"] = _table(bag, topics["imu"], bag.messages(topics["imu"]), imu_row)
+            data["imu"] = _table(bag, topics["imu"], imu_row)
         latency = latency_of(bag, topics.get("odom"))
     made = streams(data, mapping.stamps, str(path))
     recording = Recording(**made, source=str(path), variables=spec.variable_names, latency=latency)
@@ -77,8 +76,13 @@ def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recordin
 
 
 def _table(
-    bag: BagFile, topic: str, messages: Sequence[Message], row: Callable[[Any], Row]
+    bag: BagFile,
+    topic: str,
+    row: Callable[[Any], Row],
+    messages: Sequence[Message] | None = None,
 ) -> TopicData:
+    """Reads a row of numbers from each message of a topic, or from those given."""
+    messages = bag.messages(topic) if messages is None else messages
     receive, header = times_of(messages)
     values = np.array([row(m.content) for m in messages], dtype=np.float64)
     for k in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
@@ -90,15 +94,15 @@ def _table(
 
 
 def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
-    if bag.types[topic] in (roles.ACKERMANN, roles.ACKERMANN_STAMPED):
-        for variable in spec.command:
-            if variable.turns and not variable.steers:
-                raise RecordingError(
-                    f"{bag.place}: topic {topic!r} holds steering angles [rad], but "
-                    f"{variable.name!r} of robot {spec.name!r} is in {variable.unit}; choose the "
-                    "robot that drove, or another topic."
-                )
-    data = _table(bag, topic, bag.messages(topic), command_row)
+    for variable in spec.command:
+        steered = bag.types[topic] in (roles.ACKERMANN, roles.ACKERMANN_STAMPED)
+        if steered and variable.turns and not variable.steers:
+            raise RecordingError(
+                f"{bag.place}: topic {topic!r} holds steering angles [rad], but {variable.name!r} "
+                f"of robot {spec.name!r} is in {variable.unit}; choose the robot that drove, or "
+                "another topic."
+            )
+    data = _table(bag, topic, command_row)
     return replace(data, values=spec.from_cmd_vel(data.values))
 
 
@@ -114,7 +118,7 @@ def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
             f"{bag.place}: topic {topic!r}: message {k}: the quaternion has the length "
             f"{length[k]:.3f} and not 1; check its publisher, or choose another topic."
         )
-    return _table(bag, topic, messages, pose_row)
+    return _table(bag, topic, pose_row, messages)
 
 
 def _of_one_body(
@@ -134,12 +138,12 @@ def _of_one_body(
     }
     if len(pairs) == 1:
         return [message for pair, message in single if pair in pairs]
-    named = " with the given names" if any(wanted) else ""
     problem = "several transforms" if pairs else "no transform"
+    named = " with the given names" if any(wanted) else ""
+    listed = ", ".join(sorted(f"{a} -> {b}" for a, b in there)) or "none"
     raise RecordingError(
         f"{bag.place}: topic {topic!r} holds {problem}{named}; write those of the robot into the "
-        f"topics file, as in `frame: world` and `child_frame: base_link`; it holds "
-        f"{', '.join(sorted(f'{a} -> {b}' for a, b in there)) or 'none'}."
+        f"topics file, as in `frame: world` and `child_frame: base_link`; it holds {listed}."
     )
 
 
@@ -164,13 +168,6 @@ class JointMessage(NamedTuple):
     velocity: Sequence[float]
 
 
-def _joints(message: Message) -> JointMessage:
-    found = message.content
-    return JointMessage(
-        message.receive_ns, stamp(found), found.name, found.position, found.velocity
-    )
-
-
 def gather(topic: str, messages: Iterable[JointMessage]) -> Joints:
     """Collects messages, which may contain different joints, in one table."""
     messages = list(messages)
@@ -189,18 +186,14 @@ def gather(topic: str, messages: Iterable[JointMessage]) -> Joints:
 def state_of(joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str) -> TopicData | None:
     """Returns the measured state (T, S), from the messages that contain all of it.
 
-    None if joints of some state variables are missing, but each follows a command.
-
-    Raises:
-        RecordingError: a named joint does not exist, or a required state was not measured.
+    None if joints of some state variables are missing, but each follows a command. RecordingError
+    if a named joint does not exist, or a required state was not measured.
     """
     known = [v.name for v in spec.state]
-    for name in mapping.state:
-        if name not in known:
-            raise RecordingError(
-                f"{place}: topics: robot {spec.name!r} has no state {name!r}; "
-                f"{nearest(name, known)}"
-            )
+    for name in sorted(mapping.state.keys() - set(known)):
+        raise RecordingError(
+            f"{place}: topics: robot {spec.name!r} has no state {name!r}; {nearest(name, known)}"
+        )
     sources = {v.name: _source(joints, v, mapping, place) for v in spec.state}
     found = [source for source in sources.values() if source is not None]
     if spec.state and len(found) == len(sources):
@@ -278,11 +271,8 @@ def latency_of(bag: BagFile, odom: str | None = None) -> Latency:
     If a topic is missing, has too few messages or is stamped by another clock, its delay is
     unknown. The odometry topic is by default the one of that type or name.
     """
-    scan, odom = _topic(bag, SCAN, "scan"), odom or _topic(bag, roles.ODOMETRY, "odom")
-    return Latency(
-        scan=None if scan is None else _delay(bag.messages(scan)),
-        odom=None if odom is None else _delay(bag.messages(odom)),
-    )
+    odom = odom or _topic(bag, roles.ODOMETRY, "odom")
+    return Latency(scan=_delay(bag, _topic(bag, SCAN, "scan")), odom=_delay(bag, odom))
 
 
 def _topic(bag: BagFile, kind: str, name: str) -> str | None:
@@ -293,12 +283,11 @@ def _topic(bag: BagFile, kind: str, name: str) -> str | None:
     return found[0] if len(found) == 1 else None
 
 
-def _delay(messages: Sequence[Message]) -> Delay | None:
+def _delay(bag: BagFile, topic: str | None) -> Delay | None:
     """Fits a uniform distribution to the delays of stamped messages."""
-    if len(messages) < LEAST_MESSAGES:
-        return None
+    messages = bag.messages(topic) if topic else []
     receive, stamps = times_of(messages)
-    if stamps is None or not stamps.all():
+    if len(messages) < LEAST_MESSAGES or stamps is None or not stamps.all():
         return None
     late = (receive - stamps) * S_PER_NS - np.array([_sweep(m.content) for m in messages])
     low, middle, high = np.percentile(late, PERCENTILES)
@@ -310,6 +299,5 @@ def _delay(messages: Sequence[Message]) -> Delay | None:
 
 def _sweep(scan: Any) -> float:
     """Returns the time from a scan's stamp, that of beam 0, to its last beam [s]; else 0."""
-    if not hasattr(scan, "ranges"):
-        return 0.0
-    return max(0.0, float(scan.time_increment)) * max(0, len(scan.ranges) - 1)
+    beams = len(getattr(scan, "ranges", ()))
+    return max(0.0, float(scan.time_increment)) * (beams - 1) if beams else 0.0
