@@ -18,13 +18,11 @@ def assume_textbook(
 ) -> tuple[TaylorModel, tuple[str, ...]]:
     """Adds terms for inputs that never moved, from the structure of the textbook kinematics.
 
-    A fit at a constant input is a section through the whole model: `wz = c speed`, measured at
-    the steering angle s0, becomes `wz = (c/s0) speed*steering`. At s0 = 0 the section shows
-    nothing of the input's effect, so the coefficient comes from the spec's parameters. The model
-    lists the new terms in `assumed`; a sentence is returned per change.
-
-    Raises:
-        ConfigError: the spec names no textbook kinematics.
+    A fit at a constant input is a section through the whole model: `wz = c speed`, measured at the
+    steering angle s0, becomes `wz = (c/s0) speed*steering`. At s0 = 0 the section shows nothing of
+    the input's effect, so the coefficient comes from the spec's parameters. The model lists the new
+    terms in `assumed`; a sentence is returned per change. Raises ConfigError: the spec names no
+    textbook kinematics.
     """
     book = textbook(spec)
     named = model.named

@@ -308,8 +308,7 @@ class ExpectedMotion:
 def expected_motion(spec: RobotSpec) -> ExpectedMotion:
     """Returns the motion of a robot's textbook kinematics, else its `cmd_vel` as body twist.
 
-    Raises:
-        ConfigError: the spec names no textbook, and a command is not part of a twist.
+    Raises ConfigError: the spec names no textbook, and a command is not part of a twist.
     """
     if spec.textbook is not None:
         book = textbook(spec)
@@ -358,8 +357,7 @@ class DrivePlan:
     def preview(self) -> Pattern:
         """Returns the pattern of the drive under the expected motion.
 
-        Raises:
-            ConfigError: the circle is too small for the robot to show its motion in it.
+        Raises ConfigError: the circle is too small for the robot to show its motion in it.
         """
         return self._found[1]
 

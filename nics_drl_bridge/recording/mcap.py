@@ -64,8 +64,7 @@ class _View:
 def records(data: memoryview, place: int = 0) -> Iterator[Record]:
     """Yields the records from an offset on, until the end of the data or a footer.
 
-    Raises:
-        DamageError: a record is truncated, of an unknown kind, or shorter than its fields.
+    Raises DamageError: a record is truncated, of an unknown kind, or shorter than its fields.
     """
     stream = _View(data, place)
     source = cast("IO[bytes]", stream)
@@ -178,10 +177,8 @@ class _Walk:
 def check_mcap(path: Path) -> None:
     """Checks a file (https://mcap.dev/spec) from its first byte to its last.
 
-    Counts, times and index must agree, and every checksum present must match.
-
-    Raises:
-        DamageError: it is truncated, a checksum is wrong, or two of its parts disagree.
+    Counts, times and index must agree, and every checksum present must match. Raises DamageError:
+    it is truncated, a checksum is wrong, or two of its parts disagree.
     """
     if path.stat().st_size < len(MAGIC):
         raise DamageError(0, "the file is empty or ends at once")
@@ -301,9 +298,8 @@ def _zstd() -> Any:
 def unpack(data: bytes, compression: str, most: int = MOST_UNPACKED) -> bytes:
     """Decompresses the content of a chunk by `lz4` or `zstd`: a few bytes can unpack to terabytes.
 
-    Raises:
-        ValueError: the result is larger than `most` bytes, or the data is truncated. Other
-            exceptions of the libraries on damaged data are passed on.
+    Raises ValueError: the result is larger than `most` bytes, or the data is truncated. Other
+    exceptions of the libraries on damaged data are passed on.
     """
     if compression == "zstd":
         unpacker = _zstd().ZstdDecompressor()

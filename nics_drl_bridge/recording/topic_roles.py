@@ -161,8 +161,9 @@ class _Topics:
         """Tells that no topic has any of the roles, with the fix."""
         kinds = dict.fromkeys(kind for role in roles for kind in TYPES[role])
         advice = f"record one of type {', '.join(kinds)}"
-        for role, topic in [(role, topic) for role in roles for topic in self._fitting(role)][:1]:
-            advice = f"say which does, as in --topic {role}={topic}"
+        fitting = [f"{role}={topic}" for role in roles for topic in self._fitting(role)]
+        if fitting:
+            advice = f"say which does, as in --topic {fitting[0]}"
         return f"no topic is known to hold the {words}; {advice}; {self._listed(roles)}"
 
     def _fitting(self, *roles: str) -> list[str]:

@@ -49,9 +49,8 @@ CHUNK_BYTES = 1 << 16  # damage costs a whole chunk, since each checksum covers 
 def check_out(path: str | Path) -> Path:
     """Checks an output path of a recording: an `.npz` file or the folder of a rosbag2.
 
-    Raises:
-        ConfigError: it exists already, or has another suffix.
-        RecordingError: it needs a library that is missing.
+    Raises ConfigError: it exists already, or has another suffix. Raises RecordingError: it needs a
+    library that is missing.
     """
     path = Path(path)
     if path.exists():
@@ -248,10 +247,8 @@ def bag_sink(path: str | Path, storage: Storage = "mcap") -> Iterator[BagSink]:
 
     It is written to a hidden folder `.NAME.*` next to `path`. After an error nothing is left; a
     killed process or a full disk leaves that folder, from which `salvage` recovers the flushed
-    messages. MCAP has checksums, so that any damage is found; SQLite has none.
-
-    Raises:
-        RecordingError: the folder exists already or can't be written, or a library is missing.
+    messages. MCAP has checksums, so that any damage is found; SQLite has none. Raises
+    RecordingError: the folder exists already or can't be written, or a library is missing.
     """
     path = Path(path)
     check_libraries(path, "writing")

@@ -79,9 +79,7 @@ def salvage(path: str | Path, out: str | Path, storage: Storage = "mcap") -> Sal
     From an MCAP file these are all chunks with a correct checksum, or, in chunks without one, all
     messages before the damage; from an SQLite file all readable rows. Messages that can't be
     decoded are dropped. The hidden folder that a killed recorder leaves is accepted too.
-
-    Raises:
-        RecordingError: nothing is intact, or `out` exists already.
+    Raises RecordingError: nothing is intact, or `out` exists already.
     """
     path, found = Path(path), _Found()
     for file in _files(path):
