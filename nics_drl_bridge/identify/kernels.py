@@ -27,8 +27,8 @@ def _sinc(half):  # type: ignore[no-untyped-def]
     return 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
 
 
-@kernel(allocates=True, inline=True) def _follow_derivatives(now, values, dof, free, dx, dy, turn,
-along_x, along_y, dt):  # type: ignore[no-untyped-def]
+@kernel(allocates=True, inline=True)
+def _follow_derivatives(now, values, dof, free, dx, dy, turn, along_x, along_y, dt):  # type: ignore[no-untyped-def]
     """Propagates the derivatives (3, P) of a pose along one arc: (dx, dy, turn)."""
     for p in range(now.shape[1]):
         value, d = values[free[p]], dof[free[p]]

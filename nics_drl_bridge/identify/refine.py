@@ -315,13 +315,15 @@ def _unpack(
 ) -> tuple[TaylorModel, Calibration]:
     """Returns model and calibration with the free parameters; fixed gains follow their lags."""
     coefficients, count = model.coefficients.copy(), int(free.coefficients.sum())
-    coefficients[free.coefficients] = theta[:count] for i, response in
-    enumerate(calibration.responses): own, command = ( linear_term(model, problem.drive.spec, n) for
-    n in (response.state, response.command) ) if own is not None and command is not None and not
-    free.coefficients[3 + i, command]: coefficients[3 + i, command] = -response.gain *
-    coefficients[3 + i, own] values = dict(zip(free.names, map(float, theta[count:]), strict=True))
-    return replace(model, coefficients=coefficients), replace(calibration, **values)  # type:
-    ignore[arg-type]
+    coefficients[free.coefficients] = theta[:count]
+    for i, response in enumerate(calibration.responses):
+        own, command = (
+            linear_term(model, problem.drive.spec, n) for n in (response.state, response.command)
+        )
+        if own is not None and command is not None and not free.coefficients[3 + i, command]:
+            coefficients[3 + i, command] = -response.gain * coefficients[3 + i, own]
+    values = dict(zip(free.names, map(float, theta[count:]), strict=True))
+    return replace(model, coefficients=coefficients), replace(calibration, **values)  # type: ignore[arg-type]
 
 
 def _with_uncertainty(

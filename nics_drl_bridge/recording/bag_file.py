@@ -233,8 +233,8 @@ class BagFile:
 
     def offers(self, topic: str) -> tuple[Offer, ...]:
         """Returns the offers of a topic's publishers, as far as the bag contains them."""
-        found = (offers_of(c.ext.offered_qos_profiles) for c in self._connections[topic])  # type:
-        ignore[union-attr] return tuple(offer for some in found for offer in some)
+        found = (offers_of(c.ext.offered_qos_profiles) for c in self._connections[topic])  # type: ignore[union-attr]
+        return tuple(offer for some in found for offer in some)
 
     def knows(self, topic: str) -> bool:
         """True if messages of the topic can be decoded."""

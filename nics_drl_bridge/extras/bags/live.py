@@ -155,8 +155,8 @@ class BagRecorder(QosWatch):
 def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
     """Records until the duration is over, SIGINT or SIGTERM; returns the messages by topic.
 
-    `say` is called with a sentence when a topic begins or can't be recorded. Raises BackendError: nothing
-    was received. Raises RecordingError: the bag can't be written.
+    `say` is called with a sentence when a topic begins or can't be recorded. Raises BackendError:
+    nothing was received. Raises RecordingError: the bag can't be written.
     """
     nodes: list[BagRecorder] = []
     with bag_sink(order.out, order.storage) as sink:
@@ -296,8 +296,9 @@ def play_bag(order: PlayOrder, say: Callable[[str], None]) -> int:
 
     They are published as recorded, with the quality of service that their publishers offered.
     `/clock` gives the times of receipt, as with `ros2 bag play --clock`. `say` is called with a
-    sentence about each topic that is left out. Raises RecordingError: the bag is damaged, lacks a topic,
-    or none of its types is installed. Raises BackendError: the peer in lock-step does not answer.
+    sentence about each topic that is left out. Raises RecordingError: the bag is damaged, lacks a
+    topic, or none of its types is installed. Raises BackendError: the peer in lock-step does not
+    answer.
     """
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
