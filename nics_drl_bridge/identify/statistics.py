@@ -89,7 +89,7 @@ def standard_errors(chi: Array, residual: Array) -> Array:
     unit = chi / scale
     middle = long_run(unit, residual)
     inverse = np.linalg.pinv(unit.T @ unit, hermitian=True)
-    return _deviations(inverse @ middle @ inverse * count / (count - terms)) / scale
+    return np.asarray(_deviations(inverse @ middle @ inverse * count / (count - terms)) / scale)
 
 
 def long_run(chi: Array, residual: Array) -> Array:

@@ -266,19 +266,19 @@ def with_quality(
     def by_dof(values: Array) -> dict[str, float]:
         return {dof: float(value) for dof, value in zip(model.dofs, values, strict=True)}
 
-    tried: dict[str, Any] = {"held_out_rmse": {}, "held_out_r2": {}}
+    figures: dict[str, Any] = {"held_out_rmse": {}, "held_out_r2": {}}
     if unseen is not None:
         believed = unseen.rows(plausible(unseen.x, spec))
         errors = map(by_dof, errors_of(model, believed))
-        tried |= zip(("held_out_rmse", "held_out_r2"), errors, strict=True)
+        figures |= zip(("held_out_rmse", "held_out_r2"), errors, strict=True)
     if held_out is not None:
-        tried |= {
+        figures |= {
             "open_loop_horizon_s": held_out.horizon_s,
             "open_loop_position_error_m": held_out.mean_position_error_m,
             "open_loop_heading_error_rad": held_out.mean_heading_error_rad,
             "open_loop_path_m": held_out.mean_path_m,
         }
     measures = ("outliers", "condition", "rmse", "r2")
-    fitted = {name: by_dof(getattr(linear, name)) for name in measures}
-    quality = Quality(samples=len(linear.regression.samples.t), **fitted, **tried)
+    figures |= {name: by_dof(getattr(linear, name)) for name in measures}
+    quality = Quality(samples=len(linear.regression.samples.t), **figures)
     return replace(model, quality=quality)

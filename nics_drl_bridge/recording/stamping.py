@@ -75,7 +75,7 @@ def streams(data: Mapping[str, TopicData], stamps: Stamps, place: str) -> dict[s
         if ns is None or (len(robot) > 1 and name in ROBOT_STREAMS):
             made[name] = _by_receipt(part, origin)
         else:
-            made[name] = Stream((ns + shift - origin) * S_PER_NS, part.values, clock)
+            made[name] = Stream(_seconds(ns + shift - origin), part.values, clock)
     return made
 
 
@@ -147,4 +147,8 @@ def _in_order(part: TopicData, place: str) -> TopicData:
 
 def _by_receipt(part: TopicData, origin: int) -> Stream:
     order = np.argsort(part.receive_ns, kind="stable")
-    return Stream((part.receive_ns[order] - origin) * S_PER_NS, part.values[order], RECEIVE)
+    return Stream(_seconds(part.receive_ns[order] - origin), part.values[order], RECEIVE)
+
+
+def _seconds(ns: Nanoseconds) -> Array:
+    return np.asarray(ns * S_PER_NS, dtype=np.float64)
