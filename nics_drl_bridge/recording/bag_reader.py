@@ -76,10 +76,7 @@ def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recordin
 
 
 def _table(
-    bag: BagFile,
-    topic: str,
-    row: Callable[[Any], Row],
-    messages: Sequence[Message] | None = None,
+    bag: BagFile, topic: str, row: Callable[[Any], Row], messages: Sequence[Message] | None = None
 ) -> TopicData:
     """Reads a row of numbers from each message of a topic, or from those given."""
     messages = bag.messages(topic) if messages is None else messages
