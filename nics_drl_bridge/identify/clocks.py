@@ -129,7 +129,6 @@ def residual_by_shift(state: Stream, target: Target) -> Residual:
 
 
 def _search_or_zero(residual: Residual, centers: tuple[float, ...] = (0.0,)) -> DelayEstimate:
-    """Estimates a delay; exactly zero if zero explains the signal to rounding."""
     if np.sqrt((residual(np.zeros(1)) ** 2).mean()) < EXACT:
         return DelayEstimate(0.0, 0.0, np.zeros(0), np.zeros(0), 1.0)
     return _search(residual, centers, np.zeros(0))

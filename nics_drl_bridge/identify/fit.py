@@ -153,7 +153,6 @@ def regress(
 
 
 def _scale(chi: Array) -> Array:
-    """Returns the spread (K,) of each feature; 1 for the constant."""
     spread = chi.std(axis=0)
     return np.where(spread > 0.0, spread, 1.0)
 

@@ -230,7 +230,6 @@ def _spread(values: Array) -> Array:
 def _without(
     drive: Drive, twists: TwistIntervals, offset: float, begin: float, end: float
 ) -> tuple[Drive, TwistIntervals]:
-    """Drops the twists and the measured state between two times of the pose's clock [s]."""
     rows = (twists.end <= begin) | (twists.start >= end)
     kept = TwistIntervals(twists.start[rows], twists.end[rows], twists.twist[rows])
     state = drive.recording.state

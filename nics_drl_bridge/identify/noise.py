@@ -88,7 +88,6 @@ def level(variances: Array, unit: str) -> Level:
 def _errors(
     drive: Drive, calibration: Calibration, model: TaylorModel, horizon: float
 ) -> tuple[open_loop.Windows, Array] | None:
-    """Returns windows and the errors (W, 3) at their ends; None if there are too few."""
     chosen = open_loop.windows(drive, calibration, 0.0, drive.duration_s, horizon, SPACING_S)
     if len(chosen.start_t) < MIN_WINDOWS:
         return None

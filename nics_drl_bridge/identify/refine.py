@@ -138,7 +138,6 @@ def problem_of(model: TaylorModel, calibration: Calibration, drive: Drive) -> Pr
 
 
 def _without_outliers(chosen: open_loop.Windows, error: Array) -> open_loop.Windows:
-    """Drops windows that contain a jump of the pose, or have one at an end."""
     size = np.hypot(error[:, 0], error[:, 1])
     far = max(OUTLYING * float(np.median(size)), OUTLYING_SHARE * float(chosen.path.max()))
     inside = size <= far
@@ -187,8 +186,6 @@ def prediction_slopes(
 
 @dataclass(frozen=True)
 class _Free:
-    """Free parameters of a model and its calibration."""
-
     model: TaylorModel
     calibration: Calibration
     coefficients: Mask  # (D, K) that are free
@@ -313,7 +310,6 @@ def _coefficient_errors(
 def _with_uncertainty(
     free: _Free, model: TaylorModel, calibration: Calibration, sigma: Array
 ) -> Calibration:
-    """Completes a refined calibration by uncertainties, and by the responses of the model."""
     known = calibration.uncertainty
     spread = dict(zip(free.names, map(float, sigma), strict=True))
     if free.time:

@@ -168,7 +168,6 @@ def _check_storage(file: Path) -> None:
 
 
 def _check_summary(reader: Reader) -> None:
-    """Compares the topics and numbers of messages of a bag's summary with those of its files."""
     from nics_drl_bridge.recording.mcap import check_message
 
     storages: list[Any] = list(getattr(reader.storage, "storages", [reader.storage]))

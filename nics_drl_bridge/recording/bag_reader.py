@@ -78,7 +78,6 @@ def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recordin
 def _table(
     bag: BagFile, topic: str, row: Callable[[Any], Row], messages: Sequence[Message] | None = None
 ) -> TopicData:
-    """Reads a row of numbers from each message of a topic, or from those given."""
     messages = bag.messages(topic) if messages is None else messages
     receive, header = times_of(messages)
     values = np.array([row(m.content) for m in messages], dtype=np.float64)
@@ -252,7 +251,6 @@ def _column(joints: Joints, variable: StateVariable, source: JointSource) -> Arr
 
 
 def _complete(joints: Joints, values: Array, names: Sequence[str], place: str) -> TopicData:
-    """Drops the messages about other joints."""
     keep = np.asarray(np.isfinite(values).all(axis=1))
     if not keep.any():
         raise RecordingError(
@@ -281,7 +279,6 @@ def _topic(bag: BagFile, kind: str, name: str) -> str | None:
 
 
 def _delay(bag: BagFile, topic: str | None) -> Delay | None:
-    """Fits a uniform distribution to the delays of stamped messages."""
     messages = bag.messages(topic) if topic else []
     receive, stamps = times_of(messages)
     if len(messages) < LEAST_MESSAGES or stamps is None or not stamps.all():

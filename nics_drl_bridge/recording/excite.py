@@ -129,18 +129,15 @@ class Exploration:
         self._tick += 1
 
     def _roll(self, commands: Array, period: float = PERIOD_S) -> tuple[Array, Array]:
-        """Rolls out commands (K, T, C) from the present pose and state."""
         many = len(commands)
         pose, state = np.repeat(self.pose[None], many, 0), np.repeat(self._state[None], many, 0)
         return self._motion.roll(pose, state, commands, period)
 
     def _cells(self, command: Array) -> tuple[NDArray[np.intp], ...]:
-        """Returns the cell indices of commands (..., C), by dimension."""
         share = (command - self.low) / (self.high - self.low)
         return tuple(np.moveaxis(np.clip((share * BINS).astype(np.intp), 0, BINS - 1), -1, 0))
 
     def _segment(self) -> Array:
-        """Returns the commands (T, C) up to the next decision."""
         left = self._ticks - self._still - self._tick
         if left <= self._ramp:
             return np.asarray(self._towards(self.rest[None], left + self._still)[0])
@@ -155,7 +152,6 @@ class Exploration:
         return self._least_harm(length)
 
     def _candidates(self, alone: bool) -> Array:
-        """Draws random levels (K, C) for one command or for several."""
         size = (CANDIDATES, len(self.low))
         fresh = self._rng.uniform(self.low, self.high, size)
         changed = self._rng.random(size) < (0.0 if alone else REDRAWN)
@@ -226,7 +222,6 @@ class Exploration:
 
 
 def _distance(pose: Array) -> Array:
-    """Returns the distance of poses (..., 3) from the start [m]."""
     return np.asarray(np.hypot(pose[..., 0], pose[..., 1]))
 
 
@@ -383,7 +378,6 @@ class DrivePlan:
 
 
 def _driven(drive: Exploration, bound: float, footprint: float) -> Pattern | None:
-    """Returns the expected pattern of a drive; None if it finds no way back into its circle."""
     poses, commands = [drive.pose], []
     while not drive.done:
         commands.append(drive.next())

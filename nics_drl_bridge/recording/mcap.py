@@ -161,8 +161,6 @@ def seal(path: Path) -> None:
 
 @dataclass
 class _Walk:
-    """Contents found while walking through a file."""
-
     data: McapSummary = field(default_factory=McapSummary)  # of the data section
     summary: McapSummary = field(default_factory=McapSummary)  # of the summary
     data_end: int = 0  # offset of the summary; 0 within the data
@@ -263,7 +261,6 @@ def _in_summary(walk: _Walk, record: Record) -> None:
 
 
 def _agree(walk: _Walk) -> None:
-    """Compares the summary, if there is one, with the data."""
     data, summary = walk.data, walk.summary
     for name in ("schemas", "channels"):
         ours, theirs = getattr(data, name), getattr(summary, name)

@@ -69,7 +69,6 @@ def command_row(message: Any) -> Row:
 
 
 def _place(message: Any) -> tuple[Any, Any]:
-    """Returns position and quaternion of any message that has them."""
     if hasattr(message, "transform"):
         return message.transform.translation, message.transform.rotation
     pose = getattr(message.pose, "pose", message.pose)

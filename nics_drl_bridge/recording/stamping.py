@@ -107,7 +107,6 @@ def _clocks(
 
 
 def _header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
-    """Returns the checked header stamps of a topic; None if there are none."""
     ns, topic = part.header_ns, f"{place}: topic {part.topic!r}"
     if ns is None or not ns.any():
         if stamps == "header":

@@ -167,12 +167,10 @@ class _Topics:
         return f"no topic is known to hold the {words}; {advice}; {self._listed(roles)}"
 
     def _fitting(self, *roles: str) -> list[str]:
-        """Returns the topics with messages of a type allowed in any of the roles."""
         kinds = {kind for role in roles for kind in TYPES[role]}
         return sorted(t for t, kind in self.types.items() if kind in kinds and t not in self.empty)
 
     def _listed(self, roles: Sequence[str]) -> str:
-        """Lists the topics with their types, those that fit a role first."""
         fitting = self._fitting(*roles)
         topics = sorted(self.types, key=lambda topic: (topic not in fitting, topic))
         told = [

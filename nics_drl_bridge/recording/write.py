@@ -96,7 +96,6 @@ def write_bag(
 def _topics(
     recording: Recording, spec: RobotSpec, messages: _Messages
 ) -> Iterator[tuple[str, str, Stream, Make]]:
-    """Yields topic, type, stream and the function that makes a message of a row."""
     beside = recording.odometry is not None or recording.pose.clock != recording.command.clock
     joints, names, still = recording.wheels, list(WHEELS), np.zeros(len(WHEELS), dtype=bool)
     if recording.state is not None:
@@ -130,8 +129,6 @@ def _to_commands_clock(recording: Recording, stream: Stream) -> int:
 
 
 class _Messages:
-    """Conversion of rows to messages."""
-
     def __init__(self, store: Typestore) -> None:
         self._types = store.types
 

@@ -270,7 +270,6 @@ def _moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> Finding
 def _compared(
     field: str, real: Array, claimed: Array, units: Sequence[tuple[float, str]], good: str
 ) -> Findings:
-    """Compares the changes of the pose (T,) with those according to the twist (T,)."""
     ratio, size = _slope(real, claimed), float(np.sqrt((real @ real) * (claimed @ claimed)))
     if _alike(ratio):
         return
@@ -345,7 +344,6 @@ def layout(facts: Facts, expected: Expected) -> Findings:
 
 
 def _beams(have: doctor_facts.Layout, expected: Expected) -> Findings:
-    """Compares a header's beams and range limits with those of the expected lidar."""
     want = expected.lidar.header
     fix = "set the driver, or make a lidar file of what it sends and generate the model anew"
     if have.beams != expected.lidar.beams:

@@ -187,7 +187,6 @@ def _response(
 
 
 def _predicted(identified: Identified, chosen: Windows) -> Array:
-    """Open-loop paths (W, n, 3) over windows."""
     shares = np.linspace(0.02, 1.0, POINTS)
     ends = [chosen.start_t + share * (chosen.end_t - chosen.start_t) for share in shares]
     model, calibration, drive = identified.model, identified.calibration, identified.drive

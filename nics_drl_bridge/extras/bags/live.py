@@ -182,8 +182,6 @@ Timed = tuple[int, str, bytes]  # receipt [ns], topic, data
 
 
 class _Player:
-    """Publishes messages one after another, when they are due."""
-
     def __init__(self, node: Node, order: PlayOrder, stopping: threading.Event) -> None:
         self._node, self._order, self._stopping = node, order, stopping
         self.publishers: dict[str, Publisher] = {}
@@ -229,7 +227,6 @@ class _Player:
         )
 
     def _wait(self, condition: Callable[[], bool], patience_s: float) -> bool:
-        """Waits for a condition; returns False if it did not come true in time."""
         until = time.monotonic() + patience_s
         while not (condition() or self._stopping.is_set()):
             if time.monotonic() > until:

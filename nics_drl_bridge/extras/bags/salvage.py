@@ -131,7 +131,6 @@ def _number(file: Path) -> tuple[int, str]:
 
 
 def _decodable(found: _Found) -> Iterator[tuple[str, int, bytes]]:
-    """Yields the decodable messages of known topics, decompressed."""
     store = typestore()
     for topic, ns, data in found.messages:
         kind = found.kinds.get(topic)
