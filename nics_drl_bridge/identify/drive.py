@@ -137,34 +137,26 @@ def pose_noise(pose: Stream, bursts: Bursts | None) -> tuple[float, float] | Non
     They come from sixth differences, in which smooth motion vanishes; in bursts, whose sample
     times are not known well enough, from stretches at rest. None if there are none.
     """
-    if bursts is None:
-        rest = _high_differences(pose)
-        sigma = np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD if len(rest) >= DIFFERENCE else None
-    else:
+    if bursts is not None:
         sigma = _spread_at_rest(unwrapped(pose.values))
+    else:
+        rest = pose_residual(pose)
+        sigma = np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD if len(rest) >= DIFFERENCE else None
     if sigma is None:
         return None
     sigma = np.where(sigma < NEGLIGIBLE, 0.0, sigma)
     return float(np.hypot(sigma[0], sigma[1]) / np.sqrt(2.0)), float(sigma[2])
 
 
-def pose_residual(drive: Drive) -> Array | None:
-    """Returns the noise (n, 3) of poses at its own scale; None for bursts or too few poses."""
-    pose = drive.recording.pose
-    if drive.bursts is not None or len(pose.t) <= 2 * DIFFERENCE:
-        return None
-    return _high_differences(pose)
-
-
-def _high_differences(pose: Stream) -> Array:
+def pose_residual(pose: Stream) -> Array:
     """Returns sixth differences (n, 3) at the scale of the noise, over gap-free stretches."""
-    rest = np.diff(unwrapped(pose.values), DIFFERENCE, axis=0) / DIFFERENCE_GAIN
+    rest = np.asarray(np.diff(unwrapped(pose.values), DIFFERENCE, axis=0) / DIFFERENCE_GAIN)
     if not len(rest):
-        return np.asarray(rest)
+        return rest
     span = np.diff(pose.t)
     even = np.abs(span - np.median(span)) < UNEVEN * np.median(span)
     whole = np.convolve(even, np.ones(DIFFERENCE), "valid") > DIFFERENCE - 0.5
-    return np.asarray(rest[whole] if whole.mean() > LEAST_WHOLE else rest)
+    return np.asarray(rest[whole]) if whole.mean() > LEAST_WHOLE else rest
 
 
 def _spread_at_rest(pose: Array) -> Array | None:

@@ -70,16 +70,11 @@ def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
     names = ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
     values = map(float, (mounting.rotation, *mounting.lever))
     sigmas = tuple(map(float, (mounting.rotation_sigma, *mounting.lever_sigma)))
-    rotation, x, y = (
-        clocks.if_certain(v, s, MIN_LENGTH) for v, s in zip(values, sigmas, strict=True)
-    )
+    both = zip(values, sigmas, strict=True)
+    rotation, x, y = (clocks.if_certain(value, sigma, MIN_LENGTH) for value, sigma in both)
     learnt = {n: s for n, s in zip(names, sigmas, strict=True) if not np.isnan(s)}
-    return replace(
-        calibration,
-        rotation_rad=rotation,
-        lever_arm_m=(x, y),
-        uncertainty={**calibration.uncertainty, **learnt},
-    )
+    uncertainty = {**calibration.uncertainty, **learnt}
+    return replace(calibration, rotation_rad=rotation, lever_arm_m=(x, y), uncertainty=uncertainty)
 
 
 def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> Mounting | None:
@@ -156,12 +151,9 @@ def _by_commands(
     across = rotate(gain[2, :2], -rotation) / gain[2, 2]  # (-lever_y, lever_x)
     scale = float(np.hypot(gain[0, 0], gain[0, 1]))
     return Mounting(
-        float(wrap_angle(rotation)),
-        np.array([across[1], -across[0]]),
-        float(spread[0, 1] / scale),
-        np.full(2, float(spread[2, 0] / abs(gain[2, 2]))),
-        True,
-    )
+        float(wrap_angle(rotation)), np.array([across[1], -across[0]]), float(spread[0, 1] / scale),
+        np.full(2, float(spread[2, 0] / abs(gain[2, 2]))), True,
+    )  # fmt: skip
 
 
 def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
@@ -214,12 +206,9 @@ def jackknifed(
     if len(found) < BLOCKS:
         return whole
     rotation = wrap_angle(np.array([p.rotation - whole.rotation for p in found]))
-    lever = np.array([p.lever for p in found])
-    return replace(
-        whole,
-        rotation_sigma=max(whole.rotation_sigma, float(_spread(rotation))),
-        lever_sigma=np.maximum(whole.lever_sigma, _spread(lever)),
-    )
+    rotation_sigma = max(whole.rotation_sigma, float(_spread(rotation)))
+    lever_sigma = np.maximum(whole.lever_sigma, _spread(np.array([p.lever for p in found])))
+    return replace(whole, rotation_sigma=rotation_sigma, lever_sigma=lever_sigma)
 
 
 def _spread(values: Array) -> Array:

@@ -43,13 +43,15 @@ PERCENTILES = (5.0, 50.0, 95.0)
 SPANNED = 0.9  # share of a uniform distribution between the first and last of these percentiles
 
 
-def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recording:
+def load_bag(path: str | Path, spec: RobotSpec | None, mapping: TopicRoles) -> Recording:
     """Reads a drive of a robot from a bag: its folder or its only file.
 
     Missing roles of topics are guessed; for the clocks see `stamping.streams`. RecordingError, one
     sentence with place and fix: the bag is damaged or incomplete, a topic is missing or ambiguous,
     or the data can't be used for this robot.
     """
+    if spec is None:
+        raise RecordingError(f"{path}: is a bag; say of which robot, with a RobotSpec.")
     with opened(path) as bag:
         topics = roles.assign(mapping, bag.types, bag.empty, bag.place)
         data = {

@@ -26,14 +26,8 @@ class Format(NamedTuple):
     has_topics: bool = False
 
 
-def _load_bag(path: Path, spec: RobotSpec | None, topics: TopicRoles) -> Recording:
-    if spec is None:
-        raise RecordingError(f"{path}: is a bag; say of which robot, with a RobotSpec.")
-    return load_bag(path, topics, spec)
-
-
 FORMATS = (
-    Format("a rosbag2", lambda p: p.exists() and is_bag(p), _load_bag, has_topics=True),
+    Format("a rosbag2", lambda p: p.exists() and is_bag(p), load_bag, has_topics=True),
     Format("a folder of CSV files", Path.is_dir, lambda path, *_: load_csv_folder(path)),
     Format("an .npz file", lambda p: p.suffix == ".npz", lambda path, *_: load_recording(path)),
 )

@@ -83,11 +83,13 @@ def write_bag(
     `/joint_states`, the IMU `/imu`. Headers contain the streams' stamps. For errors see `bag_sink`.
     """
     with bag_sink(path, storage) as sink:
-        messages = _Messages(store := sink.store)
+        messages, command = _Messages(store := sink.store), recording.command
         for topic, kind, stream, make in _topics(recording, spec, messages):
             sink.add_topic(topic, kind)
             stamps = np.round(stream.t * NS_PER_S).astype(np.int64) + START_NS
-            receive = stamps + _to_commands_clock(recording, stream)
+            # By their receipt, streams of other clocks start together with the commands.
+            late = 0.0 if stream.clock == command.clock else float(command.t[0] - stream.t[0])
+            receive = stamps + round(late * NS_PER_S)
             for k, values in enumerate(stream.values):
                 message = make(messages.header(int(stamps[k])), values)
                 sink.write(topic, int(receive[k]), bytes(store.serialize_cdr(message, kind)))
@@ -101,14 +103,15 @@ def _topics(
     if recording.state is not None:
         joints, names = recording.state, [v.name for v in spec.state]
         still = np.array([v.unit in POSITION_UNITS for v in spec.state])
+    pose = ("/odom", topic_roles.ODOMETRY, recording.pose, messages.odometry)
+    if beside:
+        pose = ("/pose", topic_roles.POSE, recording.pose, messages.pose_stamped)
     topics: list[tuple[str, str, Stream | None, Make]] = [
         (
             "/cmd_vel", topic_roles.TWIST, recording.command,
             lambda _, row: messages.twist(spec.to_cmd_vel(row)),
         ),
-        ("/pose", topic_roles.POSE, recording.pose, messages.pose_stamped)
-        if beside
-        else ("/odom", topic_roles.ODOMETRY, recording.pose, messages.odometry),
+        pose,
         ("/odom", topic_roles.ODOMETRY, recording.odometry, messages.speeds),
         (
             "/joint_states", topic_roles.JOINTS, joints,
@@ -119,13 +122,6 @@ def _topics(
     for topic, kind, stream, make in topics:
         if stream is not None:
             yield topic, kind, stream, make
-
-
-def _to_commands_clock(recording: Recording, stream: Stream) -> int:
-    """Returns the offset from stamp to receipt [ns]: streams of other clocks start together."""
-    if stream.clock == recording.command.clock:
-        return 0
-    return round(float(recording.command.t[0] - stream.t[0]) * NS_PER_S)
 
 
 class _Messages:
@@ -181,17 +177,12 @@ class _Messages:
 
 
 class BagSink:
-    """An open bag, created by `bag_sink` with an open writer of rosbags.
-
-    Attributes:
-        store: known message types.
-        counts: number of messages by topic.
-    """
+    """An open bag, created by `bag_sink` with an open writer of rosbags."""
 
     def __init__(self, writer: Writer) -> None:
-        self._writer, self.store = writer, typestore()
+        self._writer, self.store = writer, typestore()  # the known message types
         self._connections: dict[str, Connection] = {}
-        self.counts: dict[str, int] = {}
+        self.counts: dict[str, int] = {}  # number of messages by topic
 
     def add_topic(
         self,

@@ -23,7 +23,7 @@ from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.noise import drift_growth, odometry_residual
 from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, predict, windows
 from nics_drl_bridge.identify.report import CalibratedValue, estimates
-from nics_drl_bridge.identify.signals import held, moved_commands, nominal_lags
+from nics_drl_bridge.identify.signals import DIFFERENCE, held, moved_commands, nominal_lags
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.report.page import DARK, MEASURED, MODEL, OTHER, png
 from nics_drl_bridge.robot.noise import Level
@@ -313,8 +313,7 @@ def noise(identified: Identified) -> bytes | None:
     """Draws histograms of the residuals, and the growth of the drift; None if free of noise."""
     levels, panels = identified.noise, []
     drive, calibration, model = identified.drive, identified.calibration, identified.model
-    pose = pose_residual(drive)
-    if pose is not None:
+    if drive.bursts is None and len(pose := pose_residual(drive.recording.pose)) > DIFFERENCE:
         panels += [("pose position", levels.pose_position, pose[:, :2].ravel())]
         panels += [("pose heading", levels.pose_heading, pose[:, 2])]
     odometry = odometry_residual(drive, calibration, model, identified.samples)
