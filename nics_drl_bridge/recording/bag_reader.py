@@ -27,7 +27,6 @@ from nics_drl_bridge.recording.messages import (
     imu_row,
     pose_row,
     quaternion,
-    stamp,
     twist_row,
 )
 from nics_drl_bridge.recording.recording import Recording, check
@@ -61,14 +60,7 @@ def load_bag(path: str | Path, spec: RobotSpec | None, mapping: TopicRoles) -> R
         if "pose" in topics and "odom" in topics:
             data["odometry"] = _table(bag, topics["odom"], twist_row)
         if topic := topics.get("joint_states"):
-            messages = ((m.receive_ns, stamp(m.content), m.content) for m in bag.messages(topic))
-            joints = gather(
-                topic,
-                (JointMessage(ns, t, c.name, c.position, c.velocity) for ns, t, c in messages),
-            )
-            state = state_of(joints, spec, mapping, bag.place)
-            wheels = wheels_of(joints, mapping, bag.place)
-            data |= {n: d for n, d in (("state", state), ("wheels", wheels)) if d is not None}
+            data |= joint_streams(topic, bag.messages(topic), spec, mapping, bag.place)
         if "imu" in topics:
             data["imu"] = _table(bag, topics["imu"], imu_row)
         latency = latency_of(bag, topics.get("odom"))
@@ -145,40 +137,38 @@ def _of_one_body(
     )
 
 
+def joint_streams(
+    topic: str, messages: Sequence[Message], spec: RobotSpec, mapping: TopicRoles, place: str
+) -> dict[str, TopicData]:
+    """Returns state and wheels, each if the joints show it; for errors see `state_of`."""
+    joints = gather(topic, messages)
+    found = {"state": state_of(joints, spec, mapping, place)}
+    found["wheels"] = wheels_of(joints, mapping, place)
+    return {name: data for name, data in found.items() if data is not None}
+
+
 class Joints(NamedTuple):
     """Messages about J joints, in one table; NaN if missing in a message."""
 
     topic: str
     receive_ns: Nanoseconds  # (T,)
-    header_ns: Nanoseconds  # (T,)
+    header_ns: Nanoseconds | None  # (T,)
     names: tuple[str, ...]
     position: Array  # (T, J) [rad or m]
     velocity: Array  # (T, J) [rad/s or m/s]
 
 
-class JointMessage(NamedTuple):
-    """One message; positions or velocities may be empty."""
-
-    receive_ns: int
-    header_ns: int
-    names: Sequence[str]
-    position: Sequence[float]
-    velocity: Sequence[float]
-
-
-def gather(topic: str, messages: Iterable[JointMessage]) -> Joints:
+def gather(topic: str, messages: Sequence[Message]) -> Joints:
     """Collects messages, which may contain different joints, in one table."""
-    messages = list(messages)
-    names = tuple(dict.fromkeys(name for message in messages for name in message.names))
+    names = tuple(dict.fromkeys(name for message in messages for name in message.content.name))
     position, velocity = np.full((2, len(messages), len(names)), np.nan)
     for row, message in enumerate(messages):
-        columns = [names.index(name) for name in message.names]
-        for table, values in ((position, message.position), (velocity, message.velocity)):
+        told = message.content
+        columns = [names.index(name) for name in told.name]
+        for table, values in ((position, told.position), (velocity, told.velocity)):
             if len(values) == len(columns):
                 table[row, columns] = values
-    receive = np.array([m.receive_ns for m in messages], dtype=np.int64)
-    header = np.array([m.header_ns for m in messages], dtype=np.int64)
-    return Joints(topic, receive, header, names, position, velocity)
+    return Joints(topic, *times_of(messages), names, position, velocity)
 
 
 def state_of(joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str) -> TopicData | None:
