@@ -271,18 +271,17 @@ def _agree(walk: _Walk) -> None:
             raise DamageError(walk.data_end, f"the channel {channel.topic!r} has no schema")
     if walk.indexed and walk.indexed != walk.chunks:
         raise DamageError(walk.data_end, "the index of its chunks does not fit them")
-    if walk.statistics is not None and not _fits(walk.statistics.content, walk):
+    if walk.statistics is None:
+        return
+    told: kinds.Statistics = walk.statistics.content
+    counts = Counter({key: n for key, n in told.channel_message_counts.items() if n})
+    if not (
+        told.message_count == data.counts.total()
+        and (not counts or counts == data.counts)
+        and told.chunk_count in (0, len(walk.chunks))
+        and data.span in (None, (told.message_start_time, told.message_end_time))
+    ):
         raise DamageError(walk.statistics.offset, "its statistics do not fit its messages")
-
-
-def _fits(statistics: kinds.Statistics, walk: _Walk) -> bool:
-    counts = Counter({key: n for key, n in statistics.channel_message_counts.items() if n})
-    return (
-        statistics.message_count == walk.data.counts.total()
-        and (not counts or counts == walk.data.counts)
-        and statistics.chunk_count in (0, len(walk.chunks))
-        and walk.data.span in (None, (statistics.message_start_time, statistics.message_end_time))
-    )
 
 
 def _zstd() -> Any:
