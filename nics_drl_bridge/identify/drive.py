@@ -78,10 +78,23 @@ class Drive:
 
     @cached_property
     def twists(self) -> TwistIntervals:
-        """Twists of the tracked body over intervals as long as the pose noise requires."""
-        (t, pose), bursts = (self.dated.t, self.dated.values), self.bursts
-        stride = 1 if bursts is not None else _stride(t, pose, self.pose_noise or (0.0, 0.0))
-        limit = 1.8 * bursts.period_s if bursts is not None else MAX_GAP_S
+        """Twists of the tracked body over intervals as long as the pose noise requires.
+
+        Between samples so far apart, motion stands out of the noise.
+        """
+        t, pose, stride, limit = self.dated.t, self.dated.values, 1, MAX_GAP_S
+        if self.bursts is not None:
+            limit = 1.8 * self.bursts.period_s
+        else:
+            dt = float(np.median(np.diff(t)))
+            coarse = max(1, round(MAX_SPAN_S / dt))
+            far = geometry.log(geometry.between(pose[:-coarse:coarse], pose[coarse::coarse]))
+            far = far / (coarse * dt)
+            speed = float(np.sqrt((far[:, :2] ** 2).sum(axis=1).mean())) if len(far) else 0.0
+            turn = float(np.sqrt((far[:, 2] ** 2).mean())) if len(far) else 0.0
+            both = zip(self.pose_noise or (0.0, 0.0), (speed, turn), strict=True)
+            needed = max(noise / max(SLOPE_NOISE * size, 1e-9) for noise, size in both)
+            stride = int(np.clip(np.ceil(np.sqrt(2.0) * needed / dt), 1, coarse))
         t, pose = t[::stride], pose[::stride]
         span = np.diff(t)
         usable = (span > 0.0) & (span < max(limit, 3.0 * float(np.median(span))))
@@ -184,15 +197,3 @@ class TwistIntervals:
     def on_clock(self, offset: float) -> tuple[Array, Array]:
         """Returns start and end on a clock that is ahead of the pose's by an offset."""
         return self.start + offset, self.end + offset
-
-
-def _stride(t: Array, pose: Array, noise: tuple[float, float]) -> int:
-    """Returns the number of samples between poses that makes motion stand out of the noise."""
-    dt = float(np.median(np.diff(t)))
-    coarse = max(1, round(MAX_SPAN_S / dt))
-    far = geometry.log(geometry.between(pose[:-coarse:coarse], pose[coarse::coarse]))
-    far = far / (coarse * dt)
-    speed = float(np.sqrt((far[:, :2] ** 2).sum(axis=1).mean())) if len(far) else 0.0
-    turn = float(np.sqrt((far[:, 2] ** 2).mean())) if len(far) else 0.0
-    needed = max(n / max(SLOPE_NOISE * v, 1e-9) for n, v in zip(noise, (speed, turn), strict=True))
-    return int(np.clip(np.ceil(np.sqrt(2.0) * needed / dt), 1, coarse))

@@ -200,9 +200,15 @@ def jackknifed(
     whole = estimate(drive, twists)
     if whole is None:
         return None
-    edges = np.linspace(twists.start[0], twists.end[-1], BLOCKS + 1)
-    parts = (estimate(*_without(drive, twists, offset, *ends)) for ends in pairwise(edges))
-    found = [part for part in parts if part is not None]
+    edges, found = np.linspace(twists.start[0], twists.end[-1], BLOCKS + 1), []
+    for begin, end in pairwise(edges):
+        rows, rest = (twists.end <= begin) | (twists.start >= end), drive
+        if (state := drive.recording.state) is not None:
+            outside = (state.t < begin + offset) | (state.t > end + offset)
+            rest = drive.part(replace(drive.recording, state=state.rows(outside)))
+        kept = TwistIntervals(twists.start[rows], twists.end[rows], twists.twist[rows])
+        if (part := estimate(rest, kept)) is not None:
+            found.append(part)
     if len(found) < BLOCKS:
         return whole
     rotation = wrap_angle(np.array([p.rotation - whole.rotation for p in found]))
@@ -214,15 +220,3 @@ def jackknifed(
 def _spread(values: Array) -> Array:
     """Returns standard errors (...) from estimates (B, ...) that each omit one block."""
     return np.asarray(np.sqrt((len(values) - 1.0) * values.var(axis=0)))
-
-
-def _without(
-    drive: Drive, twists: TwistIntervals, offset: float, begin: float, end: float
-) -> tuple[Drive, TwistIntervals]:
-    rows = (twists.end <= begin) | (twists.start >= end)
-    kept = TwistIntervals(twists.start[rows], twists.end[rows], twists.twist[rows])
-    state = drive.recording.state
-    if state is None:
-        return drive, kept
-    outside = (state.t < begin + offset) | (state.t > end + offset)
-    return drive.part(replace(drive.recording, state=state.rows(outside))), kept

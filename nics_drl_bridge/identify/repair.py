@@ -183,7 +183,10 @@ def check_axes(drive: Drive) -> None:
     mirrored, then x, y or heading is reversed.
     """
     recording = drive.recording
-    t, pose = _far_apart(drive.dated, TRAVEL_SHARE * drive.spec.footprint_radius)
+    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(drive.dated.values[:, :2], axis=0).T)))
+    apart = max(TRAVEL_SHARE * drive.spec.footprint_radius, 1e-3)
+    some = drive.dated.rows(np.unique(np.searchsorted(path, np.arange(0.0, path[-1], apart))))
+    t, pose = some.t, some.values
     if len(t) < MIN_DIRECTIONS or np.ptp(np.unwrap(pose[:, 2])) < MIN_TURN:
         return
     other = pose * np.array([1.0, 1.0, -1.0])
@@ -199,14 +202,6 @@ def check_axes(drive: Drive) -> None:
             "x, y and heading is reversed: they must be x forward, y left, heading "
             "counter-clockwise (REP-103)."
         )
-
-
-def _far_apart(dated: Stream, distance: float) -> tuple[Array, Array]:
-    """Returns stamps (n,) and poses (n, 3) of a stream, about `distance` [m] apart."""
-    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(dated.values[:, :2], axis=0).T)))
-    marks = np.arange(0.0, path[-1], max(distance, 1e-3))
-    chosen = np.unique(np.searchsorted(path, marks))
-    return dated.t[chosen], dated.values[chosen]
 
 
 def _steadiness(pose: Array) -> float:
