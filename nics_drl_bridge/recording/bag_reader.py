@@ -185,7 +185,11 @@ def state_of(joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str) -
     sources = {v.name: _source(joints, v, mapping, place) for v in spec.state}
     found = [source for source in sources.values() if source is not None]
     if spec.state and len(found) == len(sources):
-        columns = [_column(joints, v, s) for v, s in zip(spec.state, found, strict=True)]
+        columns = []
+        for variable, source in zip(spec.state, found, strict=True):
+            usual = "position" if variable.unit in POSITION_UNITS else "velocity"
+            table = joints.position if (source.field or usual) == "position" else joints.velocity
+            columns.append(source.scale * table[:, joints.names.index(source.joint)])
         return _complete(joints, np.stack(columns, axis=1), [s.joint for s in found], place)
     if mapping.state or any(v.follows is None for v in spec.state):
         missing = next(name for name, source in sources.items() if source is None)
@@ -234,12 +238,6 @@ def _alike(names: Iterable[str], wanted: str) -> str | None:
     words = set(wanted.split("_"))
     found = [name for name in names if words <= set(re.split(r"[^a-z]+", name.lower()))]
     return wanted if wanted in found else found[0] if len(found) == 1 else None
-
-
-def _column(joints: Joints, variable: StateVariable, source: JointSource) -> Array:
-    usual = "position" if variable.unit in POSITION_UNITS else "velocity"
-    table = joints.position if (source.field or usual) == "position" else joints.velocity
-    return np.asarray(source.scale * table[:, joints.names.index(source.joint)])
 
 
 def _complete(joints: Joints, values: Array, names: Sequence[str], place: str) -> TopicData:

@@ -166,7 +166,9 @@ def _read_mcap(file: Path, found: _Found) -> None:
             record = next(mcap.records(data, place))
             whole, end = isinstance(record.content, Chunk), record.end
             if whole:
-                waiting += _inside(record)
+                span = record.content.message_start_time, record.content.message_end_time
+                with suppress(mcap.DamageError):
+                    waiting += _until_damage(mcap.unpacked(record), span)
             elif isinstance(record.content, mcap.INSIDE):
                 waiting.append(record)
             elif isinstance(record.content, Statistics):
@@ -192,14 +194,6 @@ def _read_mcap(file: Path, found: _Found) -> None:
     for key, count in promised.items():
         known = told.channels.get(key)
         found.promised[known.topic if known else f"unknown channel {key}"] += count
-
-
-def _inside(record: mcap.Record) -> list[mcap.Record]:
-    with suppress(mcap.DamageError):
-        chunk = record.content
-        span = chunk.message_start_time, chunk.message_end_time
-        return list(_until_damage(mcap.unpacked(record), span))
-    return []
 
 
 def _cut_chunk(data: memoryview, place: int) -> list[mcap.Record]:
