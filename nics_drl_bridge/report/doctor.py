@@ -22,27 +22,23 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Mismatch = doctor_facts.Mismatch
 Findings = Iterator[Mismatch]
 
-LEAST_PATH_M, LEAST_TURN_RAD = 0.3, 0.3
-"""A drive with less motion than this does not determine scales."""
+LEAST_PATH_M, LEAST_TURN_RAD = 0.3, 0.3  # a drive with less motion does not determine scales
 TOLERANCE = 1.4  # differences of the pose and the twist must agree within this factor
+# Below this correlation a ratio of pose and twist is meaningless; the same for commands, which the
+# robot follows with delay and within its limits.
 ALIKE, LEAST_ALIKE = 0.8, 0.3
-"""Below this correlation a ratio of pose and twist is meaningless; the same for commands, which the
-robot follows with delay and within its limits."""
-JUMP, JUMP_M = 5.0, 0.2
-"""A step is a jump beyond this multiple of what the maximum speed allows, and this length [m]."""
+JUMP, JUMP_M = 5.0, 0.2  # a step is a jump beyond this multiple of the top speed's, and this length
 QUATERNION_TOLERANCE = 0.05
 LEAST_STEPS = 10
 UNITS = ((1000.0, "mm/s"), (100.0, "cm/s"), (3.6, "km/h"), (180.0 / np.pi, "degrees per second"))
 RATE_TOLERANCE = 0.2
+# Stamps are from the future if this much after their arrival; too old for the command gate if this
+# much before it; and so far before it that the clocks must differ.
 FUTURE_S, LATE_S, OFFSET_S = 0.005, 0.35, 5.0
-"""Stamps are from the future if this much after their arrival; too old for the command gate if this
-much before it; and so far before it that the clocks must differ."""
 STALE_CLOCK_S = 1.0
 BODY_FRAMES = ("base_link", "base_footprint")
 ANGLE_TOLERANCE = 0.5  # tolerance of a beam's direction, in increments
-ODD_SHARE = 0.01
-"""A value in more than this share of the beams is taken to be intended by the lidar."""
-
+ODD_SHARE = 0.01  # a value in more than this share of the beams is intended by the lidar
 
 error, warning = partial(Mismatch, "error"), partial(Mismatch, "warning")
 no_match, layout_error = partial(error, "quality of service"), partial(error, "beam layout", SCAN)
